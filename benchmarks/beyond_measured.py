@@ -21,7 +21,7 @@ from pisigma.calibration.geometric.problem.setup import identified_geometry
 from pisigma.calibration.geometric.result import SolvedCalibration
 from pisigma.calibration.hybrid.calibrator import HybridCalibrator
 from pisigma.calibration.hybrid.design import Design
-from pisigma.calibration.hybrid.refinement import Refined, linearise_rows, network
+from pisigma.calibration.hybrid.refinement import Refined, correction_from_weights, linearise_rows
 from pisigma.calibration.hybrid.regression import build_regression
 from pisigma.estimation.prior import GaussianPrior
 from pisigma.joint_correction.feature import AbstractFeature
@@ -68,13 +68,18 @@ def fitted(
         else:
             posterior = fit.solve(prior, noise)
             posterior = fit.solve(prior, fit.updated_noise(posterior))
-        x, sizes, noise, effective = posterior.x, posterior.prior, posterior.noise, posterior.effective
-    rows = linearise_rows(design, posterior.x, posterior.effective, group)
+        x, sizes, noise, effective = (
+            posterior.x,
+            posterior.prior,
+            posterior.noise,
+            posterior.effective_unknowns,
+        )
+    rows = linearise_rows(design, posterior.x, posterior.effective_unknowns, group)
     fit = build_regression(design, rows)
     there = fit.solve(posterior.prior, posterior.noise)
     there = fit.solve(posterior.prior, fit.updated_noise(there))
     point = problem.nominal.index_add(0, problem.active, there.x[: design.active])
-    return Refined(rows, design, there, fit, point, network(design, there.x), ROUNDS)
+    return Refined(rows, design, there, fit, point, correction_from_weights(design, there.x), ROUNDS)
 
 
 def amplitudes(both: Refined, prior: GaussianPrior) -> GaussianPrior:

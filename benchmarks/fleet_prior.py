@@ -63,7 +63,7 @@ def true_prior(individual: float, gears: float) -> CalibratedModel:
 def begun_with(prior: CalibratedModel, rows: Measurements) -> Adaptation:
     """Return the posterior of a robot."""
     posterior = ModelPosterior.from_model(prior)
-    rows = posterior.renamed(rows)
+    rows = posterior.with_model_names(rows)
     problem = recalibration_problem(prior, posterior, rows, frame_keys(rows, ("base", "tool")))
     return adapt(problem)
 

@@ -100,7 +100,9 @@ def months() -> None:
 
 def _alarmed(monitoring: pisigma.Monitoring) -> list[bool]:
     """Return, per session, whether a chart is outside its limits or a motion is reported."""
-    outside = torch.stack([one for chart in monitoring.charts for one in chart.outside.values()]).any(0)
+    outside = torch.stack(
+        [one for chart in monitoring.charts for one in chart.sessions_outside.values()]
+    ).any(0)
     moved = [one.session.verdict != "unchanged" for one in monitoring.sessions]
     return [one or other for one, other in zip(outside.tolist(), moved, strict=True)]
 

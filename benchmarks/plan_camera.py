@@ -98,7 +98,7 @@ class Bench:
         rows = image_measurements(images, self.camera, self.board, False, noise.repeatability, "fixed")
         robot = GeometricCalibrator(self.arm.robot, prior=PRIOR).fit(rows).robot
         points, estimated = (forward_kinematics(one, judged)[:, :3, 3] for one in (true, robot))
-        predicted = rms_of(self.posterior["geometric"].informed(q).tool(judged))
+        predicted = rms_of(self.posterior["geometric"].given_poses(q).tool(judged))
         return 1e3 * aligned_error(points, estimated), 1e3 * predicted
 
 
@@ -125,7 +125,7 @@ def main(draws: int, candidates: int, counts: list[int]) -> None:
         for name, posterior in bench.posterior.items():
             for criterion in get_args(Criterion):
                 chosen = select_poses(
-                    posterior.measured(bench.q), posterior.tool(bench.task), count, criterion
+                    posterior.sensitivities(bench.q), posterior.tool(bench.task), count, criterion
                 )
                 ways[f"{criterion}, {name}"] = [chosen] * draws
         pooled = {}

@@ -79,7 +79,7 @@ def measured(
         for count in counts:
             rows: dict[str, Tensor] = {"random": torch.arange(count)}
             rows |= {
-                one: select_poses(posterior.measured(pool.q), posterior.tool(pool.q[:300]), count, one)
+                one: select_poses(posterior.sensitivities(pool.q), posterior.tool(pool.q[:300]), count, one)
                 for one in criteria
             }
             for how, chosen in rows.items():
@@ -97,7 +97,10 @@ def sequential(name: str, counts: tuple[int, ...], draws: range) -> None:
         for count in counts:
             free = torch.arange(POOL)[~torch.isin(torch.arange(POOL), chosen)]
             more = select_poses(
-                posterior.measured(pool.q[free]), posterior.tool(pool.q[:300]), count - len(chosen), "I"
+                posterior.sensitivities(pool.q[free]),
+                posterior.tool(pool.q[:300]),
+                count - len(chosen),
+                "I",
             )
             chosen = torch.cat([chosen, free[more]])
             result = HybridCalibrator(robot).fit(pool.select(chosen))
@@ -145,7 +148,7 @@ class Arm:
         """Return the result for measured poses."""
         result = fit_where_it_helps(HybridCalibrator(self.nominal), self.rows(q), lambda what: None)
         assert isinstance(result, HybridResult)
-        both = posterior.informed(q), RobotPosterior.from_result(result, posterior.instrument)
+        both = posterior.given_poses(q), RobotPosterior.from_result(result, posterior.instrument)
         return Figures(rms_mm(result, self.test), *(rms_of(one.tool(self.test.q)) * 1e3 for one in both))
 
 
@@ -156,7 +159,7 @@ def predicted(seeds: range) -> None:
         arm = Arm(ARMS[seed % len(ARMS)], seed)
         posterior, q = RobotPosterior.from_robot(arm.planned, Instrument(sigma=NOISE)), arm.candidates(1000)
         for count in (15, 30, 60):
-            chosen = q[select_poses(posterior.measured(q), posterior.tool(q[:300]), count, "I")]
+            chosen = q[select_poses(posterior.sensitivities(q), posterior.tool(q[:300]), count, "I")]
             one = arm.figures(chosen, posterior)
             ratios.setdefault((count, "plan"), []).append(one.predicted / one.true)
             ratios.setdefault((count, "calibration"), []).append(one.after / one.true)
@@ -178,7 +181,7 @@ def needed(seeds: range) -> None:
                 RobotPosterior.from_robot(arm.planned, Instrument(sigma=NOISE)),
                 arm.candidates(1000),
             )
-            order = select_poses(posterior.measured(q), posterior.tool(q[:300]), STEPS[-1], "I")
+            order = select_poses(posterior.sensitivities(q), posterior.tool(q[:300]), STEPS[-1], "I")
             poses = [first(arm, rows, posterior) for rows in (q, q[order])]
             ratios.append(poses[1] / poses[0])
             print(f"{name} seed {seed}: {poses[0]:.0f} random, {poses[1]:.0f} chosen", flush=True)
@@ -207,7 +210,7 @@ def speed() -> None:
     posterior = RobotPosterior.from_robot(robot)
     for criterion in ("D", "I"):
         began = time.perf_counter()
-        select_poses(posterior.measured(q), posterior.tool(q[:300]), 100, criterion)  # type: ignore[arg-type]
+        select_poses(posterior.sensitivities(q), posterior.tool(q[:300]), 100, criterion)  # type: ignore[arg-type]
         seconds = time.perf_counter() - began
         unknowns = len(posterior.uncertainty.root)
         print(

@@ -19,7 +19,7 @@ from pisigma.cli.output import (
     command_line,
     print_json,
     saved_model_folder,
-    wrapped,
+    wrap_lines,
 )
 from pisigma.cli.progress import progress_of
 from pisigma.cli.screen import print_result
@@ -133,7 +133,7 @@ def _calibrate_cell(
             remark = [f"Model '{entry.name}': {entry.remark}."]
         assert isinstance(calibration, Calibration)  # there is no prior
         text = calibration_text(calibration.summary, folder, calibration.seconds)
-        print_result(text, verbose, [*wrapped(remark), *next_lines(cell.status())])
+        print_result(text, verbose, [*wrap_lines(remark), *next_lines(cell.status())])
     if entry is None:
         raise AcceptanceError(
             "no model was stored, because the result must not be trusted, for the reasons above."

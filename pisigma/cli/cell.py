@@ -10,7 +10,7 @@ import typer
 from pisigma.cli.arguments import AsJson
 from pisigma.cli.endings import NOT_ACCEPTED
 from pisigma.cli.fleet.commands import show_fleet
-from pisigma.cli.output import print_json, print_line, print_lines, print_table, wrapped
+from pisigma.cli.output import print_json, print_line, print_lines, print_table, wrap_lines
 from pisigma.cli.settings_options import Group, StatedSettings
 
 if TYPE_CHECKING:
@@ -114,7 +114,7 @@ def cell_at(path: str | Path) -> "Cell | None":
 
 def report_overrides(cell: "Cell", step: str, settings: StatedSettings[Any]) -> Mapping[str, Any]:
     """Print to stderr which settings of a step the command line overrides; return what it states, by keys."""
-    for key in sorted(settings.values.keys() & cell.file.stated(step).keys()):
+    for key in sorted(settings.values.keys() & cell.file.stated_values(step).keys()):
         print_line(f"The command line overrides {key} of {cell.file.path}.", to_stderr=True)
     return settings.values
 
@@ -124,7 +124,7 @@ def settings_at(path: str | Path, step: str, settings: StatedSettings[Group]) ->
     cell = cell_at(path)
     if cell is None:
         return settings.build()
-    chosen: Group = cell.file.settings(step, **report_overrides(cell, step, settings))
+    chosen: Group = cell.file.settings_of_step(step, **report_overrides(cell, step, settings))
     return chosen
 
 
@@ -145,8 +145,8 @@ def next_lines(status: "CellStatus") -> list[str]:
     """Return the lines that state the next step of a cell, its command on a line of its own."""
     reason = status.step.reason.rstrip(".")
     if not status.step.command:
-        return wrapped([f"Nothing to do: {reason}."])
-    return [*wrapped([f"Next step, because {reason}:"]), f"  {status.step.command}"]
+        return wrap_lines([f"Nothing to do: {reason}."])
+    return [*wrap_lines([f"Next step, because {reason}:"]), f"  {status.step.command}"]
 
 
 def print_next(status: "CellStatus") -> None:

@@ -17,7 +17,7 @@ import typer
 
 from pisigma.cli.help import HelpAll
 from pisigma.cli.output import print_json
-from pisigma.files.errors import AcceptanceError, PisigmaError, missing_extra, printable
+from pisigma.files.errors import AcceptanceError, PisigmaError, make_printable, missing_extra
 from pisigma.files.plugins import load_files, load_installed
 
 REFUSED = 2
@@ -110,7 +110,7 @@ def exit_with_problem(problem: BaseException, as_json: bool = False) -> None:
 
 def exit_with_error(sentence: str, status: int = REFUSED) -> NoReturn:
     """Say what is wrong on stderr and end with an exit status: in one line, which a terminal shows wrapped."""
-    line = f"pisigma: {printable(' '.join(sentence.split()))}"
+    line = f"pisigma: {make_printable(' '.join(sentence.split()))}"
     if sys.stderr.isatty():
         width = shutil.get_terminal_size().columns
         line = textwrap.fill(

@@ -109,7 +109,7 @@ def _confirm(proposal: "ImportProposal", yes: bool, as_json: bool) -> None:
     if not as_json:
         for file in proposal.mappings:
             cells = [
-                (column.heading, file.example(column), column.target.text, column.reason)
+                (column.heading, file.first_cell(column), column.target.text, column.reason)
                 for column in file.columns
             ]
             print_table(file.title, ("column", "first value", "read as", "because of"), cells)

@@ -1,6 +1,6 @@
 """What commands print: tables and sentences for people on stdout, or one JSON object.
 
-The contents of files reach a terminal as text only: see `pisigma.files.errors.printable`.
+The contents of files reach a terminal as text only: see `pisigma.files.errors.make_printable`.
 """
 
 import json
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import typer
 
-from pisigma.files.errors import AcceptanceError, printable
+from pisigma.files.errors import AcceptanceError, make_printable
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -32,23 +32,23 @@ def print_json(result: Any) -> None:
 
 def print_line(line: str, to_stderr: bool = False) -> None:
     """Print a line without wrapping it; control characters are made visible."""
-    typer.echo(printable(line, cut=False), err=to_stderr)
+    typer.echo(make_printable(line, cut=False), err=to_stderr)
 
 
 def print_lines(lines: Iterable[str], indent: str = "") -> None:
     """Print sentences, each wrapped to the width of the screen; further lines of one are indented."""
-    for line in wrapped(lines, indent):
+    for line in wrap_lines(lines, indent):
         typer.echo(line)
 
 
-def wrapped(lines: Iterable[str], indent: str = "") -> list[str]:
+def wrap_lines(lines: Iterable[str], indent: str = "") -> list[str]:
     """Wrap sentences to the width of the screen; further lines of one are indented."""
     width = screen_width()
     return [
         part
         for line in lines
         for part in textwrap.wrap(
-            printable(line, cut=False),
+            make_printable(line, cut=False),
             width,
             subsequent_indent=indent,
             break_long_words=False,
@@ -72,7 +72,7 @@ def table_lines(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]
     from rich.table import Table
     from rich.text import Text
 
-    rows = [[printable(cell, cut=False) for cell in row] for row in rows]
+    rows = [[make_printable(cell, cut=False) for cell in row] for row in rows]
     cells = list(zip(*rows, strict=True)) or [()] * len(columns)
     width, gaps = screen_width(), 2 * len(columns)
     widest = sum(max(map(len, (column, *texts))) for column, texts in zip(columns, cells, strict=True))
@@ -88,7 +88,7 @@ def table_lines(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]
         narrowest += longest
     for row in rows:
         table.add_row(*(Text(cell) for cell in row))
-    return [*wrapped([title]), *_rich_lines(table, max(width, narrowest)), ""]
+    return [*wrap_lines([title]), *_rich_lines(table, max(width, narrowest)), ""]
 
 
 @contextmanager
@@ -148,7 +148,7 @@ def command_line(context: typer.Context, files: Collection[str] = ("out",)) -> s
             else:
                 text = Path(str(value)).name if parameter.name in files else str(value)
                 words += [parameter.opts[0], text]
-    return printable(shlex.join(words), cut=False)
+    return make_printable(shlex.join(words), cut=False)
 
 
 def _rich_lines(table: "Table", width: int) -> list[str]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from pisigma.files.errors import printable
+from pisigma.files.errors import make_printable
 from pisigma.files.progress import TimeLeft, share_done, step_name
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ def progress_of(title: str) -> Iterator[Callable[[str], None]]:
     from rich.console import Console
 
     console = Console(stderr=True)
-    shown = _Shown(title, console.status(printable(title)) if console.is_terminal else None)
+    shown = _Shown(title, console.status(make_printable(title)) if console.is_terminal else None)
     try:
         yield shown.show_step
     finally:
@@ -85,4 +85,4 @@ class _Shown:
 
     def _line(self, what: str) -> str:
         """Write what is being done, with the time left where steps are numbered."""
-        return printable(f"{self.title}: {self.left.after(what)}")
+        return make_printable(f"{self.title}: {self.left.after(what)}")

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import typer
 
-from pisigma.cli.output import table_lines, wrapped
+from pisigma.cli.output import table_lines, wrap_lines
 from pisigma.reporting.result_text import Block, ResultText, merge_alike_warnings
 from pisigma.reporting.verdict import Verdict
 
@@ -39,9 +39,9 @@ def print_screen(
         next_step: last lines, which state the next step of a cell instead of that of the verdict.
     """
     verdict = replace(verdict, next_step="") if next_step else verdict
-    head = [line for label, text in verdict.lines if text for line in wrapped([f"{label}: {text}"], "  ")]
-    cautions = wrapped((f"Warning: {one}" for one in merge_alike_warnings(warnings)), "  ")
-    end = wrapped(closing)
+    head = [line for label, text in verdict.lines if text for line in wrap_lines([f"{label}: {text}"], "  ")]
+    cautions = wrap_lines((f"Warning: {one}" for one in merge_alike_warnings(warnings)), "  ")
+    end = wrap_lines(closing)
     room = MAX_LINES - len(head) - len(cautions) - len(end) - 5
     shown, left_out = list[str](), list[str]()
     for block in (*blocks, *details) if verbose else blocks:
@@ -57,11 +57,11 @@ def print_screen(
         *cautions,
         *([""] if shown else ()),
         *shown,
-        *wrapped([names] if names else []),
+        *wrap_lines([names] if names else []),
         *end,
     ]
     if len(lines) > SHORT:
-        lines += wrapped([verdict.short], "  ")
+        lines += wrap_lines([verdict.short], "  ")
     typer.echo("\n".join([*lines, *next_step]))
 
 
@@ -69,7 +69,7 @@ def _lines(block: Block) -> list[str]:
     """Lay out a block for the width of the screen."""
     if block.columns:
         return table_lines(block.sentences[0], block.columns, block.rows)
-    return wrapped(block.sentences, block.indent)
+    return wrap_lines(block.sentences, block.indent)
 
 
 def print_result(result: ResultText, verbose: bool, next_step: Sequence[str] = ()) -> None:

@@ -68,7 +68,7 @@ def invert_from_factor(scale: Tensor, factor: Tensor) -> Float64[Tensor, "unknow
 
 def invert_triangle(factor: Tensor) -> None:
     """Invert a lower triangular matrix in place, block by block, so that most of the work is matrix products."""
-    stretches = blocks(len(factor), BLOCK)
+    stretches = row_blocks(len(factor), BLOCK)
     for number, rows in enumerate(stretches):
         diagonal = factor[rows, rows]
         identity = torch.eye(len(diagonal), dtype=factor.dtype, device=factor.device)
@@ -80,7 +80,7 @@ def invert_triangle(factor: Tensor) -> None:
         diagonal.copy_(inverse)
 
 
-def blocks(count: int, size: int) -> list[slice]:
+def row_blocks(count: int, size: int) -> list[slice]:
     """Return the slices of rows of all blocks."""
     return [slice(start, start + size) for start in range(0, count, size)]
 

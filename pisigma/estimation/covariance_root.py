@@ -102,7 +102,7 @@ class CovarianceRoot:
             result[first:] += self.weights.right_multiply(self.weights.left_multiply(matrix[first:].t()).t())
         return result
 
-    def extended(
+    def with_columns(
         self,
         added: Float64[Tensor, "unknowns columns"],
         scale: float,

@@ -147,7 +147,7 @@ class DriftSearch:
         for one, Z in zip(self._groups, self._Z, strict=True):
             self.covariance += one.size**2 * Z @ Z.t()
 
-    def estimate(self, sweeps: int = MAX_SWEEPS) -> None:
+    def estimate_sizes(self, sweeps: int = MAX_SWEEPS) -> None:
         """Estimate sizes and noise, one group and one sensor at a time."""
         for _ in range(sweeps):
             before = [one.size for one in self._groups]
@@ -175,7 +175,7 @@ class DriftSearch:
         """Noise standard deviation of every value."""
         return self.values.deviation(self._noise)
 
-    def shift(
+    def estimate_shift(
         self, number: int, held: bool = True
     ) -> tuple[Float64[Tensor, " members"], Float64[Tensor, "members members"]]:
         """Estimate how far the unknowns of a group have moved, with all other groups at their sizes.
@@ -195,14 +195,14 @@ class DriftSearch:
         return (covariance @ (W.t() @ a)) * group.scale, covariance * group.scale * group.scale[:, None]
 
     def _best_size(self, number: int) -> float:
-        raised = gains(SIZES, *self._coordinates(number))
+        raised = evidence_gains(SIZES, *self._coordinates(number))
         best = int(raised.argmax())
         return float(SIZES[best]) if float(raised[best]) > self._groups[number].log_prior_penalty else 0.0
 
     def _coordinates(self, number: int) -> tuple[Tensor, Tensor]:
         """Return the eigenvalues of a group's covariance in the metric of the other terms, and squared coordinates."""
         _, a, W = self._whitened(number)
-        return coordinates(W, a)
+        return evidence_coordinates(W, a)
 
     def _whitened(self, number: int, reduced: bool = True) -> tuple[Tensor, Tensor, Tensor]:
         """Return a group's columns, and values and columns in the metric of all other terms."""
@@ -242,7 +242,7 @@ class DriftSearch:
         return -0.5 * float(a.square().sum()) - float(factor.diagonal().log().sum()) - odds
 
 
-def coordinates(
+def evidence_coordinates(
     W: Float64[Tensor, "values columns"], a: Float64[Tensor, " values"]
 ) -> tuple[Float64[Tensor, " k"], Float64[Tensor, " k"]]:
     """Return the eigenvalues of a group's covariance and the squared coordinates of whitened values a."""
@@ -251,7 +251,7 @@ def coordinates(
     return eigenvalues, (U.t() @ (W.t() @ a)).square() / eigenvalues
 
 
-def gains(
+def evidence_gains(
     sizes: Float64[Tensor, "sizes *#groups"],
     eigenvalues: Float64[Tensor, "*groups k"],
     squares: Float64[Tensor, "*groups k"],

@@ -17,8 +17,8 @@ from pisigma.estimation.drift import (
     DriftGroup,
     LinearValues,
     compressed_columns,
-    coordinates,
-    gains,
+    evidence_coordinates,
+    evidence_gains,
 )
 
 TRIED = SIZES[SIZES >= 1e-4]
@@ -118,7 +118,7 @@ class SessionEvidence:
             other._K = other._K + B @ B.t()
         return other
 
-    def explain(self) -> Explanation:
+    def compare_hypotheses(self) -> Explanation:
         """Compare all hypotheses, and repeat with each clear motion added until nothing else has moved."""
         motions: list[Motion] = []
         unchanged = 1.0
@@ -132,7 +132,7 @@ class SessionEvidence:
                 return replace(compared, unchanged=unchanged, candidates=candidates)
             motions.append(best)
 
-    def shift(
+    def estimate_shift(
         self, groups: Sequence[DriftGroup], noise_factor: float
     ) -> tuple[Float64[Tensor, " members"], Float64[Tensor, "members members"]]:
         """Estimate how far the unknowns of some groups have moved, with all others as uncertain as in the model.
@@ -150,7 +150,7 @@ class SessionEvidence:
     def influence(
         self, groups: Sequence[DriftGroup], noise_factor: float
     ) -> tuple[Float64[Tensor, "members directions"], Float64[Tensor, "members members"]]:
-        """Return the sources of error of an estimate by `shift` if nothing has moved.
+        """Return the sources of error of an estimate by `estimate_shift` if nothing has moved.
 
         Returns:
             Its derivative with respect to the directions of the posterior's root, which sessions have in common, and
@@ -221,10 +221,10 @@ class SessionEvidence:
         columns = W[:, single.repeat_interleave(widths)]
         eigenvalues = columns.square().sum(0)
         squares = (columns.t() @ a).square() / eigenvalues.clamp(min=1e-300)
-        raised[single] = gains(TRIED[:, None], eigenvalues[:, None], squares[:, None]).t()
+        raised[single] = evidence_gains(TRIED[:, None], eigenvalues[:, None], squares[:, None]).t()
         blocks = torch.split(W, widths.tolist(), 1)
         for number in (~single).nonzero()[:, 0].tolist():
-            raised[number] = gains(TRIED, *coordinates(blocks[number], a))
+            raised[number] = evidence_gains(TRIED, *evidence_coordinates(blocks[number], a))
         return raised
 
     def _noise(self, noise_factor: float) -> Float64[Tensor, " values"]:

@@ -10,10 +10,10 @@ from torch import Tensor
 
 from pisigma.estimation.cholesky import (
     BLOCK,
-    blocks,
     invert_triangle,
     log_determinant,
     return_free_memory,
+    row_blocks,
     scaled_cholesky,
 )
 from pisigma.estimation.covariance_root import CovarianceRoot
@@ -50,7 +50,7 @@ class Solved:
     def trace(self, matrix: Float64[Tensor, "unknowns unknowns"]) -> float:
         """Return the trace of a symmetric matrix times the covariance, which is computed block by block."""
         trace = 0.0
-        for rows in blocks(len(self.x), BLOCK):
+        for rows in row_blocks(len(self.x), BLOCK):
             block = self.inverse[rows.start :, rows].t() @ self.inverse[rows.start :, : rows.stop]
             scale = self.scale[: rows.stop].clone()
             scale[: rows.start].mul_(2)  # the blocks above the diagonal as well

@@ -42,7 +42,7 @@ class Posterior:
     used: tuple[float, ...]
 
     @property
-    def effective(self) -> float:
+    def effective_unknowns(self) -> float:
         """Effective number of unknowns that the data determine, including those without a prior."""
         return float(self.determined.sum()) + int((self.prior.base == 0).sum())
 
@@ -84,7 +84,7 @@ class AbstractRegression(ABC):
     def effective_share(self, posterior: Posterior) -> float:
         """Return the share of the values that the unknowns absorb; near 1, noise cannot be estimated."""
         values = sum(sensor.values for sensor in self.sensors if not sensor.exact)
-        return posterior.effective / max(values, 1.0)
+        return posterior.effective_unknowns / max(values, 1.0)
 
     def updated_noise(self, posterior: Posterior) -> tuple[float, ...]:
         """Estimate the noise of every sensor from its misfit and degrees of freedom (Förstner 1979)."""

@@ -9,7 +9,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from pisigma.estimation.cholesky import covariance_factor
-from pisigma.estimation.drift import LinearValues, gains
+from pisigma.estimation.drift import LinearValues, evidence_gains
 
 FACTORS = torch.logspace(0.5, 4.5, 17, dtype=torch.float64)
 """Factors on the noise of a wrong configuration that are tried."""
@@ -86,7 +86,7 @@ def _suspects(explained: Explained[What]) -> list[dict[int, float]]:
         # The block of V^-1 is the precision of these values given all others: they are judged as if left out.
         eigenvalues, U = torch.linalg.eigh(inverse[chosen][:, chosen] * sigma * sigma[:, None])
         squares = (U.t() @ (a[chosen] * sigma)).square() / eigenvalues.clamp(min=1e-300)
-        raised = gains(FACTORS, eigenvalues.clamp(min=0.0), squares)
+        raised = evidence_gains(FACTORS, eigenvalues.clamp(min=0.0), squares)
         best = int(raised.argmax())
         if float(raised[best]) > MIN_GAIN:
             tried.append((float(raised[best]), number, float(FACTORS[best])))

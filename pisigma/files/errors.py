@@ -24,7 +24,7 @@ _UNPRINTABLE = re.compile(
 _LONG_WORD = re.compile(rf"\S{{{MAX_WORD_CHARACTERS + 1},}}")
 
 
-def printable(text: str, cut: bool = True) -> str:
+def make_printable(text: str, cut: bool = True) -> str:
     r"""Return a text that is safe to print on a terminal, even if parts of it come from a file.
 
     Control characters, direction marks and surrogates are written as escapes (`\x1b`), so that nothing moves the
@@ -71,7 +71,7 @@ class PisigmaError(Exception):
     """Base class of every error that pisigma raises on purpose.
 
     The message is built from the fields: ``expected a length > 0, got -3 mm (cell.yaml, line 12); give a positive
-    length.`` It is always `printable`. All fields are attributes, so that callers need not parse the message.
+    length.`` It is always `make_printable`. All fields are attributes, so that callers need not parse the message.
 
     Attributes:
         file: the file at fault; None if there is none.
@@ -123,7 +123,7 @@ class PisigmaError(Exception):
             )
         )
         is_whole = (sentence == problem and not expected) or sentence.endswith((".", "?"))
-        super().__init__(printable(sentence if is_whole else f"{sentence}."))
+        super().__init__(make_printable(sentence if is_whole else f"{sentence}."))
 
     def fields(self) -> dict[str, Any]:
         """Return class, message and all fields that are set, as plain values for JSON."""
@@ -131,7 +131,7 @@ class PisigmaError(Exception):
         names = ("file", "line", "column", "option", "value", "expected", "remedy")
         values = {name: getattr(self, name) for name in names}
         plain = {
-            name: value if isinstance(value, bool | int | float | str) else printable(str(value))
+            name: value if isinstance(value, bool | int | float | str) else make_printable(str(value))
             for name, value in values.items()
             if value is not None and value != ""
         }
@@ -144,7 +144,7 @@ class PisigmaError(Exception):
         other._follows = self._follows + text
         return other
 
-    def located(self, at: Place, error: "type[PisigmaError] | None" = None) -> "PisigmaError":
+    def with_place(self, at: Place, error: "type[PisigmaError] | None" = None) -> "PisigmaError":
         """Return a copy of the error with a place, for errors that are found by code that does not know the file.
 
         Args:

@@ -48,7 +48,7 @@ class Plugins:
 _loaded = Plugins()
 
 
-def loaded() -> Plugins:
+def loaded_plugins() -> Plugins:
     """Return the plug-ins that this process has loaded."""
     return _loaded
 

@@ -302,7 +302,7 @@ def _error_at(
         value = context["tag"]
     at = Place(source, line, _dotted(keys) or None)
     if isinstance(cause := context.get("error"), PisigmaError):
-        return cause.located(at, error)
+        return cause.with_place(at, error)
     if finding["type"] in ("union_tag_invalid", "literal_error") and (texts := allowed_texts(document, path)):
         return error(f"unknown value '{value}'", value=value, at=at, remedy=nearest_choice(str(value), texts))
     value = value if isinstance(value, str | int | float) else None

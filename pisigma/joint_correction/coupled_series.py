@@ -92,7 +92,9 @@ class CoupledSeries(AbstractFeature):
             return columns
         lengths = q.new_zeros((*state.q.shape, 3))
         for joint, bar in self._bars:
-            lengths[..., joint, :] = torch.stack(bar.length_derivatives(bar.drive(state.q[..., joint])), -1)
+            lengths[..., joint, :] = torch.stack(
+                bar.length_derivatives(bar.crank_rotation(state.q[..., joint])), -1
+            )
         return torch.cat([columns, lengths], -1)
 
     def is_periodic(self, weight: Float64[np.ndarray, "dof columns"]) -> bool:

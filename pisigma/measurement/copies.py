@@ -84,13 +84,13 @@ class RowValues:
         angle = _steps(rpy_from_rotation(rotation), ANGLE_STEPS, ROTATION_STEP)
         steps = torch.stack([*axes, _steps(length, LENGTH_STEPS), angle], 1)
         if "corner" in READINGS:
-            steps[rows.measured("corner").cpu(), 2:] = IMAGE_STEP
+            steps[rows.is_measured("corner").cpu(), 2:] = IMAGE_STEP
         numbers = torch.cat([q, length, rotation[:, :, :2].flatten(1)], 1)
         file = numbers_of_names(rows.origin or (rows.source,) * rows.rows)
         return RowValues(numbers, steps, _kinds(robot), file)
 
     @staticmethod
-    def kept(
+    def stored_values(
         numbers: Float64[Tensor, "rows numbers"], steps: Float64[Tensor, "rows 4"], robot: Robot
     ) -> "RowValues":
         """Return the stored values of rows of one file."""
@@ -195,8 +195,8 @@ def original_rows(values: RowValues, known: int = 0) -> Int64[Tensor, " rows"]:
     for scope, deviation in ((standing, STANDING), (~standing, RETURNING)):
         equal = torch.zeros(count, dtype=torch.bool)
         equal[worse[scope]] = True
-        partners = same_joints.partners(rank, known, scope is standing)
-        chance = same_joints.chance(values, deviation)
+        partners = same_joints.count_partners(rank, known, scope is standing)
+        chance = same_joints.repeat_probability(values, deviation)
         if _are_copies(equal, partners, chance):
             best.scatter_reduce_(0, worse[scope], rank[better[scope]], "amin")
     return order[best]
@@ -246,7 +246,9 @@ class _SameJoints:
         run = torch.cat([torch.zeros(min(len(group), 1), dtype=torch.int64), (~continues).cumsum(0)])
         return _SameJoints(group, run)
 
-    def partners(self, rank: Int64[Tensor, " rows"], known: int, standing: bool) -> Int64[Tensor, " rows"]:
+    def count_partners(
+        self, rank: Int64[Tensor, " rows"], known: int, standing: bool
+    ) -> Int64[Tensor, " rows"]:
         """Return to how many other rows a row might be equal: of its own run if `standing`, else of other runs."""
         if known:
             there = torch.bincount(self.group[:known], minlength=len(rank))[self.group]
@@ -260,7 +262,7 @@ class _SameJoints:
             self.run == self.run[rank.argsort()[best]], 0, torch.bincount(self.group)[self.group] - in_run
         )
 
-    def chance(self, values: RowValues, deviation: float) -> Float64[Tensor, " rows"]:
+    def repeat_probability(self, values: RowValues, deviation: float) -> Float64[Tensor, " rows"]:
         """Return the probability that a repeated measurement reads the same, to the coarsest rounding at these joints.
 
         Rows without a reading, as at sockets, are compared by their joint values.
@@ -362,8 +364,8 @@ def without_copies(rows: MeasuredFields, robot: Robot) -> MeasuredFields:
         CopiedRow(
             rows.line[row],
             "the row is a copy of another one",
-            place=rows.label(row),
-            original=rows.label(int(original[row])),
+            place=rows.place_text(row),
+            original=rows.place_text(int(original[row])),
         )
         for row in copied.nonzero()[:, 0].tolist()
     )
@@ -374,7 +376,7 @@ def without_copies(rows: MeasuredFields, robot: Robot) -> MeasuredFields:
 def places_text(rows: MeasuredFields, chosen: Bool[Tensor, " rows"]) -> str:
     """Return the places of the chosen rows as a text, at most the first `MAX_NAMED`."""
     numbers = chosen.nonzero()[:, 0].tolist()
-    named = ", ".join(rows.label(number) for number in numbers[:MAX_NAMED])
+    named = ", ".join(rows.place_text(number) for number in numbers[:MAX_NAMED])
     return f"{named} and {len(numbers) - MAX_NAMED} more" if len(numbers) > MAX_NAMED else named
 
 

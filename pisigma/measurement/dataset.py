@@ -169,17 +169,17 @@ class Measurements:
         """Number of joints."""
         return self.q.shape[1]
 
-    def measured(self, kind: Kind) -> Bool[Tensor, " rows"]:
+    def is_measured(self, kind: Kind) -> Bool[Tensor, " rows"]:
         """Return which rows contain a measurement of a kind; see `pisigma.measurement.fields.Kind`.
 
         A row with a position and an orientation is a "pose" only, neither a "position" nor a "rotation".
         """
-        return self.as_fields().measured(kind)
+        return self.as_fields().is_measured(kind)
 
     @property
     def kinds(self) -> frozenset[Kind]:
         """Kinds that were measured in any of the rows; empty if nothing was measured."""
-        return frozenset(kind for kind in (*KINDS, *READINGS) if bool(self.measured(kind).any()))
+        return frozenset(kind for kind in (*KINDS, *READINGS) if bool(self.is_measured(kind).any()))
 
     @property
     def T(self) -> Float64[Tensor, "rows 4 4"]:
@@ -204,7 +204,7 @@ class Measurements:
 
     def place(self, row: int) -> str:
         """Return the place of a row as a text; see `place_of`."""
-        return self.as_fields().label(row)
+        return self.as_fields().place_text(row)
 
     def split_sets(self) -> "tuple[Measurements, Measurements | None]":
         """Split the rows by the column `set` into training rows and held-out rows (the set "test").

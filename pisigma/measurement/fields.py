@@ -54,7 +54,7 @@ class UnusableRow:
     fault: Fault | None = None
 
     @staticmethod
-    def because(line: int, fault: Fault) -> "UnusableRow":
+    def from_fault(line: int, fault: Fault) -> "UnusableRow":
         """Return the row with the reason that a fault states."""
         return UnusableRow(line, str(fault), fault)
 
@@ -109,11 +109,11 @@ class MeasuredFields:
         source, image = self.origin[row] if self.origin else self.source, self.text("image")[row]
         return RowPlace(source, line or None, column, None if line else row, image)
 
-    def label(self, row: int) -> str:
+    def place_text(self, row: int) -> str:
         """Return the place of a row as a text; see `place_of`."""
         return str(self.place_of(row))
 
-    def measured(self, kind: Kind) -> Bool[Tensor, " rows"]:
+    def is_measured(self, kind: Kind) -> Bool[Tensor, " rows"]:
         """Return which rows contain a measurement of a kind.
 
         A row with a position and an orientation is a "pose" only, neither a "position" nor a "rotation".

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import torch
 
-from pisigma.files.errors import MeasurementError, Place, printable
+from pisigma.files.errors import MeasurementError, Place, make_printable
 from pisigma.files.input_file import read_text
 from pisigma.measurement.csv.header import read_header
 from pisigma.measurement.csv.reading import sound_rows
@@ -65,7 +65,7 @@ class GrowingFile:
         self.path = Path(path)
         self._robot = robot
         self._reader: Reader = reader or (lambda table, final: sound_rows(table, robot))
-        self._source = printable(str(path), cut=False)
+        self._source = make_printable(str(path), cut=False)
         self._stamp: tuple[int, ...] = ()
         self._text = ""
         self._waiting = ""

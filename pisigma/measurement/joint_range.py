@@ -31,7 +31,7 @@ class JointRange:
     rows: tuple[int, ...]
 
     @property
-    def widened(self) -> Row:
+    def widened_axis(self) -> Row:
         """The axis with limits that include the rows."""
         outside = self.q[list(self.rows)]
         lower, upper = min(self.axis.lower, outside.min()), max(self.axis.upper, outside.max())
@@ -81,7 +81,7 @@ def row_warnings(robot: Robot, rows: Measurements) -> tuple[str, ...]:
 
 def with_limits_of_rows(robot: Robot, rows: Measurements) -> Robot:
     """Return the robot with joint limits that include all rows; the robot itself if its limits do."""
-    wider = {one.axis.name: one.widened for one in joint_ranges(robot, rows)}
+    wider = {one.axis.name: one.widened_axis for one in joint_ranges(robot, rows)}
     if not wider:
         return robot
     if robot.coupling is None:

@@ -65,7 +65,7 @@ def check_fields(data: MeasuredFields) -> None:
             _check_values(data, name)
     _check_rotations(data)
     sound = np.ones(data.rows, dtype=bool)
-    for faults in (row_faults(data, Labels()), group_faults(data, Labels(), sound, data.label)):
+    for faults in (row_faults(data, Labels()), group_faults(data, Labels(), sound, data.place_text)):
         for row, fault in faults:
             raise fault.error(data.place_of(row))
 
@@ -158,11 +158,11 @@ def row_faults(data: MeasuredFields, labels: Labels) -> Iterator[RowAndFault]:
     yield from _value_faults(data, labels)
     yield from _reading_faults(data, labels)
     lengths = {
-        "position": (data.measured("position") | data.measured("pose")).cpu().numpy(),
+        "position": (data.is_measured("position") | data.is_measured("pose")).cpu().numpy(),
         "socket": _named(data.text("socket")),
         "touch": ~np.isnan(data.array("touch")),
         "distance": ~np.isnan(data.array("distance")),
-        **{name: data.measured(name).cpu().numpy() for name, one in READINGS.items() if one.is_length},
+        **{name: data.is_measured(name).cpu().numpy() for name, one in READINGS.items() if one.is_length},
     }
     if {"touch", "touch_axis"} & {*data.numbers, *data.texts}:
         yield from _touch_faults(data, labels, lengths["touch"])

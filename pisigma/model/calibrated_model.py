@@ -345,7 +345,7 @@ def hybrid_motion(
 
 
 def _motion(arm: HybridArm, q: Tensor, exact: bool) -> tuple[Tensor, Tensor]:
-    T, J = joint_jacobian(arm.robot, q + arm.delta(q))
+    T, J = joint_jacobian(arm.robot, q + arm.joint_correction(q))
     if exact:
         J = J + J @ _slope(arm, q)
     return T, J
@@ -354,6 +354,6 @@ def _motion(arm: HybridArm, q: Tensor, exact: bool) -> tuple[Tensor, Tensor]:
 def _slope(arm: HybridArm, q: Float[Tensor, "poses dof"]) -> Float[Tensor, "poses dof dof"]:
     """Compute the derivatives of the corrections by the joint values, by central differences in one call."""
     step = DIFFERENCE_STEP * torch.eye(q.shape[1], dtype=q.dtype, device=q.device)
-    above, below = torch.chunk(arm.delta(q[:, None] + torch.cat([step, -step])), 2, 1)
+    above, below = torch.chunk(arm.joint_correction(q[:, None] + torch.cat([step, -step])), 2, 1)
     slope: Tensor = (above - below).mT / (2 * DIFFERENCE_STEP)
     return slope

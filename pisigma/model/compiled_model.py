@@ -39,16 +39,16 @@ def save_compiled(model: CalibratedModel, file: str | os.PathLike[str], belongs_
         belongs_to: `content_hash` of the model folder, stored in the file; a file with another hash is stale.
 
     Raises:
-        ModelError: see `describe`.
+        ModelError: see `describe_as_arrays`.
     """
-    description, branches = describe(model)
+    description, branches = describe_as_arrays(model)
     joints = [joint.name for joint in model.robot.joints]
     write_description(
         file, description, branches=branches, joints=joints, name=model.name, belongs_to=belongs_to
     )
 
 
-def describe(model: CalibratedModel) -> tuple[arrays.Description, tuple[str, ...]]:
+def describe_as_arrays(model: CalibratedModel) -> tuple[arrays.Description, tuple[str, ...]]:
     """Convert a model to arrays, and return these with the names of its branches.
 
     Raises:

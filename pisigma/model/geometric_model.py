@@ -105,4 +105,4 @@ def _kept(uncertainty: PositionUncertainty, geometry: IdentifiedGeometry) -> Pos
 def branches_of(nominal: Robot, q: Float64[Tensor, "rows dof"]) -> tuple[str, ...]:
     """Name the nominal arm's branches that occur in joint values, most frequent first; none without closed form."""
     solver = closed_form_solver(nominal)
-    return () if solver is None else solver.frequent(nearest_branch(solver, q))
+    return () if solver is None else solver.most_frequent_branches(nearest_branch(solver, q))

@@ -96,7 +96,7 @@ class ModelPosterior:
         mean = torch.zeros(first, dtype=square.dtype).index_add(0, number, square) / count
         return mean.sqrt()[number]
 
-    def renamed(self, rows: Measurements) -> Measurements:
+    def with_model_names(self, rows: Measurements) -> Measurements:
         """Give the frame and target of rows the model's names where the rows or the model have a single unnamed one.
 
         Raises:

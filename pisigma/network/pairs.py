@@ -86,5 +86,5 @@ def build_pairs(robot: Robot, measurements: Measurements, singular_below: float 
             at=Place(measurements.source),
             remedy="check base, tool and units, or measure away from singularities",
         )
-    branches = () if solver is None else solver.frequent(index[used])
+    branches = () if solver is None else solver.most_frequent_branches(index[used])
     return TrainingPairs(T, q_nominal, target, used, singular, unreachable, branches)

@@ -55,7 +55,7 @@ class BoardViews:
         sight: BoardSight, T_cell_frame: Float64[Tensor, "4 4"], view: ViewSection
     ) -> "BoardViews":
         """Read the conditions from the section `view` of the surroundings."""
-        nearest, farthest = view.depths(sight.camera.fx)
+        nearest, farthest = view.sharp_depths(sight.camera.fx)
         return BoardViews(
             sight, T_cell_frame, nearest, farthest, math.radians(view.oblique_deg), view.margin_px
         )
@@ -99,7 +99,9 @@ class BoardViews:
         """Compute the angle between board normal and line of sight to its centre [rad]; from behind > π / 2."""
         return self._obliqueness(self._boards(arm, q)[0])
 
-    def room(self, arm: ArmInSurroundings, q: Float64[Tensor, "poses dof"]) -> Float64[Tensor, " poses"]:
+    def margin_in_image(
+        self, arm: ArmInSurroundings, q: Float64[Tensor, "poses dof"]
+    ) -> Float64[Tensor, " poses"]:
         """Compute how far the board may be from its stated place before it leaves the image [m]."""
         points, pixels, _ = self._shown(self._boards(arm, q)[0])
         edge = pixels.new_tensor([self.sight.camera.width, self.sight.camera.height])
@@ -143,7 +145,7 @@ class BoardViews:
         T_cell_camera = T_cell_board @ invert(T)
         eye = T_cell_camera[:, None, :3, 3]
         lines = torch.stack([eye + share * (corners - eye) for share in SIGHT_LINE_SHARES], -2)
-        return faults | arm.hidden(q, lines, "the board from the camera")
+        return faults | arm.blocked_lines_of_sight(q, lines, "the board from the camera")
 
     def _boards(
         self, arm: ArmInSurroundings, q: Float64[Tensor, "poses dof"]

@@ -68,7 +68,7 @@ def accuracy_curve(
     """Predict the accuracy against the number of poses.
 
     Args:
-        B: derivatives of the measured values of the candidates under the prior; see `RobotPosterior.measured`.
+        B: derivatives of the measured values of the candidates under the prior; see `RobotPosterior.sensitivities`.
         D: derivatives of the tool's position over the task; see `RobotPosterior.tool`.
         chosen: indices of the selected candidates, in their order.
         counts: numbers of poses.
@@ -180,27 +180,27 @@ class CameraProspects:
         q, sight = candidates.q[chosen], views.sight
 
         def rms(better: RobotPosterior) -> float:
-            return rms_of(better.informed(q).tool(task))
+            return rms_of(better.given_poses(q).tool(task))
 
         def seen_by(corner_noise: float, repeatability: Repeatability) -> RobotPosterior:
             better = replace(sight, corner_noise=corner_noise, repeatability=repeatability)
             return replace(posterior, instrument=replace(posterior.instrument, sight=better))
 
-        after = posterior.informed(q)
+        after = posterior.given_poses(q)
         others = torch.ones(len(candidates.q), dtype=torch.bool)
         others[chosen] = False
         left = candidates.q[others]
         more = (
-            left[select_poses(after.measured(left), after.tool(task), min(MORE_IMAGES, len(left)))]
+            left[select_poses(after.sensitivities(left), after.tool(task), min(MORE_IMAGES, len(left)))]
             if len(left)
             else left
         )
         return CameraProspects(
             rms_of(after.tool(task)),
-            rms_of(after.informed(more).tool(task)) if len(more) else rms_of(after.tool(task)),
+            rms_of(after.given_poses(more).tool(task)) if len(more) else rms_of(after.tool(task)),
             rms(seen_by(EXACT_CORNERS, sight.repeatability)),
             rms(seen_by(sight.corner_noise, EXACT_ROBOT)),
-            float(views.room(arm, q).min()),
+            float(views.margin_in_image(arm, q).min()),
             _unidentifiable(arm, sight.is_fixed),
         )
 

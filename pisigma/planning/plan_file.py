@@ -91,7 +91,7 @@ class StoredPlan:
         """Number of each pose."""
         return self.number or tuple(range(1, len(self.q) + 1))
 
-    def part(self, poses: Int64[Tensor, " some"]) -> "StoredPlan":
+    def select_poses(self, poses: Int64[Tensor, " some"]) -> "StoredPlan":
         """Return a part of the poses, which keep their numbers."""
         return replace(
             self,

@@ -42,7 +42,7 @@ def select_poses(
     and Guestrin 2008, JMLR 9, 235-284; for robots Borm and Menq 1991 select poses by observability.
 
     Args:
-        B: derivatives of the measured values of the candidates under the prior; see `RobotPosterior.measured`.
+        B: derivatives of the measured values of the candidates under the prior; see `RobotPosterior.sensitivities`.
         D: derivatives of the tool's position over the task under the prior; see `RobotPosterior.tool`.
         count: number of poses to select.
         criterion: "D" or "I", see above.
@@ -64,29 +64,29 @@ def select_poses(
         raise PlanningError(
             expected="joint values of the task", value="none", option="task", remedy="state some poses"
         )
-    goal = condensed(D)
+    goal = condense_derivatives(D)
     first = PoseSelection(B, goal, "D")
-    first.grow(count)
+    first.add_until(count)
     chosen = torch.tensor(first.chosen)
     remaining = (
         PoseSelection(B, goal, criterion, first.chosen).gains().argsort(descending=True)[: len(B) - count]
     )
     few = torch.cat([chosen, remaining[: max(MAX_EXCHANGED - count, 0)]])
     choice = PoseSelection(B[few], goal, "D", range(count))
-    choice.exchange()
+    choice.exchange_candidates()
     if criterion == "I":
         both = [PoseSelection(B[few], goal, "I", start) for start in (range(count), choice.chosen)]
         for one in both:
-            one.exchange()
+            one.exchange_candidates()
         choice = min(both, key=lambda one: one.variance)
     chosen = few[torch.tensor(choice.chosen)]
     ordered = PoseSelection(B[chosen], goal, criterion)
-    ordered.grow(count)
+    ordered.add_until(count)
     result: Tensor = chosen[torch.tensor(ordered.chosen)]
     return result
 
 
-def condensed(D: Float64[Tensor, "tasks 3 directions"]) -> Float64[Tensor, "rank directions"]:
+def condense_derivatives(D: Float64[Tensor, "tasks 3 directions"]) -> Float64[Tensor, "rank directions"]:
     """Compute few rows W with the same mean variance, `W^T W = mean(D_i^T D_i)`, up to `DROPPED_VARIANCE` of it."""
     values, vectors = torch.linalg.eigh(torch.einsum("tcd,tce->de", D, D) / len(D))
     left_out = values.clamp(min=0).cumsum(0)
@@ -134,8 +134,8 @@ class PoseSelection:
         """Start with no pose, or with some.
 
         Args:
-            B: derivatives of the measured values, see `RobotPosterior.measured`.
-            goal: rows of the task, see `condensed`.
+            B: derivatives of the measured values, see `RobotPosterior.sensitivities`.
+            goal: rows of the task, see `condense_derivatives`.
             criterion: see `select_poses`.
             chosen: indices of candidates that are selected already.
         """
@@ -152,19 +152,19 @@ class PoseSelection:
         """Compute the gain of every candidate: information [nats] for D, variance [m²] for I; -inf if selected."""
         return self._gains(self._S, self._P)
 
-    def add(self, number: int) -> None:
+    def add_candidate(self, number: int) -> None:
         """Add a candidate."""
         change = self._change(number, 1.0)
         assert change is not None  # adding loses no digits
         self._take(change)
         self.chosen.append(number)
 
-    def grow(self, count: int) -> None:
+    def add_until(self, count: int) -> None:
         """Add the best candidate until `count` are selected."""
         while len(self.chosen) < count:
-            self.add(int(self.gains().argmax()))
+            self.add_candidate(int(self.gains().argmax()))
 
-    def exchange(self) -> None:
+    def exchange_candidates(self) -> None:
         """Exchange every selected candidate for the best other one until no exchange gains anything."""
         for _ in range(MAX_PASSES if len(self.chosen) < len(self._B) else 0):
             exchanged = False
@@ -190,7 +190,7 @@ class PoseSelection:
             return False
         if without is not None:
             self._take(without)
-        self.add(best if exchanged else number)
+        self.add_candidate(best if exchanged else number)
         return exchanged
 
     def _gains(self, S: Tensor, P: Tensor) -> Float64[Tensor, " candidates"]:

@@ -146,15 +146,15 @@ class RobotPosterior:
         except ImplausibleError:
             raise
         except IdentificationError:  # too few rows
-            return self.informed(rows.q)
+            return self.given_poses(rows.q)
 
-    def informed(self, q: Float64[Tensor, "poses dof"]) -> "RobotPosterior":
+    def given_poses(self, q: Float64[Tensor, "poses dof"]) -> "RobotPosterior":
         """Return the posterior given measured poses, which does not depend on the values: `C' = R (1 + B^T B)^-1 R^T`.
 
         Args:
             q: commanded joint values [rad or m].
         """
-        root = multiply_updated_root(self.uncertainty.root, self.measured(q).flatten(0, 1))
+        root = multiply_updated_root(self.uncertainty.root, self.sensitivities(q).flatten(0, 1))
         return replace(self, uncertainty=replace(self.uncertainty, covariance_root=CovarianceRoot(root)))
 
     def corrected_joints(self, q: Float64[Tensor, "*batch dof"]) -> Float64[Tensor, "*batch dof"]:
@@ -187,7 +187,7 @@ class RobotPosterior:
             columns[..., [*self.uncertainty.space.indices_of("base")]] = 0.0
         return self.uncertainty.covariance_root.left_multiply(columns)
 
-    def measured(self, q: Float64[Tensor, "poses dof"]) -> Float64[Tensor, "poses values directions"]:
+    def sensitivities(self, q: Float64[Tensor, "poses dof"]) -> Float64[Tensor, "poses values directions"]:
         """Compute the derivative B of measured values over their noise; the covariance of these is `B B^T + 1`."""
         return torch.cat([self._measured(some) for some in torch.split(q, POSES_PER_CHUNK)])
 
@@ -264,7 +264,7 @@ class RobotPosterior:
         if instrument.kind == "pose" and rows.rotation is not None:
             turned = rotation_vector(rows.rotation @ T[:, :3, :3].mT) / instrument.sigma_rotation
             r = torch.cat([r, turned], 1)
-        B = self.measured(rows.q)[:, : r.shape[1]]
+        B = self.sensitivities(rows.q)[:, : r.shape[1]]
         # Predictive covariance of a row: uncertainty of the model plus noise, in units of the noise.
         lower = torch.linalg.cholesky(B @ B.mT + torch.eye(r.shape[1]).to(r))
         white = torch.linalg.solve_triangular(lower, r[..., None], upper=False)[..., 0]

@@ -76,11 +76,11 @@ def merge_alike_warnings(warnings: Iterable[str]) -> list[str]:
 
 def _joined(alike: Sequence[str]) -> str:
     rows = [int(match[1]) for one in alike[1:] if (match := _ROW.search(one))]
-    where = f": lines {ranges(rows)}" if len(rows) == len(alike) - 1 else ""
+    where = f": lines {numbers_as_ranges(rows)}" if len(rows) == len(alike) - 1 else ""
     return f"{alike[0]} {len(alike) - 1} more of this kind{where}."
 
 
-def ranges(numbers: Iterable[int]) -> str:
+def numbers_as_ranges(numbers: Iterable[int]) -> str:
     """Write numbers with consecutive ones joined, such as "3, 7 to 9"."""
     found: list[list[int]] = []
     for number in sorted(set(numbers)):

@@ -45,21 +45,21 @@ class FourBar:
     rocker: float
     zero: float
 
-    def follow(self, x: Any) -> Any:
+    def joint_value(self, x: Any) -> Any:
         """Return the joint value [rad] for a crank rotation x [rad]; a parallelogram returns x."""
         return self._other_end(x, self.crank, self.rocker, 1.0)
 
-    def drive(self, u: Any) -> Any:
-        """Return the crank rotation [rad] for a joint value u [rad]; the inverse of `follow`."""
+    def crank_rotation(self, u: Any) -> Any:
+        """Return the crank rotation [rad] for a joint value u [rad]; the inverse of `joint_value`."""
         return self._other_end(u, self.rocker, self.crank, -1.0)
 
     def length_derivatives(self, x: Any) -> tuple[Any, Any, Any]:
-        """Return the derivatives of `follow` with respect to crank, coupler and rocker, each times its length [rad]."""
+        """Return the derivatives of `joint_value` by crank, coupler and rocker, each times its length [rad]."""
         step, result = 1e-5, []  # central differences, with errors of order step²
         for name in ("crank", "coupler", "rocker"):
             length = getattr(self, name)
             longer, shorter = (replace(self, **{name: length * (1 + h)}) for h in (step, -step))
-            result.append((longer.follow(x) - shorter.follow(x)) / (2 * step))
+            result.append((longer.joint_value(x) - shorter.joint_value(x)) / (2 * step))
         first, second, third = result
         return first, second, third
 
@@ -126,23 +126,25 @@ class Coupling:
         Raises:
             PoseError: there are more or fewer values than axes.
         """
-        return self._by_four_bars(_times(q, self.matrix) + _like(q, self.offset), FourBar.follow)
+        return self._by_four_bars(_times(q, self.matrix) + _like(q, self.offset), FourBar.joint_value)
 
     def to_controller(self, q: Any) -> Any:
         """Convert DH values `(*batch, dof)` to the controller's values `(*batch, axes)`; the inverse of `to_dh`.
 
         With passive joints this is the least-squares solution.
         """
-        driven = self._by_four_bars(q, FourBar.drive) - _like(q, self.offset)
+        driven = self._by_four_bars(q, FourBar.crank_rotation) - _like(q, self.offset)
         return _times(driven, np.linalg.pinv(self.matrix))
 
-    def slope(self, q: Any) -> Any:
+    def derivative(self, q: Any) -> Any:
         """Return the derivative of `to_dh` with respect to the controller's values, `(*batch, dof, axes)`."""
         slope = np.broadcast_to(self.matrix, (*np.shape(q)[:-1], *self.matrix.shape)).copy()
         step = 1e-6
         for joint, bar in self.four_bars:
             x = np.asarray(q) @ self.matrix[joint] + self.offset[joint]
-            slope[..., joint, :] *= ((bar.follow(x + step) - bar.follow(x - step)) / (2 * step))[..., None]
+            slope[..., joint, :] *= ((bar.joint_value(x + step) - bar.joint_value(x - step)) / (2 * step))[
+                ..., None
+            ]
         return slope
 
     def approach_to_dh(self, approach: Any) -> Any:
@@ -225,9 +227,9 @@ def dh_limits(coupling: Coupling) -> Float64[np.ndarray, "dof 2"]:
 def _driven(bar: FourBar, turn: np.ndarray, stops: tuple[float, float], joint: int) -> tuple[float, float]:
     """Return the smallest and largest value [rad] of a joint with a linkage, which has to close everywhere between."""
     with np.errstate(invalid="ignore"):  # NaN is reported below
-        ends = bar.drive(np.array(stops))
+        ends = bar.crank_rotation(np.array(stops))
         x = np.linspace(np.fmax(turn[0], ends[0]), np.fmin(turn[1], ends[1]), 181)
-        u = bar.follow(x)
+        u = bar.joint_value(x)
     if not (np.isfinite(u).all() and (np.diff(np.sign(np.sin(x + bar.zero))) == 0).all()):
         raise RobotError(
             f"the four-bar linkage of joint {joint + 1} does not close, or is stretched, at a value within the limits",

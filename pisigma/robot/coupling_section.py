@@ -52,7 +52,7 @@ class CoupledJointSection(Section):
     limits_mm: tuple[Bounded, Bounded] | None = None
 
 
-def coupled(
+def rows_and_coupling(
     rows: Sequence[Row], sections: Sequence[CoupledJointSection]
 ) -> tuple[tuple[Row, ...], Coupling | None]:
     """Return the rows with the limits of their DH values, and the coupling of DH values and controller values.
@@ -147,7 +147,7 @@ def _offset(joint: Row, section: CoupledJointSection) -> float:
 
 
 def coupling_document(coupling: Coupling, joints: Sequence[Row]) -> list[dict[str, object]]:
-    """Return the sections of a coupling as plain values; the inverse of `coupled`."""
+    """Return the sections of a coupling as plain values; the inverse of `rows_and_coupling`."""
     result: list[dict[str, object]] = []
     bars, stops = dict(coupling.four_bars), dict(coupling.stops)
     for index, (joint, factors) in enumerate(zip(joints, coupling.matrix.tolist(), strict=True)):

@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 
 from pisigma.files.errors import RobotError, UnknownRobotError, nearest_choice
 from pisigma.files.yaml_file import Section, parse_yaml, read_yaml
-from pisigma.robot.coupling_section import CoupledJointSection, coupled
+from pisigma.robot.coupling_section import CoupledJointSection, rows_and_coupling
 from pisigma.robot.robot_fields import RobotFields
 from pisigma.robot.row import MAX_ROWS, Bounded, JointType, Row
 from pisigma.robot.urdf_frames import frame_of, rotation, translation, xyzrpy_of
@@ -129,7 +129,7 @@ class RobotDocument(Section):
         Raises:
             RobotError: the coupling does not fit the rows, or a row of the modified convention has a beta.
         """
-        rows, coupling = coupled([row.to_row() for row in self.rows], self.coupling)
+        rows, coupling = rows_and_coupling([row.to_row() for row in self.rows], self.coupling)
         dh, base = np.array([row.to_si() for row in self.rows]), self.base.to_si()
         if self.convention == "modified":
             dh, base = from_modified(dh, base)

@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float64
 
-from pisigma.files.errors import Place, RobotError, nearest_choice, printable
+from pisigma.files.errors import Place, RobotError, make_printable, nearest_choice
 from pisigma.robot.urdf_file import parse_xml, read_urdf
 from pisigma.robot.urdf_frames import Frame, frame_of
 
@@ -103,7 +103,7 @@ def read_chain(path: str | os.PathLike[str], base: str | None = None, tip: str |
             remedy="choose other links with base and tip",
         )
     content = etree.tostring(root.getroottree(), xml_declaration=True, encoding="UTF-8")
-    return Chain(urdf.name, base, tip, tuple(joints), origin, printable(str(path), cut=False), content)
+    return Chain(urdf.name, base, tip, tuple(joints), origin, make_printable(str(path), cut=False), content)
 
 
 def _check_tree(urdf: Any, place: Callable[[str], Place]) -> None:

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from pisigma.robot.coupling_section import CoupledJointSection, coupled
+from pisigma.robot.coupling_section import CoupledJointSection, rows_and_coupling
 from pisigma.robot.robot_fields import RobotFields
 from pisigma.robot.row import Row
 from pisigma.robot.urdf_chain import Chain, ChainJoint
@@ -79,7 +79,7 @@ def rows_of_chain(chain: Chain, nearly_parallel: float = NEARLY_PARALLEL) -> Cha
         Row(j.name, j.type, _direction(j), j.lower, j.upper, _urdf_origin(frame))
         for j, frame in zip(joints, frames, strict=True)
     ]
-    coupled_rows, coupling = coupled(rows, _mimics(joints, rows))
+    coupled_rows, coupling = rows_and_coupling(rows, _mimics(joints, rows))
     fields = RobotFields(
         name=chain.name,
         maker="not stated",

@@ -92,7 +92,7 @@ def simulate_touches(
     met = met & inside
     source = f"simulation of {robot.nominal.name}"
     missed = (~met).nonzero()[:, 0].tolist()
-    left_out = tuple(UnusableRow.because(0, _miss(candidates, row, contact)) for row in missed)
+    left_out = tuple(UnusableRow.from_fault(0, _miss(candidates, row, contact)) for row in missed)
     if left_out and on_miss == "error":
         raise UnreachablePoseError(
             f"{len(left_out)} of {candidates.count} touches miss: {left_out[0].reason}",

@@ -47,7 +47,7 @@ class Field:
 
 def form_of(step: str, file: CellFile) -> list[Field]:
     """Return the fields of a step; files and cameras are not among them, as a page must not name paths."""
-    stated = file.stated(step)
+    stated = file.stated_values(step)
     return [
         Field(
             one.key,

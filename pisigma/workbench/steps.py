@@ -94,7 +94,7 @@ def proposal_of(files: list[Path], cell: Cell, form: Form) -> ImportProposal | N
     """
     if len(files) == 1 and is_measurement_file(files[0]):
         return None
-    settings: ImportSettings = cell.file.settings("import", **changed_settings("import", form))
+    settings: ImportSettings = cell.file.settings_of_step("import", **changed_settings("import", form))
     first = propose_import(files, settings)
     stated = []
     for number, mapping in enumerate(first.mappings):
@@ -130,9 +130,11 @@ def take_in(files: list[Path], cell: Cell, form: Form) -> Outcome:
 
 def check_rows(cell: Cell, form: Form, progress: Progress) -> tuple[Outcome, SessionState]:
     """Judge the rows of a session against the newest plan, as `measure --once --no-replan` does."""
-    session = MeasuringSession.read(newest_plan(cell.folder), cell.file.settings("measure", replan=False))
+    session = MeasuringSession.read(
+        newest_plan(cell.folder), cell.file.settings_of_step("measure", replan=False)
+    )
     path = cell.sessions.path(
-        next(one for one in cell.sessions.valid() if one.name == form.get("session", ""))
+        next(one for one in cell.sessions.valid_sessions() if one.name == form.get("session", ""))
     )
     growing: GrowingFile = growing_file(path, session.plan.arm.robot, session.plan.settings)
     progress("checking the rows against each other")

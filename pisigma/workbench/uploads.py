@@ -5,7 +5,7 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from pisigma.files.errors import MeasurementError, printable
+from pisigma.files.errors import MeasurementError, make_printable
 
 MAX_FILES = 20
 """Number of files that are kept; the oldest is removed first."""
@@ -27,9 +27,9 @@ class Uploads:
             name: name that the browser states; its folders are removed.
             content: content of the file.
         """
-        shown = printable(name.replace("\\", "/").rpartition("/")[2].replace("\0", ""))[-MAX_NAME:].strip(
-            ". "
-        )
+        shown = make_printable(name.replace("\\", "/").rpartition("/")[2].replace("\0", ""))[
+            -MAX_NAME:
+        ].strip(". ")
         self._count += 1
         folder = Path(self._folder.name) / str(self._count)
         folder.mkdir()

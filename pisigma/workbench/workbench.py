@@ -19,7 +19,7 @@ from pisigma.workbench import steps
 from pisigma.workbench.cell_scene import CellScene
 from pisigma.workbench.job import BusyError, Jobs, Outcome
 from pisigma.workbench.server.front_server import FrontServer
-from pisigma.workbench.server.viser_server import ViserBehind
+from pisigma.workbench.server.viser_server import ViserBackend
 from pisigma.workbench.tabs import TABS, Tabs, download_of
 from pisigma.workbench.uploads import Uploads
 from pisigma.workflow.cell.cell import Cell
@@ -82,7 +82,7 @@ class Workbench:
         self.folder, self.jobs, self._uploads = folder, Jobs(), Uploads()
         self._tabs, self._status = Tabs(self.jobs), (cell.status(), time.monotonic())
         self._downloads: dict[str, Path] = {}
-        self._behind = ViserBehind("pisigma")
+        self._behind = ViserBackend("pisigma")
         try:
             self._scene = CellScene(self._behind.server)
             self._scene.show_cell(cell)

@@ -30,7 +30,11 @@ from pisigma.validation.checks.row_order import explain_refusal
 from pisigma.validation.checks.scale import scale_figures
 from pisigma.validation.checks.setup_fault import setup_diagnostics
 from pisigma.validation.held_out.calibration_summary import CalibrationSummary, summarise
-from pisigma.validation.held_out.calibration_validation import CalibrationValidation, joined_repeats, judge
+from pisigma.validation.held_out.calibration_validation import (
+    CalibrationValidation,
+    joined_repeats,
+    judge_on_test_set,
+)
 from pisigma.validation.held_out.few_rows import fit_with_folds
 from pisigma.validation.held_out.held_out_rows import HeldOutRows
 from pisigma.validation.held_out.pose_statistics import predicted_at_other_poses
@@ -139,7 +143,7 @@ def calibrate(
     except IdentificationError as refusal:
         raise explain_refusal(refusal, nominal, rows) from refusal
     validation = joined_repeats(training, splits, judged) if splits else None
-    test = None if test_rows is None else judge(calibrator, result, rows, test_rows)
+    test = None if test_rows is None else judge_on_test_set(calibrator, result, rows, test_rows)
     summary = summarise(result)
     summary = summary.with_figures(
         warnings=(*summary.warnings, *((ONLY_GEOMETRY,) if faulty else ()), *beyond),
@@ -152,11 +156,11 @@ def calibrate(
         _description("geometric" if faulty else settings.model, nominal),
         "Validated on rows of the same measurement only, not on other days, payloads or temperatures.",
     )
-    calibration = compose(calibrator, result, rows, summary, texts, validation, test, training)
+    calibration = compose_calibration(calibrator, result, rows, summary, texts, validation, test, training)
     return replace(calibration, settings=settings, seconds=time.perf_counter() - started)
 
 
-def compose(
+def compose_calibration(
     calibrator: Calibrator,
     result: Result,
     rows: Measurements,

@@ -28,7 +28,7 @@ from pisigma.validation.gate import check_rows
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.held_out.frames.fitted_frames import fitted_kinds
 from pisigma.validation.held_out.model_comparison import Difference, ModelComparison, compare_models
-from pisigma.workflow.evaluate import REFERENCES, labelled, load_models, test_rows, with_references
+from pisigma.workflow.evaluate import REFERENCES, load_models, models_by_label, test_rows, with_references
 from pisigma.workflow.settings.comparison import ComparisonSettings
 
 
@@ -190,7 +190,7 @@ def compare(
         and first.name == second.name
     ):
         second = replace(second, name=f"{second.name}-2")
-    sources = labelled([first, second])
+    sources = models_by_label([first, second])
     loaded = load_models(sources)
     models = with_references(list(sources), loaded, with_orientation=True)
     one, other = models.values()

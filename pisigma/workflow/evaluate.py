@@ -142,7 +142,7 @@ def evaluate(
     settings, started = settings or EvaluationSettings(), time.perf_counter()
     if isinstance(models, str | os.PathLike | CalibratedModel | HasModel):
         models = [models]
-    sources = labelled(models)
+    sources = models_by_label(models)
     loaded = load_models(sources)
     everything = read_rows(data, next(iter(loaded.values())).robot, settings.cameras)
     rows = test_rows(everything)
@@ -213,7 +213,7 @@ def _text(source: ModelSource) -> str:
     return source.name if isinstance(source, CalibratedModel) else os.fspath(source)
 
 
-def labelled(stated: Sequence[ModelSource | HasModel]) -> dict[str, ModelSource]:
+def models_by_label(stated: Sequence[ModelSource | HasModel]) -> dict[str, ModelSource]:
     """Return the models by their names in tables: the last part of the folder, or the whole path where two are equal.
 
     Raises:

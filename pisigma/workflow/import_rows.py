@@ -9,11 +9,16 @@ from pisigma.files.errors import MeasurementError, Place
 from pisigma.files.output_file import check_output, write_whole
 from pisigma.measurement.csv.reading import fields_of
 from pisigma.measurement.dataset import Measurements
-from pisigma.measurement.foreign.accounting import FileAccount, FileLine, LeftOutRow, account, sentences
-from pisigma.measurement.foreign.conversion import ConvertedRows, MeasurementTable, convert, measurement_table
+from pisigma.measurement.foreign.accounting import FileAccount, FileLine, LeftOutRow, count_rows, sentences
+from pisigma.measurement.foreign.conversion import (
+    ConvertedRows,
+    MeasurementTable,
+    convert_rows,
+    measurement_table,
+)
 from pisigma.measurement.foreign.export_file import read_export
 from pisigma.measurement.foreign.joining import JoinedRows, append_rows, join_rows
-from pisigma.measurement.foreign.mapping import FileMapping, doubts, map_columns
+from pisigma.measurement.foreign.mapping import FileMapping, map_columns, mapping_warnings
 from pisigma.measurement.foreign.quantities import LEFT_OUT
 from pisigma.measurement.foreign.saved_map import check_used, map_for, save_map
 from pisigma.measurement.foreign.units import parse_units
@@ -171,7 +176,7 @@ def import_rows(
             file, line and column, and the option that helps.
     """
     proposal = files if isinstance(files, ImportProposal) else propose_import(files, settings)
-    converted = [(mapping, convert(mapping)) for mapping in proposal.mappings]
+    converted = [(mapping, convert_rows(mapping)) for mapping in proposal.mappings]
     rows, joined = _joined(converted, proposal.settings)
     content = measurement_table(rows)
     exports = [mapping.file for mapping in proposal.mappings]
@@ -180,11 +185,11 @@ def import_rows(
     if joined is not None:
         left_out += (*joined.unmatched, *joined.unused)
         used += joined.used
-    warnings = [sentence for mapping in proposal.mappings for sentence in doubts(mapping)]
+    warnings = [sentence for mapping in proposal.mappings for sentence in mapping_warnings(mapping)]
     return ImportedRows(
         proposal,
         content,
-        account([place for file in exports for place in file.places], used, left_out),
+        count_rows([place for file in exports for place in file.places], used, left_out),
         (*warnings, *(() if joined is None else joined.warnings)),
     )
 

@@ -24,10 +24,10 @@ from pisigma.planning.session.row_alarms import NEAR_POSE, joint_differences, of
 from pisigma.planning.session.session_accuracy import (
     SessionAccuracy,
     cross_validated,
-    expected,
+    expected_accuracy,
     session_accuracy,
 )
-from pisigma.planning.session.session_rows import FurtherPoses, SessionRows, advice, setup_sentence
+from pisigma.planning.session.session_rows import FurtherPoses, SessionRows, setup_sentence, stopping_advice
 from pisigma.planning.session.state import (
     AccuracyPoint,
     Advice,
@@ -202,13 +202,15 @@ class MeasuringSession:
         progress("planning the remaining poses")
         again = None
         if self._settings.replan:
-            again = self._further.replanned(self.plan, self._poses, so_far, measured.q, remaining)
+            again = self._further.replan(self.plan, self._poses, so_far, measured.q, remaining)
         with self._lock:
             if again is not None:
                 self._adopt(again)
             remaining = self._open
             poses = self.plan.q[remaining[~self.plan.check[remaining]]]
-        ahead = expected(so_far.posterior, so_far.point.poses, poses, self._further.q, self._task, STEP)
+        ahead = expected_accuracy(
+            so_far.posterior, so_far.point.poses, poses, self._further.q, self._task, STEP
+        )
         with self._lock:
             self._expected, self._ahead_of = ahead, so_far
         return ()
@@ -290,7 +292,7 @@ class MeasuringSession:
             OutputError: a file cannot be written.
         """
         with self._lock:
-            remaining = self.plan.part(self._open)
+            remaining = self.plan.select_poses(self._open)
         remaining.write(path)
         for program in programs if len(remaining.q) else ():
             write_whole(program, planned_program(remaining, program))
@@ -324,7 +326,7 @@ class MeasuringSession:
     @property
     def _counting(self) -> Bool[Tensor, " rows"]:
         """Which rows are used."""
-        return self._judged.counting
+        return self._judged.rows_that_count
 
     @property
     def _check(self) -> Bool[Tensor, " rows"]:
@@ -369,4 +371,4 @@ class MeasuringSession:
         if again is not None and again.repeat:
             return Advice("repeat", again.sentence)
         settings = self._settings
-        return advice(settings.limit_mm, settings.least_gain_mm, self._reached, self._expected, left)
+        return stopping_advice(settings.limit_mm, settings.least_gain_mm, self._reached, self._expected, left)

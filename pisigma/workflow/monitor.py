@@ -116,7 +116,7 @@ class Monitoring:
     seconds: float = field(default=0.0)
 
     @property
-    def action(self) -> bool:
+    def needs_action(self) -> bool:
         """Whether action is needed: rows are implausible, recalibrating pays, or a limit is exceeded."""
         alarmed = any(chart.alarm is not None for chart in self.charts)
         passed = self.forecast is not None and self.forecast.passed
@@ -125,7 +125,7 @@ class Monitoring:
         )
 
     @property
-    def advised(self) -> Record | None:
+    def advised_session(self) -> Record | None:
         """The last session with which a recalibration pays.
 
         None if there is none, or where a later session that observes as many joints agrees with the model.
@@ -154,7 +154,7 @@ class Monitoring:
         moves = (f"{one.sentence}." for one in changes)
         forecast = () if self.forecast is None else (self.forecast.sentence,)
         advice: tuple[str, ...] = ()
-        if (best := self.advised) is not None:
+        if (best := self.advised_session) is not None:
             command = RecalibrationSettings(cameras=self.cameras).command(self.model.name, best.file)
             advice = (
                 f"Recalibrating pays: errors like those of {best.file} are expected to fall from "
@@ -169,7 +169,7 @@ class Monitoring:
         return {
             "seconds": round(self.seconds, 3),
             "model": self.model.name,
-            "action": self.action,
+            "action": self.needs_action,
             "sessions": [one.to_json() for one in self.sessions],
             "untrusted": [one.to_json() for one in self.untrusted],
             "history": [one.to_json() for one in self.records],
@@ -237,7 +237,7 @@ def monitor(
     for date, day in _by_day(rows, settings.dates):
         progress(f"{Path(day.source).name}, {date}")
         warnings += row_warnings(loaded.robot, day)
-        right = right_rows(RecalibrationSettings(settings.moved), loaded, posterior.renamed(day))
+        right = right_rows(RecalibrationSettings(settings.moved), loaded, posterior.with_model_names(day))
         warnings += right.warnings
         day, again = new_rows(loaded, right.rows, date, earlier, trusted)
         warnings += again

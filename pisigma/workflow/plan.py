@@ -41,7 +41,7 @@ from pisigma.planning.surroundings.arm_in_surroundings import ArmInSurroundings
 from pisigma.planning.surroundings.motion import Motions
 from pisigma.planning.surroundings.surroundings import Surroundings, read_surroundings
 from pisigma.planning.task import task_poses
-from pisigma.planning.tour import Tour, order_of_use, stages_of, tour
+from pisigma.planning.tour import Tour, order_of_use, plan_tour, stages_of
 from pisigma.robot.description import Robot
 from pisigma.validation.checks.camera import view_warnings
 from pisigma.validation.checks.check import MOVES
@@ -212,7 +212,7 @@ def plan(
         candidates,
         points,
         problem.needed(chosen, points),
-        remaining_errors(posterior.informed(candidates.q[chosen]), task),
+        remaining_errors(posterior.given_poses(candidates.q[chosen]), task),
         way.seconds,
         (
             *repeated,
@@ -253,8 +253,8 @@ class _Problem:
 
     @cached_property
     def measured(self) -> Float64[Tensor, "candidates values directions"]:
-        """Sensitivities of the candidates' measurements; see `RobotPosterior.measured`."""
-        return self.posterior.measured(self.candidates.q)
+        """Sensitivities of the candidates' measurements; see `RobotPosterior.sensitivities`."""
+        return self.posterior.sensitivities(self.candidates.q)
 
     @cached_property
     def tool(self) -> Float64[Tensor, "tasks 3 directions"]:
@@ -283,7 +283,7 @@ class _Problem:
             poses = torch.cat([chosen, check])[use]
             progress("order of the poses")
             stages = stages_of(len(poses))
-            way = tour(motions, q[poses], self.settings.pace, stages=stages)
+            way = plan_tour(motions, q[poses], self.settings.pace, stages=stages)
             free = free[~torch.isin(free, poses[way.left_out])]
             if not len(way.left_out) or len(free) < len(poses):
                 break

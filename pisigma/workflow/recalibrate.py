@@ -140,7 +140,7 @@ def recalibrate(
         )
     nominal = posterior.space.robot
     measurements = read_rows(data, nominal, settings.cameras)
-    rows, again = without_known_rows(parent, posterior.renamed(measurements.split_sets()[0]))
+    rows, again = without_known_rows(parent, posterior.with_model_names(measurements.split_sets()[0]))
     progress("checking the rows")
     right = WithoutWrongRows(rows) if parent.kind == FLEET_PRIOR else right_rows(settings, parent, rows)
     verdict = check_rows(right.rows, parent, settings.fitted, may_move(settings))

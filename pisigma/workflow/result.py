@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from pisigma.files.errors import AcceptanceError, Place, printable
+from pisigma.files.errors import AcceptanceError, Place, make_printable
 from pisigma.files.output_folder import staged_folder
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.inverse.written_model import write_model
@@ -74,7 +74,7 @@ class AbstractModelResult(ABC):
                 "(accept_implausible, --accept-implausible)",
             )
         summary = self.summary.with_figures(command=command)
-        name = printable(name or Path(folder).resolve().name, cut=False)
+        name = make_printable(name or Path(folder).resolve().name, cut=False)
         model = replace(self.model, name=name, metrics=summary.to_json())
         with staged_folder(folder, overwrite) as scratch:
             write_model(model, scratch)

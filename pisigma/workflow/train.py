@@ -24,7 +24,12 @@ from pisigma.network.sections import LevenbergMarquardtSection
 from pisigma.reporting.cards import CardTexts, write_training_card
 from pisigma.robot.description import Robot
 from pisigma.validation.held_out.calibration_summary import summarise
-from pisigma.validation.held_out.calibration_validation import errors_under, judge, learning_curve, validate
+from pisigma.validation.held_out.calibration_validation import (
+    errors_under,
+    judge_on_test_set,
+    learning_curve,
+    validate,
+)
 from pisigma.validation.held_out.pose_statistics import Comparison, PoseErrors, compare_on
 from pisigma.validation.held_out.training_summary import (
     ComparisonFigures,
@@ -34,7 +39,7 @@ from pisigma.validation.held_out.training_summary import (
     summarise_training,
 )
 from pisigma.validation.held_out.validation_figures import ValidationFigures
-from pisigma.workflow.calibrate import Calibration, compose
+from pisigma.workflow.calibrate import Calibration, compose_calibration
 from pisigma.workflow.recipes.data import RecipeData, load_data
 from pisigma.workflow.recipes.reader import read_recipe, recipe_hash
 from pisigma.workflow.recipes.recipe import (
@@ -163,7 +168,7 @@ def _train_geometric(
         paper=recipe.model_dump(mode="json")["paper"] or None,
     )
     texts = CardTexts(recipe.description, recipe.not_validated)
-    return compose(calibrator, result, rows, summary, texts, recipe=(recipe.name, sha256))
+    return compose_calibration(calibrator, result, rows, summary, texts, recipe=(recipe.name, sha256))
 
 
 def _train_hybrid(
@@ -185,7 +190,7 @@ def _train_hybrid(
     validation = validate(
         calibrator, judged, splits, staged_progress(progress, "held-out rows"), settings.jobs
     )
-    test = None if data.test is None else judge(calibrator, result, rows, data.test)
+    test = None if data.test is None else judge_on_test_set(calibrator, result, rows, data.test)
     curve = None
     if (stated := recipe.learning_curve) is not None:
         of_curve = staged_progress(progress, "learning curve")
@@ -201,7 +206,7 @@ def _train_hybrid(
         learning_curve=curve,
     )
     texts = CardTexts(recipe.description, recipe.not_validated)
-    return compose(
+    return compose_calibration(
         calibrator,
         result,
         rows,
@@ -282,7 +287,9 @@ def train_networks(
         kind="inverse_calibration",
         robot=robot,
         network=network,
-        domain=Domain.around(network.scaled_inputs(pairs.T[used], pairs.q_nominal[used]), generator),
+        domain=Domain.from_training_rows(
+            network.scaled_inputs(pairs.T[used], pairs.q_nominal[used]), generator
+        ),
         branches=pairs.branches,
         starts=spread_rows(measurements.q[used]),
         provenance=_provenance(recipe, measurements, pairs, recipe_sha256),

@@ -6,7 +6,7 @@ from pisigma.cli import progress
 from pisigma.cli.progress import progress_of
 from pisigma.cli.screen import MAX_LINES, print_screen
 from pisigma.files.progress import share_done, step_name
-from pisigma.reporting.result_text import MAX_ALIKE, Block, merge_alike_warnings, ranges
+from pisigma.reporting.result_text import MAX_ALIKE, Block, merge_alike_warnings, numbers_as_ranges
 from pisigma.reporting.verdict import Verdict, rounded, uncapitalised
 
 VERDICT = Verdict("0.12 mm RMS, held out; nominal 1 mm.", "yes, for all: nothing is wrong.", "verify it.")
@@ -55,7 +55,7 @@ def test_many_warnings_of_a_kind_become_one_with_their_lines(count, shown):
 
 
 def test_ranges_of_numbers():
-    assert ranges([7, 3, 8, 9, 12]) == "3, 7 to 9, 12"
+    assert numbers_as_ranges([7, 3, 8, 9, 12]) == "3, 7 to 9, 12"
 
 
 @pytest.mark.parametrize(

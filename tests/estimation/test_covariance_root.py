@@ -40,7 +40,7 @@ def test_products_are_those_of_the_matrix() -> None:
 
 def test_extended_by_columns_scale_and_coordinates() -> None:
     root, added, change = factored(), normal(PARAMETERS + WEIGHTS, 2, seed=6), normal(6, PARAMETERS, seed=7)
-    extended = root.extended(added, 3.0, change)
+    extended = root.with_columns(added, 3.0, change)
     whole = torch.block_diag(change, torch.eye(WEIGHTS, dtype=torch.float64))
     C = whole @ (root.as_matrix @ root.as_matrix.t() + added @ added.t()) @ whole.t() * 9.0
     assert_close(extended.as_matrix @ extended.as_matrix.t(), C, rtol=1e-12)

@@ -31,7 +31,7 @@ def search(moved: float, seed: int = 0, stated: bool = False) -> DriftSearch:
 
 
 def estimated(looked_at: DriftSearch) -> Drift:
-    looked_at.estimate()
+    looked_at.estimate_sizes()
     return looked_at.drift
 
 
@@ -71,13 +71,13 @@ def test_a_size_has_the_highest_evidence():
 def test_a_shift_is_that_of_least_squares():
     looked_at = search(MOVED, stated=True)
     number = [group.size > 0 for group in estimated(looked_at).groups].index(True)
-    shift, covariance = looked_at.shift(number, held=False)
+    shift, covariance = looked_at.estimate_shift(number, held=False)
     x = looked_at.values.X[:, 4]
     V = looked_at._K + NOISE**2 * torch.eye(50).double()
     weight = torch.linalg.solve(V, x)
     assert_close(covariance[0, 0], 1 / (x @ weight), rtol=1e-9)
     assert_close(shift[0], (weight @ looked_at.values.y) / (x @ weight), rtol=1e-9)
-    held, narrower = looked_at.shift(number)
+    held, narrower = looked_at.estimate_shift(number)
     assert abs(float(held)) < abs(float(shift))
     assert float(narrower) < float(covariance)
 

@@ -31,7 +31,7 @@ def explained(off: float, seed: int = 0) -> Explained[DriftSearch]:
     def explain(wrong) -> Explained[DriftSearch]:
         there = replace(values, wrong=wrong)
         search = DriftSearch(there, 1e-6 * X, groups, noise, noise)
-        search.estimate()
+        search.estimate_sizes()
         return Explained(search, there, search.log_evidence, search.covariance, search.deviation)
 
     return with_wrong_rows(explain({}), explain)
@@ -42,7 +42,7 @@ def test_a_wrong_configuration_is_found_despite_a_drift(off):
     result = explained(off)
     assert list(result.values.wrong) == [5]
     assert [group.what for group in result.what.drift.groups if group.size] == ["joint 1"]
-    assert_close(result.what.shift(0)[0], torch.tensor([MOVED]), rtol=0.05)
+    assert_close(result.what.estimate_shift(0)[0], torch.tensor([MOVED]), rtol=0.05)
     expected = result.what.drift.noise * torch.ones(36).double()
     assert_close(result.deviation[:15], expected[:15])
     assert float(result.deviation[15]) > 10 * NOISE

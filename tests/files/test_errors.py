@@ -11,7 +11,7 @@ from pisigma.files.errors import (
     PisigmaError,
     Place,
     RobotError,
-    printable,
+    make_printable,
 )
 
 
@@ -23,11 +23,14 @@ def test_control_characters_are_escaped(odd: str):
 
 
 def test_printable_text_is_unchanged():
-    assert printable("Größe 10°, 測定, a\tb\nc") == "Größe 10°, 測定, a\tb\nc"
+    assert make_printable("Größe 10°, 測定, a\tb\nc") == "Größe 10°, 測定, a\tb\nc"
 
 
 def test_long_words_and_texts_are_shortened():
-    assert printable(f"'{'x' * 1_000_000}' is unknown") == f"'{'x' * 39}... (1,000,002 characters) is unknown"
+    assert (
+        make_printable(f"'{'x' * 1_000_000}' is unknown")
+        == f"'{'x' * 39}... (1,000,002 characters) is unknown"
+    )
     shown = str(MissingExtraError("no " * 1_000_000 + "end"))
     assert len(shown) < MAX_MESSAGE_CHARACTERS
     assert shown.endswith("no end")
@@ -66,17 +69,17 @@ def test_fields_are_plain_values_for_json():
 
 
 def test_a_place_is_added_to_an_error_without_one():
-    problem = RobotError("no rows", value=0, remedy="add rows").located(Place("a.csv", 3), PisigmaError)
+    problem = RobotError("no rows", value=0, remedy="add rows").with_place(Place("a.csv", 3), PisigmaError)
     assert type(problem) is PisigmaError
     assert str(problem) == "no rows (a.csv, line 3); add rows."
     assert (problem.file, problem.line, problem.value) == ("a.csv", 3, 0)
-    again = problem.located(Place("b.yaml", 7, "rows"))
+    again = problem.with_place(Place("b.yaml", 7, "rows"))
     assert (again.file, again.line, again.column) == ("a.csv", 3, None)
     assert str(again) == "b.yaml, line 7, key 'rows': no rows (a.csv, line 3); add rows."
-    more = PisigmaError("no rows").followed_by(" See the log.").located(Place("a.csv", 3))
+    more = PisigmaError("no rows").followed_by(" See the log.").with_place(Place("a.csv", 3))
     assert (str(more), more.line) == ("a.csv, line 3: no rows See the log.", 3)
     assert (
-        str(PisigmaError(expected="a row", value=0).located(Place("a", 1)))
+        str(PisigmaError(expected="a row", value=0).with_place(Place("a", 1)))
         == "expected a row, got 0 (a, line 1)."
     )
 

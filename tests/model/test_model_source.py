@@ -8,7 +8,7 @@ from pisigma.files.errors import PlanningError
 from pisigma.model.inverse.corrected_ik import CorrectedIK
 from pisigma.model.model_source import model_or_folder
 from pisigma.planning.subject import Subject
-from pisigma.workflow.evaluate import labelled
+from pisigma.workflow.evaluate import models_by_label
 
 
 @pytest.mark.usefixtures("without_type_checker")
@@ -18,6 +18,6 @@ def test_the_model_of_a_corrected_ik_is_taken():
     assert model_or_folder(ik) is model
     assert model_or_folder(model) is model
     assert model_or_folder("models/kiro3") == "models/kiro3"
-    assert list(labelled(["nominal", ik]).values()) == ["nominal", model]
+    assert list(models_by_label(["nominal", ik]).values()) == ["nominal", model]
     with refused(PlanningError, value=model.name):
         Subject.load(ik)

@@ -52,7 +52,7 @@ def test_views_cover_all_angles_distances_and_branches(settings: PlanSettings, d
     solver = closed_form_solver(arm.robot)
     assert solver is not None
     assert len(nearest_branch(solver, drawn.q).unique()) >= 6
-    assert 0 < float(views.room(arm, drawn.q).min()) < 0.05
+    assert 0 < float(views.margin_in_image(arm, drawn.q).min()) < 0.05
 
 
 def test_the_workspace_is_not_that_of_the_views(drawn: Candidates):
@@ -95,10 +95,10 @@ def test_sharp_depths_follow_from_the_lens():
     lens, f = LensSection(aperture=4.0, focus_mm=500.0, pixel_um=5.0), 1400.0
     v, s = f * 5e-6, 0.5
     focal = v * s / (v + s)
-    for depth in lens.depths(f):
+    for depth in lens.sharp_depths(f):
         behind = 1 / (1 / focal - 1 / depth)
         assert_close(abs(v - behind) / behind * focal / 4.0, 5e-6, rtol=1e-9)
-    assert LensSection(aperture=16.0, focus_mm=900.0, pixel_um=5.0).depths(f)[1] == np.inf
+    assert LensSection(aperture=16.0, focus_mm=900.0, pixel_um=5.0).sharp_depths(f)[1] == np.inf
 
 
 def test_depths_are_stated_once():

@@ -8,7 +8,7 @@ from testing.refusals import refused
 from pisigma.files.errors import PlanningError
 from pisigma.planning.expected_accuracy import accuracy_curve, p95_of, remaining_errors, rms_of
 from pisigma.planning.plan_settings import Criterion
-from pisigma.planning.pose_selection import PoseSelection, condensed, select_poses
+from pisigma.planning.pose_selection import PoseSelection, condense_derivatives, select_poses
 from pisigma.planning.robot_posterior import RobotPosterior
 from pisigma.robot import Robot
 
@@ -38,23 +38,23 @@ def variance(B: torch.Tensor, goal: torch.Tensor) -> float:
 def test_gains_and_exchange_are_those_of_the_criterion(
     posterior: RobotPosterior, criterion: Criterion
 ) -> None:
-    q, goal = random_joints(40, 0), condensed(posterior.tool(random_joints(50, 1)))
+    q, goal = random_joints(40, 0), condense_derivatives(posterior.tool(random_joints(50, 1)))
     # Base and tool are known to a millimetre here, so that determinants are right to the last digits.
-    B = posterior.measured(q).clamp(-30, 30)
+    B = posterior.sensitivities(q).clamp(-30, 30)
     choice = PoseSelection(B, goal, criterion)
 
     def value(chosen: list[int]) -> float:
         return log_det(B[chosen]) if criterion == "D" else -variance(B[chosen], goal)
 
     for number in (3, 17, 8):
-        choice.add(number)
+        choice.add_candidate(number)
     before = value([3, 17, 8])
     gains = choice.gains()
     assert_close(gains[21], value([3, 17, 8, 21]) - before, rtol=1e-6)
     assert int(gains.argmax()) not in (3, 17, 8)
-    choice.grow(8)
+    choice.add_until(8)
     grown = value(choice.chosen)
-    choice.exchange()
+    choice.exchange_candidates()
     assert len(set(choice.chosen)) == 8
     assert value(choice.chosen) >= grown - 1e-9 * abs(grown)
 
@@ -63,10 +63,10 @@ def test_gains_and_exchange_are_those_of_the_criterion(
 def test_condensed_rows_keep_the_variance_after_measuring(hybrid: bool) -> None:
     # before it is all where base and tool are, metres against tenths of a millimetre
     posterior, task = RobotPosterior.from_robot(Robot.load("ur5"), hybrid=hybrid), random_joints(50, 1)
-    q, goal = random_joints(60, 0), condensed(posterior.tool(task))
+    q, goal = random_joints(60, 0), condense_derivatives(posterior.tool(task))
     for count in (5, 20, 60):
-        left = rms_of(posterior.informed(q[:count]).tool(task)) ** 2
-        assert_close(variance(posterior.measured(q[:count]), goal), left, rtol=0.01)
+        left = rms_of(posterior.given_poses(q[:count]).tool(task)) ** 2
+        assert_close(variance(posterior.sensitivities(q[:count]), goal), left, rtol=0.01)
 
 
 def test_criterion_i_leaves_less_error_of_the_tool_than_criterion_d_and_random_poses() -> None:
@@ -77,29 +77,31 @@ def test_criterion_i_leaves_less_error_of_the_tool_than_criterion_d_and_random_p
     )
     for count in (10, 25):
         chosen = [
-            select_poses(posterior.measured(q), posterior.tool(task), count, "I"),
-            select_poses(posterior.measured(q), posterior.tool(task), count, "D"),
+            select_poses(posterior.sensitivities(q), posterior.tool(task), count, "I"),
+            select_poses(posterior.sensitivities(q), posterior.tool(task), count, "D"),
             torch.arange(count),
         ]
-        left, *others = (rms_of(posterior.informed(q[rows]).tool(task)) for rows in chosen)
+        left, *others = (rms_of(posterior.given_poses(q[rows]).tool(task)) for rows in chosen)
         assert left < 0.9 * min(others)
 
 
 def test_selected_poses_are_sorted_greedily(posterior: RobotPosterior) -> None:
     q, task = random_joints(60, 2), random_joints(40, 3)
-    chosen = select_poses(posterior.measured(q), posterior.tool(task), 12, "I")
+    chosen = select_poses(posterior.sensitivities(q), posterior.tool(task), 12, "I")
     assert len(set(chosen.tolist())) == 12
-    choice = PoseSelection(posterior.measured(q[chosen]), condensed(posterior.tool(task)), "I")
-    choice.grow(12)
+    choice = PoseSelection(
+        posterior.sensitivities(q[chosen]), condense_derivatives(posterior.tool(task)), "I"
+    )
+    choice.add_until(12)
     assert choice.chosen == list(range(12))
 
 
 def test_the_curve_is_the_covariance_after_the_poses(posterior: RobotPosterior) -> None:
     q, task = random_joints(80, 4), random_joints(40, 5)
-    chosen = select_poses(posterior.measured(q), posterior.tool(task), 20)
-    points = accuracy_curve(posterior.measured(q), posterior.tool(task), chosen, (10, 20))
+    chosen = select_poses(posterior.sensitivities(q), posterior.tool(task), 20)
+    points = accuracy_curve(posterior.sensitivities(q), posterior.tool(task), chosen, (10, 20))
     for point in points:
-        after = posterior.informed(q[chosen[: point.poses]])
+        after = posterior.given_poses(q[chosen[: point.poses]])
         assert_close(point.rms, float(after.deviation(task).square().mean().sqrt()), rtol=1e-6)
         assert point.rms < point.p95 < 3 * point.rms
         assert point.rms < point.random_rms
@@ -118,13 +120,13 @@ def test_remaining_errors_are_attributed_to_groups(posterior: RobotPosterior) ->
     errors = remaining_errors(posterior, task)
     assert {"base", "tool", "joint offsets"} <= {error.name for error in errors}
     assert errors[0].name == "base"
-    hybrid = RobotPosterior.from_robot(Robot.load("ur5")).informed(random_joints(300, 7))
+    hybrid = RobotPosterior.from_robot(Robot.load("ur5")).given_poses(random_joints(300, 7))
     assert any(error.name.startswith("correction of joint") for error in remaining_errors(hybrid, task))
 
 
 def test_impossible_selections_are_refused(posterior: RobotPosterior) -> None:
     q = random_joints(5, 0)
     with refused(PlanningError, option="count", value=6):
-        select_poses(posterior.measured(q), posterior.tool(q), 6)
+        select_poses(posterior.sensitivities(q), posterior.tool(q), 6)
     with refused(PlanningError, option="task"):
-        select_poses(posterior.measured(q), posterior.tool(q[:0]), 2)
+        select_poses(posterior.sensitivities(q), posterior.tool(q[:0]), 2)

@@ -29,7 +29,7 @@ def test_columns_are_the_derivative_of_the_measured_values(robot: Robot, kind: s
     instrument = Instrument(kind, 1e-4, 2e-4, (1.0, 2.0, 0.5))
     posterior = RobotPosterior.from_robot(robot, instrument)
     q = random_joints(robot, 4, 0)
-    B = posterior.measured(q)
+    B = posterior.sensitivities(q)
     assert B.shape[1] == {"position": 3, "pose": 6, "distance": 1}[kind]
     step, index = 1e-6, posterior.uncertainty.space.index("d_1")
     dh = robot.dh.copy()
@@ -50,12 +50,12 @@ def test_conditioning_agrees_with_a_normal_distribution(robot: Robot) -> None:
     A = posterior.columns(q)[:, :3].flatten(0, 1)
     C = posterior.uncertainty.root.square()
     expected = torch.linalg.inv(torch.linalg.inv(C) + A.t() @ A / posterior.instrument.sigma**2)
-    root = posterior.informed(q).uncertainty.root
+    root = posterior.given_poses(q).uncertainty.root
     scale = expected.diagonal().sqrt()
     assert_close(root @ root.t() / scale / scale[:, None], expected / scale / scale[:, None], atol=1e-6)
     # What is measured first and what is measured second may be exchanged.
-    halves = posterior.informed(q[:8]).informed(q[8:]).deviation(task)
-    assert_close(halves, posterior.informed(q).deviation(task), rtol=1e-6)
+    halves = posterior.given_poses(q[:8]).given_poses(q[8:]).deviation(task)
+    assert_close(halves, posterior.given_poses(q).deviation(task), rtol=1e-6)
 
 
 def test_few_rows_are_conditioned_on_without_a_fit(robot: Robot) -> None:
@@ -63,18 +63,18 @@ def test_few_rows_are_conditioned_on_without_a_fit(robot: Robot) -> None:
     rows = Measurements(q=q, position=forward_kinematics(robot, q)[:, :3, 3])
     task = random_joints(robot, 5, 4)
     assert_close(
-        posterior.updated_with(rows).deviation(task), posterior.informed(q).deviation(task), rtol=1e-9
+        posterior.updated_with(rows).deviation(task), posterior.given_poses(q).deviation(task), rtol=1e-9
     )
 
 
 def test_surprise_is_chi_square_distributed_and_larger_for_wrong_rows(robot: Robot) -> None:
-    posterior = RobotPosterior.from_robot(robot, Instrument("pose", 1e-4, 2e-4)).informed(
+    posterior = RobotPosterior.from_robot(robot, Instrument("pose", 1e-4, 2e-4)).given_poses(
         random_joints(robot, 60, 5)
     )
     q = random_joints(robot, 400, 6)
     T = forward_kinematics(robot, q)
     generator = torch.Generator().manual_seed(0)
-    spread = posterior.measured(q)
+    spread = posterior.sensitivities(q)
     numbers = torch.randn(spread.shape[2], generator=generator, dtype=torch.float64)
     off = spread @ numbers + torch.randn(400, 6, generator=generator, dtype=torch.float64)
     position = T[:, :3, 3] + off[:, :3] * 1e-4
@@ -96,7 +96,7 @@ def test_rows_without_positions_are_refused(robot: Robot) -> None:
 def test_distances_do_not_determine_the_pose_of_the_base(robot: Robot) -> None:
     known = RobotPosterior.from_robot(robot, Instrument("distance", anchor=(1.5, -1.0, 0.3)), hybrid=False)
     q = torch.rand(40, robot.dof, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
-    after = known.informed(q).deviation(q)
+    after = known.given_poses(q).deviation(q)
     assert bool((after < 0.5 * known.deviation(q)).all())
     assert float(after.max()) < 5e-3
 
@@ -107,5 +107,8 @@ def test_unknown_base_and_tool_have_a_wide_prior(robot: Robot) -> None:
     q = torch.linspace(-1, 1, 5 * robot.dof, dtype=torch.float64).view(5, robot.dof)
     unknown = RobotPosterior.from_robot(robot, hybrid=False).with_unknown_base_and_tool(base, tool)
     expected = RobotPosterior.from_robot(robot.with_geometry(base=base, tool=tool), hybrid=False)
-    for D, reference in ((unknown.tool(q), expected.tool(q)), (unknown.measured(q), expected.measured(q))):
+    for D, reference in (
+        (unknown.tool(q), expected.tool(q)),
+        (unknown.sensitivities(q), expected.sensitivities(q)),
+    ):
         assert_close(D @ D.mT, reference @ reference.mT, rtol=1e-9)

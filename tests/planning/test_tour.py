@@ -14,7 +14,7 @@ from pisigma.planning.candidates import draw_candidates
 from pisigma.planning.surroundings.arm_in_surroundings import ArmInSurroundings
 from pisigma.planning.surroundings.motion import Motions, is_free
 from pisigma.planning.surroundings.surroundings import Surroundings
-from pisigma.planning.tour import Pace, order_of_use, stages_of, tour
+from pisigma.planning.tour import Pace, order_of_use, plan_tour, stages_of
 from pisigma.robot import Robot
 
 ARM = ArmInSurroundings.from_robot(Robot.load("fanuc_r2000"), CELL)
@@ -24,11 +24,11 @@ PACE = Pace(speed=math.radians(20), settling=2.0)
 def test_few_poses_are_in_the_best_order():
     q = torch.from_numpy(np.random.default_rng(3).uniform(-0.4, 0.4, (7, 6)))
     arm = ArmInSurroundings.from_robot(Robot.load("fanuc_r2000"))
-    way = tour(Motions(arm, q), q, PACE)
+    way = plan_tour(Motions(arm, q), q, PACE)
 
     def seconds(order: tuple[int, ...]) -> float:
         path = q[list(order)]
-        return float(PACE.seconds(arm.robot, path[:-1], path[1:]).sum()) + PACE.settling * len(order)
+        return float(PACE.duration(arm.robot, path[:-1], path[1:]).sum()) + PACE.settling * len(order)
 
     best = min(seconds(order) for order in itertools.permutations(range(len(q))))
     assert sorted(way.order.tolist()) == list(range(len(q)))
@@ -40,7 +40,7 @@ def test_a_tour_starts_at_the_present_joint_values():
     q = torch.from_numpy(np.random.default_rng(3).uniform(-0.4, 0.4, (7, 6)))
     arm = ArmInSurroundings.from_robot(Robot.load("fanuc_r2000"))
     start = q[4] + 0.01
-    way = tour(Motions(arm, q), q, PACE, start)
+    way = plan_tour(Motions(arm, q), q, PACE, start)
     assert int(way.order[0]) == 4
     assert sorted(way.order.tolist()) == list(range(7))
 
@@ -48,7 +48,7 @@ def test_a_tour_starts_at_the_present_joint_values():
 def test_the_most_useful_poses_come_in_the_first_stage():
     q = torch.from_numpy(np.random.default_rng(4).uniform(-0.4, 0.4, (9, 6)))
     arm = ArmInSurroundings.from_robot(Robot.load("fanuc_r2000"))
-    order = tour(Motions(arm, q), q, PACE, q[0], stages=(2, 5, 20)).order.tolist()
+    order = plan_tour(Motions(arm, q), q, PACE, q[0], stages=(2, 5, 20)).order.tolist()
     assert [set(order[:2]), set(order[2:5]), set(order[5:])] == [{0, 1}, {2, 3, 4}, {5, 6, 7, 8}]
     assert stages_of(20) == ()
     assert stages_of(81) == (20, 40, 80)
@@ -64,7 +64,7 @@ def test_every_motion_is_collision_free():
         ARM.nominal, CELL.model_copy(update={"tracker": None, "reflector": None})
     )
     pool = draw_candidates(arm, 60, 0).q
-    way = tour(Motions(arm, pool), pool[:5], PACE)
+    way = plan_tour(Motions(arm, pool), pool[:5], PACE)
     assert not len(way.left_out)
     assert sum(map(len, way.before)) == 1, "the test wants a motion that is blocked"
     stops = [
@@ -81,7 +81,7 @@ def test_an_unreachable_pose_is_left_out():
     blocked = Surroundings.model_validate(
         {"boxes": [wall, wall | {"name": "other", "center_mm": (3200.0, 0.0, 1500.0)}]}
     )
-    way = tour(Motions(ArmInSurroundings.from_robot(robot, blocked), q), q, PACE)
+    way = plan_tour(Motions(ArmInSurroundings.from_robot(robot, blocked), q), q, PACE)
     assert len(way.left_out) == 1
     assert len(way.order) == 2
 

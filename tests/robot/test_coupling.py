@@ -89,19 +89,19 @@ def test_full_turns_bring_controller_values_into_their_limits():
 
 def test_only_a_parallelogram_rotates_with_its_crank():
     x = np.linspace(-1.0, 1.0, 21)
-    assert_close(FourBar(1.0, 0.4, 1.0, 0.4, 1.5).follow(x), x, atol=1e-14)
+    assert_close(FourBar(1.0, 0.4, 1.0, 0.4, 1.5).joint_value(x), x, atol=1e-14)
     bar = FourBar(1.0, 0.4, 1.003, 0.401, 1.5)
-    psi, phi = x + 1.5, bar.follow(x) + 1.5
+    psi, phi = x + 1.5, bar.joint_value(x) + 1.5
     ends = np.exp(1j * psi) * 0.4 - (1.0 + np.exp(1j * phi) * 0.401)
     assert_close(np.abs(ends), np.full(21, 1.003), atol=1e-14)
-    assert_close(bar.drive(bar.follow(x)), x, atol=1e-12)
+    assert_close(bar.crank_rotation(bar.joint_value(x)), x, atol=1e-12)
     assert np.abs(phi - psi).max() > 1e-3
 
 
 def test_the_slope_is_the_derivative():
     robot = coupled_robot(PALLETISER)
     q, step = drawn(robot, 5), 1e-6
-    slope = robot.coupling.slope(q)
+    slope = robot.coupling.derivative(q)
     for axis in range(len(robot.axes)):
         moved = np.zeros(len(robot.axes))
         moved[axis] = step

@@ -102,7 +102,7 @@ def linearised(robot: Robot, measurements: Measurements, **options: object) -> L
     values, design = sensor_values(problem, here.point), Design(problem, ())
     weights = [torch.ones_like(sensor.root) for sensor in values]
     x, group = (here.point - problem.nominal)[problem.active], held_out_groups(solved.setup.measurements)
-    rows = Rows.linearised(design, x, values, weights, group)
+    rows = Rows.from_linearisation(design, x, values, weights, group)
     return LinearisedArm(solved.setup, rows, tuple(view.noise.tolist()), tuple(view.prior_scale.tolist()))
 
 

@@ -50,7 +50,7 @@ def assert_same_posterior(
         assert_close(here.determined, there.determined, atol=max(exactness, 1e-6))
         assert_close(np.array(here.misfit), np.array(there.misfit), rtol=exactness)
         assert_close(np.array(here.used), np.array(there.used), rtol=exactness, atol=1e-6)
-        assert_close(here.effective, there.effective, atol=max(exactness, 1e-6))
+        assert_close(here.effective_unknowns, there.effective_unknowns, atol=max(exactness, 1e-6))
         evidence.append((here.log_evidence, there.log_evidence))
     here, there = (second - first for first, second in zip(*evidence, strict=True))
     assert_close(here, there, rtol=max(exactness, 1e-6))

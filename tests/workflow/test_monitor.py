@@ -30,7 +30,7 @@ def test_rows_of_several_days_are_several_sessions():
     monitoring = monitor(model_before(), [rows, dated(rows_later(6, 31), "2026-03-01")])
     assert [one.date for one in monitoring.sessions] == ["2026-01-01", "2026-02-01", "2026-03-01"]
     assert [one.session.rows for one in monitoring.sessions] == [6, 6, 6]
-    assert not monitoring.action
+    assert not monitoring.needs_action
     assert [chart.what for chart in monitoring.charts][-2:] == ["joint 6", "error"]
 
 
@@ -38,7 +38,7 @@ def test_an_instrument_that_was_moved_raises_no_alarm():
     monitoring = monitor(model_before(), [rows_later(12, 3, base=(1e-3, -2e-3, 5e-4, 2e-3, 0.0, 0.0))])
     assert [one.what for one in monitoring.sessions[0].session.moved] == ["base", "base"]
     assert monitoring.sentences == ()
-    assert not monitoring.action
+    assert not monitoring.needs_action
 
 
 def test_a_collision_calls_for_action():
@@ -56,8 +56,8 @@ def test_a_collision_calls_for_action():
     assert any("pisigma recalibrate" in line for line in report["says"])
     settings = MonitorSettings(dates=("2026-03-01", "2026-02-01"))
     repaired = monitor(model_before(), [rows_later(10, 30), rows_later(10, 31, COLLISION)], settings)
-    assert repaired.action
-    assert repaired.advised is None
+    assert repaired.needs_action
+    assert repaired.advised_session is None
     assert not any("pisigma recalibrate" in line for line in repaired.sentences)
 
 
@@ -88,7 +88,7 @@ def test_rows_that_are_not_trusted_are_in_no_chart_and_not_remembered(tmp_path):
     assert (len(monitoring.sessions), len(monitoring.records)) == (1, 1)
     (untrusted,) = monitoring.untrusted
     assert [one.kind for one in untrusted.diagnostics] == ["setup_fault"]
-    assert monitoring.action
+    assert monitoring.needs_action
     assert len(monitor(folder, [metres]).records) == 1
     alone = monitor(model_before(), [metres])
     assert (alone.records, alone.charts, alone.trends) == ((), (), ())

@@ -150,7 +150,7 @@ class GeometricCalibrator:
         if findings.extended or len(sensor_view_of(start).sums[0].distance) < problem.rows:
             start = problem.linearise(start.point, start)
         else:
-            start = problem.combined(start.point, sensor_view_of(start))
+            start = problem.combine_sums(start.point, sensor_view_of(start))
         left = self.maximum_iterations - rough.iterations
         fine = levenberg_marquardt(problem, start, left, close_enough=SHORTEST_STEP)
         refuse_implausible(problem, fine.linearisation, measurements.source)
@@ -256,7 +256,7 @@ class GeometricCalibrator:
         unknowns, here = setup.free_unknowns, rough.linearisation
         kept = sorted(set(active) - set(unknowns))
         others = [i for i in candidates if i not in set(kept)]
-        most = problem.space.most_independent(problem.turning)
+        most = problem.space.most_independent(problem.needs_rotation)
         if self.elimination != "exact" or not others or len(kept) >= most:
             return rough, findings, active
         now = information(problem, here.point, unknowns + kept + others, sensor_view_of(here))

@@ -97,7 +97,7 @@ class SolvedCalibration:
     @cached_property
     def refined(self) -> Linearisation[Tensor]:
         """The problem at its solution, with the noise estimated from all rows without outliers."""
-        return self.problem.refined(self.solution.linearisation)
+        return self.problem.with_refined_noise(self.solution.linearisation)
 
     @cached_property
     def covariance(self) -> Float64[np.ndarray, "parameters parameters"]:

@@ -110,7 +110,7 @@ class HybridArm:
     coverage: JointCoverage
     approach: Float[Tensor, " dof"] | None = None
 
-    def delta(self, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch dof"]:
+    def joint_correction(self, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch dof"]:
         """Compute Δ [rad or m] at commanded joint values [rad or m], with the directions of `approach`."""
         sides = None if self.approach is None else self.approach.to(q).expand_as(q)
         delta: Tensor = self.correction(q, sides)
@@ -126,5 +126,5 @@ class HybridArm:
             approach: see `JointCorrection.forward`; None for that of the arm.
         """
         with torch.no_grad():
-            delta = self.delta(q) if approach is None else self.correction(q, approach)
+            delta = self.joint_correction(q) if approach is None else self.correction(q, approach)
         return forward_kinematics(self.robot, q + delta)

@@ -16,7 +16,7 @@ from pisigma.calibration.geometric.problem.setup import identified_geometry
 from pisigma.calibration.geometric.result import SolvedCalibration
 from pisigma.calibration.hybrid.arm import JointCoverage
 from pisigma.calibration.hybrid.delivery import FinalCorrection, choose_final_correction
-from pisigma.calibration.hybrid.design import Design, Rows, weigh
+from pisigma.calibration.hybrid.design import Design, Rows, robust_weights
 from pisigma.calibration.hybrid.gravity import (
     USUAL,
     gravity_by_evidence,
@@ -165,7 +165,7 @@ class HybridCalibrator:
             coverage=JointCoverage.from_joints(self.geometric.robot, solved.problem.q),
             noise={sensor.name: sigma for sensor, sigma in noise if not sensor.certain},
             unknowns=refined.design.unknowns,
-            effective=refined.posterior.effective,
+            effective=refined.posterior.effective_unknowns,
             rounds=refined.rounds,
             outliers=_outliers(solved, refined),
         )
@@ -194,7 +194,9 @@ class HybridCalibrator:
             ((distance < GROSS) | one.certain).to(distance)
             for distance, one in zip(distances, values, strict=True)
         ]
-        rows = Rows.linearised(design, (point - problem.nominal)[problem.active], values, weights, group)
+        rows = Rows.from_linearisation(
+            design, (point - problem.nominal)[problem.active], values, weights, group
+        )
         pairs = zip(noise, values, strict=True)
         if all(sigma <= SMALLEST_NOISE for sigma, one in pairs if not one.certain):
             # The geometry explains exact data, so features would only fit the errors of the linearisation.
@@ -207,7 +209,7 @@ class HybridCalibrator:
         growing, others = tried[0]
         first = Design(problem, (*others, *growing[:FIRST_MODEL_SIZES][-1:]))
         posterior = build_regression(first, rows).maximise_evidence(first.prior(prior_scale), noise)
-        rows = linearise_rows(first, posterior.x, posterior.effective, group)
+        rows = linearise_rows(first, posterior.x, posterior.effective_unknowns, group)
         products = [InputProducts(robot)] if self.products and robot.dof > 1 else []
         choices = []
         for growing, others in tried:
@@ -260,7 +262,7 @@ def _outliers(solved: SolvedCalibration, refined: Refined) -> tuple[Outlier, ...
     """List rows with less than half of the full weight under the hybrid, the worst first."""
     problem, setup, found = solved.problem, solved.setup, []
     values = sensor_values(problem, refined.point, evaluate_in_chunks(refined.correction))
-    weights = weigh(problem, values, refined.posterior.effective)
+    weights = robust_weights(problem, values, refined.posterior.effective_unknowns)
     for number, (one, weight) in enumerate(zip(values, weights, strict=True)):
         length, sensor = one.residual.norm(dim=1), problem.sensors[number]
         deviations = length * one.root / refined.posterior.noise[number]

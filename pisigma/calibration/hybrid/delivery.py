@@ -9,14 +9,14 @@ from torch import Tensor
 
 from pisigma.calibration.geometric.problem.noise import sensor_view_of
 from pisigma.calibration.geometric.result import SolvedCalibration
-from pisigma.calibration.hybrid.design import Design, Rows, weigh
+from pisigma.calibration.hybrid.design import Design, Rows, robust_weights
 from pisigma.calibration.hybrid.refinement import (
     CONVERGENCE_TOLERANCE,
     MAX_LINEARISATIONS,
     Refined,
+    correction_from_weights,
     evaluate_in_chunks,
     linearise_rows,
-    network,
     refine,
 )
 from pisigma.calibration.hybrid.regression import build_regression
@@ -114,8 +114,8 @@ def held_out_rows(
         Errors per sensor; None for certain sensors.
     """
     values = _values(design, posterior.x)
-    weights = weigh(design.problem, values, posterior.effective)
-    rows = Rows.linearised(design, posterior.x, values, weights, group)
+    weights = robust_weights(design.problem, values, posterior.effective_unknowns)
+    rows = Rows.from_linearisation(design, posterior.x, values, weights, group)
     fit = build_regression(design, rows)
     held_out = [torch.full_like(one.root, torch.nan) for one in values]
     for groups in folds:
@@ -125,11 +125,11 @@ def held_out_rows(
         here, x = rows, rest.x
         for _ in range(MAX_LINEARISATIONS):
             seen = _values(design, x)
-            there = Rows.linearised(design, x, seen, weights, group)
-            differs = there.select_groups(others).difference(
+            there = Rows.from_linearisation(design, x, seen, weights, group)
+            differs = there.select_groups(others).squared_difference(
                 here.select_groups(others), x, design, rest.noise
             )
-            if not differs >= CONVERGENCE_TOLERANCE * rest.effective:
+            if not differs >= CONVERGENCE_TOLERANCE * rest.effective_unknowns:
                 break
             rest = build_regression(design, there).without_groups(groups).solve(rest.prior, rest.noise)
             here, x = there, rest.x
@@ -147,7 +147,9 @@ def _values(design: Design, x: Float64[Tensor, " unknowns"]) -> tuple[SensorValu
     """Linearise all rows at some unknowns."""
     problem = design.problem
     point = problem.nominal.index_add(0, problem.active, x[: design.active])
-    return sensor_values(problem, point, evaluate_in_chunks(network(design, x)) if design.features else None)
+    return sensor_values(
+        problem, point, evaluate_in_chunks(correction_from_weights(design, x)) if design.features else None
+    )
 
 
 def _with_own_unknowns(
@@ -254,7 +256,7 @@ def _geometric_posterior(solved: SolvedCalibration, choice: FeatureChoice) -> Po
     problem, group = choice.rows.problem, choice.rows.group
     design, view = Design(problem, ()), sensor_view_of(solved.solution.linearisation)
     x = (solved.solution.linearisation.point - problem.nominal)[problem.active]
-    rows = linearise_rows(design, x, choice.geometry.posterior.effective, group)
+    rows = linearise_rows(design, x, choice.geometry.posterior.effective_unknowns, group)
     prior = design.prior(view.prior_scale.tolist())
     return build_regression(design, rows).solve(prior, tuple(view.noise.tolist()))
 

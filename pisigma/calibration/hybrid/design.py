@@ -202,7 +202,7 @@ class Rows:
         return tuple(order[k::count] for k in range(count))
 
     @staticmethod
-    def linearised(
+    def from_linearisation(
         design: Design,
         x: Float64[Tensor, " unknowns"],
         values: Sequence[SensorValues],
@@ -228,7 +228,7 @@ class Rows:
             rows.append(replace(one, residual=one.residual + design.predicted_change(one, x)))
         return Rows(problem, tuple(rows), group)
 
-    def difference(
+    def squared_difference(
         self, other: "Rows", x: Float64[Tensor, " unknowns"], design: Design, noise: Sequence[float]
     ) -> float:
         """Compute the sum of squared differences of weighted residuals over the noise; infinite for different rows.
@@ -255,7 +255,7 @@ def chunks(count: int, size: int | None = None) -> list[slice]:
     return [slice(start, start + size) for start in range(0, count, size)]
 
 
-def weigh(
+def robust_weights(
     problem: CalibrationProblem, values: Sequence[SensorValues], effective: float
 ) -> tuple[Float64[Tensor, " values"], ...]:
     """Compute the robust weights of all rows of every sensor from their residuals.

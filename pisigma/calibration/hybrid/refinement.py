@@ -11,7 +11,7 @@ from pisigma.calibration.geometric.prediction import predicted_poses
 from pisigma.calibration.geometric.problem.problem import CalibrationProblem
 from pisigma.calibration.geometric.problem.setup import IdentifiedGeometry, identified_geometry
 from pisigma.calibration.geometric.result import SolvedCalibration
-from pisigma.calibration.hybrid.design import Design, Rows, chunks, weigh
+from pisigma.calibration.hybrid.design import Design, Rows, chunks, robust_weights
 from pisigma.calibration.hybrid.design_regression import AbstractDesignRegression
 from pisigma.calibration.hybrid.regression import build_regression
 from pisigma.calibration.hybrid.search import FeatureChoice
@@ -67,9 +67,9 @@ def refine(problem: CalibrationProblem, group: Int64[Tensor, " rows"], choice: F
     design, posterior = Design(problem, choice.best.design.features), choice.best.posterior
     rows, fit, rounds = choice.rows, choice.regression, 1
     while rounds < MAX_LINEARISATIONS:
-        there = linearise_rows(design, posterior.x, posterior.effective, group)
-        differs = there.difference(rows, posterior.x, design, posterior.noise)
-        if differs < CONVERGENCE_TOLERANCE * posterior.effective:
+        there = linearise_rows(design, posterior.x, posterior.effective_unknowns, group)
+        differs = there.squared_difference(rows, posterior.x, design, posterior.noise)
+        if differs < CONVERGENCE_TOLERANCE * posterior.effective_unknowns:
             break
         rows, fit = there, None  # only one system of equations in memory at a time, because they are large
         fit = build_regression(design, there)
@@ -84,10 +84,10 @@ def _refined(
 ) -> Refined:
     problem = design.problem
     point = problem.nominal.index_add(0, problem.active, posterior.x[: design.active])
-    return Refined(rows, design, posterior, fit, point, network(design, posterior.x), rounds)
+    return Refined(rows, design, posterior, fit, point, correction_from_weights(design, posterior.x), rounds)
 
 
-def network(design: Design, x: Float64[Tensor, " unknowns"]) -> JointCorrection:
+def correction_from_weights(design: Design, x: Float64[Tensor, " unknowns"]) -> JointCorrection:
     """Make the network with the weights of some unknowns; products of inputs become product units."""
     features = [chosen for chosen in design.features if not isinstance(chosen, InputProducts)]
     factors, linear = None, []
@@ -127,9 +127,9 @@ def linearise_rows(
     problem = design.problem
     point = problem.nominal.index_add(0, problem.active, x[: design.active])
     values = sensor_values(
-        problem, point, evaluate_in_chunks(network(design, x)) if design.features else None
+        problem, point, evaluate_in_chunks(correction_from_weights(design, x)) if design.features else None
     )
-    return Rows.linearised(design, x, values, weigh(problem, values, effective), group)
+    return Rows.from_linearisation(design, x, values, robust_weights(problem, values, effective), group)
 
 
 def with_frames_of(solved: SolvedCalibration, refined: Refined) -> IdentifiedGeometry:

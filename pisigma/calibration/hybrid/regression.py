@@ -11,7 +11,7 @@ from torch import Tensor
 from pisigma.calibration.hybrid.design import Design, Rows, chunks
 from pisigma.calibration.hybrid.design_regression import AbstractDesignRegression
 from pisigma.calibration.hybrid.sensor_values import SensorValues
-from pisigma.estimation.cholesky import BLOCK, blocks, return_free_memory
+from pisigma.estimation.cholesky import BLOCK, return_free_memory, row_blocks
 from pisigma.estimation.dual_regression import DualRegression, group_gram, pair_indices, stack_groups
 from pisigma.estimation.held_out import HeldOutErrors
 from pisigma.estimation.primal_regression import PrimalRegression, Solved
@@ -120,7 +120,7 @@ class NormalEquations(PrimalRegression, AbstractDesignRegression):
             first += len(r[-1])
             del columns
         M = torch.eye(first, dtype=x.dtype, device=x.device)
-        for rows in blocks(len(x), BLOCK):
+        for rows in row_blocks(len(x), BLOCK):
             S = solved.inverse[rows, : rows.stop] @ whitened[:, : rows.stop].t()
             M.addmm_(S.t(), S, alpha=-1)
         return HeldOutErrors.from_fit(M, torch.cat(r), torch.cat(number), self.sensors)

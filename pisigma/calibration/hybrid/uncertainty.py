@@ -143,7 +143,7 @@ def position_uncertainty(
     prior_scale = held_out_scale(missed)
     root = fit.covariance_root(posterior)
     change = geometry.coordinate_jacobian[:, design.problem.active.cpu()]
-    root = root.extended(root_of_sizes(posterior, root), prior_scale**0.5, change)
+    root = root.with_columns(root_of_sizes(posterior, root), prior_scale**0.5, change)
     value = {sensor.name: sigma for sensor, sigma in zip(rows.values, posterior.noise, strict=True)}
     noise = CalibrationNoise(value, stated_sigmas(design.problem.sensors))
     return PositionUncertainty(design.problem.space, geometry, design.features, root, prior_scale, noise)

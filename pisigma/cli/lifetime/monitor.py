@@ -66,7 +66,7 @@ def monitor(
         if page is not None:
             monitoring.save_page(page)
     _print(monitoring, page, as_json, verbose)
-    if monitoring.action:
+    if monitoring.needs_action:
         raise typer.Exit(NOT_ACCEPTED)
 
 
@@ -83,7 +83,7 @@ def _monitor_cell(
         if page is not None:
             monitoring.save_page(page)
     _print(monitoring, page, as_json, verbose, cell.status())
-    if monitoring.action:
+    if monitoring.needs_action:
         raise typer.Exit(NOT_ACCEPTED)
 
 
@@ -142,7 +142,7 @@ def _verdict(monitoring: "Monitoring", advice: str) -> Verdict:
     trust = f"yes: unchanged in {counted(len(sessions), 'session')}."
     return Verdict(
         f"last session {last} under the model, base and tool fitted where they were moved.",
-        f"{'no' if monitoring.action else 'with caution'}: {'; '.join(doubts)}." if doubts else trust,
+        f"{'no' if monitoring.needs_action else 'with caution'}: {'; '.join(doubts)}." if doubts else trust,
         uncapitalised(advice)
         or ("see what has changed below." if doubts else "measure the next session with the same poses."),
     )

@@ -5,9 +5,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pisigma.files.errors import printable
+from pisigma.files.errors import make_printable
 from pisigma.planning.session.state import AccuracyPoint, SessionState
-from pisigma.reporting.result_text import MAX_ALIKE, merge_alike_warnings, ranges
+from pisigma.reporting.result_text import MAX_ALIKE, merge_alike_warnings, numbers_as_ranges
 from pisigma.reporting.verdict import rounded
 from pisigma.workflow.follow import SessionStep
 from pisigma.workflow.result_texts import accuracy_text
@@ -46,12 +46,12 @@ def _row_lines(state: SessionState, lines: Sequence[int]) -> Iterator[str]:
     errors = np.linalg.norm(state.rows.error[rows], axis=1) * 1e3
     known = errors[~np.isnan(errors)]
     if not len(known):
-        yield f"lines {ranges(lines)}: cannot be judged yet"
+        yield f"lines {numbers_as_ranges(lines)}: cannot be judged yet"
         return
     worst = lines[int(np.nanargmax(errors))]
     yield (
-        f"lines {ranges(lines)}: {rounded(float(np.sqrt((known**2).mean())), len(known))} mm RMS from what the other "
-        f"rows predict, at most {rounded(float(known.max()), len(known))} mm (line {worst})"
+        f"lines {numbers_as_ranges(lines)}: {rounded(float(np.sqrt((known**2).mean())), len(known))} mm RMS from what "
+        f"the other rows predict, at most {rounded(float(known.max()), len(known))} mm (line {worst})"
     )
 
 
@@ -85,22 +85,22 @@ def page(step: SessionStep | None, state: SessionState, title: str) -> "Renderab
     def table(name: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
         laid_out = Table(*columns, title=Text(name), title_justify="left", box=None, pad_edge=False)
         for row in rows:
-            laid_out.add_row(*(Text(printable(cell, cut=False)) for cell in row))
+            laid_out.add_row(*(Text(make_printable(cell, cut=False)) for cell in row))
         return laid_out
 
     first = max(0, len(state.rows.line) - SHOWN_ROWS)
     rows = [(str(state.rows.line[row]), _verdict(state, row)) for row in range(first, len(state.rows.line))]
     points = (*state.reached, *state.expected)[-SHOWN_POINTS:]
     waiting = "" if step is None else step.growth.waiting
-    alarms = [printable(alarm.sentence, cut=False) for alarm in state.alarms[-SHOWN_ALARMS:]]
+    alarms = [make_printable(alarm.sentence, cut=False) for alarm in state.alarms[-SHOWN_ALARMS:]]
     colour = {"measure": "bold", "repeat": "bold red", "correct": "bold red", "stop": "bold green"}[
         state.advice.action
     ]
     return Group(
-        Text(printable(title), style="bold"),
+        Text(make_printable(title), style="bold"),
         Text(next_text(state)),
-        Text(printable(state.advice.sentence, cut=False), style=colour),
-        *([Text(f"Waiting: {printable(waiting, cut=False)}", style="dim")] if waiting else []),
+        Text(make_printable(state.advice.sentence, cut=False), style=colour),
+        *([Text(f"Waiting: {make_printable(waiting, cut=False)}", style="dim")] if waiting else []),
         *(Text(alarm, style="red") for alarm in alarms),
         table("Rows", ("line", "error"), rows),
         table("Accuracy [mm]", ("poses", "predicted RMS", "95 %", "held-out RMS", "95 %"), _points(points)),

@@ -48,7 +48,7 @@ def serve(
     if hasattr(signal, "SIGHUP"):
         signal.signal(signal.SIGHUP, lambda *_: server.reload(report))
     print_json(server.ports)
-    with served.followed(report):
+    with served.follow_changes(report):
         server.run()
 
 

@@ -15,7 +15,7 @@ from pisigma.cli.output import print_json, saved_model_folder
 from pisigma.cli.progress import progress_of
 from pisigma.cli.screen import print_result, print_screen
 from pisigma.cli.settings_options import takes_settings
-from pisigma.files.errors import printable
+from pisigma.files.errors import make_printable
 from pisigma.reporting.result_text import Block, table_block
 from pisigma.reporting.verdict import Verdict, rms_text, rounded, uncapitalised
 from pisigma.workflow.settings.training import TrainSettings
@@ -64,7 +64,7 @@ def train(
     with progress_of("training") as progress:
         training = train_recipe(recipe, data, settings, progress)
     command = ["pisigma", "train", recipe.as_posix(), *(["--data", data.name] if data else [])]
-    texts = {"name": read.name, "command": printable(shlex.join(command), cut=False)}
+    texts = {"name": read.name, "command": make_printable(shlex.join(command), cut=False)}
     with saved_model_folder(training, folder, accept_implausible, overwrite, **texts) as written:
         shutil.rmtree(checkpoints, ignore_errors=True)
         training = replace(training, seconds=time.perf_counter() - started)

@@ -36,14 +36,14 @@ def dh_csv(robot: Robot, comments: tuple[str, ...] = ()) -> str:
     limits = ("lower_deg", "upper_deg", "lower_mm", "upper_mm")
     parameters = (*in_file_units(DH_COLUMNS, robot.dh[0]), *in_file_units(FRAME_COLUMNS, robot.base))
     columns = ("part", "name", "type", "direction", *limits, *parameters)
-    lines = [{"part": "base", **cells(FRAME_COLUMNS, robot.base)}]
+    lines = [{"part": "base", **parameter_columns(FRAME_COLUMNS, robot.base)}]
     for row, values in zip(robot.rows, robot.dh, strict=True):
         line = {"part": "row", "name": row.name, "type": row.type, "direction": str(row.direction)}
         for side, limit in (("lower", row.lower), ("upper", row.upper)):
             if np.isfinite(limit):
                 line[f"{side}_{row.file_unit}"] = repr(row.in_file_unit(limit))
-        lines.append(line | cells(DH_COLUMNS, values))
-    lines.append({"part": "tool", **cells(FRAME_COLUMNS, robot.tool)})
+        lines.append(line | parameter_columns(DH_COLUMNS, values))
+    lines.append({"part": "tool", **parameter_columns(FRAME_COLUMNS, robot.tool)})
     return csv_table(columns, lines, (CONVENTION, *_coupling_sentences(robot), *comments))
 
 
@@ -68,7 +68,7 @@ def csv_table(
     return header_comment(sentences) + text.getvalue()
 
 
-def cells(names: tuple[str, ...], values: np.ndarray) -> dict[str, str]:
+def parameter_columns(names: tuple[str, ...], values: np.ndarray) -> dict[str, str]:
     """Return parameters by column [mm, deg] at full precision."""
     return {column: repr(value) for column, value in in_file_units(names, values).items()}
 

@@ -52,7 +52,7 @@ class ExportRequest:
     temperature_c: float | None = None
 
     @property
-    def stated(self) -> tuple[str, ...]:
+    def stated_options(self) -> tuple[str, ...]:
         """Names of the options that are given."""
         return tuple(name for name in OPTIONS if getattr(self, name) is not None)
 

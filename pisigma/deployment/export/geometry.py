@@ -47,7 +47,7 @@ def chosen_geometry(model: CalibratedModel, name: str | None) -> ChosenGeometry:
     """
     if name == HYBRID:
         return ChosenGeometry(HYBRID, _signed(model, _hybrid_geometry(model)), _hybrid_remarks(model))
-    return ChosenGeometry(GEOMETRIC, _signed(model, model.calibrated or model.robot), remarks(model))
+    return ChosenGeometry(GEOMETRIC, _signed(model, model.calibrated or model.robot), geometry_remarks(model))
 
 
 def _signed(model: CalibratedModel, robot: Robot) -> Robot:
@@ -103,7 +103,7 @@ def corrects_joints(model: CalibratedModel) -> bool:
     return model.network is not None or model.hybrid is not None
 
 
-def remarks(model: CalibratedModel) -> tuple[str, ...]:
+def geometry_remarks(model: CalibratedModel) -> tuple[str, ...]:
     """Return comments for a file that includes only the geometry of a model."""
     kind = (
         "Nominal geometry with identified base and tool"

@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from jaxtyping import Float64
 
-from pisigma.deployment.export.dh_table import TABLE_SUFFIXES, cells, csv_table, header_comment
+from pisigma.deployment.export.dh_table import TABLE_SUFFIXES, csv_table, header_comment, parameter_columns
 from pisigma.deployment.export.export_format import Exported, ExportFormat, ExportRequest, model_facts
 from pisigma.deployment.export.geometry import offset_remarks
 from pisigma.deployment.export.projection import Departure, joint_offsets, project_model
@@ -55,8 +55,8 @@ def fit_joint_offsets(model: CalibratedModel) -> JointOffsets:
         unobservable=tuple(
             j.name for j, free in zip(nominal.joints, fit.observable, strict=True) if not free
         ),
-        lost=fit.departure(fit.robot),
-        nominal=fit.departure(nominal),
+        lost=fit.deviation_of(fit.robot),
+        nominal=fit.deviation_of(nominal),
     )
 
 
@@ -121,7 +121,9 @@ def offsets_csv(offsets: JointOffsets, comments: tuple[str, ...] = ()) -> str:
     frame = in_file_units(FRAME_COLUMNS, offsets.robot.base)
     columns = ("part", "name", "type", "offset_deg", "offset_mm", *frame)
     lines = [{"part": "joint", **entry} for entry in _joints(offsets)]
-    lines += [{"part": p, **cells(FRAME_COLUMNS, getattr(offsets.robot, p))} for p in ("base", "tool")]
+    lines += [
+        {"part": p, **parameter_columns(FRAME_COLUMNS, getattr(offsets.robot, p))} for p in ("base", "tool")
+    ]
     return csv_table(columns, lines, (*comments, *offset_sentences(offsets)))
 
 

@@ -64,7 +64,7 @@ class ProjectionProblem:
     parameters: Sequence[int]
 
     @property
-    def lever(self) -> float:
+    def length_scale(self) -> float:
         """Length [m] that converts angles [rad] to distances: half the reach."""
         return self.robot.reach / 2
 
@@ -79,9 +79,9 @@ class ProjectionProblem:
         R, p = T[:, :3, :3], T[:, :3, 3]
         eye, none = torch.eye(3).to(R).expand_as(R), torch.zeros_like(R)
         translations = torch.cat([J[:, :3], eye, -skew(p), R, none], -1)
-        rotations = self.lever * torch.cat([J[:, 3:], none, eye, none, R], -1)
+        rotations = self.length_scale * torch.cat([J[:, 3:], none, eye, none, R], -1)
         missing = pose_error(self.T, T)
-        missing = torch.cat([missing[:, :3], self.lever * missing[:, 3:]], -1)
+        missing = torch.cat([missing[:, :3], self.length_scale * missing[:, 3:]], -1)
         return missing.flatten(), torch.cat([translations, rotations], 1).flatten(0, 1)
 
     def apply_step(self, robot: Robot, step: Float64[Tensor, " unknowns"]) -> Robot:
@@ -193,7 +193,7 @@ class Projection:
     q: Float64[Tensor, "poses dof"]
     T: Float64[Tensor, "poses 4 4"]
 
-    def departure(self, robot: Robot) -> Departure:
+    def deviation_of(self, robot: Robot) -> Departure:
         """Compute the deviation of a robot from the model."""
         T = forward_kinematics(robot, self.q)
         distance = (T[:, :3, 3] - self.T[:, :3, 3]).norm(dim=-1)
@@ -214,7 +214,7 @@ def departure_from_nominal(robot: Robot, nominal: Robot) -> Departure:
     low, high = torch.from_numpy(nominal.limits.clip(-torch.pi, torch.pi)).unbind(1)
     share = torch.rand((POSES, nominal.dof), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     q = low + share * (high - low)
-    return Projection(robot, (), q, forward_kinematics(robot, q)).departure(nominal)
+    return Projection(robot, (), q, forward_kinematics(robot, q)).deviation_of(nominal)
 
 
 def project_model(

@@ -89,7 +89,7 @@ def export_model(name: str, request: ExportRequest) -> Exported:
         PisigmaError: the format cannot describe the model.
     """
     form = export_format(name)
-    for option in request.stated:
+    for option in request.stated_options:
         if option not in form.options:
             takers = " or ".join(other for other in export_names() if option in export_format(other).options)
             raise OutputError(

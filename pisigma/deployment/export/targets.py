@@ -135,7 +135,7 @@ def _write(request: ExportRequest) -> Exported:
         ),
         summary=f"Targets for {len(targets.line)} poses",
         details=": " + ", ".join(f"{count} {status}" for status, count in statuses),
-        failure=targets.failure,
+        failure=targets.failure_sentence,
     )
 
 

@@ -71,7 +71,7 @@ class BinaryFrames(AbstractProtocol):
         if flags:
             return self._refuse(name, Refusal.UNKNOWN_FLAGS, begun)
         try:
-            model = self._models.find(index)
+            model = self._models.find_model(index)
         except RequestError:
             why = Refusal.MODEL_REFUSED if self._models.is_refused else Refusal.NO_SUCH_MODEL
             return self._refuse(name, why, begun)
@@ -87,7 +87,7 @@ class BinaryFrames(AbstractProtocol):
         """Return the bytes after the head of a frame with the flag `TOKEN`."""
         return message[HEAD.size :] if HEAD.unpack_from(message)[4] == TOKEN else None
 
-    def admission(self, admitted: bool) -> bytes:
+    def admission_answer(self, admitted: bool) -> bytes:
         """Return the answer to a token: status 0 if it is valid."""
         return _refusal(0, 0 if admitted else Refusal.WRONG_TOKEN)
 

@@ -135,7 +135,7 @@ class Connection:
                     self.busy = True
                     self._submit(self, reply)
             if self._token is not None and len(self._received) >= CHUNK:
-                raise BrokenStreamError(self._protocol.admission(False))
+                raise BrokenStreamError(self._protocol.admission_answer(False))
         except BrokenStreamError as problem:
             self._received.clear()
             self._ending = True
@@ -147,7 +147,7 @@ class Connection:
 
     def _admit(self, message: bytes, token: bytes) -> None:
         admitted = is_token(self._protocol.token_of(message), token)
-        reply = self._protocol.admission(admitted)
+        reply = self._protocol.admission_answer(admitted)
         if not admitted:
             raise BrokenStreamError(reply)
         self._token = None

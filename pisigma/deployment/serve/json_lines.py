@@ -21,7 +21,7 @@ from pisigma.deployment.serve.request_values import (
     read_numbers,
     read_tolerance,
 )
-from pisigma.files.errors import PisigmaError, RequestError, check_choice, nearest_choice, printable
+from pisigma.files.errors import PisigmaError, RequestError, check_choice, make_printable, nearest_choice
 from pisigma.model.inverse.corrected_ik import CorrectedIK
 from pisigma.robot.kernels.array_kinematics import xyzrpy_of
 from pisigma.robot.kinematics.status import Status
@@ -132,7 +132,7 @@ class JsonLines(AbstractProtocol):
         token = request.get("token") if isinstance(request, dict) else None
         return token.encode() if isinstance(token, str) else None
 
-    def admission(self, admitted: bool) -> bytes:
+    def admission_answer(self, admitted: bool) -> bytes:
         """Return the answer to a token."""
         if admitted:
             return _line({"status": "admitted"})
@@ -161,7 +161,7 @@ class JsonLines(AbstractProtocol):
             )
         if task == "ask":
             return *self._question(request), {}
-        model = self._models.find(request.get("model"))
+        model = self._models.find_model(request.get("model"))
         slow = not model.is_fast or task == "path" or read_flag(request, "accuracy")
         solve = {"pose": _solve, "path": _follow}.get(task, _forward)
         names = model.short_name if request.get("brief") else model.whole_name
@@ -194,11 +194,11 @@ class JsonLines(AbstractProtocol):
     def _refuse(self, request: dict[str, Any], problem: Exception, begun: int) -> bytes:
         """Return the answer to an invalid request, with its id if that could be read."""
         if isinstance(problem, PisigmaError | ValueError):
-            sentence = printable(str(problem))
+            sentence = make_printable(str(problem))
         elif isinstance(problem, RecursionError):
             sentence = "the request is nested too deeply."
         else:
-            sentence = printable(
+            sentence = make_printable(
                 f"this is a defect of pisigma ({type(problem).__name__}: {problem}); please report it."
             )
         reply = _line({"id": request.get("id"), "error": sentence})

@@ -168,7 +168,7 @@ class ServedModels:
         Args:
             folders: model folders.
             within: folder that is searched for further models on reload; damaged models in it are left out.
-            cell: cell whose model in use is served instead, also after a change; see `followed`.
+            cell: cell whose model in use is served instead, also after a change; see `follow_changes`.
 
         Raises:
             ModelError: a folder is not a complete model; with `within`, no folder is one.
@@ -200,7 +200,7 @@ class ServedModels:
         """Whether no model must be used with what is active on the controller of the cell."""
         return self._in_use is not None and bool(self._in_use.findings.refusal)
 
-    def find(self, name: object) -> ServedModel:
+    def find_model(self, name: object) -> ServedModel:
         """Return the model with a name or an index; None stands for the only model.
 
         Raises:
@@ -245,7 +245,7 @@ class ServedModels:
         return problems
 
     @contextlib.contextmanager
-    def followed(self, report: Callable[[str], None]) -> Iterator[None]:
+    def follow_changes(self, report: Callable[[str], None]) -> Iterator[None]:
         """Take over changes of the model in use of a cell, between requests, until the block ends.
 
         Args:

@@ -48,7 +48,7 @@ class AbstractProtocol(ABC):
         """Return the token of a first message; None if it has none."""
 
     @abstractmethod
-    def admission(self, admitted: bool) -> bytes:
+    def admission_answer(self, admitted: bool) -> bytes:
         """Return the answer to a token."""
 
 

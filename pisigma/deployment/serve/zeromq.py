@@ -119,7 +119,7 @@ class ZeroMq:
         if len(parts) != (1 if self._token is None else 2) or (
             self._token is not None and not is_token(parts[0], self._token)
         ):
-            return protocol.admission(False)
+            return protocol.admission_answer(False)
         if protocol is self._json:
             message = message.removesuffix(b"\n") + b"\n"
         try:

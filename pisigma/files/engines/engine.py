@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Final, TypeVar
 
-from pisigma.files.plugins import Plugins, loaded
+from pisigma.files.plugins import Plugins, loaded_plugins
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -60,7 +60,7 @@ class AbstractEngine(ABC):
 
 def pack_arguments(work: Callable[[Item], Result], chunk: Sequence[Item]) -> tuple[Plugins, bytes]:
     """Return the arguments of `process_chunk`; plug-ins are separate, as they have to be loaded first."""
-    return loaded(), pickle.dumps((work, list(chunk)))
+    return loaded_plugins(), pickle.dumps((work, list(chunk)))
 
 
 def process_chunk(plugins: Plugins, pickled: bytes) -> bytes:

@@ -63,13 +63,13 @@ class Database:
         """Add rows in one transaction; a row with the same key is replaced.
 
         Raises:
-            OutputError: the file cannot be written; see `opened`.
+            OutputError: the file cannot be written; see `open`.
         """
-        with self.writing() as database:
+        with self.transaction() as database:
             self.insert(database, rows)
 
     def insert(self, database: sqlite3.Connection, rows: Sequence[Any]) -> None:
-        """Add rows in a transaction of `writing`; a row with the same key is replaced."""
+        """Add rows in a transaction; a row with the same key is replaced."""
         for row in rows:
             values = asdict(row)
             names, marks = ", ".join(values), ", ".join("?" * len(values))
@@ -80,13 +80,13 @@ class Database:
         """Return all rows of a class in the order in which they were added; none if there is no file yet.
 
         Raises:
-            OutputError: the file cannot be read; see `opened`.
+            OutputError: the file cannot be read; see `open`.
         """
         if not self.path.exists():
             return ()
         columns = fields(kind)  # type: ignore[arg-type]  # classes with a table are dataclasses
         names = ", ".join(one.name for one in columns)
-        with self.opened() as database:
+        with self.open() as database:
             rows = database.execute(f"SELECT {names} FROM {self.tables[kind].name} ORDER BY rowid").fetchall()
         booleans = [one.type is bool for one in columns]
         return tuple(
@@ -98,7 +98,7 @@ class Database:
         """Upgrade the file to the present version of the schema; return its version before.
 
         Raises:
-            OutputError: the file cannot be upgraded; see `opened`.
+            OutputError: the file cannot be upgraded; see `open`.
         """
         with self._connected() as (database, before):
             if before < self.version:
@@ -111,21 +111,21 @@ class Database:
         Raises:
             OutputError: the file cannot be read, or the copy cannot be written; see `opened`.
         """
-        with self.opened() as database, closing(sqlite3.connect(path)) as other:
+        with self.open() as database, closing(sqlite3.connect(path)) as other:
             database.backup(other)
 
     @contextmanager
-    def writing(self) -> Iterator[sqlite3.Connection]:
+    def transaction(self) -> Iterator[sqlite3.Connection]:
         """Open the file for changes that are made together, or not at all; other processes wait before they write.
 
         Raises:
-            OutputError: the file cannot be written; see `opened`.
+            OutputError: the file cannot be written; see `open`.
         """
-        with self.opened() as database, _transaction(database):
+        with self.open() as database, _transaction(database):
             yield database
 
     @contextmanager
-    def opened(self) -> Iterator[sqlite3.Connection]:
+    def open(self) -> Iterator[sqlite3.Connection]:
         """Open the file; one of an earlier version is upgraded first, as a whole or not at all.
 
         Raises:

@@ -233,7 +233,7 @@ _OF_MODELS = "models/*.history.sqlite"
 """These files in a cell."""
 
 
-def now() -> str:
+def current_time() -> str:
     """Return the time as stored in a history (ISO 8601, UTC, to the millisecond)."""
     return datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="milliseconds")
 
@@ -325,7 +325,7 @@ class History:
         Raises:
             OutputError: the history cannot be written.
         """
-        with self.database.writing() as database:
+        with self.database.transaction() as database:
             known = database.execute(
                 f"SELECT 1 FROM {TABLES[SessionEntry].name} WHERE sha256 = ? AND name <> ? AND set_aside = ''",
                 (session.sha256, session.name),
@@ -340,7 +340,7 @@ class History:
         Raises:
             OutputError: the history cannot be written.
         """
-        with self.database.writing() as database:
+        with self.database.transaction() as database:
             for kind, column in ((ModelEntry, "sha256"), (MonitoredSession, "model_sha256")):
                 database.execute(
                     f"UPDATE OR REPLACE {TABLES[kind].name} SET {column} = ? WHERE {column} = ?",
@@ -375,7 +375,7 @@ class History:
                 expected = f"a day since {entry.made[:10]}, when model '{entry.name}' was made"
                 raise MeasurementError(expected=expected, value=day, option="--date")
             model = entry.name
-        event = Event(day, kind, note, now(), person.strip(), model)  # type: ignore[arg-type]  # checked above
+        event = Event(day, kind, note, current_time(), person.strip(), model)  # type: ignore[arg-type]  # checked above
         self.add(event)
         return event
 

@@ -195,7 +195,7 @@ def evidence_of(
 ) -> RobotEvidence:
     """Compute the information of a robot's rows, linearised at its most probable errors."""
     posterior = ModelPosterior.from_model(model)
-    rows = posterior.renamed(rows)
+    rows = posterior.with_model_names(rows)
     problem = recalibration_problem(model, posterior, rows, frame_keys(rows, ("base", "tool")))
     problem = replace(problem, groups=tuple(group for group in problem.groups if group.fixed_size))
     adaptation = adapt(problem)

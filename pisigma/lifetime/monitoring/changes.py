@@ -48,14 +48,14 @@ class Series:
         root: Tensor = torch.linalg.cholesky(self.covariance)
         return root
 
-    def whitened(self, columns: Float64[Tensor, "values columns"]) -> Float64[Tensor, "values columns"]:
+    def whiten(self, columns: Float64[Tensor, "values columns"]) -> Float64[Tensor, "values columns"]:
         """Whiten columns by the covariance of the values."""
         result: Tensor = torch.linalg.solve_triangular(self._root, columns, upper=False)
         return result
 
     def fit(self, columns: Float64[Tensor, "values columns"]) -> tuple[list[float], list[float]]:
         """Fit the coefficients of columns; return them and their standard deviations."""
-        y, A = self.whitened(self.values[:, None]), self.whitened(columns)
+        y, A = self.whiten(self.values[:, None]), self.whiten(columns)
         of_coefficients = torch.linalg.inv(A.t() @ A)
         return (of_coefficients @ A.t() @ y)[:, 0].tolist(), of_coefficients.diagonal().sqrt().tolist()
 
@@ -107,7 +107,7 @@ class Series:
     def _best(self, columns: Tensor, chosen: tuple[Event, ...]) -> tuple[Event, float]:
         """Return the event that explains most given others, and by how much it lowers the square sum."""
         left, Q = self._left(columns, chosen)
-        tried = self.whitened(torch.stack([one.column(len(self.values)) for one in self._tried], 1))
+        tried = self.whiten(torch.stack([one.column(len(self.values)) for one in self._tried], 1))
         tried = tried - Q @ (Q.t() @ tried)
         square = tried.square().sum(0)
         gain = torch.where(
@@ -118,7 +118,7 @@ class Series:
 
     def _left(self, columns: Tensor, events: tuple[Event, ...]) -> tuple[Tensor, Tensor]:
         """Return the whitened residuals of the values, and an orthonormal basis of the fitted columns."""
-        y, A = self.whitened(self.values[:, None])[:, 0], self.whitened(self.with_events(columns, events))
+        y, A = self.whiten(self.values[:, None])[:, 0], self.whiten(self.with_events(columns, events))
         Q = torch.linalg.qr(A)[0]
         return y - Q @ (Q.t() @ y), Q
 

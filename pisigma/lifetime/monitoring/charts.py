@@ -94,14 +94,14 @@ class Chart:
         return (self.cusum[:, 0] if self.one_sided else self.cusum.amax(1)) / self.limits.cusum
 
     @cached_property
-    def outside(self) -> dict[AlarmKind, Bool[Tensor, " sessions"]]:
+    def sessions_outside(self) -> dict[AlarmKind, Bool[Tensor, " sessions"]]:
         """Sessions at which each statistic is outside its limit."""
         return {"EWMA": self.ewma_share > 1, "CUSUM": self.cusum_share > 1}
 
     @property
     def alarm(self) -> int | None:
         """Index of the first session since which a statistic has been outside its limit; None if neither is."""
-        outside = torch.stack(list(self.outside.values())).any(0)
+        outside = torch.stack(list(self.sessions_outside.values())).any(0)
         if not len(outside) or not bool(outside[-1]):
             return None
         inside = (~outside).nonzero()[:, 0]
@@ -110,7 +110,9 @@ class Chart:
     @property
     def kinds(self) -> tuple[AlarmKind, ...]:
         """Statistics that are outside their limits at the last session."""
-        return tuple(kind for kind, outside in self.outside.items() if len(outside) and bool(outside[-1]))
+        return tuple(
+            kind for kind, outside in self.sessions_outside.items() if len(outside) and bool(outside[-1])
+        )
 
     def to_json(self, dates: Sequence[str]) -> dict[str, Any]:
         """Return the chart as plain values, NaN as None; `dates` are those of the sessions."""

@@ -20,7 +20,7 @@ from pisigma.lifetime.recalibration.movement import HistoryMovement, Movement, m
 from pisigma.lifetime.recalibration.recalibration_problem import (
     FrameKey,
     RecalibrationProblem,
-    hypotheses,
+    movement_hypotheses,
     recalibration_problem,
 )
 from pisigma.lifetime.recalibration.relocated_frames import MIN_MOVE
@@ -189,7 +189,7 @@ def _with_relocated(
     tools = frozenset(("tool", name) for name in rows.target if name in geometry.tools)
     tried: dict[frozenset[FrameKey], _Solved] = {frozenset(): still}
     for owners in (bases, tools, bases | tools):
-        if not owners or (owners == bases | tools and any(one.fits for one in tried.values())):
+        if not owners or (owners == bases | tools and any(one.has_usual_noise for one in tried.values())):
             continue
         with suppress(IdentificationError):  # too few rows to determine these
             tried[owners] = _solve(model, posterior, rows, owners)
@@ -210,7 +210,7 @@ class _Solved:
     explanation: Explanation
 
     @property
-    def fits(self) -> bool:
+    def has_usual_noise(self) -> bool:
         """Whether the noise is about that of the calibration."""
         return self.explanation.noise_factor <= MAX_NOISE_FACTOR
 
@@ -276,11 +276,11 @@ def _explained(
 ) -> _Solved:
     """Find the most probable explanation of the values of a session, including wrong rows."""
     standing = [one for one in problem.groups if one.fixed_size]
-    every = SessionEvidence(values, problem.root, standing, hypotheses(problem), noise)
+    every = SessionEvidence(values, problem.root, standing, movement_hypotheses(problem), noise)
 
     def explain(wrong: Mapping[int, float]) -> Explained[_Solved]:
         evidence = every.with_wrong(wrong)
-        there, explanation = evidence.values, evidence.explain()
+        there, explanation = evidence.values, evidence.compare_hypotheses()
         solved = _Solved(problem, there, noise, evidence, explanation)
         factor = explanation.noise_factor
         V = evidence.covariance([_sized(one) for one in solved.probable_movements], factor)
@@ -326,7 +326,7 @@ def _judged(solved: _Solved, relocated: dict[FrameKey, float]) -> Session:
         values=len(solved.values.y),
         standing=tuple(" ".join(owner).strip() for owner in relocated),
         observable=tuple(
-            float(evidence.shift([group], explanation.noise_factor)[1].sqrt())
+            float(evidence.estimate_shift([group], explanation.noise_factor)[1].sqrt())
             < UNOBSERVABLE * float(group.scale)
             for group in _joints(solved)
         ),
@@ -343,7 +343,9 @@ def _moved(solved: _Solved, relocated: dict[FrameKey, float]) -> tuple[Movement,
         found += [(one, probability) for one in problem.groups if one.fixed_size and one.what in whats]
     if not found:
         return ()
-    shift, covariance = solved.evidence.shift([group for group, _ in found], explanation.noise_factor)
+    shift, covariance = solved.evidence.estimate_shift(
+        [group for group, _ in found], explanation.noise_factor
+    )
     geometry = solved.arm_with(tuple(_sized(one) for one in explanation.motions)).geometry
     moved: list[Movement] = []
     first = 0
@@ -358,7 +360,7 @@ def _moved(solved: _Solved, relocated: dict[FrameKey, float]) -> tuple[Movement,
 def _zeros(solved: _Solved) -> JointZeros:
     """Estimate the zeros of all joints together."""
     evidence, noise_factor = solved.evidence.with_moved(solved.moved_frames), solved.explanation.noise_factor
-    shift, covariance = evidence.shift(_joints(solved), noise_factor)
+    shift, covariance = evidence.estimate_shift(_joints(solved), noise_factor)
     influence, own = evidence.influence(_joints(solved), noise_factor)
     return JointZeros(shift, covariance.diagonal().sqrt(), influence, own)
 

@@ -13,7 +13,7 @@ from pisigma.calibration.geometric.prediction import predicted_poses
 from pisigma.calibration.geometric.problem.setup import IdentifiedGeometry, identified_geometry
 from pisigma.calibration.hybrid.design import Rows
 from pisigma.calibration.hybrid.noise import CalibrationNoise, stated_sigmas
-from pisigma.calibration.hybrid.refinement import linearise_rows, network
+from pisigma.calibration.hybrid.refinement import correction_from_weights, linearise_rows
 from pisigma.estimation.drift import Drift, DriftGroup, DriftSearch, LinearValues, PosteriorUpdate
 from pisigma.estimation.wrong_rows import Explained, with_wrong_rows
 from pisigma.joint_correction.joint_correction import JointCorrection
@@ -49,7 +49,8 @@ class AdaptedArm:
         design = problem.design
         point = design.problem.nominal.index_add(0, design.problem.active, x[: design.active])
         return AdaptedArm(
-            identified_geometry(problem.setup, point), network(design, x) if design.features else None
+            identified_geometry(problem.setup, point),
+            correction_from_weights(design, x) if design.features else None,
         )
 
     def errors_of(self, measurements: Measurements) -> dict[str, Float64[Tensor, "rows components"]]:
@@ -204,7 +205,7 @@ def _searched(
     def explain(wrong: Mapping[int, float]) -> Explained[DriftSearch]:
         there = replace(values, wrong=wrong)
         search = DriftSearch(there, A, drift.groups, drift.noise, usual)
-        search.estimate()
+        search.estimate_sizes()
         return Explained(search, there, search.log_evidence, search.covariance, search.deviation)
 
     return with_wrong_rows(explain(values.wrong), explain).what

@@ -48,7 +48,7 @@ def judged_motion(
         some = judged_values(model, rows)
         if rows.position is not None:
             some = replace(some.select(spread(measured_rows(rows), MAX_ROWS)), pair=None, distance=None)
-        some = posterior.renamed(some)
+        some = posterior.with_model_names(some)
         with torch.no_grad():
             session, _ = judge_session(model, posterior, some, frame_keys(some, fitted) if fitted else None)
         moved = tuple(one for one in session.moved if one.what.split()[0] not in fitted)

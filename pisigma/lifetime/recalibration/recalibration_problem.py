@@ -283,7 +283,7 @@ def _arm_groups(space: ParameterSpace, free: Bool[Tensor, " parameters"]) -> lis
     return groups
 
 
-def hypotheses(problem: RecalibrationProblem) -> tuple[DriftGroup, ...]:
+def movement_hypotheses(problem: RecalibrationProblem) -> tuple[DriftGroup, ...]:
     """List all single movements: of a joint, base, tool, single length or angle, or of the correction.
 
     A change of the correction represents joint errors that changed in many ways, which no single movement explains.

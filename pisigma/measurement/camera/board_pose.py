@@ -70,19 +70,19 @@ def solve_board_pose(
     sigma = np.ones(len(pixels)) if sigma is None else sigma
     R, t = _by_homography(corners, camera.undistort(pixels))
     for _ in range(MAX_ITERATIONS):
-        residual, J, _ = linearised(camera, corners, pixels, sigma, R, t)
+        residual, J, _ = linearise_pixels(camera, corners, pixels, sigma, R, t)
         root = np.sqrt(_weights(residual, loss))[:, None]
         A, b = (root[..., None] * J).reshape(-1, POSE), (root * residual).ravel()
         step = np.linalg.solve(A.T @ A, A.T @ b)
         t, R = t + step[:3], rotation_from_vector(torch.from_numpy(step[3:])).numpy() @ R
         if np.abs(step).max() < STEP_TOLERANCE:
             break
-    residual, J, _ = linearised(camera, corners, pixels, sigma, R, t)
+    residual, J, _ = linearise_pixels(camera, corners, pixels, sigma, R, t)
     weight = _weights(residual, loss)
     by_intrinsics = camera.by_intrinsics(corners @ R.T + t) / sigma[:, None, None]
     columns = np.concatenate([J, by_intrinsics, residual[..., None]], -1)
     # blocks of the factor: pose, intrinsics with the pose eliminated, and the residual as last column
-    factor = triangle((np.sqrt(weight)[:, None, None] * columns).reshape(-1, columns.shape[-1]))
+    factor = triangular_factor((np.sqrt(weight)[:, None, None] * columns).reshape(-1, columns.shape[-1]))
     inverse = np.linalg.inv(factor[:POSE, :POSE])
     return BoardPose(
         R,
@@ -96,7 +96,9 @@ def solve_board_pose(
     )
 
 
-def triangle(columns: Float64[np.ndarray, "values columns"]) -> Float64[np.ndarray, "columns columns"]:
+def triangular_factor(
+    columns: Float64[np.ndarray, "values columns"],
+) -> Float64[np.ndarray, "columns columns"]:
     """Return the triangular factor R of a QR decomposition, square even with fewer rows than columns.
 
     With the pose in the first columns, the rows after `POSE` are the equations of the other unknowns with the pose
@@ -108,7 +110,7 @@ def triangle(columns: Float64[np.ndarray, "values columns"]) -> Float64[np.ndarr
     return factor
 
 
-def linearised(
+def linearise_pixels(
     camera: Camera, corners: np.ndarray, pixels: np.ndarray, sigma: np.ndarray, R: np.ndarray, t: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return measured minus predicted pixels and the derivatives of the prediction by pose and point, over sigma."""

@@ -14,9 +14,9 @@ from pisigma.measurement.camera.board_pose import (
     MIN_NOISE,
     POSE,
     BoardPose,
-    linearised,
+    linearise_pixels,
     solve_board_pose,
-    triangle,
+    triangular_factor,
 )
 from pisigma.measurement.camera.camera import Camera
 from pisigma.measurement.camera.camera_files import IntrinsicsChoice, Repeatability
@@ -273,11 +273,11 @@ def update_bend(
     prior = max(noise, MIN_NOISE) / (board.flatness / 2)
     rows = [np.concatenate([prior * np.eye(SHAPES), -prior * bend[:, None]], 1)]
     for number, at, deviation, pose in zip(numbers, pixels, sigma, poses, strict=True):
-        residual, J, by_point = linearised(camera, corners[number], at, deviation, pose.R, pose.t)
+        residual, J, by_point = linearise_pixels(camera, corners[number], at, deviation, pose.R, pose.t)
         by_height = (by_point @ pose.R[:, 2])[..., None] * of_corner[number][:, None]
         columns = np.concatenate([J, by_height, residual[..., None]], -1)
         weighted = np.sqrt(pose.weight)[:, None, None] * columns
-        rows.append(triangle(weighted.reshape(-1, columns.shape[-1]))[POSE:-1, POSE:])
+        rows.append(triangular_factor(weighted.reshape(-1, columns.shape[-1]))[POSE:-1, POSE:])
     stacked = np.concatenate(rows)
     heights: np.ndarray = bend + np.linalg.lstsq(stacked[:, :-1], stacked[:, -1], rcond=None)[0]
     return heights

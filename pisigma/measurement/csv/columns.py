@@ -150,6 +150,6 @@ def column_choices(name: str) -> str:
     return nearest_choice(meant, (*joints, *_columns(), f"approach{joint}"))
 
 
-def quoted(columns: Iterable[Column]) -> str:
+def quoted_names(columns: Iterable[Column]) -> str:
     """Return the names of columns as messages list them."""
     return ", ".join(f"'{column.name}'" for column in columns)

@@ -15,7 +15,7 @@ from pisigma.measurement.csv.columns import (
     Column,
     column_choices,
     find_column,
-    quoted,
+    quoted_names,
 )
 from pisigma.measurement.csv.table import Table
 from pisigma.measurement.readings import READINGS, reading_numbers
@@ -286,9 +286,8 @@ def _check_orientation(place: Place, columns: tuple[Column, ...]) -> tuple[str, 
         group: [column for column in columns if column.quantity in group] for group in (RPY, QUATERNION)
     }
     if groups[RPY] and groups[QUATERNION]:
-        problem = (
-            f"the orientation appears twice, as {quoted(groups[RPY])} and as {quoted(groups[QUATERNION])}"
-        )
+        first, second = quoted_names(groups[RPY]), quoted_names(groups[QUATERNION])
+        problem = f"the orientation appears twice, as {first} and as {second}"
         remedy = "keep roll, pitch, yaw or the quaternion"
         raise _fault(place, problem, groups[QUATERNION][0], remedy)
     for group, present in groups.items():
@@ -297,7 +296,7 @@ def _check_orientation(place: Place, columns: tuple[Column, ...]) -> tuple[str, 
         missing = [name for name in group if name not in {column.quantity for column in present}]
         if missing:
             unit = "_deg" if group == RPY else ""
-            problem = f"the orientation is incomplete, with {quoted(present)} only"
+            problem = f"the orientation is incomplete, with {quoted_names(present)} only"
             names = ", ".join(name + unit for name in missing)
             raise _fault(place, problem, present[0], f"add {names}")
         return group

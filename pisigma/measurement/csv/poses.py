@@ -13,7 +13,7 @@ from torch import Tensor
 
 from pisigma.files.errors import MeasurementError, Place, nearest_choice
 from pisigma.files.input_file import open_input
-from pisigma.measurement.csv.columns import POSITION, QUATERNION, RPY, Column, find_column, quoted
+from pisigma.measurement.csv.columns import POSITION, QUATERNION, RPY, Column, find_column, quoted_names
 from pisigma.measurement.csv.header import check_separators
 from pisigma.measurement.csv.rows import QUATERNION_TOLERANCE
 from pisigma.measurement.csv.table import content_lines, header_names, split_line
@@ -98,7 +98,7 @@ def _chunks(file: TextIO, source: str, rows: int) -> Iterator[PoseChunk]:
         yield PoseChunk(
             T=T[sound],
             line=tuple(number for (number, _), good in zip(some, sound.tolist(), strict=True) if good),
-            bad=tuple(UnusableRow.because(some[row][0], fault) for row, fault in sorted(faults.items())),
+            bad=tuple(UnusableRow.from_fault(some[row][0], fault) for row, fault in sorted(faults.items())),
             share=file.buffer.tell() / length if length else float("nan"),
         )
     if not any_row:
@@ -266,7 +266,7 @@ def _check_whole(columns: dict[str, tuple[int, Column]], place: Place) -> None:
     lengths = [columns[name][1] for name in POSITION]
     if len({column.unit for column in lengths}) > 1:
         raise MeasurementError(
-            expected=f"one unit for {quoted(lengths)}",
+            expected=f"one unit for {quoted_names(lengths)}",
             value=", ".join(column.unit for column in lengths),
             at=place,
             remedy="use mm or m for all three",

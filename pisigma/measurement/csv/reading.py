@@ -99,8 +99,8 @@ def _sound_rows(table: Table, layout: Layout, robot: Robot | None) -> MeasuredFi
     data, labels, faults = _fields(table, layout, rows), _labels(layout), rows.faults
     faults.add(row_faults(data, labels))
     lines = [f"line {line}" for line in table.lines]
-    faults.add(group_faults(data, labels, faults.sound(data.rows), lines.__getitem__))
-    sound = data.select(torch.from_numpy(np.flatnonzero(faults.sound(data.rows))))
+    faults.add(group_faults(data, labels, faults.rows_without_faults(data.rows), lines.__getitem__))
+    sound = data.select(torch.from_numpy(np.flatnonzero(faults.rows_without_faults(data.rows))))
     numbers = {
         name: values
         for name, values in sound.numbers.items()
@@ -111,7 +111,7 @@ def _sound_rows(table: Table, layout: Layout, robot: Robot | None) -> MeasuredFi
         if "approach" in numbers:
             numbers["approach"] = robot.coupling.approach_to_dh(numbers["approach"])
     left_out = tuple(
-        UnusableRow.because(table.lines[row], fault) for row, fault in sorted(faults.by_row.items())
+        UnusableRow.from_fault(table.lines[row], fault) for row, fault in sorted(faults.by_row.items())
     )
     return replace(sound, numbers=numbers, left_out=left_out)
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from pisigma.measurement.csv.columns import QUATERNION, Column, quoted
+from pisigma.measurement.csv.columns import QUATERNION, Column, quoted_names
 from pisigma.measurement.csv.header import Layout
 from pisigma.measurement.csv.table import Faults, Table
 from pisigma.measurement.faults import Fault
@@ -153,7 +153,7 @@ def _check_measured(values: _Values, cells: list[Sequence[str]], layout: Layout,
         missing = np.isnan(values[:, [layout.index[quantity] for quantity in group]])
         nothing &= missing.all(1)
         _check_whole(missing, [layout.column(quantity) for quantity in group], faults)
-    measured = quoted(
+    measured = quoted_names(
         layout.column(quantity) for quantity in (*layout.position, *layout.orientation, *layout.lengths)
     )
     empty = Fault("nothing was measured in this row", remedy=f"fill {measured}, or remove it")
@@ -172,5 +172,5 @@ def _check_whole(missing: Bool[np.ndarray, "rows group"], columns: list[Column],
     """Check that all cells of a group are filled or none."""
     for row in rows_where(np.asarray(missing.any(1) & ~missing.all(1))):
         first = columns[int(missing[row].argmax())].name
-        problem = f"the cell is empty, but not all of {quoted(columns)} are"
+        problem = f"the cell is empty, but not all of {quoted_names(columns)} are"
         faults.add([(row, Fault(problem, first, value="", remedy="fill all of them or none"))])

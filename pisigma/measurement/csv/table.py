@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool
 
-from pisigma.files.errors import MeasurementError, Place, printable
+from pisigma.files.errors import MeasurementError, Place, make_printable
 from pisigma.files.input_file import read_text
 from pisigma.measurement.faults import Fault
 
@@ -57,7 +57,7 @@ def read_table(path: str | os.PathLike[str]) -> Table:
     Raises:
         MeasurementError: the file cannot be read, is too large, not UTF-8 or empty, or contains only a header.
     """
-    table = table_of(read_text(path, MeasurementError, "CSV"), printable(str(path), cut=False))
+    table = table_of(read_text(path, MeasurementError, "CSV"), make_printable(str(path), cut=False))
     if not table.records:
         raise MeasurementError(
             "the file ends after its header", at=table.header_place, remedy="add one row per measurement"
@@ -153,7 +153,7 @@ class Faults:
         for row, fault in faults:
             self.by_row.setdefault(row, fault)
 
-    def sound(self, rows: int) -> Bool[np.ndarray, " rows"]:
+    def rows_without_faults(self, rows: int) -> Bool[np.ndarray, " rows"]:
         """Return which of the `rows` rows have no fault so far."""
         sound = np.ones(rows, dtype=bool)
         sound[list(self.by_row)] = False

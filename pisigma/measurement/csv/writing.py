@@ -68,7 +68,7 @@ def _numbers(data: MeasuredFields, revolute: Sequence[bool]) -> dict[str, Float6
     fields = {"position": nothing, **data.numbers}
     if "rotation" in fields:
         fields["rotation"] = quaternion_from_rotation(fields["rotation"])
-    alone = not any(bool(data.measured(kind).any()) for kind in ("socket", "touch", "distance", *READINGS))
+    alone = not any(bool(data.is_measured(kind).any()) for kind in ("socket", "touch", "distance", *READINGS))
     for field in number_fields(len(revolute)):
         if field.name in fields:
             values = fields[field.name].reshape(data.rows, -1).T
@@ -79,7 +79,7 @@ def _numbers(data: MeasuredFields, revolute: Sequence[bool]) -> dict[str, Float6
 
 def _check(data: MeasuredFields, texts: Mapping[str, Sequence[str]]) -> None:
     """Refuse what would not read back."""
-    nothing = ~torch.stack([data.measured(kind) for kind in (*KINDS, *READINGS)]).any(0).cpu()
+    nothing = ~torch.stack([data.is_measured(kind) for kind in (*KINDS, *READINGS)]).any(0).cpu()
     if bool(nothing.any()):
         raise MeasurementError(
             "nothing was measured in this row",

@@ -59,7 +59,7 @@ class FileAccount:
         }
 
 
-def account(
+def count_rows(
     read: Sequence[FileLine], used: Sequence[FileLine], left_out: Sequence[LeftOutRow]
 ) -> tuple[FileAccount, ...]:
     """Count the rows of every file.

@@ -20,9 +20,9 @@ from pisigma.measurement.foreign.export_file import ExportFile
 from pisigma.measurement.foreign.mapping import (
     FileMapping,
     ambiguous_spelling,
-    angles,
-    coordinates,
     joint_columns,
+    position_columns,
+    rotation_columns,
 )
 from pisigma.measurement.foreign.quantities import (
     KEYS,
@@ -77,7 +77,11 @@ def check_complete(mapping: FileMapping) -> None:
                 value=column.target.quantity,
                 remedy=f"omit one of them, such as with --map '{mapping.key(column)}=-'",
             )
-    for group in (coordinates(mapping.columns), joint_columns(mapping.columns), angles(mapping.columns)):
+    for group in (
+        position_columns(mapping.columns),
+        joint_columns(mapping.columns),
+        rotation_columns(mapping.columns),
+    ):
         for column in group:
             if column.target.unit and group[0].target.unit not in ("", column.target.unit):
                 raise MeasurementError(
@@ -104,8 +108,14 @@ def check_complete(mapping: FileMapping) -> None:
     if lacking := mapping.without_unit:
         names, many = ", ".join(f"'{one.heading}'" for one in lacking), "s" if len(lacking) > 1 else ""
         likely = mapping.likely_units
-        first = next(replace(one.target, unit=likely[kind]) for one in lacking if (kind := one.target.needs))
-        spellings = {ambiguous_spelling(mapping.file, one.index, one.target.needs) for one in lacking} - {""}
+        first = next(
+            replace(one.target, unit=likely[kind])
+            for one in lacking
+            if (kind := one.target.missing_unit_kind)
+        )
+        spellings = {
+            ambiguous_spelling(mapping.file, one.index, one.target.missing_unit_kind) for one in lacking
+        } - {""}
         meanings = "".join(f" ('{spelling}' means {AMBIGUOUS[spelling]})" for spelling in sorted(spellings))
         raise MeasurementError(
             f"the column{many} {names} have no unit{meanings}"
@@ -119,7 +129,7 @@ def check_complete(mapping: FileMapping) -> None:
         )
 
 
-def convert(mapping: FileMapping) -> ConvertedRows:
+def convert_rows(mapping: FileMapping) -> ConvertedRows:
     """Convert the rows of a file.
 
     Raises:

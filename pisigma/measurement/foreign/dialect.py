@@ -134,7 +134,7 @@ class Dialect:
         return self.numbers.text(cell) is not None
 
 
-def sniff(lines: Sequence[tuple[int, str]], source: str, decimal: Decimal | None = None) -> Dialect:
+def detect_dialect(lines: Sequence[tuple[int, str]], source: str, decimal: Decimal | None = None) -> Dialect:
     """Find the separator and the decimal sign with which most cells of most lines are numbers.
 
     Of equally good formats the first is returned, in the order of `SEPARATORS` and with points first.

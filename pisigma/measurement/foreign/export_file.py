@@ -6,11 +6,11 @@ import re
 from collections import Counter
 from dataclasses import dataclass
 
-from pisigma.files.errors import MeasurementError, Place, printable
+from pisigma.files.errors import MeasurementError, Place, make_printable
 from pisigma.files.input_file import MAX_BYTES, read_input
 from pisigma.measurement.csv.table import SPREADSHEET_ERRORS
 from pisigma.measurement.foreign.accounting import FileLine, LeftOutRow
-from pisigma.measurement.foreign.dialect import COMMENT, Decimal, Dialect, sniff
+from pisigma.measurement.foreign.dialect import COMMENT, Decimal, Dialect, detect_dialect
 from pisigma.measurement.foreign.headings import is_recognised
 from pisigma.measurement.foreign.summary_rows import summary_rows
 from pisigma.measurement.foreign.units import ambiguous_unit, unit_symbol
@@ -96,9 +96,9 @@ def read_export(
         MeasurementError: the file cannot be read, is not text, does not contain a table of numbers, or a row has
             another number of cells than the others.
     """
-    source = printable(str(path), cut=False)
-    lines = _lines_of(decoded(read_input(path, MeasurementError, most), source), source)
-    dialect = sniff(lines, source, decimal)
+    source = make_printable(str(path), cut=False)
+    lines = _lines_of(decode_text(read_input(path, MeasurementError, most), source), source)
+    dialect = detect_dialect(lines, source, decimal)
     cells = [dialect.split(line) for _, line in lines]
     width = Counter(len(row) for row in cells if dialect.is_row(row)).most_common(1)[0][0]
     is_row = [len(row) == width and dialect.is_row(row) for row in cells]
@@ -289,7 +289,7 @@ def _recognised(cells: list[str]) -> float:
     return sum(map(is_recognised, cells)) / len(cells)
 
 
-def decoded(content: bytes, source: str) -> str:
+def decode_text(content: bytes, source: str) -> str:
     """Decode a text: by its byte order mark, as UTF-16 without one, as UTF-8, else as Windows-1252.
 
     Args:

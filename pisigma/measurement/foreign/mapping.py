@@ -21,14 +21,14 @@ from pisigma.measurement.foreign.quantities import (
     LEFT_OUT,
     MappedColumn,
     Target,
-    fits,
+    fits_unit,
     is_joint,
     joints_of,
     parse_target,
     unit_kind,
 )
 from pisigma.measurement.foreign.rotations import ROTATIONS
-from pisigma.measurement.foreign.summary_rows import named_statistics, statistic
+from pisigma.measurement.foreign.summary_rows import named_statistics, statistic_name
 from pisigma.measurement.foreign.units import (
     AMBIGUOUS,
     UNITS,
@@ -84,14 +84,14 @@ class FileMapping:
     @property
     def without_unit(self) -> tuple[MappedColumn, ...]:
         """The columns whose unit is unknown; times without a unit are in s."""
-        return tuple(one for one in self.columns if one.target.needs not in (None, "time"))
+        return tuple(one for one in self.columns if one.target.missing_unit_kind not in (None, "time"))
 
     @property
     def likely_units(self) -> dict[UnitKind, str]:
         """Likely units of the columns without a unit, by kind of unit."""
-        kinds = {one.target.needs for one in self.without_unit}
+        kinds = {one.target.missing_unit_kind for one in self.without_unit}
         small_angles = is_certain("rad", largest_value(self.file, joint_columns(self.columns)))
-        length = "m" if is_certain("m", largest_value(self.file, coordinates(self.columns))) else "mm"
+        length = "m" if is_certain("m", largest_value(self.file, position_columns(self.columns))) else "mm"
         likely = (length, "rad" if small_angles else "deg", "kg", "c")
         return {UNITS[symbol].kind: symbol for symbol in likely if UNITS[symbol].kind in kinds}
 
@@ -104,7 +104,7 @@ class FileMapping:
         """Return file, line and column for messages, by default the line of the headings."""
         return Place(self.file.source, line or self.file.header_line, column.heading)
 
-    def example(self, column: MappedColumn) -> str:
+    def first_cell(self, column: MappedColumn) -> str:
         """Return the first cell of a column that is not empty."""
         return next(filter(None, self.file.column(column.index)), "")
 
@@ -165,7 +165,7 @@ def _take_stated(proposal: Proposal, name: str, text: str) -> None:
                 at=Place(file.source, file.header_line, name),
                 remedy=f"map it to {Target(target.quantity, written).text}",
             )
-        if target.needs and fits(target.quantity, written):
+        if target.missing_unit_kind and fits_unit(target.quantity, written):
             target = replace(target, unit=written)
         proposal.columns[index] = MappedColumn(index, file.headings[index], target, "stated", True)
 
@@ -190,18 +190,18 @@ def _with_units(
                 at=Place(file.source),
                 remedy=f"omit {symbol}, or state the units of single columns with --map",
             )
-    others = {one.target.unit for one in coordinates(columns) if one.is_stated and one.target.unit}
+    others = {one.target.unit for one in position_columns(columns) if one.is_stated and one.target.unit}
     of_others: dict[UnitKind, str] = {"length": next(iter(others))} if len(others) == 1 else {}
     of_comments = {kind: symbol for kind, symbol in written.items() if symbol not in AMBIGUOUS}
     of_maker = _units_of_maker(proposal.maker, file, columns)
     completed = []
     for column in columns:
-        target, kind = column.target, column.target.needs
+        target, kind = column.target, column.target.missing_unit_kind
         unit_row, ambiguous = (
             unit_symbol(file.units[column.index]),
             ambiguous_spelling(file, column.index, kind),
         )
-        if kind is not None and unit_row and fits(target.quantity, unit_row):
+        if kind is not None and unit_row and fits_unit(target.quantity, unit_row):
             completed.append(replace(column, target=replace(target, unit=unit_row)))
             continue
         open_unit = not unit_row and (bool(ambiguous) or not proposal.headings[column.index].unknown_unit)
@@ -243,8 +243,8 @@ def _units_of_maker(
     if maker is None:
         return {}
     kinds: tuple[tuple[UnitKind, str, list[MappedColumn]], ...] = (
-        ("angle", maker.angle, joint_columns(columns) or angles(columns)),
-        ("length", maker.length, coordinates(columns)),
+        ("angle", maker.angle, joint_columns(columns) or rotation_columns(columns)),
+        ("length", maker.length, position_columns(columns)),
     )
     return {
         kind: symbol
@@ -259,12 +259,12 @@ def joint_columns(columns: tuple[MappedColumn, ...]) -> list[MappedColumn]:
     return [one for one in joints if not one.target.unit or UNITS[one.target.unit].kind == "angle"]
 
 
-def coordinates(columns: tuple[MappedColumn, ...]) -> list[MappedColumn]:
+def position_columns(columns: tuple[MappedColumn, ...]) -> list[MappedColumn]:
     """Return the columns of the position."""
     return [one for one in columns if one.target.quantity in POSITION]
 
 
-def angles(columns: tuple[MappedColumn, ...]) -> list[MappedColumn]:
+def rotation_columns(columns: tuple[MappedColumn, ...]) -> list[MappedColumn]:
     """Return the columns of angles of rotations."""
     return [
         one
@@ -278,7 +278,7 @@ def largest_value(file: ExportFile, columns: list[MappedColumn]) -> float:
     return max((abs(number) for column in columns for number in file.numbers(column.index)), default=0.0)
 
 
-def doubts(mapping: FileMapping) -> tuple[str, ...]:
+def mapping_warnings(mapping: FileMapping) -> tuple[str, ...]:
     """Return warnings of values that are unlikely in their units, moving external axes, and doubtful rows.
 
     Every sentence states file, line and column.
@@ -286,8 +286,8 @@ def doubts(mapping: FileMapping) -> tuple[str, ...]:
     sentences = [_left_out(mapping, one) for one in mapping.possible_joints]
     groups = (
         ("joint values", joint_columns(mapping.columns)),
-        ("coordinates", coordinates(mapping.columns)),
-        ("angles of the orientation", angles(mapping.columns)),
+        ("coordinates", position_columns(mapping.columns)),
+        ("angles of the orientation", rotation_columns(mapping.columns)),
     )
     for name, columns in groups:
         for unit in dict.fromkeys(one.target.unit for one in columns):
@@ -326,7 +326,7 @@ def _left_out(mapping: FileMapping, column: MappedColumn) -> str:
 
 def _no_values(mapping: FileMapping) -> list[str]:
     """Return warnings of positions with three equal coordinates, which may mark that nothing was measured."""
-    columns = coordinates(mapping.columns)
+    columns = position_columns(mapping.columns)
     if len(columns) != 3:
         return []
     cells = zip(*(mapping.file.column(column.index) for column in columns), strict=True)
@@ -345,7 +345,7 @@ def _called_means(mapping: FileMapping) -> list[str]:
     if not named or len(named) == len(records):
         return []
     row, name = next(iter(named.items()))
-    column = next(one for one in mapping.columns if statistic(records[row][one.index]) == name)
+    column = next(one for one in mapping.columns if statistic_name(records[row][one.index]) == name)
     return [
         f"{mapping.place_of(column, mapping.file.lines[row])}: {len(named)} rows are named "
         f"'{records[row][column.index]}' and used as measurements, as none is the mean of the rows before it; remove "

@@ -58,7 +58,7 @@ class Target:
         return named or "_".join(filter(None, (self.quantity, self.unit)))
 
     @property
-    def needs(self) -> UnitKind | None:
+    def missing_unit_kind(self) -> UnitKind | None:
         """Kind of the missing unit; None if no unit is missing."""
         return None if self.unit else unit_kind(self.quantity)
 
@@ -87,7 +87,7 @@ def joints_of(quantities: Iterable[str]) -> list[str]:
     return sorted(filter(is_joint, quantities), key=lambda name: int(name[1:]))
 
 
-def fits(quantity: str, unit: str) -> bool:
+def fits_unit(quantity: str, unit: str) -> bool:
     """Return whether values of a quantity can be in a unit; "" fits all, and joints can be in angles or lengths."""
     kinds = {unit_kind(quantity)} | ({"length"} if is_joint(quantity) else set())
     return not unit or UNITS[unit].kind in kinds
@@ -129,7 +129,7 @@ def parse_target(text: str, heading: str) -> Target:
         return Target(column.quantity, column.unit)
     for quantity, _, unit in ((text, "", ""), text.rpartition("_")):
         is_quantity = quantity in _quantities() or is_joint(quantity)
-        if is_quantity and (not unit or unit in UNITS) and fits(quantity, unit):
+        if is_quantity and (not unit or unit in UNITS) and fits_unit(quantity, unit):
             return Target(quantity, unit)
     choices = {"q1_deg", "x_mm", "y_mm", "z_mm", "time_s", LEFT_OUT, *_quantities()}
     raise MeasurementError(

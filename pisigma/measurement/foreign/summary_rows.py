@@ -55,7 +55,7 @@ def summary_rows(records: Sequence[Sequence[str]], numbers: NumberFormat) -> dic
     )
     named = {} if is_mode else named
     found = {
-        row: f"'{next(cell for cell in records[row] if statistic(cell) == name)}' names a summary of other rows"
+        row: f"'{next(cell for cell in records[row] if statistic_name(cell) == name)}' names a summary of other rows"
         for row, name in named.items()
     }
     unnamed = [row for row in range(len(records)) if row not in named]
@@ -73,11 +73,11 @@ def named_statistics(records: Sequence[Sequence[str]]) -> dict[int, str]:
         row: name
         for row, record in enumerate(records)
         for cell in record
-        if (name := statistic(cell)) in _AVERAGES or name in _OTHERS
+        if (name := statistic_name(cell)) in _AVERAGES or name in _OTHERS
     }
 
 
-def statistic(cell: str) -> str:
+def statistic_name(cell: str) -> str:
     """Return a cell without blanks, signs, multiples ("3σ"), "value" and the quantity ("mean of X")."""
     text = re.sub(r"^\d+\s*[x*]?\s*(?=σ|sigma)|\(.*?\)|\[.*?\]|\s(?:of|von)\s.*", "", cell.casefold().strip())
     return re.sub(r"[\W_]+|values?$|wert$", "", text) if text[:1].isalpha() else ""

@@ -66,7 +66,7 @@ class AnchorSensor(AbstractSensor):
         if data.distance is None or not names:
             return None
         number = rows.numbers(data.anchor, names)
-        present = data.measured("distance") & (number >= 0)
+        present = data.is_measured("distance") & (number >= 0)
         return cls(number, torch.where(present, data.distance, 0.0), present, rows.sigma(present))
 
     def residual(self, motion: ToolMotion, unknowns: Unknowns, rows: slice) -> Values:
@@ -125,7 +125,7 @@ class AnchorSensor(AbstractSensor):
         return InitialUnknowns(values, free)
 
     @classmethod
-    def uncalibrated(
+    def uncalibrated_unknowns(
         cls, measurements: Measurements, owner: str, T: Poses, calibrated: Collection[str]
     ) -> Float64[Tensor, " columns"]:
         """Return the anchor's given position with a zero offset of 0.

@@ -192,7 +192,7 @@ class CornerSensor(AbstractSensor):
 def position_deviations(measurements: Measurements) -> Float64[Tensor, "rows 3"]:
     """Return standard deviations of positions relative to the noise of a corner; NaN in rows of other sensors."""
     weight = _scaled_weights(measurements)
-    from_image = measurements.measured("corner")
+    from_image = measurements.is_measured("corner")
     eye = torch.eye(6).to(weight)
     root = torch.linalg.inv(torch.where(from_image[:, None, None], weight, eye))
     return torch.where(from_image[:, None], root[:, :3].norm(dim=-1), torch.nan)

@@ -175,7 +175,7 @@ def scale_deviations(measurements: Measurements) -> Float64[Tensor, " boards"]:
     A scale is fixed if no deviation is given and no other row has a length that could determine it.
     """
     names, stated = boards(measurements), texts_of(measurements, SCALE_COLUMN)
-    other_lengths = bool((~measurements.measured("corner") & ~measurements.measured("rotation")).any())
+    other_lengths = bool((~measurements.is_measured("corner") & ~measurements.is_measured("rotation")).any())
     usual = USUAL_SCALE if other_lengths else 0.0
     texts = [stated[(names or ()).index(board)] for board in names_of(names)]
     return torch.tensor([float(text) if text else usual for text in texts], dtype=torch.float64)

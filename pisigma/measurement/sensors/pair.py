@@ -53,7 +53,7 @@ class PairSensor(AbstractSensor):
             return None
         paired = torch.tensor([bool(name) for name in data.pair], device=data.q.device)
         first = torch.arange(data.rows, device=paired.device) % 2 == 0
-        present = data.measured("distance") & paired & first
+        present = data.is_measured("distance") & paired & first
         return cls(torch.where(present, data.distance, 0.0), present, rows.sigma(present))
 
     def residual(self, motion: ToolMotion, unknowns: Unknowns, rows: slice) -> Values:

@@ -35,7 +35,7 @@ class PositionSensor(AbstractSensor):
     def build(cls, rows: SensorRows) -> "PositionSensor | None":
         """Gather the positions in the frames of the bases' anchors."""
         data = rows.measurements
-        present = (data.measured("position") | data.measured("pose")) & ~rows.has_corner_poses
+        present = (data.is_measured("position") | data.is_measured("pose")) & ~rows.has_corner_poses
         if data.position is None or not bool(present.any()):
             return None
         R, p = rows.bases[:, :3, :3], rows.bases[:, :3, 3]
@@ -73,7 +73,7 @@ class RotationSensor(AbstractSensor):
     def build(cls, rows: SensorRows) -> "RotationSensor | None":
         """Gather the orientations relative to the bases' and the tools' anchors."""
         data = rows.measurements
-        present = (data.measured("rotation") | data.measured("pose")) & ~rows.has_corner_poses
+        present = (data.is_measured("rotation") | data.is_measured("pose")) & ~rows.has_corner_poses
         if data.rotation is None or not bool(present.any()):
             return None
         rotation = rows.bases[:, :3, :3].mT @ data.rotation @ rows.tools.mT

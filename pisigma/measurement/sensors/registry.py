@@ -114,8 +114,8 @@ def measured_errors(
     Args:
         T: poses of the target by the model, in the frame of every row.
         measurements: the measurements.
-        unknowns: estimated unknowns of the sensors; for other owners see `AbstractSensor.uncalibrated`. None for
-            unknowns that are fitted to the rows; errors of n values with p fitted unknowns of an owner are then
+        unknowns: estimated unknowns of the sensors; for other owners see `AbstractSensor.uncalibrated_unknowns`. None
+            for unknowns that are fitted to the rows; errors of n values with p fitted unknowns of an owner are then
             multiplied by `sqrt(n / (n - p))`, and NaN without degrees of freedom.
 
     Returns:
@@ -143,7 +143,7 @@ def measured_errors(
             values = [
                 torch.from_numpy(identified[owner].copy()).to(T)
                 if owner in identified
-                else type(sensor).uncalibrated(data, owner, T, tuple(identified))
+                else type(sensor).uncalibrated_unknowns(data, owner, T, tuple(identified))
                 for owner in group.owners
             ]
             columns[group.name] = torch.stack(values, 1)

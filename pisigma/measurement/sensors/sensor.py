@@ -122,7 +122,7 @@ class SensorRows:
     @property
     def has_corner_poses(self) -> Bool[Tensor, " rows"]:
         """Which rows contain a complete pose from the corners of a board in an image, with its covariance."""
-        return self.measurements.measured("corner") & self.measurements.measured("pose")
+        return self.measurements.is_measured("corner") & self.measurements.is_measured("pose")
 
     def readings(self, name: str) -> Float64[Tensor, " rows"]:
         """Return a numeric column of a registered sensor [SI]; NaN in rows without a value."""
@@ -231,7 +231,7 @@ class AbstractSensor(ABC):
         return None
 
     @classmethod
-    def uncalibrated(
+    def uncalibrated_unknowns(
         cls, measurements: Measurements, owner: str, T: Poses, calibrated: Collection[str]
     ) -> Float64[Tensor, " columns"]:
         """Return the unknowns of an owner that was not calibrated, for the validation of its rows.

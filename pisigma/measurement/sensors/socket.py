@@ -60,7 +60,7 @@ class SocketSensor(AbstractSensor):
     def build(cls, rows: SensorRows) -> "SocketSensor | None":
         """Gather the rows whose ball sat in a socket."""
         names = rows.measurements.socket
-        present = rows.measurements.measured("socket")
+        present = rows.measurements.is_measured("socket")
         if not bool(present.any()):
             return None
         return cls(rows.numbers(names, names_of(names)), present, rows.sigma(present))
@@ -99,7 +99,7 @@ class SocketSensor(AbstractSensor):
             return None
         socket = numbers_of(measurements.socket, names, measurements.rows)
         points, socket = T[socket >= 0, :3, 3], socket[socket >= 0]
-        middle = means(points, socket, len(names))
+        middle = means_by_number(points, socket, len(names))
         usual = float((points - middle[socket]).norm(dim=-1).median())
         if usual > MAX_SCATTER * reach:
             raise IdentificationError(
@@ -111,7 +111,7 @@ class SocketSensor(AbstractSensor):
         return InitialUnknowns(middle, torch.ones_like(middle, dtype=torch.bool))
 
     @classmethod
-    def uncalibrated(
+    def uncalibrated_unknowns(
         cls, measurements: Measurements, owner: str, T: Poses, calibrated: Collection[str]
     ) -> Float64[Tensor, " columns"]:
         """Return the mean position of the rows of a socket, without outliers."""
@@ -234,7 +234,9 @@ def _check_distance(one: str, other: str, distance: float, order: tuple[str, ...
         )
 
 
-def means(values: Float64[Tensor, "rows size"], number: Int64[Tensor, " rows"], count: int) -> Tensor:
+def means_by_number(
+    values: Float64[Tensor, "rows size"], number: Int64[Tensor, " rows"], count: int
+) -> Tensor:
     """Return the mean over the rows of every number from 0 to `count - 1`."""
     total = values.new_zeros((count, values.shape[1])).index_add(0, number, values)
     return total / torch.bincount(number, minlength=count).clamp(min=1)[:, None]

@@ -40,7 +40,7 @@ class TouchSensor(AbstractSensor):
     def build(cls, rows: SensorRows) -> "TouchSensor | None":
         """Gather the touches; `e · (R p + t) = coordinate` is `(R^T e) · p = coordinate - e · t`."""
         data = rows.measurements
-        present = data.measured("touch")
+        present = data.is_measured("touch")
         if data.touch is None or not bool(present.any()):
             return None
         axis = rows.numbers(data.touch_axis, ("x", "y", "z"))

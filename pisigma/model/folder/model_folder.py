@@ -256,7 +256,7 @@ def _build_model(
 def _made_of(robot: Robot, numbers: Tensor, measured: Tensor, steps: Tensor) -> RowValues:
     if not len(numbers) == len(measured) == len(steps):
         raise MisfitError("the training rows have no numbers or steps", file=WEIGHTS, value=_ROWS[0])
-    return RowValues.kept(torch.where(measured.bool(), numbers, torch.nan), steps, robot)
+    return RowValues.stored_values(torch.where(measured.bool(), numbers, torch.nan), steps, robot)
 
 
 def _calibrated_robot(document: ModelDocument, robot: Robot) -> Robot | None:

@@ -49,7 +49,7 @@ class CompiledIK:
         name: str = "model",
         belongs_to: str = "",
     ) -> None:
-        """Take a description from `model.compiled_model.describe`.
+        """Take a description from `model.compiled_model.describe_as_arrays`.
 
         Raises:
             ModelError: the arm is larger than the compiled kernels allow, or there are no kernels for this machine.
@@ -71,11 +71,11 @@ class CompiledIK:
         """Compile a model.
 
         Raises:
-            ModelError: its correction has no compiled form, see `model.compiled_model.describe`; or see `__init__`.
+            ModelError: its correction has no compiled form (see `describe_as_arrays`); or see `__init__`.
         """
-        from pisigma.model.compiled_model import describe
+        from pisigma.model.compiled_model import describe_as_arrays
 
-        description, branches = describe(model)
+        description, branches = describe_as_arrays(model)
         return CompiledIK(description, branches, [joint.name for joint in model.robot.joints], model.name)
 
     @staticmethod

@@ -97,7 +97,7 @@ class ControllerValues:
 
     def jacobian(self, q: Any) -> Any:
         """See `CorrectedIK.jacobian`; the derivatives are with respect to the controller's values."""
-        return self.ik.jacobian(self._to_dh(q)) @ _as(self.coupling.slope(as_array(q)), q)
+        return self.ik.jacobian(self._to_dh(q)) @ _as(self.coupling.derivative(as_array(q)), q)
 
     def accuracy(self, q: Any) -> Any:
         """See `CorrectedIK.accuracy`."""
@@ -138,7 +138,7 @@ class ControllerValues:
 
     def _motion(self, q: Any, nominal: bool = False) -> tuple[Any, Any]:
         """Compute pose and Jacobian of the calibrated or the nominal arm at the controller's values."""
-        dh, slope = self.coupling.to_dh(q), self.coupling.slope(q)
+        dh, slope = self.coupling.to_dh(q), self.coupling.derivative(q)
         if nominal:
             robot = self.ik.model.robot
             return forward_kinematics(robot, dh), joint_jacobian(robot, dh) @ slope

@@ -159,7 +159,7 @@ class CorrectedIK(AbstractInverse):
         """
         task = self.for_task(ignore_axes, tolerance_mm, tolerance_deg, elbow_angle)
         if near is not None:
-            near = self.postures.checked(near, throw)
+            near = self.postures.check_near(near, throw)
         approach = checked_approach(approach)
         if task.controller is not None:
             return task.controller.solve(T_base_tool, near, self, branch, throw=throw, approach=approach)

@@ -167,7 +167,7 @@ class Postures:
         """Return whether joint values `(dof,)` are plausible; several times as fast as a comparison of arrays."""
         return all(map(le, self._lows, values)) and all(map(le, values, self._highs))
 
-    def checked(self, near: Any, throw: bool = True) -> Any:
+    def check_near(self, near: Any, throw: bool = True) -> Any:
         """Convert `near` to a float64 array with NaN for implausible values.
 
         Values that are not numbers, or of another shape, are returned unchecked.

@@ -55,7 +55,7 @@ class NumericArm:
         return sum(self.weights) < self.robot.dof
 
     @cached_property
-    def motions(self) -> tuple[Motion, ...]:
+    def motion_functions(self) -> tuple[Motion, ...]:
         """Functions for pose and Jacobian: first without the slope of the correction, for a hybrid then with it."""
         if self.hybrid is None:
             return (partial(joint_jacobian, self.robot),)
@@ -80,7 +80,7 @@ class NumericArm:
         # the exact one finishes those that came near.
         q, reached = start, torch.zeros(len(T), dtype=torch.bool)
         near, rounds = ~reached, tolerances.MAX_ITERATIONS
-        for motion in self.motions:
+        for motion in self.motion_functions:
             rows = (near & ~reached).nonzero()[:, 0]
             found = solve_numeric(
                 self.robot,
@@ -101,7 +101,7 @@ class NumericArm:
         rows = (~reached).nonzero()[:, 0]
         if len(rows) and self.axes.has_tolerances and self.axes.tolerance.count(0.0) < self.robot.dof:
             better, met = solve_within_tolerances(
-                self.robot, T[rows], start[rows], self.motions[-1], self.axes
+                self.robot, T[rows], start[rows], self.motion_functions[-1], self.axes
             )
             q, reached = q.index_copy(0, rows, better), reached.index_copy(0, rows, met)
         return start + wrapped_difference(self.nominal, q, start), reached
@@ -121,7 +121,7 @@ class NumericArm:
         q = nearest_turn(self.nominal, q, near, within_limits=True)
         return approach_preferred(self.nominal, self._task, T, q, near, torch.ones_like(half))
 
-    def freedom(
+    def posture_rating(
         self, T: Float64[Tensor, "poses 4 4"], q: Float64[Tensor, "poses dof"]
     ) -> Float64[Tensor, " poses"]:
         """Rate joint values: singularity measure times the smallest distance to a joint limit over half its range."""
@@ -139,7 +139,7 @@ class NumericArm:
     @cached_property
     def _task(self) -> TaskMotion:
         weights = torch.tensor(self.weights, dtype=torch.float64)
-        return TaskMotion(self.motions[0], self.axes, weights)
+        return TaskMotion(self.motion_functions[0], self.axes, weights)
 
     @cached_property
     def _travel(self) -> tuple[Tensor, Tensor]:

@@ -205,8 +205,8 @@ class NumericIK:
         if self._solver is None:
             return T.new_zeros(len(T), 0, self.model.robot.dof), torch.zeros(len(T), 0, dtype=torch.int64)
         if len(self.model.robot.joints) == 4 and all(self.axes.tolerance[3:5]):
-            T = self._solver.upright(T)
-        q, near_rows = self._solver.solve(T.float() if single else T).q.double(), self._solver.starts(T)
+            T = self._solver.upright_poses(T)
+        q, near_rows = self._solver.solve(T.float() if single else T).q.double(), self._solver.start_values(T)
         reached, robot = torch.isfinite(q).all(-1), self.model.identified
         each = T[:, None].expand(*near_rows.shape[:-1], 4, 4).reshape(-1, 4, 4)
         off, _ = task_error(self.axes, each, forward_kinematics(robot, near_rows.reshape(-1, robot.dof)))
@@ -315,11 +315,11 @@ class NumericIK:
         return torch.where(known, error, torch.nan)
 
     def _rank(self, T: Tensor, q: Tensor, branch: Tensor, near: Tensor | None) -> Tensor:
-        """Rank joint values inside their limits by their distance to `near`, by `freedom`, or by their branch."""
+        """Rank joint values inside their limits by distance to `near`, by `posture_rating`, or by branch."""
         if near is not None:
             rank: Tensor = ((q - near).norm(dim=-1) / SAME).round()
         elif self._spare:
-            rank = -self._arm.freedom(T, q)
+            rank = -self._arm.posture_rating(T, q)
         else:
             rank = torch.tensor(self.order).argsort()[branch].double()
         return rank

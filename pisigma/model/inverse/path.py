@@ -95,7 +95,7 @@ def follow_path(
         )
     if branch is not None:
         check_choice(PoseError, "branch", branch, ik.branches)
-    near_rows = None if near is None else np.asarray(ik.postures.checked(near), dtype=np.float64)
+    near_rows = None if near is None else np.asarray(ik.postures.check_near(near), dtype=np.float64)
     on_branches = ik.closed_form and len(ik.joints) <= ik.axes.free.count(False)
     guide = _guide(ik, T, near_rows, branch) if on_branches else _one_by_one(ik, T, near_rows)
     solution = _solve(ik, T, guide, _approaches(guide, near_rows))
@@ -138,21 +138,21 @@ def _guide(ik: AbstractInverse, T: Array, near: Array | None, branch: str | None
     if branch is not None:
         first += _OTHER_BRANCH * (np.arange(len(first)) != ik.branches.index(branch))
     elif near is not None:
-        first = np.nan_to_num((wrapped(q[reached[0]] - near, ik.revolute) ** 2).sum(-1), nan=0.0)
+        first = np.nan_to_num((wrap_motion(q[reached[0]] - near, ik.revolute) ** 2).sum(-1), nan=0.0)
     q, status = q[reached], status[reached]
     chosen = choose_branches(q, status, _jumps(ik, T[reached], q), first, ik.revolute)
-    rolled, _ = unroll(q[np.arange(len(q)), chosen], ik.limits, ik.revolute, near)
+    rolled, _ = unwrap_path(q[np.arange(len(q)), chosen], ik.limits, ik.revolute, near)
     before = np.maximum(np.searchsorted(reached, np.arange(len(T)), side="right") - 1, 0)
     return rolled[before]
 
 
 def _jumps(ik: AbstractInverse, T: Array, q: Array) -> Array:
     """Return whether staying on a branch is a jump `(poses - 1, branches)`; long steps are checked halfway."""
-    step = np.abs(wrapped(np.diff(q, axis=0), ik.revolute)).max(-1)
+    step = np.abs(wrap_motion(np.diff(q, axis=0), ik.revolute)).max(-1)
     result = np.zeros(step.shape, dtype=bool)
     rows = np.flatnonzero((np.nan_to_num(step, nan=0.0) > 0.1).any(-1))
     if len(rows):
-        middle = np.asarray(ik.all_branches(halfway(T[rows], T[rows + 1])).q)
+        middle = np.asarray(ik.all_branches(poses_halfway(T[rows], T[rows + 1])).q)
         result[rows] = is_jump(q[rows], middle, q[rows + 1], ik.revolute)
     return result
 
@@ -177,8 +177,8 @@ def _switches(ik: AbstractInverse, T: Array, q: Array, solution: Any) -> tuple[P
     before, after = rows[:-1], rows[1:]
     step = q[after] - q[before]
     far = np.flatnonzero((np.abs(step).max(-1) > 0.1) | (branch_index[after] != branch_index[before]))
-    middle = halfway(T[before[far]], T[after[far]])
-    between = q[before[far]] + wrapped(step[far], ik.revolute) / 2
+    middle = poses_halfway(T[before[far]], T[after[far]])
+    between = q[before[far]] + wrap_motion(step[far], ik.revolute) / 2
     way = np.asarray(_solve(ik, middle, between).q) if len(far) else between
     jumps = is_jump(q[before[far]], way, q[after[far]], ik.revolute)
     for place, jump in zip(far, jumps, strict=True):
@@ -202,7 +202,7 @@ def _at(
     taken: int,
 ) -> Sequence[PathSwitch]:
     """Describe the discontinuity before a pose, if there is one."""
-    turned = np.abs(step - wrapped(step, ik.revolute)) > 1
+    turned = np.abs(step - wrap_motion(step, ik.revolute)) > 1
     names = f"from branch '{ik.branches[left]}' to '{ik.branches[taken]}'"
     if jump:
         joint = int(np.abs(step).argmax())
@@ -213,7 +213,7 @@ def _at(
         return [PathSwitch(index, kind, float(np.abs(step).max()), f"Before pose {index} {words}.")]
     if turned.any():
         joint = int(np.flatnonzero(turned)[0])
-        turn = wrapped(step, ik.revolute)[joint] - step[joint]
+        turn = wrap_motion(step, ik.revolute)[joint] - step[joint]
         words = f"{ik.joints[joint]} is rewound by {_amount(ik, joint, turn)} to stay within its limits"
         return [PathSwitch(index, "turn", abs(float(turn)), f"Before pose {index} {words}.")]
     if left != taken:
@@ -233,7 +233,7 @@ def _gap(index: int, status: Array, reached: Array) -> PathSwitch:
     return PathSwitch(index, "gap", 0.0, f"{poses} not reached: {Status(int(status[index])).name.lower()}.")
 
 
-def unroll(
+def unwrap_path(
     q: Array, limits: Array, revolute: Array, near: Array | None
 ) -> tuple[Array, list[tuple[int, int]]]:
     """Unwrap the joint values of a path so that they are continuous and stay within their limits.
@@ -249,7 +249,7 @@ def unroll(
         reaches a limit. A value that has no wrap within the limits stays outside.
     """
     rolled = q.copy()
-    rolled[1:] = q[0] + np.cumsum(wrapped(np.diff(q, axis=0), revolute), axis=0)
+    rolled[1:] = q[0] + np.cumsum(wrap_motion(np.diff(q, axis=0), revolute), axis=0)
     rewinds: list[tuple[int, int]] = []
     for joint in np.flatnonzero(revolute):
         meant = 0.0 if near is None else float(near[joint])
@@ -282,7 +282,7 @@ def _within(values: Array, lower: float, upper: float, meant: float) -> tuple[Ar
     return result, breaks
 
 
-def wrapped(step: Array, revolute: Array) -> Array:
+def wrap_motion(step: Array, revolute: Array) -> Array:
     """Wrap joint motions `(..., dof)` [rad or m] of revolute joints to at most half a turn."""
     return step - np.where(revolute, _TURN * np.round(step / _TURN), 0.0)
 
@@ -294,13 +294,14 @@ def is_jump(before: Array, middle: Array, after: Array, revolute: Array) -> Arra
     the halfway pose has no solution (NaN), the solutions are not connected.
     """
     whole, first, second = (
-        np.abs(wrapped(step, revolute)).max(-1) for step in (after - before, middle - before, after - middle)
+        np.abs(wrap_motion(step, revolute)).max(-1)
+        for step in (after - before, middle - before, after - middle)
     )
     continuous = (whole <= _SMALL) | ((first <= 0.75 * whole) & (second <= 0.75 * whole))
     return ~continuous
 
 
-def halfway(T: Array, U: Array) -> Array:
+def poses_halfway(T: Array, U: Array) -> Array:
     """Compute poses `(..., 4, 4)` halfway between poses: mean position, and rotation nearest to the mean matrix."""
     mean = (T + U) / 2
     left, _, right = np.linalg.svd(mean[..., :3, :3])
@@ -347,7 +348,7 @@ def choose_branches(q: Array, status: Array, jumps: Array, first: Array, revolut
 
 def _transitions(q: Array, jumps: Array, revolute: Array) -> Array:
     """Compute the costs `(steps, branches, branches)` of transitions between branches."""
-    step = wrapped(q[1:, None] - q[:-1, :, None], revolute)
+    step = wrap_motion(q[1:, None] - q[:-1, :, None], revolute)
     motion = np.nan_to_num((step**2).sum(-1), nan=0.0)
     far = np.nan_to_num(np.abs(step).max(-1), nan=0.0) > _SMALL
     own = np.arange(q.shape[1])

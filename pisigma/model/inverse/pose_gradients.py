@@ -42,7 +42,7 @@ def as_tensors(
     result = solution.map(_tensor)
     if model is not None and torch.is_grad_enabled():
         every = poses.unsqueeze(-3) if result.status.ndim > poses.ndim - 2 else poses
-        result = differentiable(model, result, every.expand(*result.status.shape, 4, 4), axes)
+        result = with_pose_gradients(model, result, every.expand(*result.status.shape, 4, 4), axes)
     return replace(
         result,
         q=result.q.to(poses),
@@ -58,7 +58,7 @@ def _tensor(values: Any) -> Tensor:
     return values if isinstance(values, Tensor) else torch.from_numpy(np.asarray(values, order="C"))
 
 
-def differentiable(
+def with_pose_gradients(
     model: CalibratedModel, result: Solution, T: Float[Tensor, "*batch 4 4"], axes: TaskAxes = WHOLE
 ) -> Solution:
     """Return the solutions with gradients of `q` and `q_nominal` with respect to the poses.
@@ -130,7 +130,7 @@ def _inverse(robot: Robot, T: Tensor, axes: TaskAxes, reached: Tensor, J: Tensor
 
 
 def pseudo_inverse(robot: Robot, J: Float64[Tensor, "poses 6 dof"]) -> Float64[Tensor, "poses dof 6"]:
-    """Compute matrices from twists [m, rad] to joint motions [rad or m]; see `differentiable`."""
+    """Compute matrices from twists [m, rad] to joint motions [rad or m]; see `with_pose_gradients`."""
     length = characteristic_length(robot)
     result: Tensor = torch.linalg.pinv(
         dimensionless_jacobian(robot, J).contiguous(), atol=SINGULAR_TOLERANCE, rtol=0.0

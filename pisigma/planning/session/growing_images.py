@@ -83,6 +83,6 @@ def _left_out(problem: MeasurementError, image: Table) -> UnusableRow:
     line = problem.line or image.lines[0]
     if not problem.expected:
         return UnusableRow(line, str(problem).removesuffix("."))
-    return UnusableRow.because(
+    return UnusableRow.from_fault(
         line, Fault("", problem.column, problem.expected, problem.value, problem.remedy)
     )

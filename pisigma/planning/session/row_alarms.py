@@ -25,7 +25,7 @@ AMBIGUOUS_ROWS = 6
 """Number of rows up to which another row may be the wrong one."""
 
 
-def unreadable(row: UnusableRow) -> Alarm:
+def unreadable_alarm(row: UnusableRow) -> Alarm:
     """Return the alarm on a row that cannot be read."""
     return Alarm(row.line, "unreadable", f"line {row.line}: {row.reason}.", repeat=True)
 
@@ -35,7 +35,7 @@ def of_all_rows(sentence: str) -> Alarm:
     return Alarm(1, "setup", f"line 1: {sentence} Correct this before measuring on.", repeat=False)
 
 
-def cleared(line: int) -> Alarm:
+def cleared_message(line: int) -> Alarm:
     """Return the message that withdraws an alarm."""
     text = f"line {line}: later rows agree with it, so the row counts after all."
     return Alarm(line, "cleared", text, repeat=False, counts=True)
@@ -111,7 +111,7 @@ def _in_other_unit(
     return ""
 
 
-def contradicted(
+def contradiction_alarm(
     rows: Measurements,
     judgement: RowJudgement,
     row: int,
@@ -144,7 +144,7 @@ def contradicted(
         text = f"{what}; it looks like {other}. {advice}"
         return Alarm(line, "swapped", text, repeat=True)
     advice = "Check the reflector, its seat and the line of sight, and measure the pose again."
-    if bool(rows.measured("corner")[row]):
+    if bool(rows.is_measured("corner")[row]):
         advice = "Check the image and that robot and board were at rest, and take it again."
     if rows.rows <= AMBIGUOUS_ROWS:
         advice = f"With so few rows, another one may be wrong instead. {advice}"

@@ -64,7 +64,7 @@ def session_accuracy(
         return None
     checked = (math.nan, math.nan)
     if plan.model is not None:
-        posterior = before.informed(rows.q)
+        posterior = before.given_poses(rows.q)
     else:
         try:
             posterior, checked = _calibrated(plan.arm.robot, before, rows, check, progress)
@@ -88,7 +88,7 @@ def _calibrated(
     assert isinstance(result, HybridResult)
     if result.learned is None and np.array_equal(result.geometric.robot.dh, robot.dh):
         # with too few rows the arm stays nominal, so that the posterior of the fit does not contain its errors
-        posterior = before.informed(rows.q)
+        posterior = before.given_poses(rows.q)
     else:
         posterior = RobotPosterior.from_result(result, before.instrument)
     if check is None:
@@ -118,7 +118,7 @@ def cross_validated(
     return replace(so_far.point, cross_validated_rms=rms, cross_validated_p95=p95)
 
 
-def expected(
+def expected_accuracy(
     posterior: RobotPosterior,
     measured: int,
     poses: Float64[Tensor, "poses dof"],
@@ -138,7 +138,9 @@ def expected(
     """
     counts = [*range(step, len(poses), step), len(poses)] if len(poses) else []
     both = torch.cat([poses, candidates])
-    points = accuracy_curve(posterior.measured(both), posterior.tool(task), torch.arange(len(poses)), counts)
+    points = accuracy_curve(
+        posterior.sensitivities(both), posterior.tool(task), torch.arange(len(poses)), counts
+    )
     return tuple(
         AccuracyPoint(measured + point.poses, point.rms, point.p95, random_rms=point.random_rms)
         for point in points

@@ -18,19 +18,19 @@ from pisigma.planning.plan_file import StoredPlan
 from pisigma.planning.pose_selection import select_poses
 from pisigma.planning.session.row_alarms import (
     NEAR_POSE,
-    cleared,
-    contradicted,
+    cleared_message,
+    contradiction_alarm,
     is_wrong,
     joint_differences,
     other_joint_values,
     stale_readings,
-    unreadable,
+    unreadable_alarm,
 )
 from pisigma.planning.session.row_judgement import FEW_ROWS, RowJudgement, judge_rows
 from pisigma.planning.session.session_accuracy import SessionAccuracy
 from pisigma.planning.session.state import AccuracyPoint, Advice, Alarm
 from pisigma.planning.surroundings.motion import Motions
-from pisigma.planning.tour import order_of_use, tour
+from pisigma.planning.tour import order_of_use, plan_tour
 from pisigma.robot.description import Robot
 from pisigma.robot.se3 import invert, transform_from_xyzrpy
 from pisigma.validation.checks.check import MOVES
@@ -73,7 +73,7 @@ class SessionRows:
         return (*self._fixed, *self._contradicted.values())
 
     @property
-    def counting(self) -> Bool[Tensor, " rows"]:
+    def rows_that_count(self) -> Bool[Tensor, " rows"]:
         """Rows that are usable and not contradicted by others."""
         counting = self.usable.clone()
         counting[self.usable] = self.judgement.counts
@@ -97,7 +97,7 @@ class SessionRows:
         Returns:
             New alarms on these rows or on earlier ones.
         """
-        alarms = [unreadable(row) for row in left_out]
+        alarms = [unreadable_alarm(row) for row in left_out]
         changed: list[Alarm] = []
         if new is not None and new.rows:
             start = 0 if self.rows is None else self.rows.rows
@@ -125,10 +125,10 @@ class SessionRows:
             judgement = judge_rows(self._robot, some, self._sigma, trusted)
         self.judgement = judgement
         wrong = {
-            int(numbers[row]): contradicted(usable, judgement, row, planned, names)
+            int(numbers[row]): contradiction_alarm(usable, judgement, row, planned, names)
             for row in is_wrong(judgement).nonzero()[:, 0].tolist()
         }
-        agreed = [cleared(rows.line[row]) for row in self._contradicted if row not in wrong]
+        agreed = [cleared_message(rows.line[row]) for row in self._contradicted if row not in wrong]
         new = [alarm for row, alarm in wrong.items() if row not in self._contradicted]
         self._contradicted = {row: self._contradicted.get(row, alarm) for row, alarm in wrong.items()}
         return [*new, *agreed]
@@ -208,7 +208,7 @@ class FurtherPoses:
         motions = Motions(plan.arm, candidates.workspace[:MAX_CANDIDATES])
         return FurtherPoses(candidates.q[some], candidates.number[some], motions, task)
 
-    def replanned(
+    def replan(
         self,
         plan: StoredPlan,
         poses: int,
@@ -236,15 +236,15 @@ class FurtherPoses:
         if not len(first) or not 0 < count <= len(new):
             return None
         if not bool(plan.check[first]):
-            posterior = posterior.informed(plan.q[first])
-        seen, tool = posterior.measured(self.q), posterior.tool(self.task)
+            posterior = posterior.given_poses(plan.q[first])
+        seen, tool = posterior.sensitivities(self.q), posterior.tool(self.task)
         for _ in range(MAX_REPLACEMENTS):
             if count > len(new):
                 return None
             chosen = new[select_poses(seen[new], tool, count, plan.settings.criterion)]
             use = order_of_use(count, len(check))
             q = torch.cat([self.q[chosen], plan.q[check]])[use]
-            way = tour(self.motions, q, plan.settings.pace, plan.q[first[0]], stages=(AHEAD,))
+            way = plan_tour(self.motions, q, plan.settings.pace, plan.q[first[0]], stages=(AHEAD,))
             left_out = use[way.left_out]
             shut_in = left_out[left_out < count]
             new = new[~torch.isin(new, chosen[shut_in])]
@@ -252,7 +252,7 @@ class FurtherPoses:
                 break
         number = torch.cat([self.number[chosen], plan.candidate[check]])[use]
         return replace(
-            plan.part(first),
+            plan.select_poses(first),
             q=torch.cat([plan.q[first], q[way.order]]),
             check=torch.cat([plan.check[first], use[way.order] >= count]),
             candidate=torch.cat([plan.candidate[first], number[way.order]]),
@@ -270,7 +270,7 @@ AHEAD = 10
 """Number of next poses whose expected benefit decides whether to stop."""
 
 
-def advice(
+def stopping_advice(
     limit_mm: float | None,
     least_gain_mm: float,
     reached: Sequence[AccuracyPoint],

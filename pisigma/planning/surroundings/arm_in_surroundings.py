@@ -81,7 +81,7 @@ class ArmInSurroundings:
         """Put a robot into its surroundings; with None, only limits and self-collision are checked."""
         surroundings = surroundings or Surroundings()
         capsules = surroundings.capsules(robot)
-        pairs = capsules.pairs(surroundings.clearance / 2)
+        pairs = capsules.pairs_to_check(surroundings.clearance / 2)
         return ArmInSurroundings(
             robot,
             capsules.robot,
@@ -109,7 +109,7 @@ class ArmInSurroundings:
     def unseparated_links(self) -> tuple[str, ...]:
         """Sentence on links that are not checked against each other because their stated radii are too large.
 
-        Links that touch in more than half of random poses are not checked, see `Capsules.pairs`. Mostly empty.
+        Links that touch in more than half of random poses are not checked, see `Capsules.pairs_to_check`. Mostly empty.
         """
         tool = (
             None
@@ -122,7 +122,7 @@ class ArmInSurroundings:
         looked_at = set(map(tuple, self.pairs.tolist()))
         lost = [
             pair
-            for pair in usual.pairs(self.surroundings.clearance / 2).tolist()
+            for pair in usual.pairs_to_check(self.surroundings.clearance / 2).tolist()
             if tuple(pair) not in looked_at
         ]
         links = {tuple(self.capsules.link[pair].tolist()) for pair in lost}
@@ -145,7 +145,7 @@ class ArmInSurroundings:
         chunks = [self._faults(chunk) for chunk in torch.split(q, POSES_PER_CHUNK)]
         return Faults(tuple(chunks[0]), torch.cat([torch.stack([*chunk.values()], 1) for chunk in chunks]))
 
-    def gap(self, q: Float64[Tensor, "poses dof"]) -> Float64[Tensor, " poses"]:
+    def smallest_clearance(self, q: Float64[Tensor, "poses dof"]) -> Float64[Tensor, " poses"]:
         """Compute the smallest distance between the links and all that they must not touch, minus the clearance [m].
 
         Negative where the clearance is not kept, infinite where there is nothing to touch.
@@ -157,7 +157,7 @@ class ArmInSurroundings:
         return torch.cat(gaps, -1).min(0).values
 
     @cached_property
-    def lever(self) -> Float64[Tensor, " dof"]:
+    def motion_per_joint_value(self) -> Float64[Tensor, " dof"]:
         """Largest motion of any point of the robot per joint value [m/rad, or 1 for prismatic joints]."""
         d, strokes = np.abs(self.robot.dh[:, 1]), np.zeros(len(self.robot.rows))
         for index, row in enumerate(self.robot.rows):
@@ -193,7 +193,7 @@ class ArmInSurroundings:
             height = segments[:, moving, 1, 2] - radius[moving] - self.surroundings.floor_mm / 1e3
             gaps["the robot touches the floor"] = _least(height, infinite) - clearance
         for box in self.surroundings.boxes:
-            distance = box_distance(box.within(segments[:, moving]), box.half_size) - radius[moving]
+            distance = box_distance(box.to_box_frame(segments[:, moving]), box.half_size) - radius[moving]
             gaps[f"the robot touches the box '{box.name}'"] = _least(distance, infinite) - clearance
         return gaps
 
@@ -203,7 +203,7 @@ class ArmInSurroundings:
         radius = self.capsules.radius
         return segment_distance(segments[:, first], segments[:, second]) - radius[first] - radius[second]
 
-    def hidden(
+    def blocked_lines_of_sight(
         self, q: Float64[Tensor, "poses dof"], lines: Float64[Tensor, "poses lines 2 3"], what: str
     ) -> dict[str, Bool[Tensor, " poses"]]:
         """Find the poses in which a line of sight is blocked, by what blocks it.
@@ -230,7 +230,7 @@ class ArmInSurroundings:
         )
         hidden = {f"a link hides {what}": _least(distance.flatten(1), infinite) < clearance}
         for box in self.surroundings.boxes:
-            distance = box_distance(box.within(lines), box.half_size)
+            distance = box_distance(box.to_box_frame(lines), box.half_size)
             hidden[f"the box '{box.name}' hides {what}"] = distance.amin(1) < clearance
         return hidden
 
@@ -249,7 +249,7 @@ class ArmInSurroundings:
 
 
 def _beam_blockers(capsules: Capsules, clearance: float) -> Int64[Tensor, " pieces"]:
-    """Return the capsules that do not touch the reflector by construction; see `Capsules.pairs`."""
+    """Return the capsules that do not touch the reflector by construction; see `Capsules.pairs_to_check`."""
     q = capsules.random_joints()
     reflector = forward_kinematics(capsules.robot, q)[:, None, None, :3, 3].expand(-1, 1, 2, 3)
     touches = segment_distance(reflector, capsules.segments(q)) < capsules.radius + clearance

@@ -105,7 +105,7 @@ class Capsules:
         rows = list(iterate_rows(self.robot, Geometry.from_robot(self.robot), q.unbind(-1)))
         return [as_transform(frame, q[..., 0]) for frame in (rows[0].before, *(row.after for row in rows))]
 
-    def pairs(self, clearance: float) -> Int64[Tensor, "pairs 2"]:
+    def pairs_to_check(self, clearance: float) -> Int64[Tensor, "pairs 2"]:
         """Return the pairs of pieces that must not touch each other: those of links that are not neighbours.
 
         Pairs that touch in more than half of random poses do so by construction, as in a wrist; the joint limits have

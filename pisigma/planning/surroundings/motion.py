@@ -73,13 +73,13 @@ def is_free(
         end: joint values at the end [rad or m].
     """
     free = torch.ones(len(start), dtype=torch.bool)
-    travel = (end - start).abs() @ arm.lever
+    travel = (end - start).abs() @ arm.motion_per_joint_value
     finest = max(MIN_STEP, arm.surroundings.clearance / 2)
     motion, middle, half = torch.arange(len(start)), torch.full((len(start),), 0.5), 0.5
     middle = middle.double()
     while len(motion):
         q = start[motion] + middle[:, None] * (end[motion] - start[motion])
-        gap, moved = arm.gap(q), half * travel[motion]
+        gap, moved = arm.smallest_clearance(q), half * travel[motion]
         free[motion[gap < 0]] = False
         open_ = free[motion] & (gap < moved) & (moved > finest)
         motion, middle, half = motion[open_].repeat(2), middle[open_], half / 2
@@ -129,7 +129,7 @@ def way_points(
 
 def _travel(arm: ArmInSurroundings, start: Tensor, end: Tensor) -> Float64[Tensor, " poses"]:
     """Compute the largest motion of any point of the robot [m]."""
-    length: Tensor = (end - start).abs() @ arm.lever
+    length: Tensor = (end - start).abs() @ arm.motion_per_joint_value
     return length
 
 

@@ -98,7 +98,7 @@ class Box(Section):
         """Rotation matrix from the axes of the box to the robot's base frame."""
         return rotation_from_rpy(torch.tensor([np.deg2rad(self.yaw_deg), 0.0, 0.0], dtype=torch.float64))
 
-    def within(self, points: Float64[Tensor, "*batch 3"]) -> Float64[Tensor, "*batch 3"]:
+    def to_box_frame(self, points: Float64[Tensor, "*batch 3"]) -> Float64[Tensor, "*batch 3"]:
         """Transform points from the robot's base frame to the frame of the box [m]."""
         return (points - self.center) @ self.rotation
 
@@ -173,7 +173,7 @@ class LensSection(Section):
     pixel_um: Positive
     blur_px: Positive = 1.0
 
-    def depths(self, f: float) -> tuple[float, float]:
+    def sharp_depths(self, f: float) -> tuple[float, float]:
         """Compute the nearest and the farthest sharp depth [m]; the farthest may be infinite.
 
         With the image at v = f · pixel behind the lens, focused at s, the focal length is `v s / (v + s)` (thin lens),
@@ -226,10 +226,10 @@ class ViewSection(Section):
         """Pose of the measuring frame in the frame of the nominal base [m]; None if it is not stated."""
         return None if self.frame is None else transform_from_xyzrpy(torch.from_numpy(self.frame.to_si()))
 
-    def depths(self, f: float) -> tuple[float, float]:
+    def sharp_depths(self, f: float) -> tuple[float, float]:
         """Return the nearest and the farthest depth [m] for a focal length f [px]."""
         if self.lens is not None:
-            return self.lens.depths(f)
+            return self.lens.sharp_depths(f)
         assert self.near_mm is not None
         assert self.far_mm is not None
         return self.near_mm / 1e3, self.far_mm / 1e3
@@ -272,7 +272,7 @@ class Surroundings(Section):
             )
         for box in self.boxes if self.tracker is not None else ():
             assert self.tracker is not None
-            if bool((box.within(self.tracker.position).abs() <= box.half_size).all()):
+            if bool((box.to_box_frame(self.tracker.position).abs() <= box.half_size).all()):
                 raise ValueError(f"the tracker is inside the box '{box.name}'; correct one of them")
         return self
 
@@ -327,5 +327,5 @@ def read_surroundings(path: str | os.PathLike[str], robot: Robot) -> Surrounding
     try:
         surroundings.joints.limits(robot)
     except (RecipeError, PlanningError) as problem:
-        raise problem.located(place_of_key(path, ("joints",)), PlanningError) from None
+        raise problem.with_place(place_of_key(path, ("joints",)), PlanningError) from None
     return surroundings

@@ -190,7 +190,7 @@ def draw_figures(content: ReportContent) -> ReportFigures:
 def draw_dependence(dependence: Dependence) -> Drawing:
     """Draw errors over one quantity: a dot per row, and RMS errors of bins."""
     with drawing_style():
-        figure, axes = panel()
+        figure, axes = make_panel()
         if "before" in dependence.errors:
             _lengths(axes, dependence)
         else:
@@ -203,7 +203,7 @@ def draw_dependence(dependence: Dependence) -> Drawing:
 def draw_correction(curve: CorrectionCurve) -> Drawing:
     """Draw the correction of a joint over its own value, with measured values shaded."""
     with drawing_style():
-        figure, axes = panel()
+        figure, axes = make_panel()
         for low, high in _stretches(curve.values, curve.measured):
             axes.axvspan(low, high, color="0.92", linewidth=0)
         dots = axes.plot(curve.dot_values, curve.dots, ".", color=OTHER, alpha=0.5, markersize=3)
@@ -244,7 +244,7 @@ def _correlations(title: str, table: Correlations) -> Drawing:
 def draw_learning_curve(points: Sequence[LearningPoint]) -> Drawing:
     """Draw errors of held-out rows over the number of calibration rows, both logarithmic."""
     with drawing_style():
-        figure, axes = panel()
+        figure, axes = make_panel()
         rows = [point.rows for point in points]
         for name in points[0].models:
             line, mark = STYLES[name]
@@ -295,7 +295,7 @@ def draw_map(
     return Drawing(key, title, f"{what} from above and from the side.", figure)
 
 
-def panel() -> tuple[Figure, Axes]:
+def make_panel() -> tuple[Figure, Axes]:
     """Make a panel with fixed margins; computing them would take as long as drawing."""
     figure = Figure(figsize=SIZE)
     figure.subplots_adjust(left=0.155, right=0.985, bottom=0.165, top=0.9)

@@ -10,7 +10,7 @@ from PIL import Image
 from pisigma.measurement.camera.detection.detected_boards import BoardImage, DetectedBoards, rms_of
 from pisigma.measurement.camera.detection.detector import read_image
 from pisigma.reporting.page.figures import AFTER, BEFORE, Drawing, drawing_style
-from pisigma.reporting.page.page import image, resource
+from pisigma.reporting.page.page import data_url, read_resource
 from pisigma.reporting.rendering import render
 from pisigma.reporting.tables import Table
 
@@ -48,8 +48,8 @@ def images_page(
         tables=tables,
         scale=f"{scale:g}",
         pictures=[draw_image(one, detection, scale) for one in detection.images if one.is_read],
-        image=image,
-        style=Markup(resource("style.css")),  # ours
+        image=data_url,
+        style=Markup(read_resource("style.css")),  # ours
     )
 
 

@@ -18,8 +18,8 @@ from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.reporting.comparison_tables import comparison_tables
 from pisigma.reporting.fleet_tables import ERRORS_NOTE, cell_table, state_table
 from pisigma.reporting.lifetime_tables import chart_table, difference_table, session_table
-from pisigma.reporting.page.figures import AFTER, BEFORE, OTHER, Drawing, draw_map, drawing_style, panel
-from pisigma.reporting.page.page import image, resource
+from pisigma.reporting.page.figures import AFTER, BEFORE, OTHER, Drawing, draw_map, drawing_style, make_panel
+from pisigma.reporting.page.page import data_url, read_resource
 from pisigma.reporting.rendering import render
 from pisigma.reporting.tables import pose_rows
 from pisigma.validation.held_out.model_comparison import ModelComparison
@@ -59,15 +59,15 @@ def monitoring_page(
         charts=chart_table(charts),
         rate=f"{FALSE_ALARMS_PER_YEAR:g}",
         per_year=SESSIONS_PER_YEAR,
-        image=image,
-        style=Markup(resource("style.css")),  # ours
+        image=data_url,
+        style=Markup(read_resource("style.css")),  # ours
     )
 
 
 def draw_values(chart: Chart, days: Sequence[datetime.date]) -> Drawing:
     """Draw a quantity over the sessions with 95 % intervals."""
     with drawing_style():
-        figure, axes = panel()
+        figure, axes = make_panel()
         values, half = chart.values.numpy(), NORMAL_95 * chart.deviations.numpy()
         axes.errorbar(days, values, half, fmt="o", color=AFTER, markersize=4, capsize=2, linewidth=1.2)  # type: ignore[arg-type]
         if chart.alarm is not None:
@@ -87,7 +87,7 @@ def draw_values(chart: Chart, days: Sequence[datetime.date]) -> Drawing:
 def draw_statistics(chart: Chart, days: Sequence[datetime.date]) -> Drawing:
     """Draw both statistics of a chart as shares of their limits."""
     with drawing_style():
-        figure, axes = panel()
+        figure, axes = make_panel()
         for share, name, color, line in (
             (chart.ewma_share, "EWMA", AFTER, "o-"),
             (chart.cusum_share, "CUSUM", OTHER, "s--"),
@@ -131,7 +131,7 @@ def fleet_page(status: FleetStatus) -> str:
         cells=cells,
         table=cell_table(cells),
         note=ERRORS_NOTE,
-        style=Markup(resource("style.css")),  # ours
+        style=Markup(read_resource("style.css")),  # ours
     )
 
 
@@ -166,8 +166,8 @@ def comparison_page(
         rows=() if rows is None else comparison_tables(rows, "the rows", PAGE_WIDTH),
         sentences=sentences,
         warnings=warnings,
-        image=image,
-        style=Markup(resource("style.css")),  # ours
+        image=data_url,
+        style=Markup(read_resource("style.css")),  # ours
     )
 
 

@@ -57,11 +57,11 @@ def render_page(content: ReportContent, figures: ReportFigures, acceptance: Acce
         names_text=names_text,
         map_text=map_text(content.map),
         parameter_table=parameter_table,
-        image=image,
+        image=data_url,
         png=lambda png: _address("png", png),
         map_data=script_json(map_data(content.map, content.model.robot)),
-        style=Markup(resource("style.css")),  # ours
-        script=Markup(resource("viewer.js")),
+        style=Markup(read_resource("style.css")),  # ours
+        script=Markup(read_resource("viewer.js")),
     )
 
 
@@ -109,7 +109,7 @@ def map_data(error_map: ErrorMap, robot: Robot) -> dict[str, Any]:
     }
 
 
-def resource(name: str) -> str:
+def read_resource(name: str) -> str:
     """Read a file of this folder, such as the style of all pages."""
     return files(_PACKAGE).joinpath(name).read_text(encoding="utf-8")
 
@@ -118,7 +118,7 @@ def _packed(values: Any) -> str:
     return base64.b64encode(np.ascontiguousarray(values, dtype="<f4").tobytes()).decode()
 
 
-def image(drawing: Drawing) -> str:
+def data_url(drawing: Drawing) -> str:
     """Return the data URL of a figure."""
     return _address("svg+xml", drawing.svg().encode())
 

@@ -66,7 +66,7 @@ def joint_jacobian(robot: "pisigma.robot.description.Robot", q: Any) -> Any:
     """
     if robot.coupling is not None:
         values = robot.to_dh(q) if is_tensor(q) else robot.to_dh(np.asarray(q, dtype=np.float64))
-        slope = robot.coupling.slope(q)
+        slope = robot.coupling.derivative(q)
         return joint_jacobian(replace(robot, coupling=None), values) @ (
             q.new_tensor(slope) if is_tensor(q) else slope
         )

@@ -9,7 +9,7 @@ from pydantic import Field
 from torch import Tensor
 
 from pisigma.files.errors import RecipeError, RobotError, nearest_choice
-from pisigma.robot.coupling_section import CoupledJointSection, coupled, coupling_document
+from pisigma.robot.coupling_section import CoupledJointSection, coupling_document, rows_and_coupling
 from pisigma.robot.description import Robot
 from pisigma.simulation.errors.source import AbstractJointSource, JointErrorFunction
 
@@ -56,7 +56,7 @@ class CouplingDeviation(AbstractJointSource):
             limited.get(joint.name, replace(joint, lower=-np.inf, upper=np.inf)) for joint in robot.joints
         ]
         try:
-            true = coupled(rows, tuple((nominal | stated).values()))[1]
+            true = rows_and_coupling(rows, tuple((nominal | stated).values()))[1]
         except RobotError as problem:
             raise RecipeError(f"{place}: {problem}") from None
         assert true is not None

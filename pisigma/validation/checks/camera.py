@@ -40,7 +40,7 @@ POSTURES = 200
 
 def check_camera(checked: CheckedCalibration) -> Iterator[Diagnostic]:
     """Report which known weaknesses of camera calibrations this one has; `benchmarks/camera.py` measures them."""
-    by_corners = checked.rows.measured("corner")
+    by_corners = checked.rows.is_measured("corner")
     if not bool(by_corners.any()):
         return
     images, result = checked.rows.select(by_corners), checked.geometric

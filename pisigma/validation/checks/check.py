@@ -189,9 +189,9 @@ class RowsUnderModel:
     @cached_property
     def errors(self) -> Float64[Tensor, " rows"]:
         """Lengths of the position errors [m]."""
-        return self.lengths(self.predicted)
+        return self.error_lengths(self.predicted)
 
-    def lengths(self, T: Float64[Tensor, "rows 4 4"]) -> Float64[Tensor, " rows"]:
+    def error_lengths(self, T: Float64[Tensor, "rows 4 4"]) -> Float64[Tensor, " rows"]:
         """Compute the lengths of the position errors of predicted poses [m]."""
         result: Tensor = (self.measured.position - T[:, :3, 3]).norm(dim=-1)
         return result

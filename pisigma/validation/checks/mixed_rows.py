@@ -107,7 +107,7 @@ def _agreements(judged: RowsUnderModel) -> Iterator[Float64[Tensor, "rows 4 4"]]
             chosen = sample
             for _ in range(3):  # local optimisation: refit to all rows that agree
                 T = _fitted(judged, kind, chosen)
-                agreeing = judged.lengths(T) <= limit
+                agreeing = judged.error_lengths(T) <= limit
                 chosen = agreeing.nonzero()[:, 0]
                 if len(chosen) < SAMPLE:
                     break
@@ -135,7 +135,7 @@ def _fitted(judged: RowsUnderModel, kind: str, chosen: Tensor) -> Float64[Tensor
 
 def _apart(judged: RowsUnderModel, T: Float64[Tensor, "rows 4 4"]) -> Bool[Tensor, " rows"] | None:
     """Find the rows that are far from what the others agree on; None if these are few or not clearly separated."""
-    ratio = judged.lengths(T) / (AGREES * judged.predicted_deviation)
+    ratio = judged.error_lengths(T) / (AGREES * judged.predicted_deviation)
     near, far = ratio <= 1, ratio > APART
     count = judged.rows.rows
     if not int(far.sum()) > MIN_WRONG_SHARE * count or not int(near.sum()) >= MIN_AGREEING_SHARE * count:

@@ -109,7 +109,7 @@ def _fitted_to_usual_rows(judged: RowsUnderModel) -> Float64[Tensor, "rows 4 4"]
     """
     T = judged.predicted
     for _ in range(REFITS):
-        lengths = judged.lengths(T)
+        lengths = judged.error_lengths(T)
         suspicious = lengths > SUSPICIOUS * lengths.median()
         if bool(judged.measured.has_rotation.any()):
             angles = _angles(judged, T)
@@ -131,7 +131,7 @@ def _angles(judged: RowsUnderModel, T: Float64[Tensor, "rows 4 4"]) -> Float64[T
 
 def _far(judged: RowsUnderModel, T: Float64[Tensor, "rows 4 4"]) -> tuple[Bool[Tensor, " rows"], list[str]]:
     """Find the rows that are far off, and write how far every row is."""
-    lengths = judged.lengths(T)
+    lengths = judged.error_lengths(T)
     far = lengths > max(FAR * float(lengths.median()), PLAUSIBLE_SHARE * judged.model.robot.reach)
     texts = [length_text(length) for length in lengths.tolist()]
     turned = judged.measured.has_rotation

@@ -311,7 +311,7 @@ def learning_curve(
     )
 
 
-def judge(
+def judge_on_test_set(
     calibrator: Calibrator, result: Result, training: Measurements, test: Measurements
 ) -> CalibrationValidation:
     """Judge a calibration on a separate test set.

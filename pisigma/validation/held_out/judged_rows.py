@@ -224,7 +224,7 @@ def _errors(
     position = torch.full_like(T[:, :3, 3], torch.nan) if rows.position is None else rows.position
     residual = position - T[:, :3, 3]
     if rows.socket is not None:
-        of_sockets = rows.measured("socket")[:, None]
+        of_sockets = rows.is_measured("socket")[:, None]
         residual = torch.where(of_sockets, _from_socket(rows, T[:, :3, 3]), residual)
     rotation = None
     if rows.rotation is not None:

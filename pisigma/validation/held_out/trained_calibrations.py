@@ -232,7 +232,9 @@ class DistanceErrors:
         """
         errors, sockets = {}, tuple({one for pair in stated for one in pair})
         for model, T in poses.items():
-            centre = {name: SocketSensor.uncalibrated(rows, name, T.detach().cpu(), ()) for name in sockets}
+            centre = {
+                name: SocketSensor.uncalibrated_unknowns(rows, name, T.detach().cpu(), ()) for name in sockets
+            }
             errors[model] = torch.tensor(
                 [float((centre[a] - centre[b]).norm()) - distance for (a, b), distance in stated.items()],
                 dtype=torch.float64,

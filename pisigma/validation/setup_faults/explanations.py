@@ -73,13 +73,13 @@ def largest_explained(here: Hypothesis, reach: float) -> float:
     return min(COLLAPSED * here.error, PLAUSIBLE_SHARE * reach)
 
 
-def choose_simplest(hypotheses: Sequence[Hypothesis], most: float) -> list[Hypothesis]:
+def choose_simplest(fault_hypotheses: Sequence[Hypothesis], most: float) -> list[Hypothesis]:
     """Choose the simplest of the hypotheses that explain the errors about equally well, to at most `most` [m].
 
     The remaining errors must also be small relative to the spread of the poses, which a wrong unit can shrink.
     """
     explaining = [
-        other for other in hypotheses if other.error <= min(most, COLLAPSED * other.measured.spread)
+        other for other in fault_hypotheses if other.error <= min(most, COLLAPSED * other.measured.spread)
     ]
     best = min((other.error for other in explaining), default=0.0)
     explaining = [other for other in explaining if other.error <= AS_GOOD * best]
@@ -90,7 +90,9 @@ def choose_simplest(hypotheses: Sequence[Hypothesis], most: float) -> list[Hypot
     return list(chosen.values())
 
 
-def hypotheses(arm: PredictingArm, some: Measurements, here: Hypothesis, most: float) -> Iterator[Hypothesis]:
+def fault_hypotheses(
+    arm: PredictingArm, some: Measurements, here: Hypothesis, most: float
+) -> Iterator[Hypothesis]:
     """Yield all hypotheses that may explain the errors to `most` [m]; the first is that nothing is wrong."""
     yield from frame_hypotheses(arm, some, here, most)
     for measured, cause in units_and_frames(here.measured, here.T[:, :3, 3], "corner" in some.kinds):

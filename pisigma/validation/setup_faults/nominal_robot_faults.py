@@ -23,8 +23,8 @@ from pisigma.validation.setup_faults.cause import Cause, joined
 from pisigma.validation.setup_faults.explanations import (
     AS_GOOD,
     choose_simplest,
+    fault_hypotheses,
     frame_hypotheses,
-    hypotheses,
     largest_explained,
 )
 from pisigma.validation.setup_faults.hypothesis import (
@@ -93,7 +93,7 @@ def find_nominal_robot_faults(robot: Robot, measurements: Measurements) -> tuple
         return ()
     most = largest_explained(here, robot.reach)
     tried = [
-        *hypotheses(arm, some, raw, most),
+        *fault_hypotheses(arm, some, raw, most),
         *_with_joints(arm, shifted_rows(robot, rows, chosen, measured), most),
     ]
     faults = choose_simplest(tried, most)

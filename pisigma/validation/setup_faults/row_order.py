@@ -93,7 +93,9 @@ def find_motion(result: CalibrationResult | HybridResult) -> Motion | None:
     best = int(np.argmax(odds))
     motion, chosen = search.motion(fits[best]), fits[best].candidate
     starts = search.frame_starts(chosen)
-    alike = (search.log_bayes_factor(search.reweighted(one), 1.0) > AS_LIKELY * odds[best] for one in starts)
+    alike = (
+        search.log_bayes_factor(search.reweighted_fit(one), 1.0) > AS_LIKELY * odds[best] for one in starts
+    )
     return replace(motion, begins_frame=any(alike))
 
 
@@ -123,7 +125,7 @@ class _Candidate:
         return np.concatenate([self.full * course[:, None, None] for course in self.course.T], 2)
 
     @property
-    def tried(self) -> int:
+    def candidates_tried(self) -> int:
         """Number of candidates that it was chosen from."""
         return 1 if self.first is None else len(self.index) - 2 * MIN_ROWS
 
@@ -161,7 +163,7 @@ class _Fit:
         """Weight of every value."""
         return _by_sensor(self.after, self.scale, _LOSS.weight)
 
-    def costs(self, residual: Float64[np.ndarray, "rows values"]) -> Float64[np.ndarray, " rows"]:
+    def robust_costs(self, residual: Float64[np.ndarray, "rows values"]) -> Float64[np.ndarray, " rows"]:
         """Compute the robust cost of every row for given residuals."""
         cost: np.ndarray = _by_sensor(residual, self.scale, _LOSS.cost).sum(1) / 3
         return cost
@@ -237,7 +239,7 @@ class _Search:
 
     def fit(self, candidate: _Candidate) -> _Fit:
         """Fit a candidate together with the parameters; the row of a sudden motion is then searched once more."""
-        fit = self.reweighted(candidate)
+        fit = self.reweighted_fit(candidate)
         if candidate.first is None:
             return fit
         still = fit.after.copy()
@@ -245,18 +247,18 @@ class _Search:
         moved = still.copy()
         size = candidate.full.shape[2]
         moved[candidate.index] -= candidate.full @ fit.motion[:size]
-        gain = (fit.costs(still) - fit.costs(moved))[candidate.index][::-1].cumsum()[::-1]
+        gain = (fit.robust_costs(still) - fit.robust_costs(moved))[candidate.index][::-1].cumsum()[::-1]
         first = MIN_ROWS + int(gain[MIN_ROWS : len(gain) - MIN_ROWS].argmax())
-        return fit if first == candidate.first else self.reweighted(candidate.from_row(first))
+        return fit if first == candidate.first else self.reweighted_fit(candidate.from_row(first))
 
     @cached_property
     def fit_without_motion(self) -> _Fit:
         """The fit without a motion."""
         nothing = np.zeros((len(self.rows.residual), self.rows.residual.shape[1], 0))
         index = np.arange(len(self.rows.residual))
-        return self.reweighted(_Candidate("frame", 0, index, nothing, np.zeros((len(index), 1))))
+        return self.reweighted_fit(_Candidate("frame", 0, index, nothing, np.zeros((len(index), 1))))
 
-    def reweighted(self, candidate: _Candidate) -> _Fit:
+    def reweighted_fit(self, candidate: _Candidate) -> _Fit:
         """Fit a candidate by iteratively reweighted least squares, starting with full weights."""
         size, motions = self.rows.jacobian.shape[2], candidate.columns.shape[2]
         A = np.concatenate([self.rows.jacobian, np.zeros((*self.rows.jacobian.shape[:2], motions))], 2)
@@ -299,12 +301,12 @@ class _Search:
             1.0,
         )
         before = min(
-            float(fit.costs(residual).sum())
+            float(fit.robust_costs(residual).sum())
             for residual in (self.rows.residual, self.fit_without_motion.after)
         )
-        left = float(fit.costs(fit.after).sum()) / max(before, 1e-300)
+        left = float(fit.robust_costs(fit.after).sum()) / max(before, 1e-300)
         gain = (values - len(fit.motion)) * math.log1p(values) - values * math.log1p(values * min(left, 1.0))
-        return gain / 2 - math.log(fit.candidate.tried)
+        return gain / 2 - math.log(fit.candidate.candidates_tried)
 
     def values_per_independent(self, fit: _Fit) -> float:
         """Estimate the number of values per independent value from the correlation of the residuals."""

@@ -17,8 +17,8 @@ from pisigma.validation.setup_faults.explanations import (
     PLAUSIBLE_SHARE,
     PLAUSIBLE_TURN,
     choose_simplest,
+    fault_hypotheses,
     frame_hypotheses,
-    hypotheses,
     largest_explained,
 )
 from pisigma.validation.setup_faults.hypothesis import Hypothesis, PredictingArm
@@ -81,7 +81,9 @@ def find_setup_faults(
         return ()
     arm = PredictingArm(model.robot, model)
     most = largest_explained(here, model.robot.reach)
-    tried = frame_hypotheses(arm, known, here, most) if frames_only else hypotheses(arm, known, here, most)
+    tried = (
+        frame_hypotheses(arm, known, here, most) if frames_only else fault_hypotheses(arm, known, here, most)
+    )
     free = {CAUSES[kind] for kind in fitted}
     faults = tuple(
         fault_from_hypothesis(here, other.without_causes(free), _nominal_error(nominal, known, other))

@@ -30,7 +30,7 @@ SCENE_POLICY = (
 _starting = threading.Lock()
 
 
-class ViserBehind:
+class ViserBackend:
     """A viser server on a unix socket in a folder that only this user can enter.
 
     viser has no token and does not check where a page comes from, and it listens only on ports, which all users of a

@@ -32,7 +32,7 @@ RAMP = (
 """Colour ramp "viridis" with even steps of lightness, readable in grey and with colour blindness."""
 
 
-def shades(errors: Float64[np.ndarray, " rows"], top: float) -> UInt8[np.ndarray, "rows 3"]:
+def error_colors(errors: Float64[np.ndarray, " rows"], top: float) -> UInt8[np.ndarray, "rows 3"]:
     """Return the colour of every row's error.
 
     Args:

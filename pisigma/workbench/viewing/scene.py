@@ -25,7 +25,7 @@ from pisigma.workbench.viewing.colors import (
     SIGHT,
     TRACKER,
     Color,
-    shades,
+    error_colors,
 )
 from pisigma.workbench.viewing.surface import Surface, revolve, rotation_to
 
@@ -125,7 +125,7 @@ class SessionScene:
             return
         nominal = self._poses(rows.q)[:, :3, 3]
         position = np.where(np.isfinite(rows.position), rows.position, nominal)
-        colors = shades(np.linalg.norm(rows.error, axis=1), top)
+        colors = error_colors(np.linalg.norm(rows.error, axis=1), top)
         colors[rows.alarmed] = ALARM
         if not rows.check.all():
             self._dots("/rows/measured", position[~rows.check], colors[~rows.check])

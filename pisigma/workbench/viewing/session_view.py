@@ -75,12 +75,12 @@ class SessionView:
             OutputError: the host is not an address of this machine.
         """
         from pisigma.workbench.server.front_server import FrontServer
-        from pisigma.workbench.server.viser_server import ViserBehind
+        from pisigma.workbench.server.viser_server import ViserBackend
 
         self._reach, self._lock = arm.robot.reach, threading.Lock()
         self._state: SessionState | None = None
         self._magnified_by_hand = False
-        self._behind = ViserBehind("pisigma measure")
+        self._behind = ViserBackend("pisigma measure")
         try:
             self._front = FrontServer(self._behind.pages(""), host, port, self._behind.close_sockets)
         except OutputError:

@@ -90,7 +90,7 @@ def _measured(
     """Evaluate the model on a session; return a reason if that is not possible."""
     if others := seen.rows.kinds - JUDGED:
         return None, f"session {session.name} has readings without a position ({', '.join(sorted(others))})."
-    settings = seen.settings_to_fit(cell.file.settings("evaluate"))
+    settings = seen.settings_to_fit(cell.file.settings_of_step("evaluate"))
     try:
         found = evaluate(cell.model_folder(entry.name), seen.rows, settings)
     except PisigmaError as problem:

@@ -17,7 +17,16 @@ from pisigma.files.model_files import is_model
 from pisigma.files.progress import Progress
 from pisigma.lifetime.cell.controller import findings
 from pisigma.lifetime.cell.facts import CellStatus, status_of
-from pisigma.lifetime.cell.history import HISTORY, Check, Entry, History, ModelEntry, SessionEntry, Use, now
+from pisigma.lifetime.cell.history import (
+    HISTORY,
+    Check,
+    Entry,
+    History,
+    ModelEntry,
+    SessionEntry,
+    Use,
+    current_time,
+)
 from pisigma.lifetime.cell.layout import MODELS, PLANS
 from pisigma.measurement.camera.camera_files import CameraFiles
 from pisigma.measurement.dataset import Measurements
@@ -27,7 +36,7 @@ from pisigma.robot.description import Robot
 from pisigma.workflow.calibrate import Calibration
 from pisigma.workflow.cell.cell_file import CellFile
 from pisigma.workflow.cell.model_choice import (
-    calibrated,
+    calibrate_from_scratch,
     check_of,
     entry_of,
     errors_of,
@@ -113,7 +122,7 @@ class Cell:
     @property
     def cameras(self) -> CameraFiles | None:
         """Cameras and boards that measure; None without cameras."""
-        settings: CalibrationSettings = self.file.settings("calibrate")
+        settings: CalibrationSettings = self.file.settings_of_step("calibrate")
         return settings.cameras
 
     @property
@@ -162,12 +171,12 @@ class Cell:
         entry, settings = facts.in_use or facts.newest_model, self.file.plan_settings(facts, **changed)
         subject = self.robot if entry is None else self.model_folder(entry.name)
         planned = plan(subject, settings, self.file.document.surroundings, progress)
-        with self.history.database.writing():  # no other process chooses the same name meanwhile
+        with self.history.database.transaction():  # no other process chooses the same name meanwhile
             path = free_path(self.folder / PLANS, datetime.date.today().isoformat(), ".csv")
             planned.save(path, programs)
         made = f"plan '{path.stem}' of {planned.poses + planned.checks} poses"
         of = "" if entry is None else entry.name
-        self.history.add(Check("plan", of, "", "planned", made, None, False, now()))
+        self.history.add(Check("plan", of, "", "planned", made, None, False, current_time()))
         return planned, path
 
     @cached_property
@@ -206,13 +215,15 @@ class Cell:
         Raises:
             MeasurementError: there are no valid sessions.
         """
-        sessions, warnings = self.sessions.valid(), self.on_controller("calibrate", None)
-        settings: CalibrationSettings = self.file.settings("calibrate", **changed)
-        result = calibrated(self.robot, self.sessions.rows_of(sessions), settings, prior, progress)
+        sessions, warnings = self.sessions.valid_sessions(), self.on_controller("calibrate", None)
+        settings: CalibrationSettings = self.file.settings_of_step("calibrate", **changed)
+        result = calibrate_from_scratch(
+            self.robot, self.sessions.rows_of(sessions), settings, prior, progress
+        )
         result = with_warnings(result, warnings)
         doubt = "" if result.trusted else result.diagnostics[0].sentence
         if doubt and not accept_implausible:
-            self.history.add(Check("calibrate", "", "", "not_trusted", doubt, None, False, now()))
+            self.history.add(Check("calibrate", "", "", "not_trusted", doubt, None, False, current_time()))
             return result, None
         remark, better = doubt or "not verified yet", False
         if not doubt and prior is None and (in_use := self.history.in_use) is not None:
@@ -221,8 +232,8 @@ class Cell:
         p95, rms = errors_of(result)
         entry = entry_of(self.history, path, sessions, remark, p95)
         verdict = "accepted_implausible" if doubt else "trusted"
-        check = Check("calibrate", entry.name, "", verdict, doubt, p95, False, now(), rms)
-        self.history.add(entry, check, *([Use(entry.name, now(), remark)] if better else []))
+        check = Check("calibrate", entry.name, "", verdict, doubt, p95, False, current_time(), rms)
+        self.history.add(entry, check, *([Use(entry.name, current_time(), remark)] if better else []))
         return result, entry
 
     def verify(
@@ -243,14 +254,14 @@ class Cell:
             MeasurementError: there is no session with this name, or none to which the model was not fitted.
         """
         entry, chosen, seen = self._new_rows("verify", model, session)
-        settings = seen.settings_to_fit(self.file.settings("verify", **changed))
+        settings = seen.settings_to_fit(self.file.settings_of_step("verify", **changed))
         found = verify(self.model_folder(entry.name), seen.rows, settings)
         errors, moved = found.comparison.models[-1].position.statistics, found.verdict == "moved"
         found_by = ("verify", entry.name, chosen.name, found.verdict, found.sentence)
-        self.history.add(Check(*found_by, errors["p95"], moved, now(), errors["rms"]))
+        self.history.add(Check(*found_by, errors["p95"], moved, current_time(), errors["rms"]))
         in_use = self.history.in_use
         if found.accepted and (in_use is None or in_use.made < entry.made):
-            self.history.add(Use(entry.name, now(), f"verified with session '{chosen.name}'"))
+            self.history.add(Use(entry.name, current_time(), f"verified with session '{chosen.name}'"))
         return found, entry
 
     def monitor(self, progress: Progress = lambda what: None, **changed: Any) -> Monitoring:
@@ -274,11 +285,11 @@ class Cell:
             seen = self.sessions.rows_for(entry, self.sessions.as_measured(one), one.day)
             moved = {"moved": ",".join(seen.moved)} if seen.moved else {}
             settings = replace(
-                self.file.settings("monitor", **changed, **moved), cameras=None, dates=(one.day,)
+                self.file.settings_of_step("monitor", **changed, **moved), cameras=None, dates=(one.day,)
             )
             rows = replace(seen.rows, date=None)
             found = monitor(self.model_folder(entry.name), [rows], settings, progress)
-            self.history.add(check_of(found, entry, one, seen, self.file.settings("recalibrate")))
+            self.history.add(check_of(found, entry, one, seen, self.file.settings_of_step("recalibrate")))
         assert found is not None  # there is a session
         return replace(found, warnings=(*warnings, *found.warnings))
 
@@ -293,7 +304,7 @@ class Cell:
             MeasurementError: there is no session to which the model was not fitted.
         """
         entry, _, seen = self._new_rows("evaluate", None, None)
-        settings = seen.settings_to_fit(self.file.settings("evaluate", **changed))
+        settings = seen.settings_to_fit(self.file.settings_of_step("evaluate", **changed))
         return evaluate(self.model_folder(entry.name), seen.rows, settings)
 
     def recalibrate(
@@ -321,7 +332,7 @@ class Cell:
             MeasurementError: there is no session with this name, or none to which the model was not fitted.
         """
         parent, chosen, seen = self._new_rows("recalibrate", None, session)
-        settings = replace(self.file.settings("recalibrate", **changed), cameras=None)
+        settings = replace(self.file.settings_of_step("recalibrate", **changed), cameras=None)
         if seen.moved and settings.moved is None:
             settings = replace(settings, moved=seen.moved)
         result = recalibrate(self.model_folder(parent.name), seen.rows, settings, progress)
@@ -329,7 +340,7 @@ class Cell:
         if not (result.trusted or accept_implausible):
             doubt = result.diagnostics[0].sentence
             refused = ("recalibrate", parent.name, chosen.name, "not_trusted", doubt)
-            self.history.add(Check(*refused, None, False, now()))
+            self.history.add(Check(*refused, None, False, current_time()))
             return result, None
         path = save_new(self.folder / MODELS, partial(result.save, accept_implausible=accept_implausible))
         remark, (p95, rms) = result.summary.verdict, errors_of(result)
@@ -342,10 +353,10 @@ class Cell:
             parent=parent.name,
         )
         of = ("recalibrate", entry.name, chosen.name, result.summary.kept, remark)
-        added: list[Entry] = [entry, Check(*of, p95, False, now(), rms)]
+        added: list[Entry] = [entry, Check(*of, p95, False, current_time(), rms)]
         if result.trusted:
-            events = found_events(result, chosen, seen.moved, self.sessions.valid())
-            added += [Use(entry.name, now(), remark), *events]
+            events = found_events(result, chosen, seen.moved, self.sessions.valid_sessions())
+            added += [Use(entry.name, current_time(), remark), *events]
         self.history.add(*added)
         return result, entry
 
@@ -394,5 +405,5 @@ class Cell:
         """Return a model, a session (by default the newest to which it was not fitted), and its rows with its names."""
         entry = self._candidate(model)
         self.on_controller(command, entry)
-        chosen = self.sessions.chosen(entry, session)
+        chosen = self.sessions.choose(entry, session)
         return entry, chosen, self.sessions.rows_for(entry, self.sessions.as_measured(chosen), chosen.day)

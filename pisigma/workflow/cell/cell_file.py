@@ -175,9 +175,11 @@ class CellFile:
         read = CellFile(path, read_yaml(path, CellDocument, PlanningError))
         for step in STEPS:
             if step not in ("plan", "import"):
-                read.settings(step)
+                read.settings_of_step(step)
             else:
-                list(checked_values(read.stated(step), by_key(STEPS[step]), read._place(step).place_of))
+                list(
+                    checked_values(read.stated_values(step), by_key(STEPS[step]), read._place(step).place_of)
+                )
         return read
 
     @property
@@ -186,7 +188,7 @@ class CellFile:
         name = self.document.robot
         return name if robot_file(name) is None else str(path_inside_cell(self.path.parent, name))
 
-    def stated(self, step: str) -> dict[str, Any]:
+    def stated_values(self, step: str) -> dict[str, Any]:
         """Return the values that the file states for a step, by its keys, including the shared keys that it uses."""
         section = dict(getattr(self.document, {"import": "import_"}.get(step, step)) or {})
         known = by_key(STEPS[step])
@@ -200,7 +202,7 @@ class CellFile:
             shared["sensor"] = sensor
         return {key: value for key, value in shared.items() if key in known} | section
 
-    def settings(self, step: str, **changed: Any) -> Any:
+    def settings_of_step(self, step: str, **changed: Any) -> Any:
         """Return the settings of a step.
 
         Args:
@@ -211,7 +213,11 @@ class CellFile:
             PisigmaError: a setting is not valid; the message names file, line and key.
         """
         return settings_from(
-            STEPS[step], self.stated(step) | changed, self._place(step), self.path.parent, frozenset(changed)
+            STEPS[step],
+            self.stated_values(step) | changed,
+            self._place(step),
+            self.path.parent,
+            frozenset(changed),
         )
 
     def plan_settings(self, facts: CellFacts, **changed: Any) -> PlanSettings:
@@ -221,8 +227,8 @@ class CellFile:
             facts: facts about the cell.
             **changed: values that override the file, by its keys.
         """
-        settings: PlanSettings = self.settings("plan", **changed)
-        stated = self.stated("plan").keys() | changed.keys()
+        settings: PlanSettings = self.settings_of_step("plan", **changed)
+        stated = self.stated_values("plan").keys() | changed.keys()
         default: dict[str, Any] = {"seed": settings.seed + len(facts.plans)}
         if plans_check(facts):
             default |= {"count": VERIFICATION_POSES, "check": 0}
@@ -270,7 +276,7 @@ def settings_from(
     except PisigmaError as problem:  # the class of the settings refuses a value
         key = problem.option.removeprefix("--").replace("-", "_")
         raise (
-            problem if key in outside else problem.located(places.place_of(key if key in values else ""))
+            problem if key in outside else problem.with_place(places.place_of(key if key in values else ""))
         ) from None
     assert isinstance(built, group)
     return built

@@ -8,14 +8,23 @@ from typing import TypeVar
 from pisigma.files.errors import ModelError, Place
 from pisigma.files.model_files import model_hash
 from pisigma.files.progress import Progress
-from pisigma.lifetime.cell.history import Check, Event, EventKind, History, ModelEntry, SessionEntry, Use, now
+from pisigma.lifetime.cell.history import (
+    Check,
+    Event,
+    EventKind,
+    History,
+    ModelEntry,
+    SessionEntry,
+    Use,
+    current_time,
+)
 from pisigma.lifetime.cell.layout import MODELS
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import load_model
 from pisigma.robot.description import Robot
 from pisigma.workflow.calibrate import Calibration, calibrate
-from pisigma.workflow.cell.sessions import ModelRows, Sessions, newest_day, since
+from pisigma.workflow.cell.sessions import ModelRows, Sessions, name_since, newest_day
 from pisigma.workflow.evaluate import evaluate
 from pisigma.workflow.monitor import Monitoring
 from pisigma.workflow.recalibrate import Recalibration, recalibrate
@@ -82,7 +91,7 @@ def with_names_of(model: CalibratedModel, entry: ModelEntry, other: ModelEntry) 
     """Return a model whose newest frame and tool are renamed to those of another model."""
 
     def renamed(values: Mapping[str, Value], day: str, other_day: str) -> dict[str, Value]:
-        newest = {since(name, other_day): value for name, value in _of_day(values, day).items()}
+        newest = {name_since(name, other_day): value for name, value in _of_day(values, day).items()}
         return newest | {name: value for name, value in values.items() if name not in newest}
 
     frame, tool = (entry.frame_day, other.frame_day), (entry.target_day, other.target_day)
@@ -97,7 +106,7 @@ def with_names_of(model: CalibratedModel, entry: ModelEntry, other: ModelEntry) 
 
 def _of_day(values: Mapping[str, Value], day: str) -> dict[str, Value]:
     """Return the frames or tools that were set up on a day, by their names in files of rows."""
-    ending = since("", day)
+    ending = name_since("", day)
     if not day:
         return {name: value for name, value in values.items() if " since " not in f" {name}"}
     return {
@@ -123,7 +132,7 @@ def check_of(
         seen: rows of the session with the names of the model.
         settings: settings of the recalibration.
     """
-    check = Check("monitor", entry.name, session.name, "implausible", "", None, False, now())
+    check = Check("monitor", entry.name, session.name, "implausible", "", None, False, current_time())
     if found.untrusted:
         return replace(check, summary=found.untrusted[0].sentence)
     judged = found.sessions[-1].session
@@ -157,13 +166,13 @@ def found_events(
     kinds: dict[str, EventKind] = {"base": "instrument", "tool": "tool"}
     note = f"found by the recalibration with session '{session.name}'"
     return [
-        Event(session.day, kind, note, now())
+        Event(session.day, kind, note, current_time())
         for what, kind in kinds.items()
         if what in moved and what not in recorded
     ]
 
 
-def calibrated(
+def calibrate_from_scratch(
     robot: Robot, rows: Measurements, settings: CalibrationSettings, prior: Path | None, progress: Progress
 ) -> Calibration | Recalibration:
     """Calibrate a robot with rows that were read, from scratch or from the prior of a fleet.
@@ -200,7 +209,7 @@ def entry_of(
     return ModelEntry(
         name=path.name,
         sha256=model_hash(path),
-        made=now(),
+        made=current_time(),
         sessions=",".join(one.name for one in sessions),
         day=day,
         frame_day=newest_day(events, "instrument", day),
@@ -227,7 +236,7 @@ def put_into_use(history: History, model: str, reason: str, undo: bool = False) 
         raise ModelError(
             "the model was changed after it was made", at=Place(folder), remedy="use another model"
         )
-    history.add(Use(model, now(), reason, undo))
+    history.add(Use(model, current_time(), reason, undo))
 
 
 def with_warnings(result: Result, warnings: tuple[str, ...]) -> Result:

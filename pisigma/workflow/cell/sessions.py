@@ -20,7 +20,7 @@ from pisigma.files.errors import (
 )
 from pisigma.lifetime.cell.controller import Controller
 from pisigma.lifetime.cell.facts import facts_of, not_read, not_taken_in, sha256_of
-from pisigma.lifetime.cell.history import Check, Event, History, ModelEntry, SessionEntry, now
+from pisigma.lifetime.cell.history import Check, Event, History, ModelEntry, SessionEntry, current_time
 from pisigma.lifetime.cell.layout import MODELS, SESSIONS
 from pisigma.lifetime.cell.status import FOREIGN
 from pisigma.measurement.camera.camera_files import CameraFiles
@@ -147,7 +147,9 @@ class Sessions:
             self.take_in(self.folder / waiting[0])
         except PisigmaError as refusal:
             verdict = "refused" if is_measurement_file(self.folder / waiting[0]) else FOREIGN
-            refused = Check("import", "", Path(waiting[0]).stem, verdict, str(refusal), None, False, now())
+            refused = Check(
+                "import", "", Path(waiting[0]).stem, verdict, str(refusal), None, False, current_time()
+            )
             known = {(one.command, one.session, one.summary) for one in self.history.checks()}
             if (refused.command, refused.session, refused.summary) not in known:
                 self.history.add(refused)
@@ -166,7 +168,7 @@ class Sessions:
         if bool(again.all()):
             raise _known(rows)
         model, fitted, controller = self.history.in_use, False, Controller.from_history(self.history)
-        at = controller.active(day, now())
+        at = controller.active(day, current_time())
         found = controller.findings("import", model, self.history.sessions(), at).accepted(self.folder.parent)
         if model is None or found:  # with other joint zeros, the model does not describe the arm
             model, verdict = None, check_rows(rows, self.robot)
@@ -186,7 +188,7 @@ class Sessions:
         entry = SessionEntry(
             name="",
             sha256="",
-            taken_in=now(),
+            taken_in=current_time(),
             day=day,
             rows=rows.rows,
             sensor=",".join(sorted(rows.kinds)),
@@ -207,7 +209,7 @@ class Sessions:
         for file in (*not_taken_in(self.folder, known), *not_read(self.folder, known)):
             name, day = file.removesuffix(".csv"), date_in_name(file) or datetime.date.today().isoformat()
             sessions[name] = SessionEntry(
-                name, sha256_of(self.folder / file), now(), day, 0, "", judged_by=""
+                name, sha256_of(self.folder / file), current_time(), day, 0, "", judged_by=""
             )
         check_choice(MeasurementError, "session", session, tuple(sessions), Place(self.folder))
         if not reason.strip():
@@ -220,7 +222,7 @@ class Sessions:
             if file.parent.resolve() == self.folder.resolve():
                 self.set_aside(file.name.removesuffix(".csv"), f"imported as session '{session.name}'")
 
-    def valid(self) -> list[SessionEntry]:
+    def valid_sessions(self) -> list[SessionEntry]:
         """Return the sessions that describe the present arm by their days, after adding new files in the folder.
 
         Raises:
@@ -243,7 +245,9 @@ class Sessions:
         Raises:
             MeasurementError: there is none.
         """
-        found = [one for one in self.valid() if one.name not in model.made_of and one.day >= model.day]
+        found = [
+            one for one in self.valid_sessions() if one.name not in model.made_of and one.day >= model.day
+        ]
         if not found:
             raise MeasurementError(
                 f"every valid session is older than model '{model.name}' or was used to fit it",
@@ -252,7 +256,7 @@ class Sessions:
             )
         return found
 
-    def chosen(self, model: ModelEntry, name: str | None) -> SessionEntry:
+    def choose(self, model: ModelEntry, name: str | None) -> SessionEntry:
         """Return a session by its name; None: the newest to which a model was not fitted.
 
         Raises:
@@ -260,7 +264,7 @@ class Sessions:
         """
         if name is None:
             return self.new_to(model)[-1]
-        sessions = {one.name: one for one in self.valid()}
+        sessions = {one.name: one for one in self.valid_sessions()}
         check_choice(MeasurementError, "session", name, tuple(sessions), Place(self.folder))
         return sessions[name]
 
@@ -328,12 +332,12 @@ def with_session(model: ModelEntry, session: SessionEntry) -> ModelEntry:
 
 def with_setup_names(rows: Measurements, frame_day: str, target_day: str) -> Measurements:
     """Return rows whose frame and target names state the day of their setup; "": the names of the file."""
-    frame = tuple(since(name, frame_day) for name in rows.frame)
-    target = tuple(since(name, target_day) for name in rows.target)
+    frame = tuple(name_since(name, frame_day) for name in rows.frame)
+    target = tuple(name_since(name, target_day) for name in rows.target)
     return replace(rows, frame=frame, target=target)
 
 
-def since(name: str, day: str) -> str:
+def name_since(name: str, day: str) -> str:
     """Return the name of a frame or target that was set up on a day; day "" for the first one."""
     return f"{name} since {day}".lstrip() if day else name
 

@@ -192,7 +192,7 @@ def _cell(rows: list[_Row], common: NewCell) -> NewCell:
         settings = read_assignments(parts, by_key(CalibrationSettings))
         build_settings(CalibrationSettings, settings)
     except PisigmaError as problem:
-        raise problem.located(replace(at, column="options"), FleetError) from None
+        raise problem.with_place(replace(at, column="options"), FleetError) from None
     cell = replace(
         common,
         robot=robot or common.robot,

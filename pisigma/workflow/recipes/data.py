@@ -102,7 +102,7 @@ def simulate(recipe: Recipe, repeats: int = 1) -> RecipeData:
     """
     robot, stated, simulations = Robot.load(recipe.robot), simulated_data(recipe), []
     for repeat in range(repeats):
-        data = repeated(stated, repeat)
+        data = with_other_seeds(stated, repeat)
         true = TrueRobot(robot, data.errors)
         simulations.append((data.training.measure(true), data.held_out.measure(true)))
     return RecipeData(robot, simulations[0][0], simulations=tuple(simulations))
@@ -144,7 +144,7 @@ def simulated_data(recipe: Recipe) -> SimulatedData:
     return recipe.data
 
 
-def repeated(data: SimulatedData, repeat: int) -> SimulatedData:
+def with_other_seeds(data: SimulatedData, repeat: int) -> SimulatedData:
     """Return a simulation with other random numbers: all of its seeds plus the number of the repeat."""
     return data.model_copy(
         update={

@@ -58,12 +58,12 @@ def read_recipe(path: str | os.PathLike[str]) -> Recipe:
     try:
         robot = Robot.load(recipe.robot)
     except RobotError as problem:
-        raise problem.located(place_of_key(path, ("robot",))) from None
+        raise problem.with_place(place_of_key(path, ("robot",))) from None
     for keys, check in checks(recipe, robot):
         try:
             check()
         except (RecipeError, IdentificationError) as problem:
-            raise problem.located(place_of_key(path, keys), RecipeError) from None
+            raise problem.with_place(place_of_key(path, keys), RecipeError) from None
     return recipe
 
 

@@ -23,7 +23,7 @@ def free_parameters(stated: str) -> str | tuple[str, ...]:
     return stated if stated in ("identifiable", "joint_offsets") else names(stated)
 
 
-def direction(stated: str) -> tuple[float, ...]:
+def parse_direction(stated: str) -> tuple[float, ...]:
     """Return the direction of gravity from "X,Y,Z"."""
     try:
         numbers = tuple(map(float, stated.split(",")))
@@ -126,9 +126,9 @@ class CalibrationSettings:
     robot_class: Annotated["ClassName | None", Option("--class", kind=str, is_key=True)] = None
     robust: Annotated[bool, KEY] = True
     features: Annotated[tuple[str, ...] | None, NAMES] = None
-    gravity: Annotated[tuple[float, float, float] | None, Option(kind=str, read=direction, is_key=True)] = (
-        None
-    )
+    gravity: Annotated[
+        tuple[float, float, float] | None, Option(kind=str, read=parse_direction, is_key=True)
+    ] = None
     new_frame_at: Annotated[tuple[int, ...], Option(metavar="LINE", is_key=True)] = ()
     socket_distances: SocketDistances = field(default_factory=dict)
     cameras: CameraFiles | None = None

@@ -22,7 +22,7 @@ def stated_map(stated: str) -> Sequence[Mapping[str, str]]:
     return parse_map(stated)
 
 
-def seconds(stated: str) -> float:
+def parse_seconds(stated: str) -> float:
     """Return the seconds of a duration such as "0.2s" or "200ms"."""
     match = re.fullmatch(r"\s*([0-9]*\.?[0-9]+)\s*(s|ms)?\s*", stated)
     if match is None:
@@ -58,7 +58,7 @@ class ImportSettings:
         "Decimal | None", Option(kind=Literal["point", "comma"], read=_SIGNS.get, is_key=True)
     ] = None
     join: Annotated["JoinBy | None", Option(kind=str)] = None
-    within: Annotated[float, Option(kind=str, read=seconds, default="0.2s")] = 0.2
+    within: Annotated[float, Option(kind=str, read=parse_seconds, default="0.2s")] = 0.2
 
     def __post_init__(self) -> None:
         """Check `join`."""

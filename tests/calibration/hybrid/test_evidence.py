@@ -62,7 +62,7 @@ def test_posterior_is_that_of_normal_variables(seed: int) -> None:
     assert_close(covariance_of(fit, found), covariance, atol=1e-12)
     assert_close(found.x, covariance @ columns.T @ targets, atol=1e-12)
     told = 1 - prior().precision.numpy() * covariance.diagonal()
-    assert_close(found.effective, told.sum(), rtol=1e-10)
+    assert_close(found.effective_unknowns, told.sum(), rtol=1e-10)
     assert_close(found.determined, np.bincount(GROUP, told), rtol=1e-10)
     assert_close(found.square, np.bincount(GROUP, prior().base.numpy() * found.x.numpy() ** 2), rtol=1e-12)
 
@@ -212,6 +212,6 @@ def test_share_of_the_values_that_are_used_up_counts_what_is_measured() -> None:
     X, y = problem()
     fit = DenseRegression.between(X, y)
     posterior = fit.solve(prior(), NOISE)
-    assert_close(fit.effective_share(posterior), posterior.effective / 45, rtol=1e-12)
+    assert_close(fit.effective_share(posterior), posterior.effective_unknowns / 45, rtol=1e-12)
     known = DenseRegression.between(X, y, exact=(False, True))
-    assert_close(known.effective_share(posterior), posterior.effective / 30, rtol=1e-12)
+    assert_close(known.effective_share(posterior), posterior.effective_unknowns / 30, rtol=1e-12)

@@ -50,7 +50,7 @@ def test_residuals_at_the_solution_are_those_of_the_nonlinear_model(refined: Ref
 
 def test_no_row_is_left_worse_than_noise_and_model_allow(refined: Refined) -> None:
     assert 2e-5 < refined.posterior.noise[0] < 4e-5
-    assert 0 < refined.posterior.effective < refined.design.unknowns
+    assert 0 < refined.posterior.effective_unknowns < refined.design.unknowns
 
 
 def test_the_network_predicts_what_the_design_does(refined: Refined) -> None:

@@ -9,8 +9,8 @@ from testing.closeness import assert_close
 from testing.linearised import LinearisedArm, random_joints, tracker_data
 from testing.linearised import linearised as linearised_at_solution
 
-from pisigma.calibration.hybrid.design import Design, Rows, weigh
-from pisigma.calibration.hybrid.refinement import linearise_rows, network
+from pisigma.calibration.hybrid.design import Design, Rows, robust_weights
+from pisigma.calibration.hybrid.refinement import correction_from_weights, linearise_rows
 from pisigma.calibration.hybrid.sensor_values import sensor_values
 from pisigma.estimation.loss import HampelLoss, SquaredLoss
 from pisigma.joint_correction.fourier_series import FourierSeries
@@ -73,15 +73,15 @@ def test_residuals_are_counted_from_nominal_and_no_correction(arm: LinearisedArm
     design = Design(problem, (FourierSeries(robot, 2),))
     x = 1e-4 * torch.randn(design.unknowns, generator=torch.Generator().manual_seed(2)).double()
     point = problem.nominal.index_add(0, problem.active, x[: design.active])
-    values = sensor_values(problem, point, network(design, x))
+    values = sensor_values(problem, point, correction_from_weights(design, x))
     weights = [torch.ones_like(sensor.root) for sensor in values]
     bare = replace(problem, pose=None)
-    found = Rows.linearised(replace(design, problem=bare), x, values, weights, arm.rows.group)
+    found = Rows.from_linearisation(replace(design, problem=bare), x, values, weights, arm.rows.group)
     for there, sensor in zip(values, found.values, strict=True):
         left = sensor.residual - design.columns(sensor, slice(None)) @ x
         assert_close(left, there.residual, atol=1e-15)
     with_network = linearise_rows(design, x, 10.0, arm.rows.group)
-    assert with_network.difference(with_network, x, design, (1e-5, 1e-4)) == 0.0
+    assert with_network.squared_difference(with_network, x, design, (1e-5, 1e-4)) == 0.0
 
 
 def test_rows_agree_as_far_as_their_weighted_residuals_are_equal(arm: LinearisedArm) -> None:
@@ -90,13 +90,13 @@ def test_rows_agree_as_far_as_their_weighted_residuals_are_equal(arm: Linearised
     first, second = arm.rows.values
     off = replace(arm.rows, values=(replace(first, residual=first.residual + 2e-5), second))
     expected = float((first.root.square() * 3 * 4e-10).sum()) / 1e-10
-    assert_close(off.difference(arm.rows, x, design, (1e-5, 1e-4)), expected, rtol=1e-9)
+    assert_close(off.squared_difference(arm.rows, x, design, (1e-5, 1e-4)), expected, rtol=1e-9)
     heavier = replace(arm.rows, values=(replace(first, root=2 * first.root), second))
     left = (first.residual - first.geometry @ x) * first.root[:, None]
     expected = float(left.square().sum()) / 1e-10
-    assert_close(heavier.difference(arm.rows, x, design, (1e-5, 1e-4)), expected, rtol=1e-9)
+    assert_close(heavier.squared_difference(arm.rows, x, design, (1e-5, 1e-4)), expected, rtol=1e-9)
     fewer = arm.rows.select_groups(torch.arange(39))
-    assert fewer.difference(arm.rows, x, design, (1e-5, 1e-4)) == math.inf
+    assert fewer.squared_difference(arm.rows, x, design, (1e-5, 1e-4)) == math.inf
 
 
 def test_far_off_rows_count_less_and_squared_loss_counts_all_alike(arm: LinearisedArm) -> None:
@@ -104,11 +104,11 @@ def test_far_off_rows_count_less_and_squared_loss_counts_all_alike(arm: Linearis
     residual = 3e-5 * torch.randn(40, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     residual[7] += 5e-3
     values = (replace(first, residual=residual, root=torch.ones(40).double()), replace(second, certain=True))
-    robust, certain = weigh(replace(problem, loss=HampelLoss()), values, 20.0)
+    robust, certain = robust_weights(replace(problem, loss=HampelLoss()), values, 20.0)
     assert float(robust[7]) == 0.0
     assert float(robust[torch.arange(40) != 7].mean()) > 0.97
     assert_close(certain, torch.ones(40))
-    squared, _ = weigh(replace(problem, loss=SquaredLoss()), values, 20.0)
+    squared, _ = robust_weights(replace(problem, loss=SquaredLoss()), values, 20.0)
     assert_close(squared, torch.ones(40))
 
 
@@ -117,7 +117,7 @@ def test_the_scale_of_a_sensor_grows_with_the_unknowns_that_its_values_determine
     problem, values = replace(arm.rows.problem, loss=HampelLoss()), arm.rows.values
     residual = torch.randn(40, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     values = tuple(replace(sensor, residual=3e-5 * residual) for sensor in values)
-    few, many = (weigh(problem, values, used)[0] for used in (0.0, 120.0))
+    few, many = (robust_weights(problem, values, used)[0] for used in (0.0, 120.0))
     assert float(few.min()) < 1.0
     assert float((many - few).min()) >= 0.0
     assert float(many.sum()) > float(few.sum())
@@ -125,5 +125,5 @@ def test_the_scale_of_a_sensor_grows_with_the_unknowns_that_its_values_determine
 
 def test_rows_of_which_nothing_was_measured_are_weighted_too(arm: LinearisedArm) -> None:
     first, second = arm.rows.values
-    _, none = weigh(arm.rows.problem, (first, second.select(slice(0, 0))), 10.0)
+    _, none = robust_weights(arm.rows.problem, (first, second.select(slice(0, 0))), 10.0)
     assert none.shape == (0,)

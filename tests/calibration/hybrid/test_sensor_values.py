@@ -13,7 +13,7 @@ from torch import Tensor
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.calibration.geometric.problem.problem import CalibrationProblem, MotionMemory
 from pisigma.calibration.hybrid.design import Design
-from pisigma.calibration.hybrid.refinement import network
+from pisigma.calibration.hybrid.refinement import correction_from_weights
 from pisigma.calibration.hybrid.sensor_values import joint_columns, sensor_values
 from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.joint_correction.gravity_torques import GravityTorques
@@ -153,9 +153,9 @@ def test_columns_are_the_derivative_by_the_weights(name: str) -> None:
     count = sum(int(feature.used.sum()) for feature in chosen)
     weights = 0.01 * torch.randn(count, generator=generator, dtype=torch.float64)
     empty = Design(GeometricCalibrator(robot).build(CASES[name]()[1]).problem.with_active([]), chosen)
-    problem, point = case(name, network(empty, weights))
+    problem, point = case(name, correction_from_weights(empty, weights))
     design = Design(problem, chosen)
-    values = sensor_values(problem, point, network(empty, weights))
+    values = sensor_values(problem, point, correction_from_weights(empty, weights))
     assert design.unknowns == design.active + len(weights)
 
     def at(moved: Tensor) -> list[Tensor]:

@@ -202,7 +202,7 @@ def test_a_missing_target_is_refused(suffix, status):
 
 def test_many_failures_are_counted():
     targets = targets_at(some_joints(14), status=(Status.UNREACHABLE,) * 14)
-    assert "line 12 unreachable; and 3 more.)" in str(targets.failure)
+    assert "line 12 unreachable; and 3 more.)" in str(targets.failure_sentence)
 
 
 @pytest.mark.parametrize(

@@ -97,7 +97,7 @@ def test_a_pose_out_of_reach_has_no_target():
         "",
         "",
     )
-    assert targets.failure == f"poses.csv, line 5: unreachable. {Status.UNREACHABLE.sentence}"
+    assert targets.failure_sentence == f"poses.csv, line 5: unreachable. {Status.UNREACHABLE.sentence}"
 
 
 def test_targets_of_a_hybrid_state_accuracy_and_frames():

@@ -61,8 +61,8 @@ def test_a_path_that_was_begun_is_answered_by_one_model(cell):
 def test_a_damaged_model_leaves_the_one_before_and_is_reported(cell):
     models, reports = ServedModels(cell=cell.folder), []
     (cell.folder / "models" / SECOND / "model.yaml").write_text("damaged")
-    with models.followed(reports.append):
+    with models.follow_changes(reports.append):
         put_into_use(cell, SECOND)
         (problem,) = models.reload()
         assert SECOND in problem
-    assert models.find(None).name == FIRST
+    assert models.find_model(None).name == FIRST

@@ -160,7 +160,7 @@ def test_two_processes_lose_nothing(history):
 HOLD_THE_LOCK = """
 import pathlib, sys, time
 from pisigma.lifetime.cell.history import Event, History
-with History(pathlib.Path(sys.argv[1])).database.writing() as database:
+with History(pathlib.Path(sys.argv[1])).database.transaction() as database:
     database.execute("INSERT INTO events (day, kind, note, recorded) VALUES ('2026-01-01', 'tool', '', '')")
     print("locked", flush=True)
     time.sleep(600)

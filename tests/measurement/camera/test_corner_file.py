@@ -96,7 +96,7 @@ def test_rows_of_several_files_keep_their_names(tmp_path: Path) -> None:
     Measurements(cell.images.q[:2], cell.images.q[:2, :3]).write_csv(tracker, cell.nominal)
     rows = read_rows([corners, tracker], cell.nominal, camera_files(tmp_path))
     assert rows.file_names == "corners.csv + tracker.csv"
-    assert rows.select(rows.measured("position")).place(1) == f"{tracker}, line 3"
+    assert rows.select(rows.is_measured("position")).place(1) == f"{tracker}, line 3"
 
 
 def test_corners_are_weighted_by_their_deviations(tmp_path: Path) -> None:

@@ -34,10 +34,10 @@ def read(tmp_path: Path, text: str, on_bad_row: str = "error") -> Measurements:
 def test_a_file_contains_several_kinds_and_frames(tmp_path: Path):
     data = read(tmp_path, MIXED)
     assert data.kinds == {"position", "socket", "touch", "distance"}
-    assert data.measured("position").tolist() == [True] + [False] * 7
-    assert data.measured("socket").nonzero()[:, 0].tolist() == [1, 2]
-    assert data.measured("touch").nonzero()[:, 0].tolist() == [3]
-    assert data.measured("distance").nonzero()[:, 0].tolist() == [4, 5, 6, 7]
+    assert data.is_measured("position").tolist() == [True] + [False] * 7
+    assert data.is_measured("socket").nonzero()[:, 0].tolist() == [1, 2]
+    assert data.is_measured("touch").nonzero()[:, 0].tolist() == [3]
+    assert data.is_measured("distance").nonzero()[:, 0].tolist() == [4, 5, 6, 7]
     assert data.socket == ("", "a/0", "a/0", "", "", "", "", "")
     assert (data.touch_axis[3], data.frame[3], data.anchor[4], data.pair[5:7]) == (
         "z",

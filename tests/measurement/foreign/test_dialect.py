@@ -4,11 +4,11 @@ import pytest
 from testing.refusals import refused
 
 from pisigma.files.errors import MeasurementError
-from pisigma.measurement.foreign.dialect import Decimal, Dialect, sniff
+from pisigma.measurement.foreign.dialect import Decimal, Dialect, detect_dialect
 
 
 def sniffed(lines: list[str], decimal: Decimal | None = None) -> Dialect:
-    return sniff(list(enumerate(lines, start=1)), "a.csv", decimal)
+    return detect_dialect(list(enumerate(lines, start=1)), "a.csv", decimal)
 
 
 @pytest.mark.parametrize(

@@ -6,9 +6,9 @@ import pytest
 from testing.refusals import assert_fields, refused
 
 from pisigma.files.errors import MeasurementError
-from pisigma.measurement.foreign.conversion import convert
+from pisigma.measurement.foreign.conversion import convert_rows
 from pisigma.measurement.foreign.export_file import read_export
-from pisigma.measurement.foreign.mapping import FileMapping, doubts, map_columns
+from pisigma.measurement.foreign.mapping import FileMapping, map_columns, mapping_warnings
 
 ROW = "170,-20,30.5,40,50,60,1200.5,-300,400"
 
@@ -27,7 +27,7 @@ def targets(mapping: FileMapping) -> list[str]:
 
 def refusal(tmp_path: Path, text: str, *stated: object, **units: str) -> MeasurementError:
     with refused(MeasurementError) as problem:
-        convert(mapped(tmp_path, text, *stated, **units))
+        convert_rows(mapped(tmp_path, text, *stated, **units))
     return problem.value
 
 
@@ -182,7 +182,7 @@ def test_rows_that_are_not_a_rotation_are_refused(tmp_path: Path):
     names = ",".join(f"r{i}{k}" for i in (1, 2, 3) for k in (1, 2, 3))
     text = f"q1_deg,q2_deg,x_mm,y_mm,z_mm,{names}\n1,2,3,4,5,1,0,0,0,1,0,0,0,1\n1,2,3,4,5,1,0,0,0,1,0,0,0,2\n"
     assert_fields(refusal(tmp_path, text), line=3, column="r11", value="1, 0, 0, 0, 1, 0, 0, 0, 2")
-    rows = convert(mapped(tmp_path, text.replace("1,0,0,0,1,0,0,0,2", ",,,,,,,,")))
+    rows = convert_rows(mapped(tmp_path, text.replace("1,0,0,0,1,0,0,0,2", ",,,,,,,,")))
     assert rows.cells["qw"] == ("1.0", "")
 
 
@@ -193,14 +193,14 @@ def test_cells_that_are_not_numbers_are_refused(tmp_path: Path):
 
 def test_warnings_of_units_and_external_axes(tmp_path: Path):
     rows = "".join(f"{170 - i},-20,{i}.5,1200.5,{i},400\n" for i in range(8))
-    found = doubts(mapped(tmp_path, f"J1 [rad],J2 [rad],E1 [mm],X [m],Y [m],Z [m]\n{rows}"))
+    found = mapping_warnings(mapped(tmp_path, f"J1 [rad],J2 [rad],E1 [mm],X [m],Y [m],Z [m]\n{rows}"))
     assert len(found) == 3
     assert "line 1, column 'E1 [mm]': " in found[0]
     assert " 0.5 to 7.5 " in found[0]
     assert "line 2, column 'J1 [rad]': " in found[1]
     assert " 170 rad" in found[1]
     assert " 1200.5 m" in found[2]
-    assert not doubts(mapped(tmp_path, f"J1 [deg],J2 [deg],-,X [mm],Y [mm],Z [mm]\n{rows}"))
+    assert not mapping_warnings(mapped(tmp_path, f"J1 [deg],J2 [deg],-,X [mm],Y [mm],Z [mm]\n{rows}"))
 
 
 @pytest.mark.parametrize(

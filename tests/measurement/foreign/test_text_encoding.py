@@ -4,7 +4,7 @@ import pytest
 from testing.refusals import refused
 
 from pisigma.files.errors import MeasurementError
-from pisigma.measurement.foreign.export_file import decoded
+from pisigma.measurement.foreign.export_file import decode_text
 
 TEXT = "Prüfpunkt;J1 [°]\n1;2,5\n"
 
@@ -13,7 +13,7 @@ TEXT = "Prüfpunkt;J1 [°]\n1;2,5\n"
     "encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-16-le", "utf-16-be", "utf-32", "cp1252"]
 )
 def test_texts_come_back(encoding: str):
-    assert decoded(TEXT.replace("\n", "\r\n").encode(encoding), "a.csv") == TEXT
+    assert decode_text(TEXT.replace("\n", "\r\n").encode(encoding), "a.csv") == TEXT
 
 
 @pytest.mark.parametrize(
@@ -28,4 +28,4 @@ def test_texts_come_back(encoding: str):
 )
 def test_binary_files_are_refused(content: bytes, value: str | None):
     with refused(MeasurementError, file="a.csv", value=value):
-        decoded(content, "a.csv")
+        decode_text(content, "a.csv")

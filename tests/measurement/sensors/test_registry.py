@@ -67,7 +67,7 @@ class Inclinometer(AbstractSensor):
 
     @classmethod
     def build(cls, rows: SensorRows) -> "Inclinometer | None":
-        present = rows.measurements.measured("tilt")
+        present = rows.measurements.is_measured("tilt")
         if not bool(present.any()):
             return None
         measured = torch.stack([rows.readings("tilt_x"), rows.readings("tilt_y")])
@@ -109,7 +109,7 @@ class HeightGauge(AbstractSensor):
 
     @classmethod
     def build(cls, rows: SensorRows) -> "HeightGauge | None":
-        present = rows.measurements.measured("height")
+        present = rows.measurements.is_measured("height")
         if not bool(present.any()):
             return None
         names = gauges(rows.measurements)

@@ -103,7 +103,7 @@ def test_gradients_without_kernels(without_kernels):
 
 def test_the_correction_depends_on_the_approach_direction(monkeypatch):
     model = calibrated_arm("ur5")
-    q, plain = joints_of(model.robot, 6, seed=2, share=0.8), HybridArm.delta
+    q, plain = joints_of(model.robot, 6, seed=2, share=0.8), HybridArm.joint_correction
 
     def with_backlash(arm, q):
         return plain(arm, q) + (0.0 if arm.approach is None else 1e-3 * arm.approach)

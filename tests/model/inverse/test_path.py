@@ -12,7 +12,7 @@ from testing.refusals import numbers_in, refused
 from pisigma.files.errors import PoseError
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.inverse.corrected_ik import CorrectedIK
-from pisigma.model.inverse.path import JUMP, choose_branches, halfway, is_jump, unroll, wrapped
+from pisigma.model.inverse.path import JUMP, choose_branches, is_jump, poses_halfway, unwrap_path, wrap_motion
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.kinematics.status import Status
@@ -217,7 +217,7 @@ def cost(way, q, jumps, first, revolute):
     """The cost that `choose_branches` minimises, pose by pose."""
     total = first[way[0]] + 1e12 * sum(not np.isfinite(q[i, branch]).all() for i, branch in enumerate(way))
     for i in range(1, len(way)):
-        step = wrapped(q[i, way[i]] - q[i - 1, way[i - 1]], revolute)
+        step = wrap_motion(q[i, way[i]] - q[i - 1, way[i - 1]], revolute)
         far = jumps[i - 1, way[i]] if way[i] == way[i - 1] else np.abs(step).max() > 0.1
         total += np.nan_to_num((step**2).sum(), nan=0.0) + JUMP * far
     return total
@@ -245,7 +245,7 @@ def test_unwrapping_agrees_with_an_exhaustive_search():
     for _ in range(40):
         smooth = np.cumsum(rng.uniform(-0.4, 0.5, 60))
         q = np.stack([np.mod(smooth, 2 * math.pi), np.zeros(60)], -1)
-        rolled, rewinds = unroll(q, limits, revolute, None)
+        rolled, rewinds = unwrap_path(q, limits, revolute, None)
         assert (np.abs(rolled[:, 0]) <= 7.0 + 1e-8).all()
         assert_close(np.exp(1j * rolled[:, 0]), np.exp(1j * smooth), atol=1e-9)
         broken = np.flatnonzero(np.abs(np.diff(rolled[:, 0])) > 1) + 1
@@ -266,7 +266,7 @@ def test_halfway():
     T, U = np.tile(np.eye(4), (20, 1, 1)), np.tile(np.eye(4), (20, 1, 1))
     T[:, :3, :3], U[:, :3, :3] = first.as_matrix(), (first * step * step).as_matrix()
     T[:, :3, 3], U[:, :3, 3] = rng.normal(size=(2, 20, 3))
-    middle = halfway(T, U)
+    middle = poses_halfway(T, U)
     assert_close(middle[:, :3, :3], (first * step).as_matrix(), atol=1e-12)
     assert_close(middle[:, :3, 3], (T[:, :3, 3] + U[:, :3, 3]) / 2)
 

@@ -5,7 +5,12 @@ from testing.measured_plans import NOISE, measured_plan, with_offset
 
 from pisigma.measurement.dataset import Measurements, join
 from pisigma.measurement.fields import UnusableRow
-from pisigma.planning.session.row_alarms import contradicted, other_joint_values, stale_readings, unreadable
+from pisigma.planning.session.row_alarms import (
+    contradiction_alarm,
+    other_joint_values,
+    stale_readings,
+    unreadable_alarm,
+)
 from pisigma.planning.session.row_judgement import judge_rows
 
 PLAN = measured_plan()
@@ -14,7 +19,9 @@ NAMES = [f"pose {number} of the plan" for number in range(1, 25)]
 
 
 def test_an_unreadable_row_has_to_be_measured_again():
-    alarm = unreadable(UnusableRow(7, "column 'x_mm': 'abc' is not a finite number; write one such as -12.5"))
+    alarm = unreadable_alarm(
+        UnusableRow(7, "column 'x_mm': 'abc' is not a finite number; write one such as -12.5")
+    )
     assert alarm.line == 7
     assert "'abc'" in alarm.sentence
     assert (alarm.kind, alarm.repeat, alarm.counts) == ("unreadable", True, False)
@@ -55,11 +62,11 @@ def test_a_contradicted_row_and_a_swapped_point():
     rows = PLAN.rows(15)
     wrong = with_offset(rows, 14, (0.003, -0.004, 0.0))
     trusted = torch.arange(15) < 14
-    alarm = contradicted(wrong, judge_rows(ROBOT, wrong, NOISE, trusted), 14, PLAN.stored.q, NAMES)
+    alarm = contradiction_alarm(wrong, judge_rows(ROBOT, wrong, NOISE, trusted), 14, PLAN.stored.q, NAMES)
     assert alarm.kind == "off"
     assert alarm.line == 16
     other = PLAN.measure(PLAN.stored.q[20:21]).position
     swapped = Measurements(q=rows.q, position=torch.cat([rows.position[:14], other]), line=rows.line)
-    alarm = contradicted(swapped, judge_rows(ROBOT, swapped, NOISE, trusted), 14, PLAN.stored.q, NAMES)
+    alarm = contradiction_alarm(swapped, judge_rows(ROBOT, swapped, NOISE, trusted), 14, PLAN.stored.q, NAMES)
     assert alarm.kind == "swapped"
     assert "pose 21 of the plan" in alarm.sentence

@@ -67,18 +67,20 @@ def test_links_too_thick_to_be_separated_are_named(links: dict[str, object], nam
 
 
 def test_a_motion_is_free_where_all_poses_on_it_are():
-    q = Q[ARM.gap(Q) >= 0]
+    q = Q[ARM.smallest_clearance(Q) >= 0]
     start, end = q[:20], q[20:40]
     free = is_free(ARM, start, end)
     assert 0 < int(free.sum()) < len(free)
     steps = torch.linspace(0, 1, 100, dtype=torch.float64)[:, None, None]
-    least = ARM.gap((start + steps * (end - start)).reshape(-1, 6)).reshape(100, -1).min(0).values
+    least = (
+        ARM.smallest_clearance((start + steps * (end - start)).reshape(-1, 6)).reshape(100, -1).min(0).values
+    )
     assert bool((least[free] > -ARM.surroundings.clearance / 2).all())
     assert bool((least[~free] < 0).all())
 
 
 def test_way_points_avoid_obstacles():
-    q = Q[ARM.gap(Q) >= 0]
+    q = Q[ARM.smallest_clearance(Q) >= 0]
     blocked = (~is_free(ARM, q[:20], q[20:40])).nonzero()[:, 0].tolist()
     start, end = q[blocked[0]], q[20 + blocked[0]]
     points = way_points(ARM, start, end, q)
@@ -89,7 +91,7 @@ def test_way_points_avoid_obstacles():
 
 
 def test_checked_motions_are_kept_in_both_directions():
-    q = Q[ARM.gap(Q) >= 0]
+    q = Q[ARM.smallest_clearance(Q) >= 0]
     motions, free = Motions(ARM, q), is_free(ARM, q[:20], q[20:40])
     assert motions.are_free(q[:20], q[20:40]).tolist() == free.tolist()
     assert motions.are_free(q[20:40], q[:20]).tolist() == free.tolist()

@@ -15,7 +15,7 @@ from pisigma.calibration.hybrid.arm import HybridArm
 from pisigma.files.errors import ModelError, PoseError
 from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.joint_correction.shared_features import NominalPose
-from pisigma.model.compiled_model import describe, save_compiled
+from pisigma.model.compiled_model import describe_as_arrays, save_compiled
 from pisigma.model.inverse.compiled_ik import CompiledIK
 from pisigma.model.inverse.numeric_ik import NumericIK
 from pisigma.robot.kinematics.closed_form import closed_form_solver
@@ -254,14 +254,14 @@ def test_invalid_batches_are_rejected(arms):
 def test_models_without_a_compiled_form_are_rejected(arms):
     model = arms.calibrated("ur5")
     with refused(ModelError, value="network"):
-        describe(replace(hand_made_model("ur10"), calibrated=model.calibrated))
+        describe_as_arrays(replace(hand_made_model("ur10"), calibrated=model.calibrated))
     correction = JointCorrection(model.robot, [NominalPose(model.robot)])
     arm = HybridArm(model.calibrated, correction, model.hybrid.coverage)
     with refused(ModelError, value="pose"):
-        describe(replace(model, hybrid=arm))
+        describe_as_arrays(replace(model, hybrid=arm))
     panda = arms.calibrated("panda")
     with refused(ModelError, value="starts"):
-        describe(replace(panda, starts=panda.starts[:0]))
+        describe_as_arrays(replace(panda, starts=panda.starts[:0]))
     with refused(ModelError, value=(800, 7)):
         CompiledIK.from_model(replace(panda, starts=panda.starts.repeat(2, 1)))
 

@@ -12,7 +12,7 @@ from testing.models import hand_made_model, joints_around, no_type_checker
 from testing.refusals import refused
 
 from pisigma.files.errors import ModelError
-from pisigma.model.compiled_model import describe, save_compiled
+from pisigma.model.compiled_model import describe_as_arrays, save_compiled
 from pisigma.model.domain import Domain
 from pisigma.model.inverse.compiled_ik import CompiledIK
 from pisigma.model.inverse.numeric_ik import NumericIK
@@ -48,7 +48,9 @@ def grouped():
         networks.append(network)
     correction = CorrectionNetwork(robot.dof, groups, networks).requires_grad_(False)
     seen = correction.scaled_inputs(forward_kinematics(robot, model.starts), model.starts)
-    return replace(model, network=correction, domain=Domain.around(seen, torch.Generator().manual_seed(0)))
+    return replace(
+        model, network=correction, domain=Domain.from_training_rows(seen, torch.Generator().manual_seed(0))
+    )
 
 
 @functools.cache
@@ -176,4 +178,4 @@ def test_networks_that_are_too_large_are_rejected():
     domain = Domain(model.domain.samples.repeat(40, 1), model.domain.radius)
     with refused(ModelError, expected="at most 2048 training rows", value=2560):
         CompiledIK.from_model(replace(model, domain=domain))
-    assert describe(replace(model, domain=domain))[0].network.samples == 40 * 64
+    assert describe_as_arrays(replace(model, domain=domain))[0].network.samples == 40 * 64

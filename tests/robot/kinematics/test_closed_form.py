@@ -152,7 +152,7 @@ def test_the_nearest_joint_values_reach_a_pose_or_nearly(name, robots, generator
     robot = robots.load(name) if name == "rb5" else _family(robots)[name]
     solver = closed_form_solver(robot)
     T = forward_kinematics(robot, robots.random_joints(robot, generator, 2_000))
-    solved, nearest = solver.solve(T).q, solver.starts(T)
+    solved, nearest = solver.solve(T).q, solver.start_values(T)
     assert bool(torch.isfinite(nearest).all())
     reached = torch.isfinite(solved).all(-1)
     off = pose_error(T[:, None].expand(*nearest.shape[:-1], 4, 4), forward_kinematics(robot, nearest))[

@@ -14,7 +14,7 @@ from testing.refusals import refused
 
 from pisigma.files.errors import ModelError
 from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.model.compiled_model import describe
+from pisigma.model.compiled_model import describe_as_arrays
 from pisigma.model.inverse.corrected_ik import CorrectedIK
 from pisigma.robot import Robot, Row
 from pisigma.robot.kernels import machine_code
@@ -127,7 +127,7 @@ def test_a_compiled_form_is_added_to_the_kernels(mast, registered, monkeypatch):
     assert forms.closed_forms == ("scara", "mast")
     assert not (machine_code.ready_forms() or forms).cover(forms)
     q = np.array([0.4, -1.2])
-    description, branches = describe(model_of(mast, torch.from_numpy(q)[None]))
+    description, branches = describe_as_arrays(model_of(mast, torch.from_numpy(q)[None]))
     assert description.forms.closed_forms == ("mast",)
     assert branches == ("only",)
     arm = np.rec.array(pack(description, "mast", forms))[0]
@@ -153,6 +153,6 @@ def test_the_key_of_machine_code_changes_with_a_registered_form(registered, monk
 
 def test_kernels_without_a_form_are_rejected(mast, registered, monkeypatch):
     monkeypatch.setattr(Mast, "compiled", staticmethod(mast_branches))
-    description, _ = describe(model_of(mast, torch.tensor([[0.4, -1.2]]).double()))
+    description, _ = describe_as_arrays(model_of(mast, torch.tensor([[0.4, -1.2]]).double()))
     with refused(ModelError, value="mast"):
         pack(description, "mast", KernelForms())

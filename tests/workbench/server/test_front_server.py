@@ -128,10 +128,10 @@ def test_a_second_server_takes_the_next_port_and_has_its_own_secrets(server, bro
 
 def test_viser_can_be_reached_only_by_this_user(server):
     pytest.importorskip("viser", reason="the extra view is not installed")
-    from pisigma.workbench.server.viser_server import ViserBehind
+    from pisigma.workbench.server.viser_server import ViserBackend
 
     before = listening()
-    with contextlib.closing(ViserBehind("test")) as behind:
+    with contextlib.closing(ViserBackend("test")) as behind:
         assert listening() == before
         assert os.stat(behind.path.parent).st_mode & 0o077 == 0
         assert behind.server.request_share_url() is None

@@ -13,7 +13,7 @@ from pisigma.workflow.cell.cell_file import (
     STATED_ABOVE,
     STEPS,
     CellFile,
-    template,
+    cell_template,
 )
 from pisigma.workflow.settings.calibration import CalibrationSettings
 from pisigma.workflow.settings.recalibration import RecalibrationSettings
@@ -25,7 +25,7 @@ def cell_file(folder, text):
 
 
 def test_a_new_file_states_every_setting_as_a_comment_and_gives_the_defaults(tmp_path):
-    text = template({"robot": "ur10", "sensor": "tracker", "limit_mm": 0.3})
+    text = cell_template({"robot": "ur10", "sensor": "tracker", "limit_mm": 0.3})
     file = cell_file(tmp_path, text)
     assert file.document.robot == "ur10"
     for step, group in STEPS.items():
@@ -33,8 +33,8 @@ def test_a_new_file_states_every_setting_as_a_comment_and_gives_the_defaults(tmp
         for setting in flat_settings(group):
             if setting.key not in (*CAMERA_KEYS, *STATED_ABOVE.get(step, ())):
                 assert f"\n  # {setting.key}:" in section, (step, setting.key)
-    assert file.settings("calibrate") == CalibrationSettings()
-    assert file.settings("recalibrate") == RecalibrationSettings()
+    assert file.settings_of_step("calibrate") == CalibrationSettings()
+    assert file.settings_of_step("recalibrate") == RecalibrationSettings()
 
 
 def test_values_have_the_units_and_forms_of_the_command_line(tmp_path):
@@ -42,7 +42,7 @@ def test_values_have_the_units_and_forms_of_the_command_line(tmp_path):
         tmp_path,
         "robot: ur10\ncalibrate:\n  prior_mm: 2\n  free: a_2,theta_3\n  socket_distance: A,B,50\n  gravity: 0,0,-1\n",
     )
-    settings = file.settings("calibrate")
+    settings = file.settings_of_step("calibrate")
     assert settings.prior_length == pytest.approx(2e-3)
     assert settings.free == ("a_2", "theta_3")
     assert settings.socket_distances == {("A", "B"): 0.05}
@@ -51,15 +51,15 @@ def test_values_have_the_units_and_forms_of_the_command_line(tmp_path):
 
 def test_what_is_stated_once_counts_for_every_step_and_a_step_may_state_another(tmp_path):
     file = cell_file(tmp_path, "robot: ur10\nlimit_mm: 0.3\nplan:\n  limit_mm: 0.5\n")
-    assert file.settings("plan").limit_mm == 0.5
-    assert file.settings("measure").limit_mm == 0.3
-    assert file.settings("plan", limit_mm=0.4).limit_mm == 0.4
-    assert cell_file(tmp_path, "robot: ur10\nlimit_mm: 0.3\n").settings("plan").limit_mm == 0.3
+    assert file.settings_of_step("plan").limit_mm == 0.5
+    assert file.settings_of_step("measure").limit_mm == 0.3
+    assert file.settings_of_step("plan", limit_mm=0.4).limit_mm == 0.4
+    assert cell_file(tmp_path, "robot: ur10\nlimit_mm: 0.3\n").settings_of_step("plan").limit_mm == 0.3
 
 
 def test_the_defaults_of_a_new_file_are_those_of_the_settings(tmp_path):
     """Every line of a setting with a default, without its #, is read as this default."""
-    text = re.sub(r"^  # (\w+: \S+)$", r"  \1", template({"robot": "ur10"}), flags=re.M)
+    text = re.sub(r"^  # (\w+: \S+)$", r"  \1", cell_template({"robot": "ur10"}), flags=re.M)
     file = cell_file(tmp_path, text)
     for step, group in STEPS.items():
         above = (*CAMERA_KEYS, *STATED_ABOVE.get(step, ()))
@@ -68,12 +68,12 @@ def test_the_defaults_of_a_new_file_are_those_of_the_settings(tmp_path):
             for one in flat_settings(group)
             if one.default not in (None, "") and one.key not in above
         }
-        stated = file.stated(step)
+        stated = file.stated_values(step)
         assert defaults.items() <= stated.items(), step
 
 
 def test_the_limit_of_95_percent_is_not_taken_for_one_of_the_rms(tmp_path):
-    assert cell_file(tmp_path, "robot: ur10\nlimit_mm: 0.3\n").settings("monitor").limit_mm is None
+    assert cell_file(tmp_path, "robot: ur10\nlimit_mm: 0.3\n").settings_of_step("monitor").limit_mm is None
 
 
 def test_a_camera_is_stated_once_with_paths_inside_the_cell(tmp_path):
@@ -82,10 +82,12 @@ def test_a_camera_is_stated_once_with_paths_inside_the_cell(tmp_path):
     text = "robot: ur10\ncamera:\n  camera: [camera.yaml]\n  board: [board.yaml]\n  fixed_camera: true\n"
     file = cell_file(tmp_path, text)
     for step in ("calibrate", "verify", "monitor", "recalibrate", "compare", "evaluate"):
-        cameras = file.settings(step).cameras
+        cameras = file.settings_of_step(step).cameras
         assert cameras.cameras == (str(tmp_path / "camera.yaml"),)
         assert cameras.is_fixed
-        assert file.settings(step, repeatability_mm=0.05).cameras.repeatability.length == pytest.approx(5e-5)
+        assert file.settings_of_step(
+            step, repeatability_mm=0.05
+        ).cameras.repeatability.length == pytest.approx(5e-5)
 
 
 @pytest.mark.parametrize(
@@ -115,7 +117,7 @@ def test_a_camera_is_stated_once_with_paths_inside_the_cell(tmp_path):
 )
 def test_a_fault_is_refused_with_its_line_and_key(tmp_path, text, error, fields):
     with refused(error, file=CELL_FILE, **fields):
-        cell_file(tmp_path, text).settings("plan")
+        cell_file(tmp_path, text).settings_of_step("plan")
 
 
 @pytest.mark.parametrize(

@@ -123,7 +123,7 @@ def test_joint_zeros_ask_for_a_model_that_was_measured_with_them(cell, used):
     assert "offsets.csv" in (cell.model_folder(entry.name) / "README.md").read_text()
     assert served.reload() == []
     followed._in_use.check()
-    assert served.find(None).name == followed.name == entry.name
+    assert served.find_model(None).name == followed.name == entry.name
 
     set_controller(cell, "none", day(1))
     with refused(ModelError, file=cell.folder):

@@ -8,7 +8,7 @@ from testing.refusals import refused
 from pisigma.calibration.hybrid.calibrator import HybridCalibrator
 from pisigma.files.errors import RecipeError
 from pisigma.robot import Robot
-from pisigma.workflow.recipes.data import load_data, repeated, simulate
+from pisigma.workflow.recipes.data import load_data, simulate, with_other_seeds
 from pisigma.workflow.recipes.reader import read_recipe
 from pisigma.workflow.recipes.recipe import HybridRecipe, MeasuredData, SimulatedData
 
@@ -81,9 +81,9 @@ def test_repeats_are_other_robots_other_poses_and_other_noise(write_recipe):
     assert_close(rows.position[train], first.position, atol=0.0)
     assert_close(rows.position[test], held_out.position, atol=0.0)
     assert float((rows.q[other] - first.q).abs().min()) > 0
-    again = repeated(recipe.data, 0)
+    again = with_other_seeds(recipe.data, 0)
     assert again == recipe.data
-    seeds = [source.seed for source in repeated(recipe.data, 3).errors if hasattr(source, "seed")]
+    seeds = [source.seed for source in with_other_seeds(recipe.data, 3).errors if hasattr(source, "seed")]
     assert seeds == [3]
 
 

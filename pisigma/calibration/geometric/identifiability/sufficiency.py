@@ -263,7 +263,7 @@ def _touched_frames(setup: CalibrationSetup) -> list[CalibrationWarning]:
     data = setup.measurements
     if data.touch is None or data.touch_axis is None or not setup.problem.space.indices_of("base"):
         return []
-    other = (data.measured("position") | data.measured("pose")).tolist()
+    other = (data.is_measured("position") | data.is_measured("pose")).tolist()
     warnings = []
     for frame in setup.problem.space.frames:
         rows = [row for row, name in enumerate(data.frame) if name == frame]

@@ -117,8 +117,8 @@ def check_touched_frames(measurements: Measurements, names: tuple[str, ...]) -> 
     """
     if measurements.touch is None:
         return
-    touch = measurements.measured("touch").tolist()
-    other = (measurements.measured("position") | measurements.measured("pose")).tolist()
+    touch = measurements.is_measured("touch").tolist()
+    other = (measurements.is_measured("position") | measurements.is_measured("pose")).tolist()
     for name in names:
         rows = [row for row, frame in enumerate(measurements.frame) if frame == name]
         touches = sum(touch[row] for row in rows)

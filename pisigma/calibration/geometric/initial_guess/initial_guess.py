@@ -24,7 +24,7 @@ from pisigma.files.errors import IdentificationError, Place, nearest_choice
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.sensors.registry import SENSORS
 from pisigma.measurement.sensors.sensor import names_of, numbers_of
-from pisigma.measurement.sensors.socket import means
+from pisigma.measurement.sensors.socket import means_by_number
 from pisigma.robot.description import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.se3 import (
@@ -136,8 +136,8 @@ def _from_positions(
     bases, tools = dict(stated), dict[str, np.ndarray]()
     if measurements.position is None:
         return bases, tools
-    positions = (measurements.measured("position") | measurements.measured("pose")).cpu()
-    touches = measurements.measured("touch").cpu()
+    positions = (measurements.is_measured("position") | measurements.is_measured("pose")).cpu()
+    touches = measurements.is_measured("touch").cpu()
     frame = numbers_of(measurements.frame, space.frames, measurements.rows)
     count = [int((positions & (frame == number)).sum()) for number in range(len(space.frames))]
     for number in sorted(range(len(space.frames)), key=lambda number: -count[number]):
@@ -153,7 +153,7 @@ def _from_positions(
         if part.pair is not None:
             part = replace(part, pair=None, distance=None)
         find_base = free_base and name not in stated
-        turned = bool(part.measured("pose").any())
+        turned = bool(part.is_measured("pose").any())
         if find_base and 3 <= len(rows) < MIN_POSITIONS and not turned and set(part.target) <= set(tools):
             bases[name] = _base_by_tools(robot, part, tools)
             continue
@@ -191,7 +191,7 @@ def _touched_rows(
     """Return the touches of frames without a base."""
     if measurements.touch is None:
         return {}
-    touches = measurements.measured("touch").cpu()
+    touches = measurements.is_measured("touch").cpu()
     frame = numbers_of(measurements.frame, space.frames, measurements.rows)
     touched = {name: touches & (frame == number) for number, name in enumerate(space.frames)}
     return {name: rows for name, rows in touched.items() if bool(rows.any()) and name not in bases}
@@ -266,7 +266,7 @@ def tool_from_sockets(
 
 
 def _centred(values: Tensor, number: Tensor) -> Tensor:
-    return values - means(values, number, int(number.max()) + 1)[number]
+    return values - means_by_number(values, number, int(number.max()) + 1)[number]
 
 
 def _check_frame_names(stated: Mapping[str, object], frames: tuple[str, ...], source: str) -> None:

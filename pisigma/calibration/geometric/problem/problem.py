@@ -185,7 +185,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
             chunks.append([self._sums(k, before, motion, unknowns, rows) for k in range(len(self.sensors))])
         sums = tuple(joined_sums(of_sensor) for of_sensor in zip(*chunks, strict=True))
         view = SensorView.without_noise(sums) if before is None else replace(before, sums=sums)
-        return self.combined(point, view)
+        return self.combine_sums(point, view)
 
     def linearise_at_start(self, point: Tensor) -> Linearisation[Tensor]:
         """Linearise the problem at a start, with rows weighted by the noise estimated from them.
@@ -202,7 +202,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         """Estimate noise (robustly), the weight of repeats, and the prior scales."""
         return self._renewed(linearisation, refine=False)
 
-    def refined(self, linearisation: Linearisation[Tensor]) -> Linearisation[Tensor]:
+    def with_refined_noise(self, linearisation: Linearisation[Tensor]) -> Linearisation[Tensor]:
         """Estimate the same with the noise from all rows without outliers, for the end of a search."""
         return self._renewed(linearisation, refine=True)[0]
 
@@ -231,7 +231,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
             torch.cat([one.noise, one.repetition, one.disagreement, one.prior_scale])
             for one in (view, renewed)
         )
-        return self.combined(linearisation.point, renewed), has_converged(
+        return self.combine_sums(linearisation.point, renewed), has_converged(
             before, after, CONVERGENCE_TOLERANCE
         )
 
@@ -274,7 +274,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         the tool.
         """
         make = partial(self._motion, point, rows)
-        made_from = (point, self.space, self.q, self.frame, self.target, self.turning)
+        made_from = (point, self.space, self.q, self.frame, self.target, self.needs_rotation)
         motion = self.memory.motion(made_from, make) if rows == slice(0, self.rows) else make()
         columns = self.space.motion_columns.to(active.device)
         J = motion.derivative.index_select(0, columns[0].index_select(0, active))
@@ -294,7 +294,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
             for owners, number in ((bases, self.frame), (tools, self.target))
         )
         dh_rows, q, robot = dh.cpu().numpy(), self.q[rows], self.space.robot
-        return tool_motion(robot, dh_rows, bases.t(), tools.t(), q, self.turning, frame, target)
+        return tool_motion(robot, dh_rows, bases.t(), tools.t(), q, self.needs_rotation, frame, target)
 
     def derivative(
         self, sensor: AbstractSensor, motion: ToolMotion, unknowns: Unknowns, rows: slice, active: Tensor
@@ -308,7 +308,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
                 J = J.index_add(0, positions, block.derivative[column] * theirs)
         return J
 
-    def combined(self, point: Tensor, view: SensorView) -> Linearisation[Tensor]:
+    def combine_sums(self, point: Tensor, view: SensorView) -> Linearisation[Tensor]:
         """Combine the sensors' sums, divided by their variances, and the prior to a linearisation."""
         off = self._off(point)
         precision = view.scaled_precision(self._prior, self.prior_group)
@@ -348,7 +348,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         return self.q.new_tensor([values * (epsilon * size) ** 2 for values, size in pairs])
 
     @cached_property
-    def turning(self) -> bool:
+    def needs_rotation(self) -> bool:
         """Whether any sensor needs the tool's rotation."""
         return any(sensor.turning for sensor in self.sensors)
 

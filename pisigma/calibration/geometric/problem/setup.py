@@ -161,8 +161,8 @@ def setup_from_guess(
         nominal=start,
         precision=torch.from_numpy(space.precision(prior)).to(device),
         active=torch.zeros(0, dtype=torch.int64, device=device),
-        pose=repeated(repeats, frame, target),
-        configuration=repeated(repeats, frame) if len(space.targets) > 1 else None,
+        pose=number_repeats(repeats, frame, target),
+        configuration=number_repeats(repeats, frame) if len(space.targets) > 1 else None,
         pairs=len(set(measurements.pair or ()) - {""}),
         stated=JointState.from_measurements(measurements).stated,
         prior_sizes=options.prior_sizes,
@@ -184,7 +184,7 @@ def usable_rows(measurements: Measurements) -> tuple[Tensor, Measurements]:
     Raises:
         IdentificationError: no row has a measured value, or all have the same joint values.
     """
-    usable = torch.stack([measurements.measured(kind) for kind in (*KINDS, *READINGS)]).any(0)
+    usable = torch.stack([measurements.is_measured(kind) for kind in (*KINDS, *READINGS)]).any(0)
     if not bool(usable.any()):
         raise IdentificationError(
             f"none of the {len(usable)} rows has a measured value",
@@ -208,7 +208,7 @@ def usable_rows(measurements: Measurements) -> tuple[Tensor, Measurements]:
     return rows, chosen
 
 
-def repeated(q: Tensor, *names: Tensor) -> Tensor | None:
+def number_repeats(q: Tensor, *names: Tensor) -> Tensor | None:
     """Number the rows by joint values (with payload, to 1e-9) and names, such as frame and target.
 
     Returns:

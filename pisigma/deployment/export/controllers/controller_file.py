@@ -147,7 +147,7 @@ class ControllerFile:
         draft, held = FileText(fit.robot, nominal, request), fit.robot
         if self.read is not None:
             held = self.read(self.text(draft), str(request.out), nominal)
-        lost, of_nominal = fit.departure(held), fit.departure(nominal)
+        lost, of_nominal = fit.deviation_of(held), fit.deviation_of(nominal)
         title = f"{self.contents[0].upper()}{self.contents[1:]} of model {model.name} (robot {nominal.name})."
         convention = self.convention(model.nominal or nominal)
         sentences = [

@@ -11,7 +11,7 @@ from pisigma.deployment.export.controllers.controller_file import (
     untested_on_controller,
 )
 from pisigma.deployment.export.controllers.offset_table import read_offsets
-from pisigma.deployment.export.dh_table import cells, csv_table
+from pisigma.deployment.export.dh_table import csv_table, parameter_columns
 from pisigma.deployment.export.export_format import ExportRequest
 from pisigma.deployment.export.joint_offsets import joints_by_axes, offsets_between
 from pisigma.deployment.export.projection import joint_offsets
@@ -69,7 +69,9 @@ def write_counts(content: FileText) -> str:
     for axis, *values, offset in zip(nominal.axes, *columns, strict=True):
         entry = {"part": "joint", "name": axis.name, f"offset_{axis.file_unit}": axis.in_file_unit(offset)}
         lines.append(entry | {column: f"{value:.17g}" for column, value in zip(COLUMNS, values, strict=True)})
-    lines += [{"part": part, **cells(FRAME_COLUMNS, getattr(robot, part))} for part in ("base", "tool")]
+    lines += [
+        {"part": part, **parameter_columns(FRAME_COLUMNS, getattr(robot, part))} for part in ("base", "tool")
+    ]
     frame = in_file_units(FRAME_COLUMNS, robot.base)
     return csv_table(("part", "name", "offset_deg", "offset_mm", *COLUMNS, *frame), lines, content.comments)
 

@@ -15,7 +15,7 @@ import numpy as np
 from pisigma.deployment.export.export_format import Exported, ExportFormat, ExportRequest, model_facts
 from pisigma.files.errors import OutputError
 from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.model.compiled_model import describe
+from pisigma.model.compiled_model import describe_as_arrays
 from pisigma.model.inverse.compiled_ik import CompiledIK
 from pisigma.model.inverse.joint_input import Postures
 from pisigma.robot.kernels.arrays import CORRECTED, IDENTIFIED
@@ -79,7 +79,7 @@ def _write(request: ExportRequest) -> Exported:
     content = {
         HEADER: Path(__file__).with_name(HEADER).read_bytes(),
         MODEL: model_file(model),
-        LIBRARY: _link(library_object(describe(model)[0].forms), compiler),
+        LIBRARY: _link(library_object(describe_as_arrays(model)[0].forms), compiler),
     }
     remarks = (
         f"The library is for {sys.platform} on {platform.machine()}; export it again for other platforms.",

@@ -73,7 +73,7 @@ class Targets:
         return tuple(line for line, status in zip(self.line, self.status, strict=True) if status in statuses)
 
     @property
-    def failure(self) -> str | None:
+    def failure_sentence(self) -> str | None:
         """Sentence on poses without a target, and the reasons; None if all have one."""
         failed = [(n, s) for n, s in zip(self.line, self.status, strict=True) if s not in WITH_TARGET]
         if not failed:
@@ -101,8 +101,8 @@ class Targets:
         Raises:
             UnreachablePoseError: a pose has no target; the message states line and status.
         """
-        if self.failure:
-            raise UnreachablePoseError(f"{self.failure} A program requires targets for all poses.")
+        if self.failure_sentence:
+            raise UnreachablePoseError(f"{self.failure_sentence} A program requires targets for all poses.")
 
 
 def targets_of(solution: Solution, source: str, line: tuple[int, ...], accuracy: bool = True) -> Targets:

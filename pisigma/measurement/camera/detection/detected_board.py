@@ -78,7 +78,7 @@ def edge_pixels(detected: DetectedBoard, board: Board) -> Float64[np.ndarray, "e
     return shown
 
 
-def refined(image: Image, detected: DetectedBoard, board: Board) -> DetectedBoard:
+def refine_corners(image: Image, detected: DetectedBoard, board: Board) -> DetectedBoard:
     """Refine corners of squares to sub-pixel accuracy.
 
     Corners are first moved to the point to which the gradients around them are perpendicular (Förstner & Gülch 1987).

@@ -18,7 +18,7 @@ from pisigma.measurement.camera.detection.detected_board import (
     Image,
     NoBoard,
     edge_pixels,
-    refined,
+    refine_corners,
 )
 from pisigma.measurement.camera.detection.detected_boards import BoardImage
 from pisigma.measurement.camera.detection.markers import detect_apriltags, detect_charuco
@@ -41,7 +41,7 @@ def detect_checkerboard(image: Image, board: Board) -> DetectedBoard | NoBoard:
         return _missing(image, board)
     grid = np.asarray(corners, dtype=np.float64).reshape(board.rows, board.columns, 2)
     grid = _numbered(image, grid, board.is_symmetric)
-    return refined(image, DetectedBoard(np.arange(len(board.corners)), grid.reshape(-1, 2)), board)
+    return refine_corners(image, DetectedBoard(np.arange(len(board.corners)), grid.reshape(-1, 2)), board)
 
 
 def _numbered(

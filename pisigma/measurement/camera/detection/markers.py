@@ -11,7 +11,7 @@ from pisigma.measurement.camera.detection.detected_board import (
     EdgeProfiles,
     Image,
     NoBoard,
-    refined,
+    refine_corners,
 )
 
 ITERATIONS = 2
@@ -26,7 +26,7 @@ def detect_charuco(image: Image, board: Board) -> DetectedBoard | NoBoard:
     if corners is None or not len(corners):
         return NoBoard(f"no corner of a ChArUco board with markers {board.dictionary} is found in it")
     pixels = np.asarray(corners, dtype=np.float64).reshape(-1, 2)
-    return refined(image, DetectedBoard(np.asarray(numbers, dtype=np.int64).ravel(), pixels), board)
+    return refine_corners(image, DetectedBoard(np.asarray(numbers, dtype=np.int64).ravel(), pixels), board)
 
 
 def detect_apriltags(image: Image, board: Board) -> DetectedBoard | NoBoard:

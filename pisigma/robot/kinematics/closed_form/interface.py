@@ -45,14 +45,14 @@ class AbstractClosedForm(ABC):
             last fork varying fastest.
         robot: the robot.
         rows: its rows with canonical twists.
-        margin: distance that cosines keep from 1: 0, except for `starts`.
+        margin: distance that cosines keep from 1: 0, except for `start_values`.
         name: name of the form in model files.
         compiled: the same formulas as a plain function that the kernels compile; None if there is none. It is called as
             `compiled(form, P, only, rounding, q)` with `kernels.arrays.ClosedForm`, the pose `(4, 4)` (of which
             `_solve_components` gets the first three rows), the index of the only requested branch or -1 for all, and
             the relative size of rounding errors. It writes the canonical joint variables of branches that reach the
             pose into `q`, `(branches, dof)`, whose first column is NaN before; with -2 also those of branches that do
-            not reach it, as near to it as possible (see `starts`). It and the functions that it calls may use numbers,
+            not reach it, as near to it as possible (see `start_values`). It and its functions may use numbers,
             entries of arrays and functions of `math` only; each is decorated by `typing.no_type_check`.
     """
 
@@ -107,13 +107,13 @@ class AbstractClosedForm(ABC):
         index = torch.where(torch.isfinite(distance), distance, torch.inf).argmin(-1)
         return every[torch.arange(len(q)), index], index
 
-    def frequent(self, index: Int64[Tensor, " poses"]) -> tuple[str, ...]:
+    def most_frequent_branches(self, index: Int64[Tensor, " poses"]) -> tuple[str, ...]:
         """Return the names of the branches with these indices, the most frequent first."""
         counts = torch.bincount(index, minlength=len(self.branches))
         order = counts.argsort(descending=True, stable=True).tolist()
         return tuple(self.branches[i] for i in order if counts[i] > 0)
 
-    def starts(self, T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch branches dof"]:
+    def start_values(self, T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch branches dof"]:
         """Return joint values of all branches; those that do not reach a pose are nearest to it, stretched or folded.
 
         They are starts for an arm that differs slightly from this one and may reach the pose. A small margin keeps them
@@ -124,7 +124,7 @@ class AbstractClosedForm(ABC):
         """
         return replace(self, margin=NEAREST_MARGIN)._solve_branches(T)[0]
 
-    def upright(self, T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:
+    def upright_poses(self, T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:
         """Return poses that a SCARA can reach if its tool may tilt.
 
         They are rotated about the tool's origin until the last joint's axis is parallel to the first's.

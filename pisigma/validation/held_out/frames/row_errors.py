@@ -56,7 +56,7 @@ def other_lengths(measurements: Measurements) -> Bool[Tensor, " rows"]:
     kinds = [kind for kind in measurements.kinds if kind in SENSORS and SENSORS[kind].unit == "m"]
     there = torch.zeros(measurements.rows, dtype=torch.bool)
     for kind in kinds:
-        there |= measurements.measured(kind)
+        there |= measurements.is_measured(kind)
     return there & ~has_position(measurements)
 
 
