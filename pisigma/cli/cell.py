@@ -141,6 +141,15 @@ def refuse_with_cell(**given: object) -> None:
             )
 
 
+def output_in_cell(cell: "Cell | None", part: str, suffix: str) -> Path:
+    """Return a path for an output in a folder of a cell; without a cell, `--out` is missing."""
+    from pisigma.workflow.cell.new_files import output_path
+
+    if cell is None:
+        raise typer.BadParameter("expected a path", param_hint="'--out'")
+    return output_path(cell.folder, part, suffix)
+
+
 def next_lines(status: "CellStatus") -> list[str]:
     """Return the lines that state the next step of a cell, its command on a line of its own."""
     reason = status.step.reason.rstrip(".")

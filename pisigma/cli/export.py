@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pisigma.cli.arguments import AsJson, ModelOrCell, PayloadKg, TemperatureC, complete_export
-from pisigma.cli.cell import cell_at
+from pisigma.cli.cell import cell_at, output_in_cell
 from pisigma.cli.endings import NOT_ACCEPTED, exit_with_error
 from pisigma.cli.output import print_json, print_line
 from pisigma.deployment.export.registry import BUILT_IN
@@ -15,10 +15,11 @@ if TYPE_CHECKING:
     from pisigma.deployment.export.export_format import Exported
 
 Out = Annotated[
-    Path,
+    Path | None,
     typer.Option(
         help="File to write, with the suffix of the format: .urdf, .csv, .yaml, .conf, .cfx, .xacro, .onnx, "
-        ".script (URScript), .src (KUKA), .mod (ABB) or .ls (FANUC); for library a folder."
+        ".script (URScript), .src (KUKA), .mod (ABB) or .ls (FANUC); for library a folder. "
+        "[default: in exports/ of a cell]"
     ),
 ]
 Form = Annotated[
@@ -96,8 +97,8 @@ PresentCounts = Annotated[
 
 def export(
     model: ModelOrCell,
-    out: Out,
     form: Form,
+    out: Out = None,
     like: Like = None,
     tip: Tip = None,
     geometry: Geometry = None,
@@ -122,8 +123,13 @@ def export(
     """
     from pisigma.deployment.export.export_format import ExportRequest
     from pisigma.deployment.export.registry import export_format, export_model
+    from pisigma.lifetime.cell.layout import EXPORTS
     from pisigma.workflow.cell.exports import export_from_cell
 
+    cell, kind = cell_at(model), export_format(form)
+    if out is None:
+        suffix = program.suffix if program else "".join(kind.suffixes[:1])
+        out = output_in_cell(cell, EXPORTS, suffix)
     request = ExportRequest(
         model=model,
         out=out,
@@ -142,9 +148,8 @@ def export(
         payload_kg=payload_kg,
         temperature_c=temperature_c,
     )
-    cell = cell_at(model)
     exported = export_model(form, request) if cell is None else export_from_cell(cell, form, request)
-    _print(exported, form, out, export_format(form).contents, as_json)
+    _print(exported, form, out, kind.contents, as_json)
 
 
 def _print(exported: "Exported", form: str, out: Path, contents: str, as_json: bool) -> None:

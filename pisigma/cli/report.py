@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pisigma.cli.arguments import AsJson, ModelOrCell
-from pisigma.cli.cell import cell_at
+from pisigma.cli.cell import cell_at, output_in_cell
 from pisigma.cli.output import print_json
 from pisigma.cli.progress import progress_of
 from pisigma.cli.screen import print_screen
@@ -31,7 +31,10 @@ def report(
             help="Measurements (CSV) in the model's frame. [default: held-out rows in the folder]"
         ),
     ] = None,
-    out: Annotated[Path, typer.Option(help="Page to write (.html).")] = Path("report.html"),
+    out: Annotated[
+        Path | None,
+        typer.Option(help="Page to write (.html). [default: report.html, or in reports/ of a cell]"),
+    ] = None,
     figures: Annotated[Path | None, typer.Option(help="Folder for the figures as PNG and SVG files.")] = None,
     cameras: CameraFiles | None = None,
     as_json: AsJson = False,
@@ -42,10 +45,12 @@ def report(
     accepted the model. Exits with status 3 if the rows must not be trusted, or the measured errors are larger than the
     budget explains; the page says why.
     """
-    from pisigma.lifetime.cell.layout import model_folder
+    from pisigma.lifetime.cell.layout import REPORTS, model_folder
     from pisigma.workflow import report as workflow
 
     cell, model = cell_at(model), model_folder(model)
+    if out is None:
+        out = Path("report.html") if cell is None else output_in_cell(cell, REPORTS, ".html")
     if cameras is None and cell is not None:
         cameras = cell.cameras
     workflow.check_report_outputs(out, figures, inputs=(model, data, *(cameras.files if cameras else ())))

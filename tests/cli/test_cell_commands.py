@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+from pathlib import Path
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -145,8 +146,11 @@ def test_commands_on_models_take_the_one_in_use(run, used, tmp_path):
             one.pop("seconds", None)
         of_cell.pop("acceptance", None)  # see test_report_of_a_cell
         assert of_cell == of_model
-    exported = run("export", cell, "--format", "urdf", "--out", tmp_path / "arm.urdf", "--json")
+    exported = run("export", cell, "--format", "urdf", "--json")
     assert exported.exit_code == 0, exported.output
+    file = Path(json.loads(exported.stdout)["file"])
+    assert (file.parent, file.suffix) == (cell / "exports", ".urdf")
+    assert file.is_file()
 
 
 def test_status_shows_sessions_and_the_model_in_use(run, used):

@@ -35,5 +35,7 @@ def test_errors_that_the_budget_does_not_explain_end_with_3(run, tmp_path):
 def test_a_cell_whose_errors_are_explained_ends_with_0(run, tmp_path):
     cell = cell_of_schema_1(tmp_path)
     run("session", cell, "2026-08-01", "--set-aside", "joint 3 had slipped")
-    done = run("report", cell, "--out", tmp_path / "report.html")
+    done = run("report", cell)
     assert done.exit_code == 0, done.output
+    (page,) = (cell / "reports").iterdir()
+    assert page.suffix == ".html"

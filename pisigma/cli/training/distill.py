@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pisigma.cli.arguments import AsJson, ModelOrCell, Overwrite, Verbose
+from pisigma.cli.cell import cell_at, output_in_cell
 from pisigma.cli.output import command_line, print_json
 from pisigma.cli.progress import progress_of
 from pisigma.cli.screen import print_screen
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
 
 Box = tuple[float, float, float, float, float, float]
 
-Out = Annotated[Path, typer.Option(help="Model folder to write.")]
+Out = Annotated[Path | None, typer.Option(help="Model folder to write. [default: in exports/ of a cell]")]
 RegionMm = Annotated[
     Box | None,
     typer.Option(
@@ -52,8 +53,8 @@ Harmonics = Annotated[
 def distill(
     context: typer.Context,
     model: ModelOrCell,
-    out: Out,
     settings: DistillationSettings,
+    out: Out = None,
     region: RegionMm = None,
     joints: Joints = None,
     orders: Orders = None,
@@ -67,9 +68,11 @@ def distill(
     Prints its error against the full solution at held-out poses.
     """
     from pisigma.files.output_folder import check_folder
-    from pisigma.lifetime.cell.layout import model_folder
+    from pisigma.lifetime.cell.layout import EXPORTS, model_folder
     from pisigma.workflow import distill as workflow
 
+    if out is None:
+        out = output_in_cell(cell_at(model), EXPORTS, "")
     model = model_folder(model)
     check_folder(out, overwrite, inputs=(model, joints))
     size = _size(orders, harmonics)

@@ -21,7 +21,7 @@ HISTORY = "history.sqlite"
 """Name of the history of a cell."""
 MODEL_HISTORY = ".history.sqlite"
 """Suffix of the history of a model outside of a cell, after the name of its folder."""
-SCHEMA_VERSION = 3
+SCHEMA_VERSION = 4
 """Version of the schema. Version 1 had no monitored sessions: each model had a file for them, without a version.
 Version 2 had no exports, and changes of the model in use could not be undone."""
 

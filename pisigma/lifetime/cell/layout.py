@@ -1,4 +1,4 @@
-"""Layout of the folder of a cell: its file, plans, sessions and models."""
+"""Layout of the folder of a cell: its file, plans, sessions, models, exports and reports."""
 
 import os
 from pathlib import Path
@@ -8,6 +8,7 @@ from pisigma.lifetime.cell.history import HISTORY, MODEL_HISTORY, History
 
 CELL_FILE = "cell.yaml"
 PLANS, SESSIONS, MODELS = "plans", "sessions", "models"
+EXPORTS, REPORTS = "exports", "reports"
 
 
 def is_cell(path: str | os.PathLike[str]) -> bool:

@@ -1,4 +1,4 @@
-"""Write sessions and models of a cell under new names, even if other processes write to the same folders."""
+"""New names for outputs of a cell; sessions and models are written even if other processes write there too."""
 
 import datetime
 import os
@@ -24,6 +24,25 @@ def free_path(folder: Path, name: str, suffix: str, taken: Collection[str] = ())
         if not path.exists() and stem not in taken:
             return path
     raise OutputError(f"the folder already contains {MAX_NAMES:,} files named after {name}", at=Place(folder))
+
+
+def output_path(cell: str | os.PathLike[str], part: str, suffix: str) -> Path:
+    """Return a new path in a folder of a cell, named after the day of today; the folder is created.
+
+    Args:
+        cell: folder of the cell.
+        part: `EXPORTS` or `REPORTS`.
+        suffix: suffix of the file; "" for a folder.
+
+    Raises:
+        OutputError: the folder cannot be created.
+    """
+    folder = Path(cell) / part
+    try:
+        folder.mkdir(exist_ok=True)
+    except OSError as problem:
+        raise OutputError(f"the folder cannot be created ({problem.strerror})", at=Place(folder)) from None
+    return free_path(folder, datetime.date.today().isoformat(), suffix)
 
 
 def save_new(folder: Path, save: Callable[[Path], object]) -> Path:
