@@ -97,8 +97,9 @@ PresentCounts = Annotated[
 
 def export(
     model: ModelOrCell,
-    form: Form,
     out: Out = None,
+    *,
+    form: Form,
     like: Like = None,
     tip: Tip = None,
     geometry: Geometry = None,

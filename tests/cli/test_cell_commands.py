@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-from pathlib import Path
 import shutil
 from dataclasses import replace
 from pathlib import Path

@@ -53,8 +53,9 @@ Harmonics = Annotated[
 def distill(
     context: typer.Context,
     model: ModelOrCell,
-    settings: DistillationSettings,
     out: Out = None,
+    *,
+    settings: DistillationSettings,
     region: RegionMm = None,
     joints: Joints = None,
     orders: Orders = None,
