@@ -313,7 +313,7 @@ def path_inside_cell(folder: Path, path: str | os.PathLike[str]) -> Path:
     return whole
 
 
-def template(document: Mapping[str, Any], calibrate: Mapping[str, Any] | None = None) -> str:
+def cell_template(document: Mapping[str, Any], calibrate: Mapping[str, Any] | None = None) -> str:
     """Return the text of a new `cell.yaml`: the known values, and every setting as a comment with help and default.
 
     Args:

@@ -22,7 +22,7 @@ from pisigma.model.model_posterior import FLEET_PRIOR
 from pisigma.robot.description import Robot
 from pisigma.robot.robot_file import robot_file
 from pisigma.robot.writing import robot_to_yaml
-from pisigma.workflow.cell.cell_file import CellFile, template
+from pisigma.workflow.cell.cell_file import CellFile, cell_template
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ class NewCell:
             shutil.copyfile(file, folder / SESSIONS / f"{name}.csv")
         if self.model is not None:
             self._add_model(self.model, folder)
-        write_whole(folder / CELL_FILE, template(known, self.calibrate))
+        write_whole(folder / CELL_FILE, cell_template(known, self.calibrate))
         try:
             CellFile.read(folder)
         except PisigmaError as problem:  # the file is not kept, so its place means nothing

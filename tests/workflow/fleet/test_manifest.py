@@ -43,9 +43,13 @@ def test_rows_of_one_id_are_sessions_of_one_cell(tmp_path):
         "2026-04-01.csv",
         "2026-05-01.csv",
     ]
-    settings = b.file.settings("calibrate")
+    settings = b.file.settings_of_step("calibrate")
     assert (settings.free, settings.model, settings.folds) == ("joint_offsets", "geometric", 0)
-    assert (c.file.settings("calibrate").folds, c.file.document.limit_mm, c.robot.name) == (4, 0.3, "ur10")
+    assert (c.file.settings_of_step("calibrate").folds, c.file.document.limit_mm, c.robot.name) == (
+        4,
+        0.3,
+        "ur10",
+    )
     assert c.status().facts.not_taken_in == ("2026-03-01.csv",)
 
 
