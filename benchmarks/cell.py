@@ -143,8 +143,8 @@ def main() -> None:
     stated = parser.parse_args()
     sim = import_simulator(stated.folder)
     print("arm     seed  commands  right steps  nominal [mm]  cell [mm]  alone [mm]  equal  seconds")
-    for name in stated.arms:
-        for seed in range(stated.first, stated.first + stated.seeds):
+    for seed in range(stated.first, stated.first + stated.seeds):
+        for name in stated.arms:
             with tempfile.TemporaryDirectory() as folder:
                 begun, arm = time.monotonic(), Arm(sim, name, seed, Path(folder), stated.subprocess)
                 try:

@@ -112,9 +112,19 @@ def _against_robot(rows: Measurements, robot: Robot) -> Iterator[Iterable[Diagno
 
 
 def _as_calibrated(rows: Measurements, robot: Robot) -> tuple[Diagnostic, ...]:
-    """Check a calibration of the rows."""
+    """Check a calibration of the rows.
+
+    It has no joint correction, so that residuals above the stated noise are no finding yet.
+    """
     try:
-        return diagnostics_of_rows(GeometricCalibrator(robot), rows)
+        found = diagnostics_of_rows(GeometricCalibrator(robot), rows)
+        return tuple(one for one in found if not _is_unmodelled(one))
     except IdentificationError as refusal:  # no calibration error explains the rows
         sentence = str(refusal).removeprefix(f"{rows.source}: ")
         return (Diagnostic(kind="implausible_errors", severity="implausible", sentence=sentence),)
+
+
+def _is_unmodelled(found: Diagnostic) -> bool:
+    """Return whether a finding is that residuals are larger than stated."""
+    ratio = found.values.get("residual_over_stated")
+    return isinstance(ratio, float) and ratio > 1

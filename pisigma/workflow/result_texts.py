@@ -62,10 +62,12 @@ def _plan_verdict(planned: Plan, file: Path) -> Verdict:
     """Say how accurate a calibration with the poses is expected to be."""
     last, settings, warnings = planned.curve[-1], planned.stored.settings, planned.warnings
     cautions = f"with caution ({counted(len(warnings), 'warning')})" if warnings else "yes"
+    checked = f"; {counted(planned.checks, 'pose')} will check it" if planned.checks else ""
+    more = "" if planned.curve[0].poses else "more "
     return Verdict(
         f"{rounded(last.rms * 1e3)} mm RMS and {rounded(last.p95 * 1e3)} mm for 95 % expected of the tool's position "
-        f"with {planned.poses} poses; {rounded(last.random_rms * 1e3)} mm RMS with random poses.",
-        f"{cautions}, if the sensor scatters as stated; {counted(planned.checks, 'pose')} will check it.",
+        f"with {planned.poses} {more}poses; {rounded(last.random_rms * 1e3)} mm RMS with random poses.",
+        f"{cautions}, if the sensor scatters as stated{checked}.",
         f"measure the poses, about {planned.travel / 60:.0f} min at {settings.speed_deg_s:g} deg/s and "
         f"{settings.settling_s:g} s a pose, with `pisigma measure {file} --rows ROWS.csv`.",
     )

@@ -38,6 +38,25 @@ def test_simulated_rows_are_those_of_the_training(run, trained, tmp_path):
     assert rows.rows == load_model(trained[0] / "model").provenance.rows == 100
 
 
+def test_rows_at_other_joint_values_have_other_noise(run, refuses, repository, tmp_path):
+    recipe, robot = repository / "training" / "rb5_hybrid.yaml", Robot.load("rb5")
+    for name, of in (("first", ()), ("again", ("--at", tmp_path / "first.csv"))):
+        assert run("simulate", recipe, *of, "--out", tmp_path / f"{name}.csv").exit_code == 0
+    first, again = (Measurements.read_csv(tmp_path / f"{name}.csv", robot) for name in ("first", "again"))
+    assert_close(again.q, first.q, atol=1e-12)
+    assert 1e-5 < float((again.position - first.position).abs().mean()) < 1e-4
+    refuses(
+        "simulate",
+        recipe,
+        "--at",
+        tmp_path / "first.csv",
+        "--held-out",
+        "--out",
+        tmp_path / "x.csv",
+        error=RecipeError,
+    )
+
+
 def test_poses_before_and_after(run, trained, held_out):
     result = run("evaluate", trained[0] / "model", held_out, "--json")
     assert result.exit_code == 0

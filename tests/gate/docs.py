@@ -46,6 +46,8 @@ STATUS: Mapping[str, int] = {
 }
 """Starts of calls with an exit status other than 0, as the page says."""
 _BLOCK = re.compile(r"^(?:(?P<marked><!-- runs -->)\n+)?```(?P<language>\w*)\n(?P<text>.*?)^```", re.M | re.S)
+COMPARED = ("docs/tutorial.md",)
+"""Pages on which a block of text after commands is what they print, apart from days, times and ports."""
 _OUTPUTS = ("--out", "--page", "--rest", "--save-map", "--figures")
 
 
@@ -96,11 +98,13 @@ class Page:
         name: name of the page.
         small: folder of the small inputs.
         names: names that its Python blocks have defined so far.
+        printed: what the last bash block has printed to stdout.
     """
 
     name: str
     small: Path
     names: dict[str, object]
+    printed: str = ""
 
     def run(self, block: Block) -> Iterator[tuple[str, str]]:
         """Run a block, and return every line that ran (for Python the first one), and the failures."""
@@ -108,12 +112,26 @@ class Page:
         for begin, made in AT.items():
             for name, maker in made.items() if block.text.startswith(begin) else ():
                 self._put(name, maker)
+        if block.language == "text":
+            yield block.text.splitlines()[0], self._compared(block)
+            return
+        self.printed = ""
         if block.language == "python":
             yield block.text.splitlines()[0], self._python(block)
             return
         for line in block.lines:
             if not reason_not_to_run(line):
                 yield line, self._bash(line)
+
+    def _compared(self, block: Block) -> str:
+        """Compare a block of text with what the block before it has printed; "..." stands for any lines."""
+        printed, begin = normalised(self.printed), 0
+        for part in map(normalised, re.split(r"^\.\.\.$", block.text, flags=re.M)):
+            found = printed.find(part, begin)
+            if found < 0:
+                return f"expected {part!r}\n  in {printed[begin:]!r}"
+            begin = found + len(part)
+        return ""
 
     def _python(self, block: Block) -> str:
         for name in re.findall(r"(?<!save\()\"([\w./-]+)\"", block.text):
@@ -148,6 +166,7 @@ class Page:
         words = [f"{HASH_OF}{_model(words)}" if word.endswith("...") else word for word in words]
         status, printed = _session(words) if words[1] == "measure" else self._call(words)
         wanted = next((one for begin, one in STATUS.items() if line.startswith(begin)), 0)
+        self.printed += printed
         return "" if status == wanted else f"status {status}, expected {wanted}\n{printed[-1500:]}"
 
     def _call(self, words: Sequence[str]) -> tuple[int, str]:
@@ -171,6 +190,13 @@ class Page:
             shutil.rmtree(path) if path.is_dir() else path.unlink()
         path.parent.mkdir(parents=True, exist_ok=True)
         maker(path, self.small)
+
+
+def normalised(printed: str) -> str:
+    """Return a text in one line, with other days, times and ports replaced."""
+    for pattern, name in ((r"\d{4}-\d\d-\d\d", "DAY"), (r"\d+\.\d s", "TIME"), (r'(_port": )\d+', r"\1PORT")):
+        printed = re.sub(pattern, name, printed)
+    return " ".join(printed.split())
 
 
 def _model(words: Sequence[str]) -> str:
@@ -240,7 +266,7 @@ MADE: Mapping[str, Mapping[str, inputs.Maker]] = {
         "controller/calibration.conf": inputs.exported(inputs.MY_UR5, "ur-calibration"),
         "controller/arm.cfx": inputs.copy("arm.cfx"),
     },
-    "docs/tutorial.md": {"grid.csv": inputs.measured("ur5")},
+    f"{HOW_TO}calibrate-files.md": {"grid.csv": inputs.measured("ur5")},
 }
 """How to create the files that a page names."""
 AT: Mapping[str, Mapping[str, inputs.Maker]] = {
@@ -287,7 +313,8 @@ def run_page(name: str, small: Path, folder: Path) -> int:
         Path("models", model).symlink_to(REPOSITORY / "models" / model)
     page = Page(name, small, {"q_now": np.deg2rad(inputs.UR5_NEAR), "T_base_tool": inputs.T_NEAR.numpy()})
     failed = 0
-    for block in [one for one in blocks("bash", "python") if one.page == name]:
+    languages = ("bash", "python", "text") if name in COMPARED else ("bash", "python")
+    for block in [one for one in blocks(*languages) if one.page == name]:
         begun = time.perf_counter()
         try:
             ran = list(page.run(block))

@@ -63,7 +63,7 @@ def run_call(call: Call) -> tuple[int, str]:
         done = subprocess.run([*COMMAND, *words], capture_output=True, text=True, check=False)
         return done.returncode, done.stdout + done.stderr
     result = CliRunner().invoke(get_command(app), words)
-    printed = result.output
+    printed = result.stdout + result.stderr
     if result.exception is not None and not isinstance(result.exception, SystemExit):
         printed += "".join(traceback.format_exception(result.exception))
         return 1, printed

@@ -72,3 +72,9 @@ def test_a_reversed_joint_is_named_with_few_rows(name, rows):
     (diagnostic,) = check_rows(replace(some, q=some.q * signs), robot).implausible
     assert (diagnostic.kind, diagnostic.cause) == ("setup_fault", "joint_sign")
     assert diagnostic.values["joints"] == (4,)
+
+
+def test_a_joint_correction_that_is_still_missing_is_no_finding():
+    rows = PLAN.rows(24)
+    stated = replace(rows, sigma_position=torch.full((24,), 1e-7, dtype=torch.float64))
+    assert "stated_noise" not in {one.kind for one in check_rows(stated, ROBOT).diagnostics}

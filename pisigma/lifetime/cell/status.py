@@ -145,7 +145,7 @@ def plans_check(facts: CellFacts) -> bool:
 def _to_measure(facts: CellFacts, plan: str) -> Step:
     return Step(
         "not_measured",
-        f"{plan} has not been measured yet; measure its poses, add the measured columns to its rows, and import them",
+        f"{plan} has not been measured yet; ROWS.csv contains its rows with the measured columns added",
         facts.import_command(),
     )
 
@@ -187,7 +187,7 @@ def _no_session(facts: CellFacts) -> Step | None:
         why = "all sessions were measured with other joint zeros than those that are active on the controller"
     if not facts.plans or why:
         return Step("no_plan", why or "there is no plan and no session", facts.command("plan"))
-    return _to_measure(facts, f"plan '{facts.plans[-1]}'")
+    return _to_measure(facts, facts.unmeasured_plan or f"plan '{facts.plans[-1]}'")
 
 
 def _not_calibrated(facts: CellFacts) -> Step | None:

@@ -1,6 +1,7 @@
 """The robot of a recipe and its rows: simulated, or read from a file."""
 
 import os
+import zlib
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -9,11 +10,13 @@ import torch
 from pisigma.files.errors import RecipeError
 from pisigma.files.yaml_file import Section
 from pisigma.measurement.camera.corner_file import read_rows
+from pisigma.measurement.csv.reading import read_joints
 from pisigma.measurement.dataset import Measurements, join
 from pisigma.measurement.splits import TrainTest, k_folds
 from pisigma.robot.description import Robot
 from pisigma.simulation.camera.simulated_images import SimulatedImages, write_images
-from pisigma.simulation.measure import SimulatedPoses
+from pisigma.simulation.measure import SimulatedMeasurements, SimulatedPoses
+from pisigma.simulation.measure import simulate as measure
 from pisigma.simulation.true_robot import TrueRobot
 from pisigma.workflow.recipes.recipe import GeometricRecipe, HybridRecipe, MeasuredData, Recipe, SimulatedData
 
@@ -106,6 +109,32 @@ def simulate(recipe: Recipe, repeats: int = 1) -> RecipeData:
         true = TrueRobot(robot, data.errors)
         simulations.append((data.training.measure(true), data.held_out.measure(true)))
     return RecipeData(robot, simulations[0][0], simulations=tuple(simulations))
+
+
+def simulate_at(recipe: Recipe, poses: str | os.PathLike[str]) -> tuple[Robot, Measurements]:
+    """Simulate what the tracker of a recipe measures at other joint values, the same at every call.
+
+    Args:
+        recipe: a recipe with a simulated tracker.
+        poses: CSV file with columns of joint values, such as a plan.
+
+    Returns:
+        The nominal robot, and the rows.
+
+    Raises:
+        RecipeError: the recipe simulates no tracker.
+        MeasurementError: the joint values cannot be read.
+    """
+    data, robot = simulated_data(recipe), Robot.load(recipe.robot)
+    tracker = data.training
+    if not isinstance(tracker, SimulatedMeasurements):
+        raise RecipeError(
+            expected="a recipe that simulates a tracker", value=recipe.name, option="--at", remedy="omit it"
+        )
+    q, noise = read_joints(poses, robot), tracker.noise
+    if noise is not None:  # other poses have other noise
+        noise = noise.model_copy(update={"seed": noise.seed + zlib.crc32(q.numpy().tobytes())})
+    return robot, measure(TrueRobot(robot, data.errors), q, tracker.sensor, noise)
 
 
 def write_recipe_images(recipe: Recipe, folder: str | os.PathLike[str]) -> int:
