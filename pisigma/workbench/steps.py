@@ -162,7 +162,7 @@ def export(cell: Cell, form: Form, out: Path, files: Mapping[str, Any]) -> Outco
     contents = export_format(name).contents
     what = exported.summary or f"{contents[0].upper()}{contents[1:]}"
     verdict = Verdict(
-        f"{what} written to {out.name}{exported.details}.", "test every program at low speed", "", "File"
+        f"{what} written to {out.name}{exported.details}.", "", "test every program at low speed.", "File"
     )
     blocks = (
         sentences("remarks", exported.remarks),

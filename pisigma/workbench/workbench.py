@@ -79,8 +79,9 @@ class Workbench:
             PlanningError: the folder is not a cell.
         """
         cell = Cell.open(folder)
-        self.folder, self.jobs, self._uploads = folder, Jobs(), Uploads()
-        self._tabs, self._status = Tabs(self.jobs), (cell.status(), time.monotonic())
+        self.folder, self._status = folder, (cell.status(), time.monotonic())
+        self.jobs, self._uploads = Jobs(), Uploads()
+        self._tabs = Tabs(self.jobs)
         self._downloads: dict[str, Path] = {}
         self._behind = ViserBackend("pisigma")
         try:
