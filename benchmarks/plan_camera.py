@@ -25,10 +25,9 @@ from pisigma.calibration.geometric.problem.parameters import Prior
 from pisigma.measurement.camera.board import Board
 from pisigma.measurement.camera.camera import Camera
 from pisigma.measurement.camera.image_rows import image_measurements
-from pisigma.planning.camera_settings import CameraSettings
 from pisigma.planning.expected_accuracy import rms_of
 from pisigma.planning.plan_inputs import find_candidates, instrument_of, views_of
-from pisigma.planning.plan_settings import Criterion, PlanSettings
+from pisigma.planning.plan_settings import CameraSettings, Criterion, PlanSettings
 from pisigma.planning.pose_selection import select_poses
 from pisigma.planning.robot_posterior import RobotPosterior
 from pisigma.planning.surroundings.arm_in_surroundings import ArmInSurroundings

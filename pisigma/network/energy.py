@@ -1,6 +1,7 @@
-"""Energy of a Pi-Sigma network and its derivatives in closed form."""
+"""Energy of a Pi-Sigma network, its derivatives in closed form, and its history."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
@@ -81,3 +82,20 @@ def output_jacobian(
     by_sum = (products_of_others(weighted, orders) * fixed).movedim(0, -2)
     with_bias = torch.cat([x, x.new_ones((x.shape[0], 1))], -1)
     return (by_sum[..., None] * with_bias[:, None, :]).flatten(-2)
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingHistory:
+    """Energies of a training by epoch.
+
+    Attributes:
+        joints: names of the corrected joints.
+        energies: `E = 1/2 Σ_μ (d - y)²` of every joint in every epoch (Jeong et al. 1998, eq. 3), in scaled units:
+            before the step of the epoch (gradient descent), after it (Levenberg-Marquardt), or over its steps
+            (mini-batches).
+        resumed_from: epoch from which the training was resumed; 0 for a new training.
+    """
+
+    joints: tuple[str, ...]
+    energies: Float[Tensor, "epochs joints"]
+    resumed_from: int

@@ -12,8 +12,7 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader, Sampler, TensorDataset
 
 from pisigma.files.errors import TrainingError
-from pisigma.network.energy import energy, energy_gradient
-from pisigma.network.history import TrainingHistory
+from pisigma.network.energy import TrainingHistory, energy, energy_gradient
 from pisigma.network.levenberg_marquardt import LevenbergMarquardt, Patterns
 from pisigma.network.pi_sigma import PiSigma
 from pisigma.network.sections import FitSection, GradientDescentSection, MiniBatchSection

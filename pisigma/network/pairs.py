@@ -10,9 +10,9 @@ from pisigma.files.errors import IdentificationError, Place
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import Robot
 from pisigma.robot.kinematics.closed_form import closed_form_solver
+from pisigma.robot.kinematics.jacobian import singularity_measure
 from pisigma.robot.kinematics.joint_limits import wrapped_difference
 from pisigma.robot.kinematics.numeric import solve_numeric
-from pisigma.robot.kinematics.singularity import singularity_measure
 from pisigma.robot.kinematics.status import Status
 
 

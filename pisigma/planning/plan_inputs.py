@@ -15,7 +15,6 @@ from pisigma.measurement.csv.reading import holds_measurements, read_joints
 from pisigma.measurement.dataset import Measurements
 from pisigma.planning.board_sight import BoardSight
 from pisigma.planning.board_views import BoardViews
-from pisigma.planning.camera_settings import CameraSettings
 from pisigma.planning.candidates import (
     Candidates,
     Workspace,
@@ -23,7 +22,7 @@ from pisigma.planning.candidates import (
     read_candidates,
     with_workspace,
 )
-from pisigma.planning.plan_settings import PlanSettings
+from pisigma.planning.plan_settings import CameraSettings, PlanSettings
 from pisigma.planning.robot_posterior import Instrument
 from pisigma.planning.surroundings.arm_in_surroundings import ArmInSurroundings
 from pisigma.robot.description import Robot

@@ -12,8 +12,7 @@ from torch import Tensor
 
 from pisigma.files.errors import PlanningError
 from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.model.folder.model_folder import load_model
-from pisigma.model.model_source import HasModel
+from pisigma.model.folder.model_folder import HasModel, load_model
 from pisigma.planning.board_views import BoardViews
 from pisigma.planning.plan_inputs import instrument_of, read_planned_rows, views_of
 from pisigma.planning.plan_settings import PlanSettings

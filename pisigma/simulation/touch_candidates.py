@@ -13,8 +13,8 @@ from pisigma.files.yaml_file import Count, Section, Seed
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.jig import Jig
 from pisigma.robot.description import Robot
+from pisigma.robot.kinematics.jacobian import singularity_measure
 from pisigma.robot.kinematics.numeric import solve_numeric
-from pisigma.robot.kinematics.singularity import singularity_measure
 from pisigma.robot.kinematics.status import Status
 from pisigma.robot.robot_file import FrameSection
 from pisigma.robot.se3 import invert, rotation_from_rpy, transform, transform_from_xyzrpy

@@ -9,8 +9,7 @@ from typing import Any
 
 from pisigma.files.model_files import model_hash
 from pisigma.files.output_file import check_page, write_whole
-from pisigma.lifetime.comparison.displacement import Displacement
-from pisigma.lifetime.comparison.model_pair import ModelPair
+from pisigma.lifetime.comparison.model_pair import Displacement, ModelPair
 from pisigma.lifetime.comparison.parameter_differences import (
     ParameterDifference,
     ParameterDifferences,
@@ -20,7 +19,7 @@ from pisigma.measurement.camera.corner_file import MeasurementFiles, read_rows
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.joint_range import row_warnings
 from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.model.model_source import HasModel, ModelSource, model_or_folder
+from pisigma.model.folder.model_folder import HasModel, ModelSource, model_or_folder
 from pisigma.model.training_rows import training_row_warnings
 from pisigma.planning.task import read_task
 from pisigma.validation.checks.wrong_rows import without_wrong_rows

@@ -14,8 +14,7 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.joint_range import row_warnings
 from pisigma.measurement.sensors.socket import matching_sockets
 from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.model.folder.model_folder import load_model
-from pisigma.model.model_source import HasModel, ModelSource, model_or_folder
+from pisigma.model.folder.model_folder import HasModel, ModelSource, load_model, model_or_folder
 from pisigma.model.stated_conditions import condition_warnings
 from pisigma.model.training_rows import training_row_warnings
 from pisigma.validation.checks.other_sensors import distance_diagnostics

@@ -43,9 +43,8 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.dates import EXPECTED_DATE, date_in_name, is_date
 from pisigma.measurement.joint_range import row_warnings
 from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.model.folder.model_folder import load_model
+from pisigma.model.folder.model_folder import HasModel, ModelSource, loaded_model
 from pisigma.model.model_posterior import FLEET_PRIOR, ModelPosterior
-from pisigma.model.model_source import HasModel, ModelSource, model_or_folder
 from pisigma.model.stated_conditions import condition_warnings
 from pisigma.validation.gate import check_rows
 from pisigma.validation.held_out.diagnostic import Diagnostic
@@ -219,8 +218,7 @@ def monitor(
         OutputError: the history cannot be used.
     """
     started = time.perf_counter()
-    source = model_or_folder(model)
-    loaded = source if isinstance(source, CalibratedModel) else load_model(source)
+    loaded, folder = loaded_model(model)
     if loaded.kind == FLEET_PRIOR:
         raise ModelError(
             f"expected the model of one robot, got the prior of a fleet, '{loaded.name}'",
@@ -232,7 +230,7 @@ def monitor(
     warnings: list[str] = []
     trusted: list[Record] = []
     untrusted: list[UntrustedSession] = []
-    folder = source if settings.history and not isinstance(source, CalibratedModel) else None
+    folder = folder if settings.history else None
     earlier = () if folder is None else read_sessions(history_of_model(folder), model_hash(folder))
     for date, day in _by_day(rows, settings.dates):
         progress(f"{Path(day.source).name}, {date}")

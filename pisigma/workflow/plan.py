@@ -20,7 +20,7 @@ from pisigma.files.output_file import check_output, write_whole
 from pisigma.files.progress import Progress
 from pisigma.measurement.joint_range import row_warnings
 from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.model.model_source import HasModel
+from pisigma.model.folder.model_folder import HasModel
 from pisigma.model.training_rows import known_rows, training_row_warnings
 from pisigma.planning.board_views import BoardViews
 from pisigma.planning.candidates import Candidates, spread

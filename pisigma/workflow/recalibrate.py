@@ -35,10 +35,9 @@ from pisigma.measurement.camera.corner_file import MeasurementFiles, read_rows
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.joint_range import row_warnings
 from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.model.folder.model_folder import load_model
+from pisigma.model.folder.model_folder import HasModel, ModelSource, loaded_model
 from pisigma.model.geometric_model import model_of_hybrid
 from pisigma.model.model_posterior import FLEET_PRIOR, ModelPosterior, check_fleet_prior
-from pisigma.model.model_source import HasModel, ModelSource, model_or_folder
 from pisigma.model.stated_conditions import condition_warnings
 from pisigma.model.training_rows import with_wide_limits, without_known_rows
 from pisigma.reporting.derived_cards import write_recalibration_card
@@ -125,9 +124,8 @@ def recalibrate(
         PoseError: the joint values do not fit the robot.
     """
     started = time.perf_counter()
-    source = model_or_folder(model)
-    parent = source if isinstance(source, CalibratedModel) else load_model(source)
-    sha256 = "" if isinstance(source, CalibratedModel) else model_hash(source)
+    parent, folder = loaded_model(model)
+    sha256 = "" if folder is None else model_hash(folder)
     if nominal is not None:
         check_fleet_prior(parent)
     posterior = ModelPosterior.from_model(parent)

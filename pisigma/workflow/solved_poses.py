@@ -11,8 +11,8 @@ from pisigma.files.progress import Progress
 from pisigma.model.inverse.corrected_ik import CorrectedIK
 from pisigma.robot.description import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.robot.kinematics.jacobian import singularity_measure
 from pisigma.robot.kinematics.joint_limits import wrapped_difference
-from pisigma.robot.kinematics.singularity import singularity_measure
 from pisigma.robot.kinematics.status import Status
 from pisigma.robot.kinematics.tolerances import LIMIT_TOLERANCE
 from pisigma.robot.se3 import wrap_to_pi

@@ -16,8 +16,7 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.joint_range import row_warnings
 from pisigma.measurement.sensors.socket import matching_sockets
 from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.model.folder.model_folder import load_model
-from pisigma.model.model_source import HasModel, ModelSource, model_or_folder
+from pisigma.model.folder.model_folder import HasModel, ModelSource, loaded_model
 from pisigma.model.stated_conditions import condition_warnings
 from pisigma.model.training_rows import training_row_warnings
 from pisigma.robot.row import Row
@@ -175,8 +174,7 @@ def verify(
         PoseError: the joint values do not fit the robot.
     """
     settings, started = settings or VerificationSettings(), time.perf_counter()
-    source = model_or_folder(model)
-    loaded = source if isinstance(source, CalibratedModel) else load_model(source)
+    loaded, folder = loaded_model(model)
     rows = data if isinstance(data, Measurements) else read_for_verification(data, loaded, settings.cameras)
     distances = matching_sockets(settings.socket_distances, rows.socket or ())
     right = without_wrong_rows([loaded], rows, settings.fitted)
@@ -202,7 +200,7 @@ def verify(
     if wrong and not faults:
         verdict, motion = "implausible", None
         sentence = f"{NOTHING_SHOWN}: {wrong[0].sentence}"
-    name = loaded.name if isinstance(source, CalibratedModel) else os.fspath(source)
+    name = loaded.name if folder is None else os.fspath(folder)
     return Verification(
         model=name,
         data=rows.source,

@@ -5,8 +5,8 @@ from testing.models import hand_made_model
 from testing.refusals import refused
 
 from pisigma.files.errors import PlanningError
+from pisigma.model.folder.model_folder import model_or_folder
 from pisigma.model.inverse.corrected_ik import CorrectedIK
-from pisigma.model.model_source import model_or_folder
 from pisigma.planning.subject import Subject
 from pisigma.workflow.evaluate import models_by_label
 

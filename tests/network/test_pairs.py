@@ -14,7 +14,7 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.network.pairs import build_pairs
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
-from pisigma.robot.kinematics.singularity import singularity_measure
+from pisigma.robot.kinematics.jacobian import singularity_measure
 from pisigma.simulation.measure import simulate
 from pisigma.simulation.true_robot import TrueRobot
 

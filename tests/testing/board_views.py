@@ -7,7 +7,7 @@ import torch
 
 from pisigma.measurement.camera.board import Board
 from pisigma.measurement.camera.camera import Camera
-from pisigma.planning.camera_settings import CameraSettings
+from pisigma.planning.plan_settings import CameraSettings
 from pisigma.planning.surroundings.arm_in_surroundings import ArmInSurroundings
 from pisigma.planning.surroundings.surroundings import Surroundings
 from pisigma.robot import Robot

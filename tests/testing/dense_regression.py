@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from pisigma.calibration.hybrid.design import Design, Rows
-from pisigma.calibration.hybrid.design_regression import AbstractDesignRegression
+from pisigma.calibration.hybrid.design import AbstractDesignRegression, Design, Rows
 from pisigma.estimation.covariance_root import CovarianceRoot
 from pisigma.estimation.held_out import HeldOutErrors
 from pisigma.estimation.prior import GaussianPrior

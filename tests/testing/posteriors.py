@@ -6,7 +6,7 @@ import numpy as np
 from testing.closeness import assert_close
 from torch import Tensor
 
-from pisigma.calibration.hybrid.design_regression import AbstractDesignRegression
+from pisigma.calibration.hybrid.design import AbstractDesignRegression
 from pisigma.estimation.prior import GaussianPrior
 from pisigma.estimation.regression import Posterior
 

@@ -20,7 +20,7 @@ from pisigma.files.errors import IdentificationError, RecipeError
 from pisigma.files.yaml_file import Section, read_yaml
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import Robot
-from pisigma.robot.kinematics.singularity import singularity_measure
+from pisigma.robot.kinematics.jacobian import singularity_measure
 from pisigma.robot.se3 import rotation_from_rpy, transform
 from pisigma.simulation.commanded import BranchSection
 from pisigma.simulation.noise import SensorNoise

@@ -9,7 +9,6 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.calibration.geometric.identifiability.calibration_warning import CalibrationWarning
 from pisigma.calibration.geometric.identifiability.observability import (
     Observability,
     find_weak_directions,
@@ -21,7 +20,7 @@ from pisigma.calibration.geometric.identifiability.pairwise import (
 )
 from pisigma.calibration.geometric.identifiability.plausibility import misfitting_frames
 from pisigma.calibration.geometric.identifiability.redundancy import Findings, Redundancy
-from pisigma.calibration.geometric.identifiability.sufficiency import measurement_advice
+from pisigma.calibration.geometric.identifiability.sufficiency import CalibrationWarning, measurement_advice
 from pisigma.calibration.geometric.outliers import Outlier, outliers_of
 from pisigma.calibration.geometric.parameter_table import ParameterEstimate, parameter_table
 from pisigma.calibration.geometric.posterior import ParameterPosterior

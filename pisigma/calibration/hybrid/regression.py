@@ -8,8 +8,7 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
-from pisigma.calibration.hybrid.design import Design, Rows, chunks
-from pisigma.calibration.hybrid.design_regression import AbstractDesignRegression
+from pisigma.calibration.hybrid.design import AbstractDesignRegression, Design, Rows, chunks
 from pisigma.calibration.hybrid.sensor_values import SensorValues
 from pisigma.estimation.cholesky import BLOCK, return_free_memory, row_blocks
 from pisigma.estimation.dual_regression import DualRegression, group_gram, pair_indices, stack_groups

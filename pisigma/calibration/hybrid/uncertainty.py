@@ -8,8 +8,14 @@ from torch import Tensor
 
 from pisigma.calibration.geometric.problem.parameters import ParameterSpace
 from pisigma.calibration.geometric.problem.setup import IdentifiedGeometry
-from pisigma.calibration.hybrid.design import FOLDS, FOLDS_OF_FEW, MAX_GROUPS, Design, Rows
-from pisigma.calibration.hybrid.design_regression import AbstractDesignRegression
+from pisigma.calibration.hybrid.design import (
+    FOLDS,
+    FOLDS_OF_FEW,
+    MAX_GROUPS,
+    AbstractDesignRegression,
+    Design,
+    Rows,
+)
 from pisigma.calibration.hybrid.noise import CalibrationNoise, stated_sigmas
 from pisigma.calibration.hybrid.sensor_values import joint_columns, weight_columns
 from pisigma.estimation.covariance_root import CovarianceRoot

@@ -20,7 +20,7 @@ from pisigma.files.setting import Option
 from pisigma.workflow.settings.measuring import MeasureSettings
 
 if TYPE_CHECKING:
-    from pisigma.planning.camera_settings import CameraSettings
+    from pisigma.planning.plan_settings import CameraSettings
     from pisigma.planning.session.state import SessionState
     from pisigma.planning.surroundings.arm_in_surroundings import ArmInSurroundings
     from pisigma.robot.description import Robot

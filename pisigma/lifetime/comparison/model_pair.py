@@ -1,11 +1,11 @@
-"""Pairs of models of one robot, with their bases and tools aligned."""
+"""Pairs of models of one robot, with their bases and tools aligned, and displacements of their poses."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 from torch import Tensor
 
 from pisigma.files.errors import ModelError
@@ -13,7 +13,8 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel, poses_of_rows
 from pisigma.robot.description import Robot
 from pisigma.robot.frame_fits import LEVER_SHARE, MeasuredPoses, best_base_and_tool
-from pisigma.robot.se3 import pose_error, transform_from_xyzrpy
+from pisigma.robot.se3 import invert, pose_error, transform_from_xyzrpy
+from pisigma.validation.held_out.pose_statistics import PoseErrors
 
 FrameChoice = Literal["fitted", "fixed"]
 """Whether base and tool of the second model are fitted to those of the first, or are the same by name."""
@@ -214,3 +215,74 @@ def _coupled_alike(one: Robot, other: Robot) -> bool:
         return False
     values = np.eye(len(one.axes))
     return bool(np.allclose(one.to_dh(values), other.to_dh(values), equal_nan=True))
+
+
+@dataclass(frozen=True, eq=False)
+class Displacement:
+    """Distances between the poses that two models predict for the same joint values.
+
+    Attributes:
+        source: description of the poses.
+        q: joint values of poses that both models predict [rad or m].
+        number: number of every pose among all of the source, from 1.
+        place: position of the tool in the robot's base frame under the first model [m].
+        errors: distance [m] and angle [rad] between the poses of both models.
+        not_predicted: number of poses that are left out because a model does not predict them.
+    """
+
+    source: str
+    q: Float64[Tensor, "poses dof"]
+    number: Int64[Tensor, " poses"]
+    place: Float64[Tensor, "poses 3"]
+    errors: PoseErrors
+    not_predicted: int
+
+    @staticmethod
+    def from_pair(pair: ModelPair, q: Float64[Tensor, "poses dof"], source: str) -> "Displacement":
+        """Compare a pair of models at joint values.
+
+        Args:
+            pair: the models.
+            q: joint values [rad or m].
+            source: description of the joint values, such as a file.
+
+        Raises:
+            ModelError: there is no pose that both models predict.
+        """
+        by = pair.displacement(q)
+        there = torch.isfinite(by).all(1)
+        if not bool(there.any()):
+            raise ModelError(
+                f"{pair.first.name} and {pair.second.name} predict no pose of {source}",
+                value=source,
+                remedy="give poses that the robot reaches",
+            )
+        base = frames_of(pair.first, pair.frame_names[0])[0]
+        place = (invert(base) @ pair.poses(q[there])[0])[:, :3, 3]
+        errors = PoseErrors(by[there, :3].norm(dim=-1), by[there, 3:].norm(dim=-1))
+        number = there.nonzero()[:, 0]
+        return Displacement(source, q[there], number + 1, place, errors, len(q) - len(number))
+
+    @property
+    def largest(self) -> int:
+        """Index of the pose with the largest distance."""
+        return int(self.errors.position.argmax())
+
+    def to_json(self, robot: Robot) -> dict[str, Any]:
+        """Return plain values: statistics in mm and deg, and where the largest distance is.
+
+        Args:
+            robot: robot by which joint values are converted to those of the controller.
+        """
+        values = robot.to_controller(self.q[self.largest].numpy()).tolist()
+        return {
+            "source": self.source,
+            "poses": len(self.q),
+            "poses_not_predicted": self.not_predicted,
+            **self.errors.figures.by_name,
+            "largest_at_pose": int(self.number[self.largest]),
+            "largest_at_mm": (self.place[self.largest] * 1e3).tolist(),
+            "largest_at_joints": [
+                axis.in_file_unit(value) for axis, value in zip(robot.axes, values, strict=True)
+            ],
+        }

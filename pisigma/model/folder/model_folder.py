@@ -5,6 +5,7 @@ import os
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -334,3 +335,27 @@ def _check_tensors(tensors: dict[str, Tensor], expected: dict[str, Shape]) -> No
                 file=WEIGHTS,
                 value=value.dtype,
             )
+
+
+ModelSource = CalibratedModel | str | os.PathLike[str]
+"""A model, or the path of its folder."""
+
+
+@runtime_checkable
+class HasModel(Protocol):
+    """Object with a model: a `pisigma.CorrectedIK`, or a result of `pisigma.calibrate` and similar functions."""
+
+    @property
+    def model(self) -> CalibratedModel:
+        """The calibrated model."""
+
+
+def loaded_model(source: ModelSource | HasModel) -> tuple[CalibratedModel, str | os.PathLike[str] | None]:
+    """Return a model, and its folder if it is read from one; see `load_model`."""
+    source = model_or_folder(source)
+    return (source, None) if isinstance(source, CalibratedModel) else (load_model(source), source)
+
+
+def model_or_folder(source: ModelSource | HasModel) -> ModelSource:
+    """Return the model of an object that has one; a model or a folder is returned as it is."""
+    return source.model if isinstance(source, HasModel) else source

@@ -11,7 +11,7 @@ from pisigma.calibration.hybrid.arm import HybridArm
 from pisigma.model.calibrated_model import hybrid_motion
 from pisigma.robot.description import Robot
 from pisigma.robot.kinematics import tolerances
-from pisigma.robot.kinematics.jacobian import joint_jacobian
+from pisigma.robot.kinematics.jacobian import joint_jacobian, smallest_singular_value
 from pisigma.robot.kinematics.joint_limits import nearest_turn, wrap_into_limits, wrapped_difference
 from pisigma.robot.kinematics.numeric import (
     Motion,
@@ -20,7 +20,6 @@ from pisigma.robot.kinematics.numeric import (
     solve_numeric,
     solve_within_tolerances,
 )
-from pisigma.robot.kinematics.singularity import smallest_singular_value
 from pisigma.robot.kinematics.status import Status
 from pisigma.robot.kinematics.task_axes import TaskAxes
 

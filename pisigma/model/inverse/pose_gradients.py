@@ -13,9 +13,8 @@ from torch.autograd.function import once_differentiable
 from pisigma.model.calibrated_model import CalibratedModel, hybrid_motion
 from pisigma.model.inverse.solution import AbstractInverse, Solution
 from pisigma.robot.description import Robot
-from pisigma.robot.kinematics.jacobian import joint_jacobian
+from pisigma.robot.kinematics.jacobian import characteristic_length, dimensionless_jacobian, joint_jacobian
 from pisigma.robot.kinematics.numeric import Motion
-from pisigma.robot.kinematics.singularity import characteristic_length, dimensionless_jacobian
 from pisigma.robot.kinematics.task_axes import WHOLE, TaskAxes
 from pisigma.robot.kinematics.task_error import task_error
 from pisigma.robot.kinematics.tolerances import SINGULAR_TOLERANCE

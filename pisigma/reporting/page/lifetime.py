@@ -8,7 +8,7 @@ from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
 
-from pisigma.lifetime.comparison.displacement import Displacement
+from pisigma.lifetime.comparison.model_pair import Displacement
 from pisigma.lifetime.comparison.parameter_differences import ParameterDifferences
 from pisigma.lifetime.fleet.status import FleetStatus, urgency
 from pisigma.lifetime.monitoring.charts import FALSE_ALARMS_PER_YEAR, SESSIONS_PER_YEAR, Chart

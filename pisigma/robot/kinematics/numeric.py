@@ -12,13 +12,13 @@ from torch import Tensor
 from pisigma.files.errors import PoseError
 from pisigma.robot.description import Robot
 from pisigma.robot.kinematics import tolerances
-from pisigma.robot.kinematics.jacobian import joint_jacobian
-from pisigma.robot.kinematics.joint_limits import wrap_into_limits
-from pisigma.robot.kinematics.singularity import (
+from pisigma.robot.kinematics.jacobian import (
     characteristic_length,
     dimensionless_jacobian,
+    joint_jacobian,
     smallest_singular_value,
 )
+from pisigma.robot.kinematics.joint_limits import wrap_into_limits
 from pisigma.robot.kinematics.status import Status
 from pisigma.robot.kinematics.task_axes import WHOLE, TaskAxes
 from pisigma.robot.kinematics.task_error import task_error, tolerated

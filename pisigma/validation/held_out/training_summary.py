@@ -11,7 +11,7 @@ from torch import Tensor
 from pisigma.files.yaml_file import Section
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.network.history import TrainingHistory
+from pisigma.network.energy import TrainingHistory
 from pisigma.network.pairs import TrainingPairs
 from pisigma.validation.held_out.pose_statistics import Comparison
 from pisigma.validation.held_out.summary import AbstractSummary

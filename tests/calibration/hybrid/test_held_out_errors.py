@@ -8,7 +8,7 @@ from testing.closeness import assert_close
 from testing.regression_cases import CASES, few_values, poses
 from torch import Tensor
 
-from pisigma.calibration.hybrid.design_regression import AbstractDesignRegression
+from pisigma.calibration.hybrid.design import AbstractDesignRegression
 from pisigma.calibration.hybrid.regression import NormalEquations, ValueCovariance
 from pisigma.estimation.held_out import HeldOutErrors
 from pisigma.estimation.regression import SensorCount

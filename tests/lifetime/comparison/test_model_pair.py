@@ -11,8 +11,7 @@ from testing.models import hand_made_model
 from testing.refusals import refused
 
 from pisigma.files.errors import ModelError
-from pisigma.lifetime.comparison.displacement import Displacement
-from pisigma.lifetime.comparison.model_pair import ModelPair
+from pisigma.lifetime.comparison.model_pair import Displacement, ModelPair
 from pisigma.robot.kinematics.forward import forward_kinematics
 
 

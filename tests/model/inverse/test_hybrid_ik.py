@@ -15,7 +15,7 @@ from pisigma.model.geometric_model import model_of_hybrid
 from pisigma.model.inverse.compiled_ik import MAX_SOLUTIONS
 from pisigma.model.inverse.corrected_ik import CorrectedIK, load
 from pisigma.robot.kinematics.forward import forward_kinematics
-from pisigma.robot.kinematics.singularity import singularity_measure
+from pisigma.robot.kinematics.jacobian import singularity_measure
 from pisigma.robot.kinematics.status import Status
 from pisigma.robot.se3 import pose_error
 

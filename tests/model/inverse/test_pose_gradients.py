@@ -8,8 +8,7 @@ from testing.models import HOMES, hand_made_model, joints_around
 
 from pisigma.model.inverse.corrected_ik import CorrectedIK
 from pisigma.robot.kinematics.forward import forward_kinematics
-from pisigma.robot.kinematics.jacobian import joint_jacobian
-from pisigma.robot.kinematics.singularity import singularity_measure
+from pisigma.robot.kinematics.jacobian import joint_jacobian, singularity_measure
 from pisigma.robot.kinematics.status import Status
 from pisigma.robot.se3 import rotation_from_vector, transform
 

@@ -12,9 +12,8 @@ from testing.refusals import refused
 from pisigma.files.errors import PoseError
 from pisigma.robot.kinematics.closed_form import closed_form_solver
 from pisigma.robot.kinematics.forward import forward_kinematics
-from pisigma.robot.kinematics.jacobian import joint_jacobian
+from pisigma.robot.kinematics.jacobian import characteristic_length, joint_jacobian, singularity_measure
 from pisigma.robot.kinematics.numeric import solve_numeric
-from pisigma.robot.kinematics.singularity import characteristic_length, singularity_measure
 from pisigma.robot.kinematics.status import Status
 from pisigma.robot.se3 import pose_error, transform_from_xyzrpy
 

@@ -1,9 +1,11 @@
 """Whether measurements determine the free parameters, what they leave undetermined, and what to measure next."""
 
+from dataclasses import dataclass
+from typing import Literal
+
 import numpy as np
 import torch
 
-from pisigma.calibration.geometric.identifiability.calibration_warning import CalibrationWarning
 from pisigma.calibration.geometric.identifiability.redundancy import Redundancy
 from pisigma.calibration.geometric.problem.information import Information
 from pisigma.calibration.geometric.problem.problem import CalibrationProblem
@@ -12,6 +14,33 @@ from pisigma.files.errors import IdentificationError, Place
 from pisigma.measurement.sensors.intrinsics import SCALE_COLUMN, BoardScaleSensor, IntrinsicsSensor, texts_of
 from pisigma.robot.description import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
+
+
+@dataclass(frozen=True)
+class CalibrationWarning:
+    """Something that the measurements do not determine, or that does not fit, and what to do about it.
+
+    Attributes:
+        kind: kind of the warning.
+        subject: name of the joint, target or frame concerned; empty if it concerns all measurements.
+        sentence: the warning as a sentence.
+    """
+
+    kind: Literal[
+        "few_values",
+        "still_joint",
+        "target_on_axis",
+        "scale_of_boards",
+        "scale_of_touches",
+        "scale_of_sockets",
+        "touched_frame",
+        "floating_frame",
+        "frame_misfit",
+        "angle_disagreement",
+    ]
+    subject: str
+    sentence: str
+
 
 LITTLE_MOTION = 0.1
 """[rad or m] Range of a joint below which its errors are hardly identifiable."""
