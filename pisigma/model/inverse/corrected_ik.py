@@ -166,14 +166,14 @@ class CorrectedIK(AbstractInverse):
         kernels = self.compiled
         if isinstance(T_base_tool, np.ndarray) and T_base_tool.shape == (4, 4) and kernels is not None:
             return kernels.solve(T_base_tool, near, branch, throw, approach, self, task.axes)
-        T, single = pose_array(T_base_tool)
+        T, single, tensor = pose_array(T_base_tool)
         if T.ndim == 2 and not single and kernels is not None:
             solution = kernels.solve(T, near, branch, throw, approach, self, task.axes)
         else:
             solution = (kernels or self.numeric).solve_batch(
                 T, near=near, branch=branch, throw=throw, approach=approach, single=single, axes=task.axes
             )
-        return self._like(T_base_tool, solution, task.axes)
+        return self._like(tensor, solution, task.axes)
 
     def all_branches(self, T_base_tool: Any, *, approach: Any = None) -> Solution:
         """Find solutions on every branch, as `(*batch, branches)`; see `__call__` and `for_task`.
@@ -184,10 +184,10 @@ class CorrectedIK(AbstractInverse):
         approach = checked_approach(approach)
         if self.controller is not None:
             return self.controller.all_branches(T_base_tool, self, approach=approach)
-        T, single = pose_array(T_base_tool)
+        T, single, tensor = pose_array(T_base_tool)
         route = self.compiled or self.numeric
         every = route.all_branches(T, approach=approach, single=single, axes=self.axes)
-        return self._like(T_base_tool, every, self.axes)
+        return self._like(tensor, every, self.axes)
 
     def path(
         self, T_base_tool: Any, *, near: Any = None, branch: str | None = None
@@ -342,8 +342,8 @@ class CorrectedIK(AbstractInverse):
         return ik
 
     def _like(self, poses: Any, solution: Solution, axes: TaskAxes) -> Solution:
-        """Convert the solutions of tensors to tensors, with gradients if required, and others to arrays."""
-        if not is_tensor(poses):
+        """Convert the solutions of tensors to tensors, with gradients if required; those of arrays (None) to arrays."""
+        if poses is None:
             return replace(solution.map(as_array), owner=self)
         from pisigma.model.inverse.pose_gradients import as_tensors
 

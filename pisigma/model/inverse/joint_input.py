@@ -49,18 +49,22 @@ def as_array(values: Any) -> Any:
     return values.detach().numpy(force=True) if is_tensor(values) else values
 
 
-def pose_array(values: Any) -> tuple[Any, bool]:
-    """Convert matrices `(*batch, 4, 4)` to a float64 array, and return whether they were float32 before.
+def pose_array(values: Any) -> tuple[Any, bool, Any]:
+    """Convert matrices `(*batch, 4, 4)` to a float64 array.
+
+    Returns:
+        The array, whether the matrices were float32 before, and the tensor that they were, or None.
 
     Raises:
         PoseError: they are not numbers, or have another type or shape.
     """
-    if is_tensor(values) and str(values.dtype) not in ("torch.float32", "torch.float64"):
+    tensor = values if is_tensor(values) else None
+    if tensor is not None and str(tensor.dtype) not in ("torch.float32", "torch.float64"):
         raise PoseError(
             expected="float64 or float32, lengths in metres", value=values.dtype, option="T_base_tool"
         )
     try:
-        given = np.asarray(as_array(values))
+        given = np.asarray(values if tensor is None else tensor.detach().numpy(force=True))
         T = given.astype(np.float64, copy=False)
     except (TypeError, ValueError):
         raise PoseError(
@@ -71,7 +75,7 @@ def pose_array(values: Any) -> tuple[Any, bool]:
         ) from None
     if T.ndim < 2 or T.shape[-2:] != (4, 4):
         raise PoseError(expected=_POSES, value=T.shape, option="T_base_tool")
-    return T, given.dtype == np.float32
+    return T, given.dtype == np.float32, tensor
 
 
 def numbers(values: Any, what: str, throw: bool) -> Any:

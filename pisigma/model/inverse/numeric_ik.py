@@ -348,7 +348,7 @@ class _Poses:
         Raises:
             PoseError: see `pose_array`; or a matrix is not a valid pose and `throw` is True.
         """
-        array, rounded = pose_array(values)
+        array, rounded, _ = pose_array(values)
         T = torch.from_numpy(np.array(array))
         single = rounded if single is None else single
         tolerance = tolerances.POSE_TOLERANCE_SINGLE if single else tolerances.POSE_TOLERANCE

@@ -108,12 +108,12 @@ def _twist(T: Float64[Tensor, "*batch 4 4"]) -> Float64[Tensor, "*batch 6"]:
 
 def _attached(robot: Robot, T: Tensor, axes: TaskAxes, q: Tensor, motion: Motion) -> Tensor:
     """Attach gradients with respect to the poses to joint values; `motion` evaluates rows of joint values."""
-    flat = q.detach().reshape(-1, q.shape[-1])
+    twist, flat = _twist(T), q.detach().reshape(-1, q.shape[-1])
     rows = torch.isfinite(flat).all(-1).nonzero()[:, 0]
     inverse = flat.new_zeros(len(flat), q.shape[-1], 6)
     if len(rows):
         inverse[rows] = _inverse(robot, T.detach().reshape(-1, 4, 4)[rows], axes, *motion(flat[rows]))
-    result: Tensor = _Implicit.apply(_twist(T), q.detach(), inverse.reshape(*q.shape, 6))  # type: ignore[no-untyped-call]
+    result: Tensor = _Implicit.apply(twist, q.detach(), inverse.reshape(*q.shape, 6))  # type: ignore[no-untyped-call]
     return result
 
 
