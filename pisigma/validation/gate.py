@@ -60,9 +60,8 @@ def check_rows(
     may_move: Collection[Move] = (),
     nominal: CalibratedModel | None = None,
 ) -> RowVerdict:
-    """Check rows before they are used.
+    """Check rows before they are used, against a model or a nominal robot.
 
-    Against a model, the checks of `ROW_CHECKS` are run, or those of `diagnosed_lengths` for rows without positions.
     Against a nominal robot, or the mean robot of a fleet, the spread of the positions is compared with that of the
     robot's poses; with at least 6 rows other robots of the catalogue are tried, with 8 signs and exchanges of joint
     columns, with 12 the rows are used for a calibration that is checked by `CHECKS`, and with 24 for setup faults.
@@ -82,9 +81,20 @@ def check_rows(
         against = against.nominal
     if isinstance(against, Robot):
         return RowVerdict(_until_implausible(_against_robot(rows, against)))
-    judged = RowsUnderModel.from_rows(against, rows, fitted, may_move, nominal)
+    return check_rows_by_model(rows, against, fitted, may_move, nominal)
+
+
+def check_rows_by_model(
+    rows: Measurements,
+    model: CalibratedModel,
+    fitted: Collection[FrameKind] = (),
+    may_move: Collection[Move] = (),
+    nominal: CalibratedModel | None = None,
+) -> RowVerdict:
+    """Run the checks of `ROW_CHECKS`, or those of `diagnosed_lengths` for rows without positions; see `check_rows`."""
+    judged = RowsUnderModel.from_rows(model, rows, fitted, may_move, nominal)
     if judged is None and rows.position is None:
-        diagnostics, faults = diagnosed_lengths(against, rows, fitted, may_move)
+        diagnostics, faults = diagnosed_lengths(model, rows, fitted, may_move)
         return RowVerdict(diagnostics, None, faults)
     if judged is None:
         return RowVerdict()

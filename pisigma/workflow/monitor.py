@@ -46,7 +46,7 @@ from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import HasModel, ModelSource, loaded_model
 from pisigma.model.model_posterior import FLEET_PRIOR, ModelPosterior
 from pisigma.model.stated_conditions import condition_warnings
-from pisigma.validation.gate import check_rows
+from pisigma.validation.gate import check_rows_by_model
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.workflow.recalibrate import may_move, right_rows
 from pisigma.workflow.settings.monitoring import MonitorSettings
@@ -328,7 +328,7 @@ def _record(
     """Compare a session with the model."""
     stated = RecalibrationSettings(settings.moved)
     file = Path(rows.source).name
-    if implausible := check_rows(rows, model, stated.fitted, may_move(stated)).implausible:
+    if implausible := check_rows_by_model(rows, model, stated.fitted, may_move(stated)).implausible:
         return UntrustedSession(file, date, implausible)
     elsewhere = None if settings.moved is None else frame_keys(rows, settings.moved)
     session, zeros = judge_session(model, posterior, rows, elsewhere)
