@@ -1,1 +1,17 @@
-"""Checks of a calibration, one file each: whether it can be trusted, and if not, why."""
+"""Checks of rows and calibrations: one question a file, a calibration or rows under a model in, diagnostics out.
+
+| question | before a calibration (nominal robot) | after it (linearised residuals) | rows under a model |
+|---|---|---|---|
+| Does a fault of setup or file explain all errors? | `setup_fault` | `setup_fault` | `setup_fault`, `other_sensors` |
+| Was another robot measured? | `other_robot` | `other_robot` | `other_robot` |
+| Did frame or tool move while the rows were measured? | `row_order.new_setup` | `row_order` | `mixed_rows` |
+| Are rows of two setups mixed? | | `mixed_rows.check_two_populations` | `mixed_rows` |
+| Are single rows wrong? | | robust loss of the calibration | `wrong_rows` |
+| Were joint values logged too early, or rounded? | | `lag`, `rounding` | |
+| Are all lengths wrong by one factor? | `setup_fault.size_of_positions` | `scale` | `scale` |
+| Do large errors remain that nothing explains? | | `unexplained` | `unexplained` |
+
+What has moved since a calibration, and which rows are wrong under it, are questions about the posterior of a model:
+`pisigma.lifetime.recalibration` and `pisigma.estimation.wrong_rows`. `pisigma.validation.gate` asks all questions for
+every command.
+"""

@@ -55,7 +55,8 @@ def check_lag(checked: CheckedCalibration) -> Iterator[Diagnostic]:
         f"{abs(lag.share):.2g} of the motion {motion}, which makes the errors {lag.factor:.3g} times as large; log "
         "them when the robot has stopped.",
         cause="before_arrival" if lag.before else "after_departure",
-        values={"share": lag.share, "factor": lag.factor},
+        values={"share": lag.share, "factor": lag.factor, "log_odds": lag.log_bayes_factor},
+        remedy="Log them when the robot has stopped.",
     )
 
 

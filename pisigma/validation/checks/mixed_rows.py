@@ -80,6 +80,7 @@ def many_wrong(rows: Measurements, wrong: Bool[Tensor, " rows"]) -> Diagnostic:
         f"{distinction.clause}.{ADVICE}",
         rows=tuple(rows.place(row) for row in wrong.nonzero()[:, 0].tolist()),
         values={"distinguished_by": distinction.by},
+        remedy=ADVICE.strip(),
     )
 
 
@@ -238,7 +239,12 @@ def _two_populations(rows: Measurements, found: Populations) -> Diagnostic:
         f"errors of all rows together are {found.factor:.2g} times as large as separately. {advice}.",
         rows=tuple(rows.place(row) for row in second.nonzero()[:, 0].tolist()),
         cause=found.differing,
-        values={"factor": found.factor, "distinguished_by": distinction.by},
+        values={
+            "factor": found.factor,
+            "log_odds": found.log_bayes_factor,
+            "distinguished_by": distinction.by,
+        },
+        remedy=f"{advice}.",
     )
 
 

@@ -56,12 +56,15 @@ def check_row_order(checked: CheckedCalibration) -> Iterator[Diagnostic]:
     if likely:
         motion = max(likely, key=lambda motion: motion.factor)
         certain = motion.log_bayes_factor > CERTAIN and motion.factor > LARGE
+        what, remedy = _texts(motion, checked.rows)
         yield Diagnostic(
             kind="row_order",
             severity="implausible" if certain else "warning",
-            sentence=_sentence(motion, checked.rows),
+            sentence=f"{what}; this makes the errors of the rows {motion.factor:.3g} times as large. {remedy}",
+            rows=() if motion.first is None else (checked.rows.place(int(motion.rows[motion.first])),),
             cause=motion.moved,
             values=_values(motion, checked.rows),
+            remedy=remedy,
         )
 
 
@@ -71,6 +74,7 @@ def _values(motion: Motion, rows: Measurements) -> dict[str, float | int | str]:
         "shift_mm": math.hypot(*motion.shift) * 1e3,
         "turn_deg": math.degrees(motion.turn),
         "factor": motion.factor,
+        "log_odds": motion.log_bayes_factor,
     }
     if motion.first is not None:
         row = int(motion.rows[motion.first])
@@ -78,28 +82,27 @@ def _values(motion: Motion, rows: Measurements) -> dict[str, float | int | str]:
     return values
 
 
-def _sentence(motion: Motion, rows: Measurements) -> str:
-    """Say what moved, at which row and how far, and what to do."""
+def _texts(motion: Motion, rows: Measurements) -> tuple[str, str]:
+    """Say what moved, at which row and how far; and what to do."""
     what = {"frame": "measuring frame", "target": "target on the tool", "tool": "tool"}[motion.moved]
     what += f" '{motion.name}'" if motion.name and motion.moved != "tool" else ""
     x, y, z = motion.shift * 1e3
     amount = f"{length_text(math.hypot(*motion.shift))} (x {x:.3g}, y {y:.3g}, z {z:.3g} mm "
     amount += "in its axes)" if motion.moved == "frame" else "in the flange's axes)"
     amount += f" and {math.degrees(motion.turn):.2g} deg" if motion.turn > 0 else ""
-    errors = f"this makes the errors of the rows {motion.factor:.3g} times as large"
     if motion.first is None:
         return (
-            f"{rows.source}: the {what} moved slowly while the rows were measured, by up to {amount}; {errors}. Let "
-            "the instrument warm up, fasten its stand and the tool, and measure again, or start new frames at several "
-            "lines (--set new_frame_at=LINE)."
+            f"{rows.source}: the {what} moved slowly while the rows were measured, by up to {amount}",
+            "Let the instrument warm up, fasten its stand and the tool, and measure again, or start new frames at "
+            "several lines (--set new_frame_at=LINE).",
         )
     row = int(motion.rows[motion.first])
-    remedy = "name another target in them (column 'target')"
+    naming = "name another target in them (column 'target')"
     if motion.moved == "frame":
-        remedy = f"give them another frame (--set new_frame_at={rows.line[row] or 'LINE'})"
+        naming = f"give them another frame (--set new_frame_at={rows.line[row] or 'LINE'})"
     return (
-        f"{rows.place(row)}: the {what} moved before this row by {amount}; {errors}. Leave out this row and the later "
-        f"ones, or {remedy}."
+        f"{rows.place(row)}: the {what} moved before this row by {amount}",
+        f"Leave out this row and the later ones, or {naming}.",
     )
 
 

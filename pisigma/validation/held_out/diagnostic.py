@@ -20,6 +20,8 @@ class Diagnostic(Section):
         rows: places (file and line) of the rows at fault; empty if all rows are concerned.
         cause: what was found, among the findings of this kind, such as "frame" or "tool" of "row_order"; may be empty.
         values: numbers and names of the sentence by name; the unit ends the name ("shift_mm"). Joints count from 1.
+            "log_odds" is the logarithm of the odds of the finding, "sigma" the standard deviation of its amount.
+        remedy: what to do, as at the end of the sentence; empty if the sentence says only what to check.
     """
 
     kind: str
@@ -28,3 +30,4 @@ class Diagnostic(Section):
     rows: tuple[str, ...] = ()
     cause: str = ""
     values: dict[str, float | int | str | tuple[int, ...]] = Field(default_factory=dict)
+    remedy: str = ""

@@ -68,6 +68,7 @@ class SetupFault:
             sentence=self.sentence,
             cause=self.cause,
             values=self.values,
+            remedy=self.advice,
         )
 
     @property
