@@ -11,8 +11,7 @@ from pisigma.calibration.geometric.prediction import predicted_poses
 from pisigma.calibration.geometric.problem.problem import CalibrationProblem
 from pisigma.calibration.geometric.problem.setup import IdentifiedGeometry, identified_geometry
 from pisigma.calibration.geometric.result import SolvedCalibration
-from pisigma.calibration.hybrid.design import Design, Rows, chunks, robust_weights
-from pisigma.calibration.hybrid.design import AbstractDesignRegression
+from pisigma.calibration.hybrid.design import AbstractDesignRegression, Design, Rows, chunks, robust_weights
 from pisigma.calibration.hybrid.regression import build_regression
 from pisigma.calibration.hybrid.search import FeatureChoice
 from pisigma.calibration.hybrid.sensor_values import Shift, sensor_values

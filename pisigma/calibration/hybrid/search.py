@@ -8,8 +8,14 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from pisigma.calibration.hybrid.design import FOLDS, FOLDS_OF_FEW, MAX_GROUPS, Design, Rows
-from pisigma.calibration.hybrid.design import AbstractDesignRegression
+from pisigma.calibration.hybrid.design import (
+    FOLDS,
+    FOLDS_OF_FEW,
+    MAX_GROUPS,
+    AbstractDesignRegression,
+    Design,
+    Rows,
+)
 from pisigma.calibration.hybrid.regression import build_regression, extend_regression
 from pisigma.estimation.held_out import HeldOutErrors
 from pisigma.estimation.regression import Posterior
