@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 from pisigma.lifetime.cell.acceptance import Acceptance
 from pisigma.reporting.tables import Table, figure_text
-from pisigma.validation.iso9283.repeats import RepeatedPose
+from pisigma.validation.iso9283.repeats import MIN_CYCLES, RepeatedPose, pooled_deviation
 from pisigma.validation.uncertainty.budget import COVERAGE
 
 NOT_STATED = "not stated"
@@ -55,7 +55,7 @@ def statement_table(acceptance: Acceptance) -> tuple[tuple[str, str], ...]:
     """Return what is stated about instrument, robot and temperatures, by name."""
     instrument, span = acceptance.instrument, acceptance.temperature_span
     U, k = instrument.expanded_uncertainty_mm, instrument.coverage_factor
-    maker = acceptance.repeatability_mm
+    maker, scatter = acceptance.repeatability_mm, pooled_deviation(acceptance.repeats)
     return (
         ("instrument", instrument.name or NOT_STATED),
         ("serial number", instrument.serial or NOT_STATED),
@@ -66,6 +66,12 @@ def statement_table(acceptance: Acceptance) -> tuple[tuple[str, str], ...]:
             f"U = {NOT_STATED if U is None else f'{U:g} mm'}, k = {NOT_STATED if k is None else f'{k:g}'}",
         ),
         ("repeatability RP of the maker", NOT_STATED if maker is None else f"{maker:g} mm"),
+        (
+            "standard deviation of a coordinate in repeated poses",
+            "no pose was measured twice"
+            if scatter is None
+            else f"{figure_text(scatter[0] * 1e3)} mm ({scatter[1]} degrees of freedom)",
+        ),
         (
             "temperatures of the sessions",
             NOT_STATED if span is None else f"{span[0]:.1f} to {span[1]:.1f} deg C",
@@ -137,12 +143,16 @@ def comparison_table(acceptance: Acceptance) -> Table:
 def iso_table(repeats: Sequence[RepeatedPose]) -> Table:
     """Return pose accuracy and repeatability of the poses that were measured more than once [mm]."""
     accuracies = [one.accuracy * 1e3 for one in repeats if one.accuracy is not None]
-    repeatabilities = [one.repeatability * 1e3 for one in repeats]
-    cycles = sorted({one.rows for one in repeats})
-    counts = f"{cycles[0]} to {cycles[-1]}" if len(cycles) > 1 else f"{cycles[0]}"
+    repeatabilities = [one.repeatability * 1e3 for one in repeats if one.repeatability is not None]
+    names = (
+        ("pose accuracy AP", accuracies, 2),
+        (f"pose repeatability RP, {MIN_CYCLES} cycles or more", repeatabilities, MIN_CYCLES),
+    )
     rows = []
-    for name, values in (("pose accuracy AP", accuracies), ("pose repeatability RP", repeatabilities)):
+    for name, values, fewest in names:
+        cycles = sorted({one.rows for one in repeats if one.rows >= fewest})
         if values:
+            counts = f"{cycles[0]} to {cycles[-1]}" if len(cycles) > 1 else f"{cycles[0]}"
             mean = sum(values) / len(values)
             rows.append((name, str(len(values)), counts, figure_text(mean), figure_text(max(values))))
     return Table(("ISO 9283:1998", "poses", "cycles", "mean [mm]", "largest [mm]"), tuple(rows))

@@ -6,7 +6,7 @@ from typing import Any
 
 from pisigma.lifetime.cell.history import Event
 from pisigma.validation.held_out.model_comparison import QuantityErrors
-from pisigma.validation.iso9283.repeats import CYCLES, RepeatedPose
+from pisigma.validation.iso9283.repeats import CYCLES, RepeatedPose, pooled_deviation
 from pisigma.validation.uncertainty.budget import UncertaintyBudget
 from pisigma.validation.uncertainty.components import SCATTER
 from pisigma.validation.uncertainty.instrument import Instrument
@@ -114,7 +114,7 @@ class Acceptance:
 
     def to_json(self) -> dict[str, Any]:
         """Return plain values, lengths in mm."""
-        span = self.temperature_span
+        span, scatter = self.temperature_span, pooled_deviation(self.repeats)
         return {
             "model": self.model,
             "limit_mm": self.limit_mm,
@@ -124,6 +124,9 @@ class Acceptance:
             "budget": self.budget.to_json(),
             "contradicted": self.contradicted,
             "measured": None if self.measured is None else self.measured.to_json(),
+            "repeats": {}
+            if scatter is None
+            else {"deviation_mm": scatter[0] * 1e3, "degrees_of_freedom": scatter[1]},
             "iso9283": [one.to_json() for one in self.repeats],
             "accepted": [one.to_json() for one in self.accepted],
             "not_stated": list(self.not_stated),

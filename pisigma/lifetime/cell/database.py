@@ -109,10 +109,14 @@ class Database:
         """Write a copy of the file without the changes that other processes are making.
 
         Raises:
-            OutputError: the file cannot be read, or the copy cannot be written; see `opened`.
+            OutputError: the file cannot be read, or the copy cannot be written; see `open`.
         """
-        with self.open() as database, closing(sqlite3.connect(path)) as other:
-            database.backup(other)
+        with self.open() as database:
+            try:
+                with closing(sqlite3.connect(path)) as other:
+                    database.backup(other)
+            except sqlite3.Error as problem:
+                raise OutputError(f"the history cannot be copied: {problem}", at=Place(path.parent)) from None
 
     @contextmanager
     def transaction(self) -> Iterator[sqlite3.Connection]:

@@ -1,5 +1,7 @@
 """Pose accuracy and repeatability of the poses that were measured more than once, as in rows of a session."""
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,10 +11,12 @@ from torch import Tensor
 
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import groups_of_equal_joints, numbers_of_names
-from pisigma.validation.iso9283.pose import position_accuracy, position_repeatability
+from pisigma.validation.iso9283.pose import barycentre, position_accuracy, position_repeatability
 
 CYCLES = 30
 """Number of repeats of a pose that ISO 9283:1998 asks for."""
+MIN_CYCLES = 10
+"""Number of repeats below which RP is not computed: of few, the spread of their distances is far too small."""
 
 
 @dataclass(frozen=True)
@@ -23,23 +27,38 @@ class RepeatedPose:
         rows: number of measurements of the pose.
         accuracy: pose accuracy AP_P [m]: distance from the commanded position, which the model predicts, to the
             barycentre of the measured ones; None if the frame of the rows is not one of the model.
-        repeatability: pose repeatability RP_l [m].
+        repeatability: pose repeatability RP_l [m]; None with fewer than `MIN_CYCLES` measurements.
+        squares: sum of the squared distances from the barycentre [m²].
     """
 
     rows: int
     accuracy: float | None
-    repeatability: float
+    repeatability: float | None
+    squares: float
 
     def to_json(self) -> dict[str, Any]:
         """Return plain values, lengths in mm."""
-        accuracy = None if self.accuracy is None else self.accuracy * 1e3
-        return {"rows": self.rows, "ap_mm": accuracy, "rp_mm": self.repeatability * 1e3}
+        ap, rp = (None if value is None else value * 1e3 for value in (self.accuracy, self.repeatability))
+        return {"rows": self.rows, "ap_mm": ap, "rp_mm": rp}
+
+
+def pooled_deviation(poses: Sequence[RepeatedPose]) -> tuple[float, int] | None:
+    """Pool the scatter of a coordinate over poses that were measured more than once.
+
+    `s² = Σ_poses Σ_j |x_j - x̄|² / (3 Σ_poses (n - 1))`, with `3 Σ (n - 1)` degrees of freedom; it contains the noise of
+    the instrument.
+
+    Returns:
+        The standard deviation of a coordinate [m] and its degrees of freedom; None without repeats.
+    """
+    freedom = 3 * sum(one.rows - 1 for one in poses)
+    return (math.sqrt(sum(one.squares for one in poses) / freedom), freedom) if freedom else None
 
 
 def repeated_poses(
     rows: Measurements, commanded: Float64[Tensor, "rows 3"] | None
 ) -> tuple[RepeatedPose, ...]:
-    """Compute AP_P and RP_l of every pose with two or more measured positions.
+    """Compute AP_P of every pose with two or more measured positions, and RP_l of those with `MIN_CYCLES` or more.
 
     Args:
         rows: measured rows; rows of one pose have equal joint values, frames and targets.
@@ -57,5 +76,7 @@ def repeated_poses(
             accuracy = None
             if commanded is not None:
                 accuracy = float(position_accuracy(attained, commanded[of_pose][0]).length)
-            found.append(RepeatedPose(len(attained), accuracy, float(position_repeatability(attained))))
+            repeatability = float(position_repeatability(attained)) if len(attained) >= MIN_CYCLES else None
+            squares = float((attained - barycentre(attained)).square().sum())
+            found.append(RepeatedPose(len(attained), accuracy, repeatability, squares))
     return tuple(found)

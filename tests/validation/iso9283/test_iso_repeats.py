@@ -7,7 +7,7 @@ from testing.closeness import assert_close
 
 from pisigma.measurement.dataset import Measurements
 from pisigma.validation.iso9283.pose import position_accuracy, position_repeatability
-from pisigma.validation.iso9283.repeats import repeated_poses
+from pisigma.validation.iso9283.repeats import MIN_CYCLES, pooled_deviation, repeated_poses
 
 GENERATOR = torch.Generator().manual_seed(3)
 Q = torch.randn(3, 6, generator=GENERATOR, dtype=torch.float64)
@@ -23,7 +23,28 @@ def test_poses_that_were_measured_more_than_once_have_figures():
     for one, number in zip(found, (0, 1), strict=True):
         attained, commanded = ATTAINED[number == POSE], COMMANDED[number == POSE][0]
         assert_close(one.accuracy, float(position_accuracy(attained, commanded).length))
-        assert_close(one.repeatability, float(position_repeatability(attained)))
+        assert one.repeatability is None
+    s, freedom = pooled_deviation(found)
+    assert freedom == 9
+    parts = [ATTAINED[number == POSE] - ATTAINED[number == POSE].mean(0) for number in (0, 1)]
+    assert_close(s, float((torch.cat(parts).square().sum() / 9).sqrt()), rtol=1e-9)
+
+
+def test_the_repeatability_needs_ten_cycles():
+    attained = 1e-4 * torch.randn(MIN_CYCLES, 3, generator=GENERATOR, dtype=torch.float64)
+    (found,) = repeated_poses(Measurements(q=Q[:1].expand(MIN_CYCLES, -1), position=attained), None)
+    assert_close(found.repeatability, float(position_repeatability(attained)))
+    (fewer,) = repeated_poses(Measurements(q=Q[:1].expand(MIN_CYCLES - 1, -1), position=attained[1:]), None)
+    assert fewer.repeatability is None
+
+
+def test_scatter_is_unbiased_with_two_cycles():
+    q = torch.arange(2_000.0, dtype=torch.float64).repeat_interleave(2)[:, None].expand(-1, 6)
+    attained = 1e-4 * torch.randn(4_000, 3, generator=GENERATOR, dtype=torch.float64)
+    s, freedom = pooled_deviation(repeated_poses(Measurements(q=q, position=attained), None))
+    assert freedom == 6_000
+    assert_close(s, 1e-4, rtol=0.03)
+    assert pooled_deviation(()) is None
 
 
 def test_there_is_no_accuracy_without_the_command():

@@ -3,11 +3,15 @@
 import math
 
 import pytest
+import torch
 from testing.cell_before import cell_of_schema_1
+from testing.cell_rows import measured
 from testing.closeness import assert_close
 from testing.refusals import refused
+from testing.simulated_arm import BASE
 
 from pisigma.files.errors import PlanningError
+from pisigma.measurement.dataset import Measurements
 from pisigma.workflow.cell.acceptance import acceptance_of
 from pisigma.workflow.cell.cell import Cell
 
@@ -59,6 +63,25 @@ def test_what_is_stated_is_in_the_budget(cell):
 
 def test_errors_that_the_budget_does_not_explain_are_found(cell):
     assert acceptance_of(_stated(cell)).contradicted
+
+
+def test_repeated_poses_after_the_instrument_was_moved_have_no_accuracy(cell):
+    """The base is then fitted to the rows; two cycles show the scatter, but not RP."""
+    base = BASE.copy()
+    base[0] += 0.4
+    rows = measured(12, 9, base=base)
+    noise = 3e-5 * torch.randn(4, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    rows = Measurements(
+        q=torch.cat([rows.q, rows.q[:4]]), position=torch.cat([rows.position, rows.position[:4] + noise])
+    )
+    cell.sessions.set_aside("2026-08-01", "joint 3 had slipped")
+    cell.history.record("instrument", "2026-09-01")
+    cell.take_in(rows, day="2026-09-10")
+    found = acceptance_of(cell)
+    assert (found.measured.session, found.measured.fitted) == ("2026-09-10", ("base",))
+    assert not found.contradicted
+    assert [(one.rows, one.accuracy, one.repeatability) for one in found.repeats] == [(2, None, None)] * 4
+    assert found.to_json()["repeats"]["degrees_of_freedom"] == 12
 
 
 @pytest.mark.parametrize(
