@@ -36,7 +36,7 @@ def test_an_unpacked_cell_has_the_same_files(cell, tmp_path):
 
 
 def test_a_cell_is_packed_without_the_changes_that_another_process_is_making(cell, tmp_path):
-    with cell.history.database.writing() as database:
+    with cell.history.database.transaction() as database:
         cell.history.database.insert(database, cell.history.events())
         assert cell.history.path.with_name(f"{HISTORY}-journal").exists()
         pack(cell, tmp_path / "welder7.zip")
