@@ -49,6 +49,7 @@ class GradientDescentSection(Section):
     """The paper's rule: `Δw = -η ∂E/∂w` over all patterns at once (Jeong et al. 1998, eqs 3 and 4).
 
     Attributes:
+        method: "gradient_descent".
         learning_rate: η of every joint, by name.
         epochs: number of steps.
         seed: random seed of the initial weights.
@@ -83,6 +84,7 @@ class LevenbergMarquardtSection(Section):
     """Least squares for every output, from several starts; the best by validation error is kept.
 
     Attributes:
+        method: "levenberg_marquardt".
         epochs: largest number of iterations; fewer if the weights converge.
         starts: number of starts of every output.
         validation_share: share of the patterns that only choose between starts.
@@ -106,6 +108,7 @@ class MiniBatchSection(Section):
     The learning rate falls along half a cosine to 0 at the last step.
 
     Attributes:
+        method: "mini_batches".
         batch_rows: rows of a mini-batch.
         epochs: number of passes over all rows.
         optimiser: "adam", "adamw", or "sgd" with momentum 0.9.

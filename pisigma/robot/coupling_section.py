@@ -13,7 +13,15 @@ from pisigma.robot.row import MAX_MAGNITUDE, Bounded, Row
 
 
 class FourBarSection(Section):
-    """The bar lengths of a linkage, and its crank angle where the sum of factors and offset is 0; see `FourBar`."""
+    """A four-bar linkage that drives a joint; see `FourBar`.
+
+    Attributes:
+        ground_mm: length of the ground bar [mm].
+        crank_mm: length of the crank [mm].
+        coupler_mm: length of the coupler [mm].
+        rocker_mm: length of the rocker [mm].
+        zero_deg: angle of the crank relative to the ground bar where the sum of factors and offset is 0 [deg].
+    """
 
     ground_mm: float = Field(gt=0, le=MAX_MAGNITUDE)
     crank_mm: float = Field(gt=0, le=MAX_MAGNITUDE)

@@ -20,7 +20,15 @@ Limits = Annotated[tuple[Bounded, Bounded], Field(description="lower and upper")
 
 
 class ParameterSection(Section):
-    """DH and Hayati parameters of a row, angles in degrees and lengths in millimetres."""
+    """DH and Hayati parameters of a row.
+
+    Attributes:
+        theta_deg: rotation about the joint axis z, before the joint value [deg].
+        d_mm: translation along z [mm].
+        a_mm: translation along x [mm].
+        alpha_deg: rotation about x [deg].
+        beta_deg: rotation about y, for nearly parallel axes [deg].
+    """
 
     theta_deg: Bounded = 0.0
     d_mm: Bounded = 0.0
@@ -78,7 +86,16 @@ class RowSection(ParameterSection):
 
 
 class FrameSection(Section):
-    """Base or tool: `Trans(x, y, z) · RotZ(roll) · RotY(pitch) · RotX(yaw)`."""
+    """Base or tool: `Trans(x, y, z) · RotZ(roll) · RotY(pitch) · RotX(yaw)`.
+
+    Attributes:
+        x_mm: translation along x [mm].
+        y_mm: translation along y [mm].
+        z_mm: translation along z [mm].
+        roll_deg: rotation about z [deg].
+        pitch_deg: rotation about y [deg].
+        yaw_deg: rotation about x [deg].
+    """
 
     x_mm: Bounded = 0.0
     y_mm: Bounded = 0.0

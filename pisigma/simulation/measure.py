@@ -22,6 +22,8 @@ class SimulatedMeasurements(AbstractCommanded):
     """Recipe section of a tracker that measures the true robot.
 
     Attributes:
+        poses: desired poses, or joint values to command.
+        branch: branch of the inverse kinematics for desired poses; not for joint values.
         kind: "tracker", the default.
         sensor: "pose" (position and orientation) or "position".
         noise: noise of the sensor; none by default.

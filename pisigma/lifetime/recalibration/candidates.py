@@ -37,7 +37,7 @@ FOLDS = 5
 MIN_RATIO = 1.05
 """Ratio of RMS errors below which another candidate does not replace the recalibrated model."""
 CLEAR_RATIO = 2.0
-"""Ratio of RMS errors above which a candidate is better, whatever the distribution of the errors."""
+"""Ratio of RMS errors above which a candidate is better, for any distribution of the errors."""
 OUTLIER_FACTOR = 5.0
 """Factor over the median error above which rows that every candidate misses are ignored."""
 

@@ -75,6 +75,14 @@ class JointErrorFigures(Section):
 
     They are those of Jeong et al. 1998, Tables 1 and 2; the standard deviation is over all rows (divided by n, as the
     paper's figures are).
+
+    Attributes:
+        average_deg: average of a revolute joint [deg].
+        deviation_deg: standard deviation of a revolute joint [deg].
+        maximum_deg: maximum of a revolute joint [deg].
+        average_mm: average of a prismatic joint [mm].
+        deviation_mm: standard deviation of a prismatic joint [mm].
+        maximum_mm: maximum of a prismatic joint [mm].
     """
 
     average_deg: float | None = None
@@ -106,7 +114,12 @@ class JointErrorFigures(Section):
 
 
 class BeforeAfter(Section):
-    """Errors of a joint before and after the correction."""
+    """Errors of a joint before and after the correction.
+
+    Attributes:
+        before: errors before the correction.
+        after: errors after the correction.
+    """
 
     before: JointErrorFigures
     after: JointErrorFigures
