@@ -21,7 +21,7 @@ from pisigma.calibration.geometric.problem.setup import identified_geometry
 from pisigma.calibration.geometric.result import SolvedCalibration
 from pisigma.calibration.hybrid.calibrator import HybridCalibrator
 from pisigma.calibration.hybrid.design import Design
-from pisigma.calibration.hybrid.refinement import Refined, correction_from_weights, linearise_rows
+from pisigma.calibration.hybrid.refinement import RefinedFit, correction_from_weights, linearise_rows
 from pisigma.calibration.hybrid.regression import build_regression
 from pisigma.estimation.prior import GaussianPrior
 from pisigma.joint_correction.feature import AbstractFeature
@@ -53,7 +53,7 @@ def together(first: Measurements, second: Measurements) -> Measurements:
 
 def fitted(
     solved: SolvedCalibration, features: tuple[AbstractFeature, ...], prior: GaussianPrior | None = None
-) -> Refined:
+) -> RefinedFit:
     """Return the hybrid with some features, with prior sizes estimated or given."""
     problem, group = solved.problem, held_out_groups(solved.setup.measurements)
     view, design = sensor_view_of(solved.solution.linearisation), Design(problem, features)
@@ -79,10 +79,10 @@ def fitted(
     there = fit.solve(posterior.prior, posterior.noise)
     there = fit.solve(posterior.prior, fit.updated_noise(there))
     point = problem.nominal.index_add(0, problem.active, there.x[: design.active])
-    return Refined(rows, design, there, fit, point, correction_from_weights(design, there.x), ROUNDS)
+    return RefinedFit(rows, design, there, fit, point, correction_from_weights(design, there.x), ROUNDS)
 
 
-def amplitudes(both: Refined, prior: GaussianPrior) -> GaussianPrior:
+def amplitudes(both: RefinedFit, prior: GaussianPrior) -> GaussianPrior:
     """Return the prior of series C with the amplitude of every harmonic of every joint in both series."""
     design, precision = both.design, prior.precision.clone()
     # base and tool of the other series are unknowns of both and precede the weights
@@ -98,7 +98,7 @@ def amplitudes(both: Refined, prior: GaussianPrior) -> GaussianPrior:
     return replace(prior, base=precision * prior.sizes[prior.group].square())
 
 
-def error(solved: SolvedCalibration, refined: Refined, rows: Measurements) -> float:
+def error(solved: SolvedCalibration, refined: RefinedFit, rows: Measurements) -> float:
     """Return the RMS error of other rows, with base and tool fitted to them [mm]."""
     geometry = identified_geometry(solved.setup, refined.point)
     rows = named(rows, "c")

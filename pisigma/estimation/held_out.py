@@ -62,7 +62,7 @@ class HeldOutErrors:
         return HeldOutErrors((inverse @ residual) * repetition.sqrt(), spread.sqrt(), sensor)
 
     @staticmethod
-    def joined(parts: "Sequence[HeldOutErrors]") -> "HeldOutErrors":
+    def concatenate(parts: "Sequence[HeldOutErrors]") -> "HeldOutErrors":
         """Concatenate the errors of several folds."""
         names = ("error", "spread", "sensor")
         return HeldOutErrors(*(torch.cat([getattr(part, name) for part in parts]) for name in names))

@@ -22,7 +22,7 @@ from pisigma.estimation.regression import AbstractRegression, Posterior, SensorC
 
 
 @dataclass(frozen=True, eq=False)
-class Solved:
+class SolvedRegression:
     """The normal equations, divided by the noise's variance, with a prior: `D (Σ X^T X + precision) D = L L^T`.
 
     Attributes:
@@ -74,7 +74,7 @@ class PrimalRegression(AbstractRegression):
     descent: Float64[Tensor, "sensors unknowns"]
     square: tuple[float, ...]
     sensors: tuple[SensorCount, ...]
-    latest: list[Solved] = field(default_factory=list, init=False)
+    latest: list[SolvedRegression] = field(default_factory=list, init=False)
 
     def solve(self, prior: GaussianPrior, noise: tuple[float, ...]) -> Posterior:
         """Solve `(Σ_s N_s / noise_s² + precision) x = Σ_s b_s / noise_s²` by Cholesky with column scaling."""
@@ -94,12 +94,12 @@ class PrimalRegression(AbstractRegression):
         return Posterior(x, evidence, prior, noise, square, determined, misfit, tuple(used))
 
     def covariance_root(self, posterior: Posterior) -> CovarianceRoot:
-        """See `AbstractRegression.covariance_root`; with the names of `Solved` it is `D L^-T`."""
+        """See `AbstractRegression.covariance_root`; with the names of `SolvedRegression` it is `D L^-T`."""
         solved = self.solved_with(posterior.prior, posterior.noise)
         self.latest.clear()
         return CovarianceRoot(solved.inverse.t().mul_(solved.scale[:, None]))
 
-    def solved_with(self, prior: GaussianPrior, noise: tuple[float, ...]) -> Solved:
+    def solved_with(self, prior: GaussianPrior, noise: tuple[float, ...]) -> SolvedRegression:
         """Return the cached solution if prior and noise are the same, else solve."""
 
         def normal() -> Tensor:
@@ -121,7 +121,7 @@ class PrimalRegression(AbstractRegression):
             inner = torch.linalg.solve_triangular(factor, (scale * descent)[:, None], upper=False)
             x = scale * torch.linalg.solve_triangular(factor.mT, inner, upper=True)[:, 0]
             invert_triangle(factor)
-            self.latest.append(Solved(prior, noise, scale, factor, log_det, x))
+            self.latest.append(SolvedRegression(prior, noise, scale, factor, log_det, x))
         return self.latest[0]
 
     def _misfits(self, x: Float64[Tensor, " unknowns"]) -> tuple[float, ...]:

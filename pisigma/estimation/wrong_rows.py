@@ -24,7 +24,7 @@ What = TypeVar("What")
 
 
 @dataclass(frozen=True, eq=False)
-class Explained(Generic[What]):
+class ExplainedRows(Generic[What]):
     """The best explanation of measured values.
 
     Attributes:
@@ -43,8 +43,8 @@ class Explained(Generic[What]):
 
 
 def with_wrong_rows(
-    explained: Explained[What], explain: Callable[[Mapping[int, float]], Explained[What]]
-) -> Explained[What]:
+    explained: ExplainedRows[What], explain: Callable[[Mapping[int, float]], ExplainedRows[What]]
+) -> ExplainedRows[What]:
     """Mark configurations as wrong as long as that raises the log evidence by more than its prior penalty.
 
     If a drift of many unknowns is estimated from all rows, a wrong row is hard to detect. Therefore the most suspicious
@@ -68,7 +68,7 @@ def with_wrong_rows(
     return explained
 
 
-def _suspects(explained: Explained[What]) -> list[dict[int, float]]:
+def _suspects(explained: ExplainedRows[What]) -> list[dict[int, float]]:
     """Return the known wrong configurations plus one of those that gain most from a larger noise, for each of these.
 
     Adding a variance `f² σ²` to the values of a configuration raises the log evidence like a drift along their unit

@@ -9,11 +9,11 @@ Progress = Callable[[str], None]
 """Callback that receives a short description of the current step."""
 
 
-def ignore_progress(what: str) -> None:
+def no_progress(what: str) -> None:
     """Ignore progress, for processes without a listener."""
 
 
-def staged_progress(progress: Progress, name: str, separator: str = ": ") -> Progress:
+def with_stage(progress: Progress, name: str, separator: str = ": ") -> Progress:
     """Return a callback that puts the name of a stage before each message.
 
     It can be pickled if `progress` can, so that stages may run in other processes.

@@ -11,7 +11,7 @@ import torch
 from pisigma.files.errors import MeasurementError, Place, make_printable
 from pisigma.files.input_file import read_text
 from pisigma.measurement.csv.header import read_header
-from pisigma.measurement.csv.reading import sound_rows
+from pisigma.measurement.csv.reading import read_usable_rows
 from pisigma.measurement.csv.table import Table, table_of
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.fields import MeasuredFields, UnusableRow
@@ -26,7 +26,7 @@ Reader = Callable[[Table, bool], MeasuredFields]
 
 
 @dataclass(frozen=True, eq=False)
-class Growth:
+class FileGrowth:
     """Changes of a file since it was last read.
 
     Attributes:
@@ -64,7 +64,7 @@ class GrowingFile:
         """
         self.path = Path(path)
         self._robot = robot
-        self._reader: Reader = reader or (lambda table, final: sound_rows(table, robot))
+        self._reader: Reader = reader or (lambda table, final: read_usable_rows(table, robot))
         self._source = make_printable(str(path), cut=False)
         self._stamp: tuple[int, ...] = ()
         self._text = ""
@@ -72,7 +72,7 @@ class GrowingFile:
         self._accepted: Counter[str] = Counter()
         self._refused: set[UnusableRow] = set()
 
-    def read(self, final: bool = False) -> Growth:
+    def read(self, final: bool = False) -> FileGrowth:
         """Read the new rows.
 
         Args:
@@ -88,10 +88,10 @@ class GrowingFile:
                 raise MeasurementError(
                     "there is no such file", at=Place(self._source), remedy="check the path"
                 ) from None
-            return Growth(waiting=f"{self._source} does not exist yet.")
+            return FileGrowth(waiting=f"{self._source} does not exist yet.")
         stamp = (state.st_ino, state.st_size, state.st_mtime_ns, final)
         if stamp == self._stamp:
-            return Growth(waiting=self._waiting)
+            return FileGrowth(waiting=self._waiting)
         text = read_text(self.path, MeasurementError, "CSV")
         complete = text if final else text[: max(text.rfind("\n"), text.rfind("\r")) + 1]
         self._stamp, notices = stamp, self._changes(complete)
@@ -99,17 +99,17 @@ class GrowingFile:
         self._waiting = "" if complete == text else "the last line is not complete yet."
         if not complete.strip() and not final:
             self._waiting = f"{self._source} has no complete header yet."
-            return Growth(notices=notices, waiting=self._waiting)
+            return FileGrowth(notices=notices, waiting=self._waiting)
         table = table_of(complete, self._source)
         if not table.records:
             read_header(table, self._robot)
-            return Growth(notices=notices, waiting=self._waiting)
+            return FileGrowth(notices=notices, waiting=self._waiting)
         data = self._reader(table, final)
         left_out = tuple(one for one in data.left_out if one not in self._refused)
         self._refused.update(left_out)
         new = self._new_rows(data)
         rows = Measurements.from_fields(data.select(torch.tensor(new))) if new else None
-        return Growth(rows, left_out, notices, self._waiting)
+        return FileGrowth(rows, left_out, notices, self._waiting)
 
     def _changes(self, text: str) -> tuple[str, ...]:
         """Return a notice if the file does not continue the text that was read."""

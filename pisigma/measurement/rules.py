@@ -30,7 +30,7 @@ _ROTATION_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True)
-class Labels:
+class FieldLabels:
     """Names of fields and units of values in messages.
 
     Attributes:
@@ -65,7 +65,10 @@ def check_fields(data: MeasuredFields) -> None:
             _check_values(data, name)
     _check_rotations(data)
     sound = np.ones(data.rows, dtype=bool)
-    for faults in (row_faults(data, Labels()), group_faults(data, Labels(), sound, data.place_text)):
+    for faults in (
+        row_faults(data, FieldLabels()),
+        group_faults(data, FieldLabels(), sound, data.place_text),
+    ):
         for row, fault in faults:
             raise fault.error(data.place_of(row))
 
@@ -149,7 +152,7 @@ RowAndFault = tuple[int, Fault]
 """The number of a row, and what is wrong with it."""
 
 
-def row_faults(data: MeasuredFields, labels: Labels) -> Iterator[RowAndFault]:
+def row_faults(data: MeasuredFields, labels: FieldLabels) -> Iterator[RowAndFault]:
     """Find rows with impossible values and rows that contradict themselves.
 
     A row contains one measured length: a position, the coordinate of a touch, a socket, or a distance. A second
@@ -187,7 +190,7 @@ def rows_where(bad: Bool[np.ndarray, " rows"]) -> list[int]:
     return rows
 
 
-def _value_faults(data: MeasuredFields, labels: Labels) -> Iterator[RowAndFault]:
+def _value_faults(data: MeasuredFields, labels: FieldLabels) -> Iterator[RowAndFault]:
     """Find impossible standard deviations, payloads, temperatures, directions of approach, sets and dates."""
     for name, least, most in (
         ("sigma_position", MIN_SIGMA, math.inf),
@@ -224,7 +227,7 @@ def _value_faults(data: MeasuredFields, labels: Labels) -> Iterator[RowAndFault]
 _CORRECT = "correct it or leave it empty"
 
 
-def _reading_faults(data: MeasuredFields, labels: Labels) -> Iterator[RowAndFault]:
+def _reading_faults(data: MeasuredFields, labels: FieldLabels) -> Iterator[RowAndFault]:
     """Find readings of registered sensors that are incomplete or impossible."""
     for sensor, readings in READINGS.items():
         if not {*readings.numbers, *readings.texts} & {*data.numbers, *data.texts}:
@@ -254,7 +257,7 @@ def _named(names: Sequence[str]) -> Bool[np.ndarray, " rows"]:
 
 
 def _touch_faults(
-    data: MeasuredFields, labels: Labels, touch: Bool[np.ndarray, " rows"]
+    data: MeasuredFields, labels: FieldLabels, touch: Bool[np.ndarray, " rows"]
 ) -> Iterator[RowAndFault]:
     axes = data.text("touch_axis")
     axis = _named(axes)
@@ -272,7 +275,7 @@ def _touch_faults(
 
 
 def _distance_faults(
-    data: MeasuredFields, labels: Labels, distance: Bool[np.ndarray, " rows"]
+    data: MeasuredFields, labels: FieldLabels, distance: Bool[np.ndarray, " rows"]
 ) -> Iterator[RowAndFault]:
     anchors, pairs, values = data.text("anchor"), data.text("pair"), data.array("distance")
     anchor, pair = _named(anchors), _named(pairs)
@@ -316,7 +319,7 @@ def _distance_faults(
 
 
 def group_faults(
-    data: MeasuredFields, labels: Labels, sound: Bool[np.ndarray, " rows"], place: Callable[[int], str]
+    data: MeasuredFields, labels: FieldLabels, sound: Bool[np.ndarray, " rows"], place: Callable[[int], str]
 ) -> Iterator[RowAndFault]:
     """Find rows that contradict other rows of the same pair, anchor or socket.
 
@@ -360,7 +363,7 @@ def _groups(names: Sequence[str]) -> dict[str, list[int]]:
 
 def _pair_fault(
     data: MeasuredFields,
-    labels: Labels,
+    labels: FieldLabels,
     name: str,
     rows: list[int],
     sound: Bool[np.ndarray, " rows"],

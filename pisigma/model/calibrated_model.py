@@ -64,7 +64,7 @@ class Provenance:
     versions: dict[str, str] = field(default_factory=dict)
 
     @staticmethod
-    def present_versions() -> dict[str, str]:
+    def installed_versions() -> dict[str, str]:
         """Return the versions of pisigma, torch and python that are running."""
         return {"pisigma": version("pisigma"), "torch": version("torch"), "python": platform.python_version()}
 

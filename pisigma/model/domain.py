@@ -44,7 +44,7 @@ class Domain(nn.Module):
         self.register_buffer("radius", radius)
 
     @staticmethod
-    def from_training_rows(scaled: Float[Tensor, "rows inputs"], generator: torch.Generator) -> "Domain":
+    def from_rows(scaled: Float[Tensor, "rows inputs"], generator: torch.Generator) -> "Domain":
         """Make the region around training rows, of which at most `MAX_SAMPLES`, drawn at random, are kept."""
         if scaled.shape[0] > MAX_SAMPLES:
             sampled = torch.randperm(scaled.shape[0], generator=generator)[:MAX_SAMPLES]

@@ -60,7 +60,7 @@ def model_of_calibration(
             data_sha256=measurements.content_hash(),
             rows=measurements.rows,
             rows_left_out=len(measurements.left_out),
-            versions=Provenance.present_versions(),
+            versions=Provenance.installed_versions(),
         ),
     )
 

@@ -20,7 +20,7 @@ _SHOWN = {"rms": "RMS", "p95": "95 %", "max": "largest"}
 def error_table(figures: ValidationFigures) -> Table:
     """RMS, 95 % quantile and maximum of the errors, one column per calibration."""
     models = figures.models
-    named = [errors.by_name for errors in models.values()]
+    named = [errors.figures_by_name for errors in models.values()]
     rows = []
     for key in named[0]:
         statistic, unit = key.rsplit("_", 1)

@@ -72,7 +72,7 @@ def pose_rows(models: Mapping[str, ErrorFigures]) -> Table:
     Args:
         models: errors by the name of the model.
     """
-    figures = [errors.by_name for errors in models.values()]
+    figures = [errors.figures_by_name for errors in models.values()]
     rows = [(*_with_unit(name), *(figure_text(errors[name]) for errors in figures)) for name in figures[0]]
     return Table(("error", "unit", *models), tuple(rows))
 

@@ -132,7 +132,7 @@ class TouchCandidates:
         return replace(self, **{name: getattr(self, name)[index] for name in _ARRAYS})
 
     @staticmethod
-    def joined(parts: Sequence["TouchCandidates"]) -> "TouchCandidates":
+    def concatenate(parts: Sequence["TouchCandidates"]) -> "TouchCandidates":
         """Concatenate candidates, with the placements of the first ones."""
         arrays = {name: torch.cat([getattr(part, name) for part in parts]) for name in _ARRAYS}
         return TouchCandidates(parts[0].placements, **arrays)
@@ -197,7 +197,7 @@ class TouchCandidatesSection(Section):
         parts = [self._of_placement(robot, placement, generator) for placement in placements]
         numbers = torch.arange(len(parts)).repeat_interleave(self.count)
         names = tuple(placement.name for placement in placements)
-        return replace(TouchCandidates.joined(parts), placements=names, placement=numbers)
+        return replace(TouchCandidates.concatenate(parts), placements=names, placement=numbers)
 
     def _of_placement(
         self, robot: Robot, placement: JigPlacement, generator: torch.Generator
@@ -210,7 +210,7 @@ class TouchCandidatesSection(Section):
         for _ in range(MAX_DRAWS):
             sampled = self._draw(jig, placement.name, robot.dof, generator)
             parts.append(self._reachable(robot, jig, placement, sampled))
-            reachable = TouchCandidates.joined(parts)
+            reachable = TouchCandidates.concatenate(parts)
             of_axis = {axis: (reachable.axis == axis).nonzero()[:, 0] for axis in axes}
             if all(len(of_axis[axis]) >= share[axis] for axis in axes):
                 return reachable.select(

@@ -33,7 +33,7 @@ from pisigma.validation.held_out.calibration_summary import CalibrationSummary, 
 from pisigma.validation.held_out.calibration_validation import (
     CalibrationValidation,
     joined_repeats,
-    judge_on_test_set,
+    judge,
 )
 from pisigma.validation.held_out.few_rows import fit_with_folds
 from pisigma.validation.held_out.held_out_rows import HeldOutRows
@@ -143,7 +143,7 @@ def calibrate(
     except IdentificationError as refusal:
         raise explain_refusal(refusal, nominal, rows) from refusal
     validation = joined_repeats(training, splits, judged) if splits else None
-    test = None if test_rows is None else judge_on_test_set(calibrator, result, rows, test_rows)
+    test = None if test_rows is None else judge(calibrator, result, rows, test_rows)
     summary = summarise(result)
     summary = summary.with_figures(
         warnings=(*summary.warnings, *((ONLY_GEOMETRY,) if faulty else ()), *beyond),

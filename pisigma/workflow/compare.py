@@ -123,14 +123,14 @@ class ComparedModels:
     def _displacements_in_words(self) -> tuple[str, ...]:
         """Return how far the tools are apart over the workspace and along a program."""
         first, second = self.models
-        figures = self.workspace.errors.figures.by_name
+        figures = self.workspace.errors.figures.figures_by_name
         where = " with base and tool fitted" if self.settings.frames == "fitted" else ""
         lines = [
             f"Over the workspace, the tool positions of {second} and {first} differ by {figures['rms_mm']:.3f} mm (RMS)"
             f"{where}, at most by {figures['max_mm']:.3f} mm."
         ]
         if self.program is not None:
-            figures, largest = self.program.errors.figures.by_name, self.program.largest
+            figures, largest = self.program.errors.figures.figures_by_name, self.program.largest
             lines.append(
                 f"The poses of {self.program.source}, taught with {first}, are off by {figures['rms_mm']:.3f} mm (RMS) "
                 f"under {second}, at most by {figures['max_mm']:.3f} mm at pose {int(self.program.number[largest])}."

@@ -29,7 +29,7 @@ from pisigma.robot.kinematics.status import Status
 from pisigma.robot.row import Row
 from pisigma.robot.se3 import pose_error
 from pisigma.validation.held_out.distillation_summary import (
-    AbsoluteFigures,
+    AbsoluteErrorFigures,
     DistillationSummary,
     DistilledErrors,
     DistilledJoint,
@@ -138,7 +138,7 @@ def distill(
         kind="distilled",
         robot=parent.robot,
         network=network,
-        domain=Domain.from_training_rows(scaled[:DOMAIN_SAMPLES], generator),
+        domain=Domain.from_rows(scaled[:DOMAIN_SAMPLES], generator),
         branches=() if solver is None else solver.most_frequent_branches(every.branch),
         starts=spread_rows((every.q_nominal + every.correction)[fitted]),
         bases=parent.bases,
@@ -182,7 +182,7 @@ def _provenance(parent: CalibratedModel, sha256: str, settings: DistillationSett
         data_sha256=sha256,
         rows=settings.poses,
         seed=settings.seed,
-        versions=Provenance.present_versions(),
+        versions=Provenance.installed_versions(),
     )
 
 
@@ -227,7 +227,7 @@ def _summary(
 def _warnings(held_out: DistilledErrors, rows: int, joints: int) -> tuple[str, ...]:
     """Return reasons not to use the distilled model, one sentence each."""
     sentences = []
-    distilled, nominal = held_out.distilled.by_name, held_out.nominal.by_name
+    distilled, nominal = held_out.distilled.figures_by_name, held_out.nominal.figures_by_name
     for key, what, unit in (("rms_mm", "position", "mm"), ("rms_deg", "orientation", "deg")):
         if distilled[key] > MAX_ERROR_SHARE * nominal[key]:
             sentences.append(
@@ -322,7 +322,7 @@ def _joint_errors(
     return tuple(joints)
 
 
-def _absolute(values: Float64[Tensor, " poses"], joint: Row) -> AbsoluteFigures:
+def _absolute(values: Float64[Tensor, " poses"], joint: Row) -> AbsoluteErrorFigures:
     size = values.abs()
     figures = {"mean": size.mean(), "rms": size.square().mean().sqrt(), "max": size.max()}
-    return AbsoluteFigures(**{name: joint.in_file_unit(float(value)) for name, value in figures.items()})
+    return AbsoluteErrorFigures(**{name: joint.in_file_unit(float(value)) for name, value in figures.items()})

@@ -7,7 +7,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from pisigma.files.errors import IdentificationError
-from pisigma.files.progress import Progress, staged_progress
+from pisigma.files.progress import Progress, with_stage
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.network.correction_network import CorrectionNetwork, JointGroup
 from pisigma.network.inputs import Inputs
@@ -38,7 +38,7 @@ _MIN_MOTION = 1e-6
 
 
 @dataclass(frozen=True)
-class Size:
+class NetworkSize:
     """Size of a network, which is the same for every joint.
 
     Attributes:
@@ -56,13 +56,13 @@ class Size:
         return sum(self.orders) * (inputs + 1)
 
 
-SMOOTH = (Size((1, 2)), Size((1, 2, 3)), Size((1, 2, 3, 4)))
+SMOOTH = (NetworkSize((1, 2)), NetworkSize((1, 2, 3)), NetworkSize((1, 2, 3, 4)))
 """Sizes for errors that vary slowly with the joints: geometry and sag."""
-RIPPLED = (Size((1, 2)), Size((1, 2, 3)), Size((1, 2, 3), 8), Size((1, 2, 3), 24))
+RIPPLED = (NetworkSize((1, 2)), NetworkSize((1, 2, 3)), NetworkSize((1, 2, 3), 8), NetworkSize((1, 2, 3), 24))
 """Sizes for models with ripple of gears and encoders as well."""
 
 
-def sizes_for(model: CalibratedModel, poses: int) -> tuple[Size, ...]:
+def sizes_for(model: CalibratedModel, poses: int) -> tuple[NetworkSize, ...]:
     """Return the sizes to try for a model, given the number of poses to fit to, small ones first.
 
     Raises:
@@ -89,7 +89,7 @@ def choose_network(
     parent: CalibratedModel,
     poses: SolvedPoses,
     chosen: tuple[slice, slice],
-    sizes: tuple[Size, ...],
+    sizes: tuple[NetworkSize, ...],
     search: tuple[int, int],
     progress: Progress,
 ) -> tuple[CorrectionNetwork, tuple[SizeFigures, ...]]:
@@ -104,9 +104,9 @@ def choose_network(
         progress: called with the current step.
     """
     pairs = _pairs(poses, chosen[0])
-    fits: list[tuple[CorrectionNetwork, Size, float]] = []
+    fits: list[tuple[CorrectionNetwork, NetworkSize, float]] = []
     for size in sizes:
-        of_size = staged_progress(progress, f"orders {size.orders}, harmonics {size.harmonics}")
+        of_size = with_stage(progress, f"orders {size.orders}, harmonics {size.harmonics}")
         network = _fit_size(parent.robot, size, pairs, *search, of_size)
         T, q = poses.T[chosen[1]], poses.q_nominal[chosen[1]]
         with torch.no_grad():
@@ -138,7 +138,7 @@ def _pairs(poses: SolvedPoses, rows: slice) -> TrainingPairs:
 
 
 def _fit_size(
-    robot: Robot, size: Size, pairs: TrainingPairs, seed: int, epochs: int, progress: Progress
+    robot: Robot, size: NetworkSize, pairs: TrainingPairs, seed: int, epochs: int, progress: Progress
 ) -> CorrectionNetwork:
     """Fit a network of a size to corrections by Levenberg-Marquardt.
 
@@ -174,7 +174,7 @@ def _fit_size(
     return CorrectionNetwork(robot.dof, groups, networks).requires_grad_(False)
 
 
-def _sections(robot: Robot, size: Size, q: Float64[Tensor, "poses dof"]) -> list[NetworkSection]:
+def _sections(robot: Robot, size: NetworkSize, q: Float64[Tensor, "poses dof"]) -> list[NetworkSection]:
     """Return one group of all joints, or one group for each joint where its overtones are inputs.
 
     Raises:

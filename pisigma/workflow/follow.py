@@ -8,7 +8,7 @@ from pathlib import Path
 
 from pisigma.deployment.export.programs.languages import LANGUAGES, check_program
 from pisigma.files.output_file import check_output
-from pisigma.measurement.growing_file import GrowingFile, Growth
+from pisigma.measurement.growing_file import FileGrowth, GrowingFile
 from pisigma.planning.plan_file import YAML_SUFFIX, yaml_of
 from pisigma.planning.session.state import AccuracyPoint, Alarm, SessionState
 from pisigma.robot.description import Robot
@@ -32,7 +32,7 @@ class SessionStep:
         replanned: whether the remaining poses differ from the planned ones, or from those of the last step.
     """
 
-    growth: Growth
+    growth: FileGrowth
     alarms: tuple[Alarm, ...]
     state: SessionState
     points: tuple[AccuracyPoint, ...] = ()
@@ -61,7 +61,7 @@ def follow(session: MeasuringSession, file: GrowingFile, once: bool = False) -> 
         return
     waiting, plan, state, ending = "", session.plan, session.state, False
     work: Future[tuple[Alarm, ...]] | None = None
-    yield SessionStep(Growth(), (), state)
+    yield SessionStep(FileGrowth(), (), state)
     with ThreadPoolExecutor(1) as pool:
         while True:
             growth = file.read()

@@ -189,7 +189,7 @@ def import_rows(
     return ImportedRows(
         proposal,
         content,
-        count_rows([place for file in exports for place in file.places], used, left_out),
+        count_rows([place for file in exports for place in file.row_places], used, left_out),
         (*warnings, *(() if joined is None else joined.warnings)),
     )
 

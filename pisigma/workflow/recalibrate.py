@@ -15,7 +15,7 @@ from pisigma.calibration.hybrid.calibrator import HybridCalibrator
 from pisigma.calibration.hybrid.result import HybridResult
 from pisigma.files.errors import IdentificationError, ModelError
 from pisigma.files.model_files import model_hash
-from pisigma.files.progress import Progress, staged_progress
+from pisigma.files.progress import Progress, with_stage
 from pisigma.lifetime.recalibration.adaptation import Adaptation, adapt
 from pisigma.lifetime.recalibration.candidates import CLEAR_RATIO, CandidateChoice, choose_candidate
 from pisigma.lifetime.recalibration.movement import Movement, movements_text, significant_movements
@@ -43,7 +43,7 @@ from pisigma.model.training_rows import with_wide_limits, without_known_rows
 from pisigma.reporting.derived_cards import write_recalibration_card
 from pisigma.robot.description import Robot
 from pisigma.validation.checks.check import MOVES, Move
-from pisigma.validation.checks.wrong_rows import WithoutWrongRows, without_wrong_rows
+from pisigma.validation.checks.wrong_rows import RowsWithoutWrongOnes, without_wrong_rows
 from pisigma.validation.gate import check_rows
 from pisigma.validation.held_out.calibration_validation import errors_under
 from pisigma.validation.held_out.distillation_summary import ParentFigures
@@ -140,7 +140,7 @@ def recalibrate(
     measurements = read_rows(data, nominal, settings.cameras)
     rows, again = without_known_rows(parent, posterior.with_model_names(measurements.split_sets()[0]))
     progress("checking the rows")
-    right = WithoutWrongRows(rows) if parent.kind == FLEET_PRIOR else right_rows(settings, parent, rows)
+    right = RowsWithoutWrongOnes(rows) if parent.kind == FLEET_PRIOR else right_rows(settings, parent, rows)
     verdict = check_rows(right.rows, parent, settings.fitted, may_move(settings))
     progress("what has moved")
     elsewhere = _moved_frames(parent, posterior, rows, settings)
@@ -148,11 +148,11 @@ def recalibrate(
     rows, adaptation, outliers = _adapted(parent, posterior, rows, elsewhere, right.numbers)
     calibrator = HybridCalibrator(nominal)
     choice = choose_candidate(
-        parent, adaptation, elsewhere, rows, calibrator, staged_progress(progress, "cross-validation")
+        parent, adaptation, elsewhere, rows, calibrator, with_stage(progress, "cross-validation")
     )
     consistency = _fleet_consistency(parent, rows)
     odd = consistency is not None and consistency.is_inconsistent
-    from_scratch = staged_progress(progress, "from scratch")
+    from_scratch = with_stage(progress, "from scratch")
     choice, kept = _kept(choice, odd, parent, adaptation, rows, calibrator, from_scratch)
     moved = (
         significant_movements(adaptation) if consistency is None and _believable(choice, nominal) else None
@@ -332,7 +332,7 @@ def may_move(settings: RecalibrationSettings) -> frozenset[Move]:
 
 def right_rows(
     settings: RecalibrationSettings, model: CalibratedModel, rows: Measurements
-) -> WithoutWrongRows:
+) -> RowsWithoutWrongOnes:
     """Return the rows without single wrong ones, also with base and tool fitted where these may have moved."""
     right = without_wrong_rows([model], rows, settings.fitted)
     if right.warnings or settings.moved is not None:

@@ -12,7 +12,7 @@ import torch
 from pisigma.calibration.geometric.initial_guess.base_and_tool import fit_base_and_tool
 from pisigma.files.engines.processes import run_in_processes
 from pisigma.files.errors import MeasurementError, RecipeError
-from pisigma.files.progress import Progress, ignore_progress, staged_progress
+from pisigma.files.progress import Progress, no_progress, with_stage
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import groups_of_equal_joints
 from pisigma.model.calibrated_model import CalibratedModel, Provenance
@@ -24,12 +24,7 @@ from pisigma.network.sections import LevenbergMarquardtSection
 from pisigma.reporting.cards import CardTexts, write_training_card
 from pisigma.robot.description import Robot
 from pisigma.validation.held_out.calibration_summary import summarise
-from pisigma.validation.held_out.calibration_validation import (
-    errors_under,
-    judge_on_test_set,
-    learning_curve,
-    validate,
-)
+from pisigma.validation.held_out.calibration_validation import errors_under, judge, learning_curve, validate
 from pisigma.validation.held_out.pose_statistics import Comparison, PoseErrors, compare_on
 from pisigma.validation.held_out.training_summary import (
     ComparisonFigures,
@@ -185,15 +180,13 @@ def _train_hybrid(
     judged, splits = data.splits()
     calibrator = recipe.calibrator(data.robot)
     started = time.perf_counter()
-    result = calibrator.fit(rows, staged_progress(progress, "calibration"))
+    result = calibrator.fit(rows, with_stage(progress, "calibration"))
     seconds = time.perf_counter() - started
-    validation = validate(
-        calibrator, judged, splits, staged_progress(progress, "held-out rows"), settings.jobs
-    )
-    test = None if data.test is None else judge_on_test_set(calibrator, result, rows, data.test)
+    validation = validate(calibrator, judged, splits, with_stage(progress, "held-out rows"), settings.jobs)
+    test = None if data.test is None else judge(calibrator, result, rows, data.test)
     curve = None
     if (stated := recipe.learning_curve) is not None:
-        of_curve = staged_progress(progress, "learning curve")
+        of_curve = with_stage(progress, "learning curve")
         sizes, seed, jobs = stated.rows, stated.seed, settings.jobs
         curve = learning_curve(calibrator, judged, splits, sizes, seed, of_curve, validation, jobs)
     summary = summarise(result).with_figures(
@@ -287,9 +280,7 @@ def train_networks(
         kind="inverse_calibration",
         robot=robot,
         network=network,
-        domain=Domain.from_training_rows(
-            network.scaled_inputs(pairs.T[used], pairs.q_nominal[used]), generator
-        ),
+        domain=Domain.from_rows(network.scaled_inputs(pairs.T[used], pairs.q_nominal[used]), generator),
         branches=pairs.branches,
         starts=spread_rows(measurements.q[used]),
         provenance=_provenance(recipe, measurements, pairs, recipe_sha256),
@@ -331,8 +322,7 @@ def cross_validate(
             replace(data, training=measurements.select(training)),
             measurements.select(test),
             partial(
-                progress if jobs is None else ignore_progress,
-                f"cross-validation: fold {number} of {len(folds)}",
+                progress if jobs is None else no_progress, f"cross-validation: fold {number} of {len(folds)}"
             ),
         )
         for number, (training, test) in enumerate(folds, start=1)
@@ -402,5 +392,5 @@ def _provenance(
         rows_left_out=int((~pairs.used).sum()),
         rule=pairs.left_out,
         seed=recipe.fit.seed,
-        versions=Provenance.present_versions(),
+        versions=Provenance.installed_versions(),
     )

@@ -9,12 +9,12 @@ from testing.closeness import assert_close
 
 from pisigma.estimation.drift import DriftGroup, DriftSearch, LinearValues
 from pisigma.estimation.regression import SensorCount
-from pisigma.estimation.wrong_rows import Explained, with_wrong_rows
+from pisigma.estimation.wrong_rows import ExplainedRows, with_wrong_rows
 
 NOISE, MOVED, CONFIGURATIONS = 1e-4, 4e-3, 12
 
 
-def explained(off: float, seed: int = 0) -> Explained[DriftSearch]:
+def explained(off: float, seed: int = 0) -> ExplainedRows[DriftSearch]:
     """Three values per configuration, one of them wrong, with as many unknowns as values and a moved joint."""
     rng, count = np.random.default_rng(seed), 3 * CONFIGURATIONS
     X = torch.from_numpy(rng.normal(size=(count, count + 1)))
@@ -28,11 +28,11 @@ def explained(off: float, seed: int = 0) -> Explained[DriftSearch]:
 
     values = LinearValues(X, y, torch.zeros(count, dtype=torch.int64), configuration, counts)
 
-    def explain(wrong) -> Explained[DriftSearch]:
+    def explain(wrong) -> ExplainedRows[DriftSearch]:
         there = replace(values, wrong=wrong)
         search = DriftSearch(there, 1e-6 * X, groups, noise, noise)
         search.estimate_sizes()
-        return Explained(search, there, search.log_evidence, search.covariance, search.deviation)
+        return ExplainedRows(search, there, search.log_evidence, search.covariance, search.deviation)
 
     return with_wrong_rows(explain({}), explain)
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from testing.models import REPOSITORY
 
 from pisigma.files.model_files import model_hash
-from pisigma.lifetime.cell.history import ModelEntry, Use, current_time
+from pisigma.lifetime.cell.history import ModelEntry, Use, now
 from pisigma.workflow.cell.cell import Cell
 
 FIRST, SECOND = "kiro4", "kiro3"
@@ -18,11 +18,11 @@ def cell_of_two_models(folder: Path) -> Cell:
     for name in (FIRST, SECOND):
         path = cell.folder / "models" / name
         shutil.copytree(REPOSITORY / "models" / name, path)
-        cell.history.add(ModelEntry(name, model_hash(path), current_time(), "", "2026-01-10"))
+        cell.history.add(ModelEntry(name, model_hash(path), now(), "", "2026-01-10"))
     put_into_use(cell, FIRST)
     return cell
 
 
 def put_into_use(cell: Cell, model: str) -> None:
     """Put a model into use as another process does."""
-    cell.history.add(Use(model, current_time(), "a test"))
+    cell.history.add(Use(model, now(), "a test"))

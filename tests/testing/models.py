@@ -63,7 +63,7 @@ def hand_made_model(
         index = set(distance.nan_to_num(math.inf).argmin(-1).tolist())
         assert len(index) == 1, "the rows of a hand-made model shall lie on one branch"
         branches = (solver.branches[index.pop()],)
-    domain = Domain.from_training_rows(corrections.scaled_inputs(T, q), torch.Generator().manual_seed(0))
+    domain = Domain.from_rows(corrections.scaled_inputs(T, q), torch.Generator().manual_seed(0))
     return CalibratedModel(
         name=f"hand_made_{name}",
         kind="inverse_calibration",

@@ -23,7 +23,7 @@ from pisigma.validation.held_out.calibration_summary import (
     RedundancyFigures,
     summarise,
 )
-from pisigma.validation.held_out.calibration_validation import CalibrationValidation, judge_on_test_set
+from pisigma.validation.held_out.calibration_validation import CalibrationValidation, judge
 from pisigma.validation.held_out.held_out_rows import HeldOutRows
 
 HOSTILE = "</script><script>alert(1)</script><img src=x onerror=alert(2)>\"'&\u2028$x_1$"
@@ -52,7 +52,7 @@ def hybrid_under_test(frames: bool = False) -> tuple[HybridArmUnderTest, Calibra
 def judged_on(arm: HybridArmUnderTest, rows: Measurements) -> CalibrationValidation:
     """Evaluate the calibration of an arm on rows."""
     calibrator = HybridCalibrator(GeometricCalibrator(arm.true.nominal))
-    return judge_on_test_set(calibrator, arm.result, arm.measurements, rows)
+    return judge(calibrator, arm.result, arm.measurements, rows)
 
 
 @functools.cache

@@ -23,7 +23,7 @@ from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.kinematics.status import Status
 from pisigma.validation.held_out.distillation_summary import DistillationSummary
 from pisigma.workflow.distill import distill
-from pisigma.workflow.distilled_network import Size, sizes_for
+from pisigma.workflow.distilled_network import NetworkSize, sizes_for
 from pisigma.workflow.settings.distillation import DistillationSettings
 from pisigma.workflow.solved_poses import Region, draw_between, draw_solved_poses
 
@@ -55,7 +55,7 @@ def rippled(name: str) -> CalibratedModel:
 
 
 @functools.cache
-def distilled(kind: str, name: str, size: Size | None, poses: int = 600):
+def distilled(kind: str, name: str, size: NetworkSize | None, poses: int = 600):
     parent = geometric_model(name) if kind == "geometric" else rippled(name)
     return distill(parent, DistillationSettings(poses=poses, size=size, epochs=30))
 
@@ -76,7 +76,7 @@ def tool_errors(found, q: torch.Tensor) -> torch.Tensor:
 )
 def test_the_tool_is_close_to_the_full_solution(kind, name, share):
     """On held-out poses, for every kind of arm, relative to the nominal robot's error."""
-    found = distilled(kind, name, Size((1, 2, 3)))
+    found = distilled(kind, name, NetworkSize((1, 2, 3)))
     poses = found.held_out
     assert_close(tool_errors(found, poses.q_nominal + poses.correction), 0.0, atol=1e-9)
     nominal = tool_errors(found, poses.q_nominal).square().mean().sqrt()
@@ -86,7 +86,7 @@ def test_the_tool_is_close_to_the_full_solution(kind, name, share):
 
 
 def test_overtones_follow_what_sines_and_cosines_cannot():
-    plain, rich = (distilled("hybrid", "kiro3", Size((1, 2), harmonics)) for harmonics in (1, 24))
+    plain, rich = (distilled("hybrid", "kiro3", NetworkSize((1, 2), harmonics)) for harmonics in (1, 24))
     errors = [
         float(tool_errors(f, f.held_out.q_nominal + f.predicted).square().mean().sqrt())
         for f in (plain, rich)
@@ -95,14 +95,14 @@ def test_overtones_follow_what_sines_and_cosines_cannot():
 
 
 def test_poses_are_those_of_the_nominal_joint_values():
-    poses = distilled("geometric", "ur10", Size((1, 2, 3))).held_out
+    poses = distilled("geometric", "ur10", NetworkSize((1, 2, 3))).held_out
     robot = Robot.load("ur10")
     assert_close(forward_kinematics(robot, poses.q_nominal), poses.T, atol=1e-9)
     assert len(poses.T) == 240
     assert set(poses.status.tolist()) <= {Status.REACHED, Status.OUTSIDE_DOMAIN}
 
 
-@pytest.mark.parametrize("size", [Size((1, 2, 3)), Size((1, 2), 24)])
+@pytest.mark.parametrize("size", [NetworkSize((1, 2, 3)), NetworkSize((1, 2), 24)])
 def test_a_folder_gives_the_same_corrections(size, tmp_path):
     found = distilled("hybrid", "kiro3", size)
     found.save(tmp_path)
@@ -119,7 +119,7 @@ def test_a_folder_gives_the_same_corrections(size, tmp_path):
         assert_close(arrays.status, solution.status)
 
 
-@pytest.mark.parametrize("size", [Size((1, 2, 3)), Size((1, 2), 24)])
+@pytest.mark.parametrize("size", [NetworkSize((1, 2, 3)), NetworkSize((1, 2), 24)])
 def test_poses_away_from_the_region_are_outside_the_domain(size):
     """Overtones, which are similar everywhere, do not hide that a joint is outside."""
     found = distilled("hybrid", "kiro3", size)
@@ -132,7 +132,7 @@ def test_poses_away_from_the_region_are_outside_the_domain(size):
 def test_a_region_of_positions_holds_all_poses():
     parent = geometric_model("kiro3")
     region = Region(parent.starts, BOX)
-    found = distill(parent, DistillationSettings(region, 300, Size((1, 2)), epochs=20))
+    found = distill(parent, DistillationSettings(region, 300, NetworkSize((1, 2)), epochs=20))
     place = found.held_out.T[:, :3, 3]
     for axis in range(3):
         assert float(place[:, axis].min()) >= BOX[2 * axis]
@@ -141,7 +141,7 @@ def test_a_region_of_positions_holds_all_poses():
 
 
 def test_a_given_seed_gives_the_same_model():
-    settings = DistillationSettings(poses=200, size=Size((1, 2)), seed=4, epochs=5)
+    settings = DistillationSettings(poses=200, size=NetworkSize((1, 2)), seed=4, epochs=5)
     first, second = (distill(geometric_model("kiro3"), settings) for _ in range(2))
     assert_close(first.predicted, second.predicted)
     other = distill(geometric_model("kiro3"), replace(settings, seed=5))
@@ -161,8 +161,8 @@ def test_sizes_fit_the_number_of_poses_and_the_parent():
     plain, rich = geometric_model("kiro3"), rippled("kiro3")
     assert {size.harmonics for size in sizes_for(plain, 10_000)} == {1}
     assert max(size.harmonics for size in sizes_for(rich, 10_000)) == 24
-    assert sizes_for(rich, 150) == (Size((1, 2)),)
-    robot, size = Robot.load("kiro3"), Size((1, 2), 24)
+    assert sizes_for(rich, 150) == (NetworkSize((1, 2)),)
+    robot, size = Robot.load("kiro3"), NetworkSize((1, 2), 24)
     network = distilled("hybrid", "kiro3", size).model.network
     assert network.networks[0].weight[0].numel() + network.networks[0].bias[0].numel() == size.unknowns(robot)
 
@@ -186,7 +186,7 @@ def test_between_goes_the_short_way_round():
 
 
 def test_figures_and_card_are_those_of_the_held_out_poses(tmp_path):
-    found = distilled("hybrid", "kiro3", Size((1, 2, 3)))
+    found = distilled("hybrid", "kiro3", NetworkSize((1, 2, 3)))
     summary = found.summary
     errors = tool_errors(found, found.held_out.q_nominal + found.predicted) * 1e3
     assert_close(summary.held_out.distilled.rms_mm, errors.square().mean().sqrt(), rtol=1e-9)
@@ -212,7 +212,7 @@ def test_a_region_out_of_reach_is_refused():
     parent = geometric_model("kiro3")
     region = Region(parent.starts, (3.0, 3.1, 0.0, 0.1, 0.0, 0.1))
     with refused(IdentificationError, value={"unreachable": 640}):
-        distill(parent, DistillationSettings(region, 200, Size((1,))))
+        distill(parent, DistillationSettings(region, 200, NetworkSize((1,))))
 
 
 def test_poses_near_a_singularity_are_not_drawn():
@@ -240,10 +240,10 @@ def test_models_that_cannot_be_distilled_are_refused(parent, expected):
     [
         ("kiro3", DistillationSettings(poses=50), 60, {"option": "--poses", "value": 50}),
         ("ur10", DistillationSettings(poses=120), 60, {"option": "--poses", "value": 120}),
-        ("kiro3", DistillationSettings(poses=120, size=Size((3, 3), 8)), 60, {}),
+        ("kiro3", DistillationSettings(poses=120, size=NetworkSize((3, 3), 8)), 60, {}),
         (
             "kiro3",
-            DistillationSettings(poses=200, size=Size((1,))),
+            DistillationSettings(poses=200, size=NetworkSize((1,))),
             1,
             {"expected": "poses with different joint values"},
         ),

@@ -7,7 +7,7 @@ from testing.simulated_arm import simulate
 
 import pisigma
 from pisigma.files.engines import processes
-from pisigma.files.progress import ignore_progress, staged_progress
+from pisigma.files.progress import no_progress, with_stage
 from pisigma.workflow.recipes.recipe import MeasuredData
 from pisigma.workflow.settings.calibration import CalibrationSettings
 from pisigma.workflow.settings.training import TrainSettings
@@ -59,5 +59,5 @@ def test_a_training_in_processes_gives_the_same(tasks):
 
 
 def test_stages_of_stages_can_be_sent(tasks):
-    nested = staged_progress(staged_progress(ignore_progress, "repeat 1 of 2", ", "), "fold 1")
+    nested = with_stage(with_stage(no_progress, "repeat 1 of 2", ", "), "fold 1")
     assert list(PicklingEngine().results(nested, ["calibrating"], 1)) == [("calibrating", None)]

@@ -49,7 +49,7 @@ def report_eliminations(
     compared = []
     for removed in (*cases, ()):
         found = calibrate_without(recipe, removed, rows)
-        errors = errors_under(found, held_out).figures.by_name
+        errors = errors_under(found, held_out).figures.figures_by_name
         compared.append(
             {
                 "removed": list(removed),

@@ -12,7 +12,7 @@ from torch import Tensor
 from pisigma.calibration.geometric.identifiability.pairwise import find_pairwise_redundancy
 from pisigma.calibration.geometric.identifiability.plausibility import refuse_implausible
 from pisigma.calibration.geometric.identifiability.redundancy import (
-    Findings,
+    RankFindings,
     Redundancy,
     find_redundancy,
     rank_extension,
@@ -202,7 +202,7 @@ class GeometricCalibrator:
             chosen |= {index for name in self.free for index in space.indices(name)}
         return sorted(chosen)
 
-    def _choose(self, setup: CalibrationSetup, source: str) -> tuple[Findings, list[int], list[int]]:
+    def _choose(self, setup: CalibrationSetup, source: str) -> tuple[RankFindings, list[int], list[int]]:
         """Choose the parameters to start with.
 
         Returns:
@@ -222,7 +222,7 @@ class GeometricCalibrator:
         chosen = self._chosen(problem.space, sizes, redundancy)
         active = [*(index for index in chosen if index not in floating), *unknowns]
         estimated = free_parameters(redundancy, explicit, len(unknowns))
-        return Findings(sizes, redundancy, [], estimated), candidates, active
+        return RankFindings(sizes, redundancy, [], estimated), candidates, active
 
     def _chosen(
         self,
@@ -239,8 +239,8 @@ class GeometricCalibrator:
         return [space.index(name) for name in names]
 
     def _solve_roughly(
-        self, setup: CalibrationSetup, findings: Findings, candidates: list[int], active: list[int]
-    ) -> tuple[Solution[Tensor], Findings, list[int]]:
+        self, setup: CalibrationSetup, findings: RankFindings, candidates: list[int], active: list[int]
+    ) -> tuple[Solution[Tensor], RankFindings, list[int]]:
         """Take some steps without the prior, and add parameters that the data determine there.
 
         These steps show the noise relative to which the prior is weighted; a few thousand rows suffice for them.

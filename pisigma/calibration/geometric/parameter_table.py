@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.calibration.geometric.identifiability.redundancy import Findings, Redundancy
+from pisigma.calibration.geometric.identifiability.redundancy import RankFindings, Redundancy
 from pisigma.calibration.geometric.problem.least_squares import Linearisation
 from pisigma.calibration.geometric.problem.noise import sensor_view_of
 from pisigma.calibration.geometric.problem.problem import CalibrationProblem
@@ -58,7 +58,7 @@ class ParameterEstimate:
 def parameter_table(
     setup: CalibrationSetup,
     problem: CalibrationProblem,
-    findings: Findings,
+    findings: RankFindings,
     here: Linearisation[Tensor],
     geometry: IdentifiedGeometry,
     covariance: Float64[np.ndarray, "parameters parameters"],
@@ -103,7 +103,7 @@ def parameter_table(
 
 
 def _without_rows(
-    problem: CalibrationProblem, normal: Float64[Tensor, "active active"], findings: Findings
+    problem: CalibrationProblem, normal: Float64[Tensor, "active active"], findings: RankFindings
 ) -> list[int]:
     """List free parameters that the rows without outliers do not determine, although all rows together would.
 

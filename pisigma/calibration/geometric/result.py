@@ -19,7 +19,7 @@ from pisigma.calibration.geometric.identifiability.pairwise import (
     find_pairwise_redundancy,
 )
 from pisigma.calibration.geometric.identifiability.plausibility import misfitting_frames
-from pisigma.calibration.geometric.identifiability.redundancy import Findings, Redundancy
+from pisigma.calibration.geometric.identifiability.redundancy import RankFindings, Redundancy
 from pisigma.calibration.geometric.identifiability.sufficiency import CalibrationWarning, measurement_advice
 from pisigma.calibration.geometric.outliers import Outlier, outliers_of
 from pisigma.calibration.geometric.parameter_table import ParameterEstimate, parameter_table
@@ -85,7 +85,7 @@ class SolvedCalibration:
     setup: CalibrationSetup
     problem: CalibrationProblem
     solution: Solution[Tensor]
-    findings: Findings
+    findings: RankFindings
     geometry: IdentifiedGeometry
 
     def result(self) -> "CalibrationResult":
@@ -321,7 +321,7 @@ def _outliers(solved: SolvedCalibration) -> tuple[Outlier, ...]:
     view = sensor_view_of(solved.refined)
     for number, (sensor, sums) in enumerate(zip(solved.problem.sensors, view.sums, strict=True)):
         deviations = sums.distance / view.scales[number]
-        weight = solved.problem.loss_of(sensor).weight(deviations, sensor.components)
+        weight = solved.problem.loss_for_sensor(sensor).weight(deviations, sensor.components)
         rows = torch.arange(len(weight))
         found += outliers_of(
             solved.setup, solved.measurements, sensor, rows, sums.residual.norm(dim=0), deviations, weight

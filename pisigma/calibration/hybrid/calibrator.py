@@ -24,7 +24,7 @@ from pisigma.calibration.hybrid.gravity import (
     to_first_row_frame,
 )
 from pisigma.calibration.hybrid.refinement import (
-    Refined,
+    RefinedFit,
     evaluate_in_chunks,
     linearise_rows,
     refine,
@@ -156,7 +156,7 @@ class HybridCalibrator:
         )
         return HybridResult(solved.result(), learned, uncertainty, trials, verdict)
 
-    def _learned(self, solved: SolvedCalibration, refined: Refined) -> LearnedPart:
+    def _learned(self, solved: SolvedCalibration, refined: RefinedFit) -> LearnedPart:
         """Return the correction with the geometry fitted together with it, and its measured ranges."""
         noise = zip(solved.problem.sensors, refined.posterior.noise, strict=True)
         return LearnedPart(
@@ -258,7 +258,7 @@ class HybridCalibrator:
         return growing, others
 
 
-def _outliers(solved: SolvedCalibration, refined: Refined) -> tuple[Outlier, ...]:
+def _outliers(solved: SolvedCalibration, refined: RefinedFit) -> tuple[Outlier, ...]:
     """List rows with less than half of the full weight under the hybrid, the worst first."""
     problem, setup, found = solved.problem, solved.setup, []
     values = sensor_values(problem, refined.point, evaluate_in_chunks(refined.correction))

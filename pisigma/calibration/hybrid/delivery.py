@@ -13,7 +13,7 @@ from pisigma.calibration.hybrid.design import Design, Rows, robust_weights
 from pisigma.calibration.hybrid.refinement import (
     CONVERGENCE_TOLERANCE,
     MAX_LINEARISATIONS,
-    Refined,
+    RefinedFit,
     correction_from_weights,
     evaluate_in_chunks,
     linearise_rows,
@@ -202,7 +202,7 @@ class FinalCorrection:
     """
 
     choice: FeatureChoice
-    refined: Refined
+    refined: RefinedFit
     held_out: float
 
 

@@ -273,7 +273,7 @@ def robust_weights(
     weights = []
     counts = [0.0 if sensor.certain else float(sensor.residual.numel()) for sensor in values]
     for number, sensor in enumerate(values):
-        loss = problem.loss_of(problem.sensors[number])
+        loss = problem.loss_for_sensor(problem.sensors[number])
         distance = sensor.residual.norm(dim=1) * sensor.root
         if not bool(torch.isfinite(distance).all()):
             raise IdentificationError(
@@ -326,7 +326,7 @@ class AbstractDesignRegression(AbstractRegression):
         for groups in folds:
             rest = self.without_groups(groups).maximise_evidence(posterior.prior, posterior.noise, updates)
             parts.append(self.held_out_errors(rest, [groups]))
-        return HeldOutErrors.joined(parts)
+        return HeldOutErrors.concatenate(parts)
 
     def initial_prior_sizes(
         self, posterior: Posterior, design: Design, features: AbstractFeature

@@ -31,7 +31,7 @@ count."""
 
 
 @dataclass(frozen=True, eq=False)
-class Refined:
+class RefinedFit:
     """A hybrid model fitted to all rows.
 
     Attributes:
@@ -55,7 +55,7 @@ class Refined:
     held_out: HeldOutErrors | None = None
 
 
-def refine(problem: CalibrationProblem, group: Int64[Tensor, " rows"], choice: FeatureChoice) -> Refined:
+def refine(problem: CalibrationProblem, group: Int64[Tensor, " rows"], choice: FeatureChoice) -> RefinedFit:
     """Fit the selected features to all rows.
 
     Args:
@@ -80,10 +80,12 @@ def refine(problem: CalibrationProblem, group: Int64[Tensor, " rows"], choice: F
 
 def _refined(
     rows: Rows, design: Design, posterior: Posterior, fit: AbstractDesignRegression, rounds: int
-) -> Refined:
+) -> RefinedFit:
     problem = design.problem
     point = problem.nominal.index_add(0, problem.active, posterior.x[: design.active])
-    return Refined(rows, design, posterior, fit, point, correction_from_weights(design, posterior.x), rounds)
+    return RefinedFit(
+        rows, design, posterior, fit, point, correction_from_weights(design, posterior.x), rounds
+    )
 
 
 def correction_from_weights(design: Design, x: Float64[Tensor, " unknowns"]) -> JointCorrection:
@@ -131,7 +133,7 @@ def linearise_rows(
     return Rows.from_linearisation(design, x, values, robust_weights(problem, values, effective), group)
 
 
-def with_frames_of(solved: SolvedCalibration, refined: Refined) -> IdentifiedGeometry:
+def with_frames_of(solved: SolvedCalibration, refined: RefinedFit) -> IdentifiedGeometry:
     """Return the geometry of the hybrid, with floating frames moved onto those of the geometric calibration.
 
     Residuals of sockets, and of distances from anchors at unknown points, do not change by any motion of the whole

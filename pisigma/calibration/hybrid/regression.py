@@ -13,7 +13,7 @@ from pisigma.calibration.hybrid.sensor_values import SensorValues
 from pisigma.estimation.cholesky import BLOCK, return_free_memory, row_blocks
 from pisigma.estimation.dual_regression import DualRegression, group_gram, pair_indices, stack_groups
 from pisigma.estimation.held_out import HeldOutErrors
-from pisigma.estimation.primal_regression import PrimalRegression, Solved
+from pisigma.estimation.primal_regression import PrimalRegression, SolvedRegression
 from pisigma.estimation.prior import GaussianPrior
 from pisigma.estimation.regression import Posterior, SensorCount
 from pisigma.joint_correction.feature import AbstractFeature
@@ -101,9 +101,9 @@ class NormalEquations(PrimalRegression, AbstractDesignRegression):
     ) -> HeldOutErrors:
         """See `AbstractDesignRegression.held_out_errors`."""
         solved = self.solved_with(posterior.prior, posterior.noise)
-        return HeldOutErrors.joined([self._held_out_errors(groups, solved) for groups in folds])
+        return HeldOutErrors.concatenate([self._held_out_errors(groups, solved) for groups in folds])
 
-    def _held_out_errors(self, groups: Int64[Tensor, " groups"], solved: Solved) -> HeldOutErrors:
+    def _held_out_errors(self, groups: Int64[Tensor, " groups"], solved: SolvedRegression) -> HeldOutErrors:
         """Leave out one fold."""
         return_free_memory(len(solved.x))
         test, x = self.rows.held_out(groups).values, solved.x
@@ -314,7 +314,7 @@ class ValueCovariance(DualRegression, AbstractDesignRegression):
                     P[chosen][:, chosen], residual[chosen], self.sensor[chosen], self.sensors
                 )
             )
-        return HeldOutErrors.joined(parts)
+        return HeldOutErrors.concatenate(parts)
 
     @cached_property
     def normal_equations(self) -> NormalEquations:

@@ -114,7 +114,7 @@ def _print(compared: "ComparedModels", page: Path | None, verbose: bool) -> None
 def _verdict(compared: "ComparedModels") -> Verdict:
     """Say how far two models differ, and which is better."""
     first, second = compared.models
-    errors = compared.workspace.errors.figures.by_name
+    errors = compared.workspace.errors.figures.figures_by_name
     count, better = len(compared.parameters.differing), compared.better
     which = (
         f"the arms differ in {counted(count, 'parameter')}"

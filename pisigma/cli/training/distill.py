@@ -20,7 +20,7 @@ from pisigma.workflow.settings.distillation import DistillationSettings
 
 if TYPE_CHECKING:
     from pisigma.workflow.distill import Distillation
-    from pisigma.workflow.distilled_network import Size
+    from pisigma.workflow.distilled_network import NetworkSize
     from pisigma.workflow.solved_poses import Region
 
 Box = tuple[float, float, float, float, float, float]
@@ -84,9 +84,9 @@ def distill(
     _print(distillation, out, as_json, verbose)
 
 
-def _size(orders: str | None, harmonics: int | None) -> "Size | None":
+def _size(orders: str | None, harmonics: int | None) -> "NetworkSize | None":
     """Return the size of the network that the options state, None for the best of several."""
-    from pisigma.workflow.distilled_network import Size
+    from pisigma.workflow.distilled_network import NetworkSize
 
     if orders is None:
         if harmonics is not None:
@@ -99,7 +99,7 @@ def _size(orders: str | None, harmonics: int | None) -> "Size | None":
         )
     if harmonics is not None and not 1 <= harmonics <= 500:
         raise RecipeError(expected="a whole number from 1 to 500", value=harmonics, option="--harmonics")
-    return Size(tuple(int(number) for number in numbers), harmonics or 1)
+    return NetworkSize(tuple(int(number) for number in numbers), harmonics or 1)
 
 
 def _region(model: Path, box: Box | None, joints: Path | None) -> "Region | None":

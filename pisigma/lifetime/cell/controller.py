@@ -13,7 +13,7 @@ from typing import Literal, get_args
 
 from pisigma.files.errors import MeasurementError, ModelError, Place
 from pisigma.lifetime.cell.exports import ON_CONTROLLER, Contents, ControllerEntry, ExportEntry
-from pisigma.lifetime.cell.history import HISTORY, History, ModelEntry, SessionEntry, current_time
+from pisigma.lifetime.cell.history import HISTORY, History, ModelEntry, SessionEntry, now
 from pisigma.lifetime.cell.layout import is_cell, model_folder
 from pisigma.measurement.dates import EXPECTED_DATE, is_date
 
@@ -298,6 +298,6 @@ def record_controller(history: History, sha256: str, day: str, note: str) -> Con
     if day < first:
         expected = f"a day since {first}, when the file was exported"
         raise MeasurementError(expected=expected, value=day, option="--date")
-    entry = ControllerEntry(day, sha256, note, current_time())
+    entry = ControllerEntry(day, sha256, note, now())
     history.add(entry)
     return entry

@@ -233,7 +233,7 @@ _OF_MODELS = "models/*.history.sqlite"
 """These files in a cell."""
 
 
-def current_time() -> str:
+def now() -> str:
     """Return the time as stored in a history (ISO 8601, UTC, to the millisecond)."""
     return datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="milliseconds")
 
@@ -375,7 +375,7 @@ class History:
                 expected = f"a day since {entry.made[:10]}, when model '{entry.name}' was made"
                 raise MeasurementError(expected=expected, value=day, option="--date")
             model = entry.name
-        event = Event(day, kind, note, current_time(), person.strip(), model)  # type: ignore[arg-type]  # checked above
+        event = Event(day, kind, note, now(), person.strip(), model)  # type: ignore[arg-type]  # checked above
         self.add(event)
         return event
 

@@ -279,7 +279,7 @@ class Displacement:
             "source": self.source,
             "poses": len(self.q),
             "poses_not_predicted": self.not_predicted,
-            **self.errors.figures.by_name,
+            **self.errors.figures.figures_by_name,
             "largest_at_pose": int(self.number[self.largest]),
             "largest_at_mm": (self.place[self.largest] * 1e3).tolist(),
             "largest_at_joints": [

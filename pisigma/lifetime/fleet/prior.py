@@ -170,7 +170,7 @@ def mean_robot(
         provenance=Provenance(
             data_source=f"{len(fleet)} robots",
             rows=sum(rows.rows for rows in fleet),
-            versions=Provenance.present_versions(),
+            versions=Provenance.installed_versions(),
         ),
     )
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from pisigma.calibration.hybrid.refinement import linearise_rows
 from pisigma.estimation.drift import Drift, DriftGroup, LinearValues, PosteriorUpdate
 from pisigma.estimation.hypotheses import Explanation, Motion, SessionEvidence
-from pisigma.estimation.wrong_rows import Explained, with_wrong_rows
+from pisigma.estimation.wrong_rows import ExplainedRows, with_wrong_rows
 from pisigma.files.errors import IdentificationError
 from pisigma.lifetime.recalibration.adaptation import AdaptedArm, linear_values, usual_noise
 from pisigma.lifetime.recalibration.movement import HistoryMovement, Movement, movements_of_group
@@ -278,13 +278,13 @@ def _explained(
     standing = [one for one in problem.groups if one.fixed_size]
     every = SessionEvidence(values, problem.root, standing, movement_hypotheses(problem), noise)
 
-    def explain(wrong: Mapping[int, float]) -> Explained[_Solved]:
+    def explain(wrong: Mapping[int, float]) -> ExplainedRows[_Solved]:
         evidence = every.with_wrong(wrong)
         there, explanation = evidence.values, evidence.compare_hypotheses()
         solved = _Solved(problem, there, noise, evidence, explanation)
         factor = explanation.noise_factor
         V = evidence.covariance([_sized(one) for one in solved.probable_movements], factor)
-        return Explained(solved, there, explanation.log_evidence, V, factor * there.deviation(noise))
+        return ExplainedRows(solved, there, explanation.log_evidence, V, factor * there.deviation(noise))
 
     return with_wrong_rows(explain(values.wrong), explain).what
 

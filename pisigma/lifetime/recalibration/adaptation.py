@@ -15,7 +15,7 @@ from pisigma.calibration.hybrid.design import Rows
 from pisigma.calibration.hybrid.noise import CalibrationNoise, stated_sigmas
 from pisigma.calibration.hybrid.refinement import correction_from_weights, linearise_rows
 from pisigma.estimation.drift import Drift, DriftGroup, DriftSearch, LinearValues, PosteriorUpdate
-from pisigma.estimation.wrong_rows import Explained, with_wrong_rows
+from pisigma.estimation.wrong_rows import ExplainedRows, with_wrong_rows
 from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.lifetime.recalibration.recalibration_problem import RecalibrationProblem
 from pisigma.measurement.dataset import Measurements
@@ -202,10 +202,10 @@ def _searched(
         values = values.select(chosen_rows(len(values.y), MAX_VALUES).sort().values)
     A = values.X @ problem.root
 
-    def explain(wrong: Mapping[int, float]) -> Explained[DriftSearch]:
+    def explain(wrong: Mapping[int, float]) -> ExplainedRows[DriftSearch]:
         there = replace(values, wrong=wrong)
         search = DriftSearch(there, A, drift.groups, drift.noise, usual)
         search.estimate_sizes()
-        return Explained(search, there, search.log_evidence, search.covariance, search.deviation)
+        return ExplainedRows(search, there, search.log_evidence, search.covariance, search.deviation)
 
     return with_wrong_rows(explain(values.wrong), explain).what

@@ -19,7 +19,7 @@ from pisigma.measurement.groups import groups_to_keep_whole
 from pisigma.measurement.splits import k_folds
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.model_posterior import FLEET_PRIOR
-from pisigma.validation.held_out.calibration_validation import PredictsErrors, errors_under
+from pisigma.validation.held_out.calibration_validation import ErrorPredictor, errors_under
 from pisigma.validation.held_out.trained_calibrations import Calibrator, fit, judgeable_rows
 
 Kept = Literal["recalibrated", "old", "scratch"]
@@ -118,7 +118,7 @@ def choose_candidate(
         training = rows.select(train)
         test = test[_predictable(rows, test, training)]
         problem = recalibration_problem(model, posterior, training, relocated)
-        candidates: dict[Kept, Callable[[], PredictsErrors]] = {
+        candidates: dict[Kept, Callable[[], ErrorPredictor]] = {
             "recalibrated": partial(adapt, problem, noise, whole.drift),
             "old": partial(adapt, problem.with_fixed_arm(), noise),
             "scratch": partial(fit, calibrator, training, lambda what: None),

@@ -20,7 +20,7 @@ from pisigma.validation.checks.mixed_rows import MIN_WRONG_SHARE, many_wrong
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.held_out.frames.fitted_frames import FrameKind
 from pisigma.validation.held_out.model_comparison import ModelComparison
-from pisigma.validation.setup_faults.cause import joined, length_text
+from pisigma.validation.setup_faults.cause import join_words, length_text
 from pisigma.validation.setup_faults.explanations import PLAUSIBLE_SHARE
 from pisigma.validation.setup_faults.nominal_robot_faults import measured_rows, spread
 from pisigma.validation.setup_faults.setup_faults import judged_values
@@ -107,8 +107,8 @@ def motion_text(motion: Session) -> str:
     amounts: dict[tuple[str, float | None], list[str]] = {}
     for one in motion.moved:
         amounts.setdefault((one.what, one.probability), []).append(one.size)
-    text = joined(
-        f"{_subject(what)} by {joined(those)} (probability {shown_probability(probability)})"
+    text = join_words(
+        f"{_subject(what)} by {join_words(those)} (probability {shown_probability(probability)})"
         for (what, probability), those in amounts.items()
     )
     return f"{text[:1].upper()}{text[1:]}"
@@ -134,7 +134,7 @@ def excessive_change_diagnostics(robot: Robot, moved: Sequence[Movement]) -> tup
     far = [one for one in moved if not is_frame(one.what) and _is_beyond(one, of_class.change)]
     if not far or (len(far) == 1 and far[0].what.startswith("joint ")):
         return ()
-    changes = joined(f"{one.what} by {one.size}" for one in far)
+    changes = join_words(f"{one.what} by {one.size}" for one in far)
     return (
         Diagnostic(
             kind="beyond_wear",

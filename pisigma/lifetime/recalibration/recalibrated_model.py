@@ -85,7 +85,7 @@ def recalibrated_model(model: CalibratedModel, adaptation: Adaptation, rows: Mea
             data_sha256=rows.content_hash(),
             rows=rows.rows,
             rows_left_out=len(rows.left_out),
-            versions=Provenance.present_versions(),
+            versions=Provenance.installed_versions(),
         ),
     )
 

@@ -28,7 +28,7 @@ from pisigma.measurement.foreign.export_file import read_export
 from pisigma.measurement.foreign.mapping import FileMapping, map_columns
 from pisigma.measurement.foreign.quantities import KEYS
 from pisigma.measurement.readings import READINGS, reading_texts, to_si
-from pisigma.measurement.rules import Labels, group_faults, row_faults
+from pisigma.measurement.rules import FieldLabels, group_faults, row_faults
 from pisigma.robot import Robot
 from pisigma.robot.se3 import rotation_from_quaternion, rotation_from_rpy
 
@@ -77,10 +77,10 @@ def fields_of(table: Table, robot: Robot | None = None) -> MeasuredFields:
     Raises:
         MeasurementError: its header or a row cannot be used.
     """
-    return _complete(sound_rows(table, robot), "error")
+    return _complete(read_usable_rows(table, robot), "error")
 
 
-def sound_rows(table: Table, robot: Robot | None) -> MeasuredFields:
+def read_usable_rows(table: Table, robot: Robot | None) -> MeasuredFields:
     """Read the usable rows of a table, possibly none; all others are listed in `left_out`.
 
     Args:
@@ -124,7 +124,7 @@ def _complete(data: MeasuredFields, on_bad_row: OnBadRow) -> MeasuredFields:
     raise problem.followed_by(f" {more} more row{'s have' if more > 1 else ' has'} a fault." if more else "")
 
 
-def _labels(layout: Layout) -> Labels:
+def _labels(layout: Layout) -> FieldLabels:
     """Return the columns that messages name, the first one of a field of several, and their units."""
     names = {quantity: layout.column(quantity).name for quantity in layout.index}
     groups = {field.name: field.quantities for field in number_fields() if len(field.quantities) > 1}
@@ -133,7 +133,7 @@ def _labels(layout: Layout) -> Labels:
         if set(group) <= set(layout.index):
             names[name] = layout.column(group[0]).name
     units = {quantity: layout.column(quantity).unit for quantity in layout.index}
-    return Labels(names, units)
+    return FieldLabels(names, units)
 
 
 def _fields(table: Table, layout: Layout, rows: CheckedRows) -> MeasuredFields:

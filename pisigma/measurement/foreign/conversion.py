@@ -54,7 +54,7 @@ class ConvertedRows:
     origins: tuple[str, ...] = ()
 
     @property
-    def places(self) -> tuple[FileLine, ...]:
+    def row_places(self) -> tuple[FileLine, ...]:
         """File and line of every row."""
         return tuple(zip(self.origins or (self.source,) * len(self.lines), self.lines, strict=True))
 
@@ -317,7 +317,7 @@ def measurement_table(rows: ConvertedRows) -> MeasurementTable:
         broken={},
     )
     fields_of(table)
-    places = list(zip(rows.places, filled, strict=True))
+    places = list(zip(rows.row_places, filled, strict=True))
     left_out = (LeftOutRow(place[0], place[1], "nothing was measured") for place, used in places if not used)
     return MeasurementTable(table, tuple(place for place, used in places if used), tuple(left_out))
 

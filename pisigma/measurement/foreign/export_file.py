@@ -65,7 +65,7 @@ class ExportFile:
     skipped: tuple[LeftOutRow, ...]
 
     @property
-    def places(self) -> tuple[FileLine, ...]:
+    def row_places(self) -> tuple[FileLine, ...]:
         """File and line of all rows, including skipped ones."""
         return (
             *((self.source, line) for line in self.lines),

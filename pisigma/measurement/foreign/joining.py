@@ -86,7 +86,7 @@ def join_rows(measured: ConvertedRows, joints: ConvertedRows, by: JoinBy, within
         measured.source,
         tuple(measured.lines[row] for row in matched),
         cells,
-        tuple(measured.places[row][0] for row in matched),
+        tuple(measured.row_places[row][0] for row in matched),
     )
     if commanded:
         names = ", ".join(commanded)
@@ -101,7 +101,7 @@ def join_rows(measured: ConvertedRows, joints: ConvertedRows, by: JoinBy, within
     why = "nothing was measured at its time" if by == "time" else same_point
     return JoinedRows(
         rows=rows,
-        used=tuple(joints.places[row] for row in np.unique(partner[matched])),
+        used=tuple(joints.row_places[row] for row in np.unique(partner[matched])),
         unmatched=(
             *_left_out(measured, np.flatnonzero(partner < 0), f"it has no partner in {joints.source}"),
             *_left_out(joints, np.setdiff1d(alone, known), f"it has no partner in {measured.source}"),
@@ -112,7 +112,7 @@ def join_rows(measured: ConvertedRows, joints: ConvertedRows, by: JoinBy, within
 
 
 def _left_out(rows: ConvertedRows, which: Int64[np.ndarray, " _which"], reason: str) -> list[LeftOutRow]:
-    places = [(*rows.places[row], _point(rows, row)) for row in which.tolist()]
+    places = [(*rows.row_places[row], _point(rows, row)) for row in which.tolist()]
     return [LeftOutRow(file, line, reason, point) for file, line, point in places]
 
 
@@ -128,7 +128,7 @@ def append_rows(rows: Sequence[ConvertedRows]) -> ConvertedRows:
             name: tuple(text for one in rows for text in one.cells.get(name, ("",) * len(one.lines)))
             for name in names
         },
-        origins=tuple(place[0] for one in rows for place in one.places),
+        origins=tuple(place[0] for one in rows for place in one.row_places),
     )
 
 

@@ -199,7 +199,7 @@ def _of_rows(values: Any, rows: Any) -> Any:
 
 
 @dataclass(frozen=True, eq=False)
-class Reached:
+class ReachedPoses:
     """Result of the iteration towards poses.
 
     Attributes:
@@ -219,7 +219,7 @@ class Reached:
         return np.where(self.reached if values.ndim == 1 else self.reached[:, None], values, np.nan)
 
 
-def solve(motion: Motion, T: Float64[np.ndarray, "rows 4 4"], start: Values) -> Reached:
+def solve(motion: Motion, T: Float64[np.ndarray, "rows 4 4"], start: Values) -> ReachedPoses:
     """Solve for poses by damped least squares from initial values.
 
     Args:
@@ -246,7 +246,9 @@ def solve(motion: Motion, T: Float64[np.ndarray, "rows 4 4"], start: Values) -> 
             break
     reached = np.abs(error * (weight == 1.0)).max(-1) < tolerances.ACCEPTED
     reached &= np.abs(error[:, 3:5]).max(-1) <= MAX_TILT
-    return Reached(q, reached, np.linalg.norm(error[:, :3], axis=-1), np.linalg.norm(error[:, 3:], axis=-1))
+    return ReachedPoses(
+        q, reached, np.linalg.norm(error[:, :3], axis=-1), np.linalg.norm(error[:, 3:], axis=-1)
+    )
 
 
 def solve_from(
@@ -254,7 +256,7 @@ def solve_from(
     T: Float64[np.ndarray, "rows 4 4"],
     starts: Float64[np.ndarray, "rows tried axes"],
     is_inside: Callable[[Values], Bool[np.ndarray, " rows"]],
-) -> Reached:
+) -> ReachedPoses:
     """Solve every pose from the first start that reaches it within the limits, else from one that reaches it."""
     result = solve(motion, T, starts[:, 0])
     for tried in starts[:, 1:].swapaxes(0, 1):

@@ -37,7 +37,7 @@ from pisigma.validation.report.corrections import (
     correction_curves,
     parameter_correlations,
 )
-from pisigma.validation.report.dependence import Dependence, ErrorsByName, by_name, dependences
+from pisigma.validation.report.dependence import Dependence, ErrorsByName, dependences, group_errors_by_name
 from pisigma.validation.report.error_map import ErrorMap, map_of_rows, map_of_workspace
 from pisigma.validation.report.largest_errors import largest_errors
 
@@ -207,7 +207,7 @@ class ReportContent:
                     "how": rows_text(one),
                     "held_out": one.held_out,
                     "rows": one.rows,
-                    "models": {name: figures.by_name for name, figures in one.models.items()},
+                    "models": {name: figures.figures_by_name for name, figures in one.models.items()},
                 }
                 for one in self.accuracies
             ],
@@ -268,8 +268,8 @@ def report_content(
         remarks=remarks,
         map=map_of_workspace(model) if rows is None else map_of_rows(model, rows),
         dependences=() if rows is None else dependences(rows, model.robot),
-        frames=ErrorsByName() if rows is None else by_name(rows, rows.measurements.frame),
-        targets=ErrorsByName() if rows is None else by_name(rows, rows.measurements.target),
+        frames=ErrorsByName() if rows is None else group_errors_by_name(rows, rows.measurements.frame),
+        targets=ErrorsByName() if rows is None else group_errors_by_name(rows, rows.measurements.target),
         correlations=correlations,
         curves=correction_curves(model),
         learned=_learned(summary),

@@ -227,7 +227,7 @@ class SimulatedImages(Section):
         """Return the joint values that are read for the images [rad or m]."""
         return self._read(self._joints(robot))
 
-    def rendered(self, robot: TrueRobot) -> Iterator[UInt8[np.ndarray, "height width"]]:
+    def render(self, robot: TrueRobot) -> Iterator[UInt8[np.ndarray, "height width"]]:
         """Render the images pixel by pixel, the same at every call; the noise of corners is that of their detection."""
         camera, board = self._true()
         q, rng = robot.actual_joints(self._joints(robot)), np.random.default_rng(self.noise.seed)
@@ -374,7 +374,7 @@ def write_images(images: SimulatedImages, robot: TrueRobot, folder: str | os.Pat
     files = [f"{number:04d}.png" for number in range(images.poses.count)]
     with staged_folder(folder, names=(*files, *GIVEN_FILES)) as scratch:
         q = robot.nominal.to_controller(images.joints_read(robot)).numpy()
-        for file, joints, image in zip(files, q, images.rendered(robot), strict=True):
+        for file, joints, image in zip(files, q, images.render(robot), strict=True):
             Image.fromarray(image).save(scratch / file)
             shown = (axis.in_file_unit(float(value)) for axis, value in zip(axes, joints, strict=True))
             lines.append(",".join((file, *(f"{value:.9f}" for value in shown))))

@@ -15,7 +15,7 @@ from pisigma.measurement.sensors.registry import SENSORS
 from pisigma.robot.frame_fits import best_base, best_tool
 from pisigma.validation.checks.check import CheckedCalibration, RowsUnderModel
 from pisigma.validation.held_out.diagnostic import Diagnostic
-from pisigma.validation.setup_faults.cause import joined, length_text
+from pisigma.validation.setup_faults.cause import join_words, length_text
 from pisigma.validation.setup_faults.ordered_rows import OrderedRows
 from pisigma.validation.setup_faults.populations import MIN_ROWS as MIN_ROWS_OF_TWO
 from pisigma.validation.setup_faults.populations import (
@@ -72,7 +72,7 @@ def mixed_rows(judged: RowsUnderModel, wrong: Bool[Tensor, " rows"]) -> Diagnost
 
 def many_wrong(rows: Measurements, wrong: Bool[Tensor, " rows"]) -> Diagnostic:
     """Report that more rows are wrong than can be left out."""
-    distinction = what_distinguishes(rows, wrong)
+    distinction = distinguishing_property(rows, wrong)
     return Diagnostic(
         kind="mixed_rows",
         severity="implausible",
@@ -90,7 +90,7 @@ def _cause(judged: RowsUnderModel, wrong: Bool[Tensor, " rows"]) -> str:
     if not faults:
         return ""
     fault = combine_alternatives(faults)
-    fall = joined(length_text(error) for error in (fault.before, fault.after))
+    fall = join_words(length_text(error) for error in (fault.before, fault.after))
     return f" In these rows, {fault.clause} (errors without and with this correction: {fall})."
 
 
@@ -218,7 +218,7 @@ def _differ(found: Populations) -> bool:
 def _two_populations(rows: Measurements, found: Populations) -> Diagnostic:
     """Report the rows of the smaller population, and how they differ from the others."""
     second = torch.from_numpy(found.second)
-    distinction = what_distinguishes(rows, second)
+    distinction = distinguishing_property(rows, second)
     size, moved = int(second.sum()), f"{length_text(math.hypot(*found.difference[:3]))}"
     difference, advice = {
         "arm": ("belong to another arm than the others", "Calibrate each robot with its own rows"),
@@ -264,12 +264,12 @@ class Distinction(NamedTuple):
     clause: str
 
 
-def what_distinguishes(rows: Measurements, some: Bool[Tensor, " rows"]) -> Distinction:
+def distinguishing_property(rows: Measurements, some: Bool[Tensor, " rows"]) -> Distinction:
     """Find a property that some rows have and all others do not."""
     for distinction in (*_by_name(rows, some), *_by_order(rows, some), *_by_value(rows, some)):
         return distinction
     numbers = some.nonzero()[:, 0].tolist()
-    listed = joined(rows.place(number) for number in numbers[:MAX_PLACES])
+    listed = join_words(rows.place(number) for number in numbers[:MAX_PLACES])
     more = f" and {len(numbers) - MAX_PLACES} more" if len(numbers) > MAX_PLACES else ""
     return Distinction("nothing", f"{listed}{more}, which are scattered among the others")
 
@@ -288,7 +288,7 @@ def _by_name(rows: Measurements, some: Bool[Tensor, " rows"]) -> Iterator[Distin
         here = {name for name, one in zip(names, some.tolist(), strict=True) if one}
         there = {name for name, one in zip(names, some.tolist(), strict=True) if not one}
         if here and there and not here & there:
-            yield Distinction("name", f"all rows of {what} {joined(sorted(here))}")
+            yield Distinction("name", f"all rows of {what} {join_words(sorted(here))}")
 
 
 def _by_order(rows: Measurements, some: Bool[Tensor, " rows"]) -> Iterator[Distinction]:

@@ -108,7 +108,7 @@ def _texts(motion: Motion, rows: Measurements) -> tuple[str, str]:
 
 def explain_refusal(refusal: IdentificationError, robot: Robot, rows: Measurements) -> IdentificationError:
     """Replace a refusal by one that names the setup fault, if one explains the errors; else return it unchanged."""
-    if moved := new_setup(robot, rows):
+    if moved := new_setup_refusal(robot, rows):
         return moved
     causes = setup_diagnostics(robot, rows)
     if not causes:
@@ -116,7 +116,7 @@ def explain_refusal(refusal: IdentificationError, robot: Robot, rows: Measuremen
     return IdentificationError(causes[0].sentence.removesuffix("."), at=Place(rows.source))
 
 
-def new_setup(robot: Robot, measurements: Measurements) -> IdentificationError | None:
+def new_setup_refusal(robot: Robot, measurements: Measurements) -> IdentificationError | None:
     """Find the row before which the instrument was moved, for motions so large that no calibration of all rows works.
 
     Base and tool are fitted to the first and to the last third of the rows. The row is the one up to (or after) which

@@ -29,7 +29,7 @@ MAX_NAMED = 5
 
 
 @dataclass(frozen=True, eq=False)
-class WithoutWrongRows:
+class RowsWithoutWrongOnes:
     """Rows without those that are wrong.
 
     Attributes:
@@ -45,7 +45,7 @@ class WithoutWrongRows:
 
 def without_wrong_rows(
     models: Iterable[CalibratedModel], rows: Measurements, fitted: Collection[FrameKind] = ()
-) -> WithoutWrongRows:
+) -> RowsWithoutWrongOnes:
     """Leave out single rows that are too far off under every model to be measured correctly.
 
     Args:
@@ -55,10 +55,10 @@ def without_wrong_rows(
     """
     found = [_far_rows(model, rows, fitted) for model in models]
     if not found or any(one is None for one in found):
-        return WithoutWrongRows(rows)
+        return RowsWithoutWrongOnes(rows)
     numbers = sorted(set.intersection(*(set(one) for one in found if one is not None)))
     if not 0 < len(numbers) <= max(MAX_WRONG_SHARE * rows.rows, 1):
-        return WithoutWrongRows(rows)
+        return RowsWithoutWrongOnes(rows)
     kept = torch.ones(rows.rows, dtype=torch.bool)
     kept[numbers] = False
     sizes = found[0] or {}
@@ -71,7 +71,7 @@ def without_wrong_rows(
         f"{len(numbers)} {have} than any calibrated robot, while the others agree with the model, and {are} left "
         f"out: {', '.join(named)}{more}; check these measurements, or measure the poses again."
     )
-    return WithoutWrongRows(rows.select(kept.nonzero()[:, 0]), (warning,), tuple(numbers))
+    return RowsWithoutWrongOnes(rows.select(kept.nonzero()[:, 0]), (warning,), tuple(numbers))
 
 
 def _far_rows(

@@ -13,7 +13,7 @@ from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.calibration.hybrid.result import HybridResult
 from pisigma.files.engines.processes import run_in_processes, run_in_threads
 from pisigma.files.errors import IdentificationError
-from pisigma.files.progress import Progress, ignore_progress, staged_progress
+from pisigma.files.progress import Progress, no_progress, with_stage
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.sensors.registry import SENSORS
 from pisigma.measurement.sensors.socket import PairOfSockets
@@ -77,14 +77,15 @@ class CalibrationValidation:
     def all_errors(self) -> dict[str, PoseErrors]:
         """Errors of all rows in all repeats by model, one repeat after the other."""
         return {
-            name: PoseErrors.joined([repeat.models[name] for repeat in self.repeats]) for name in self.models
+            name: PoseErrors.concatenate([repeat.models[name] for repeat in self.repeats])
+            for name in self.models
         }
 
     @property
     def all_spread(self) -> PredictedSpread | None:
         """Position errors and their predicted standard deviations in all repeats; None without a hybrid."""
         spreads = [repeat.spread for repeat in self.repeats if repeat.spread is not None]
-        return PredictedSpread.joined(spreads) if spreads else None
+        return PredictedSpread.concatenate(spreads) if spreads else None
 
     def figures(self, simulations: Sequence[TrainTest] = ()) -> ValidationFigures:
         """Compute the statistics of all repeats in mm and deg.
@@ -154,7 +155,7 @@ def _joined(measurements: Measurements, judged: Sequence[JudgedFold], folds: int
         if fold.spread is not None:
             spread = spread or PredictedSpread.all_nan(measurements.rows)
             spread.error[fold.test], spread.sigma[fold.test] = fold.spread.error, fold.spread.sigma
-    distances = DistanceErrors.joined([fold.distances for fold in judged])
+    distances = DistanceErrors.concatenate([fold.distances for fold in judged])
     frames, sockets, not_judged = (
         sum(getattr(fold, count) for fold in judged) for count in ("frames", "sockets", "not_judged")
     )
@@ -194,7 +195,7 @@ def judged_folds(
     jobs: int | None = None,
 ) -> Iterator[JudgedFold]:
     """Judge every fold of every repeat, in threads or processes; see `fold_tasks` and `validate`."""
-    tasks = fold_tasks(calibrator, measurements, repeats, progress if jobs is None else ignore_progress)
+    tasks = fold_tasks(calibrator, measurements, repeats, progress if jobs is None else no_progress)
     return (
         run_in_threads(tasks, measurements.rows > FEW_ROWS) if jobs is None else run_in_processes(tasks, jobs)
     )
@@ -218,7 +219,7 @@ def fold_tasks(
     for number, splits in enumerate(repeats, 1):
         of_repeat = progress
         if len(repeats) > 1:
-            of_repeat = staged_progress(progress, f"repeat {number} of {len(repeats)}", ", ")
+            of_repeat = with_stage(progress, f"repeat {number} of {len(repeats)}", ", ")
         held_out = held_out_of_folds(geometric_of(calibrator).socket_distances, measurements, splits)
         for fold, (split, without) in enumerate(zip(splits, held_out, strict=True), 1):
             name = f"fold {fold} of {len(splits)}"
@@ -250,7 +251,7 @@ def _judged_fold(
     held_out = measurements.select(judged_rows)
     chosen = drop_missing_frames(calibrator, training, measurements, distances)
     try:
-        results = fit_compared_calibrations(chosen, training, staged_progress(progress, fold))
+        results = fit_compared_calibrations(chosen, training, with_stage(progress, fold))
     except IdentificationError as problem:
         raise IdentificationError(
             f"{fold}, calibrated with {training.rows} of the {measurements.rows} rows: {problem} A calibration with "
@@ -300,7 +301,7 @@ def learning_curve(
     points = []
     for rows in sorted(sizes):
         fewer = with_fewer(measurements, splits, rows, seed)
-        of_rows = staged_progress(progress, f"{rows} training rows")
+        of_rows = with_stage(progress, f"{rows} training rows")
         points.append((rows, validate(calibrator, measurements, fewer, of_rows, jobs)))
     if whole is not None:
         points.append((min(len(train) for train, _ in splits), whole))
@@ -311,7 +312,7 @@ def learning_curve(
     )
 
 
-def judge_on_test_set(
+def judge(
     calibrator: Calibrator, result: Result, training: Measurements, test: Measurements
 ) -> CalibrationValidation:
     """Judge a calibration on a separate test set.
@@ -351,14 +352,14 @@ def _judge(
 
 
 @runtime_checkable
-class PredictsErrors(Protocol):
+class ErrorPredictor(Protocol):
     """A calibration of any kind."""
 
     def errors_of(self, measurements: Measurements) -> Mapping[str, Float64[Tensor, "rows components"]]:
         """Compute measured minus predicted values by sensor [m or rad]; see `CalibrationResult.errors_of`."""
 
 
-def errors_under(result: PredictsErrors, measurements: Measurements) -> PoseErrors:
+def errors_under(result: ErrorPredictor, measurements: Measurements) -> PoseErrors:
     """Compute the errors of rows of any sensor under a calibration.
 
     Returns:

@@ -99,7 +99,7 @@ class DistilledErrors(Section):
         return {"nominal": self.nominal, "distilled": self.distilled, "full": self.full}
 
 
-class AbsoluteFigures(Section):
+class AbsoluteErrorFigures(Section):
     """Mean, root mean square and maximum of absolute values."""
 
     mean: float
@@ -112,8 +112,8 @@ class DistilledJoint(Section):
 
     name: str
     unit: str
-    correction: AbsoluteFigures
-    error: AbsoluteFigures
+    correction: AbsoluteErrorFigures
+    error: AbsoluteErrorFigures
 
 
 class DistillationSummary(AbstractSummary):

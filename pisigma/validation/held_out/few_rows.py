@@ -16,7 +16,7 @@ from pisigma.calibration.geometric.result import CalibrationResult
 from pisigma.calibration.hybrid.calibrator import HybridCalibrator
 from pisigma.files.engines.processes import run_in_processes
 from pisigma.files.errors import IdentificationError, MeasurementError
-from pisigma.files.progress import Progress, ignore_progress, staged_progress
+from pisigma.files.progress import Progress, no_progress, with_stage
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.splits import TrainTest, k_folds
 from pisigma.validation.held_out.calibration_validation import JudgedFold, fold_tasks, judged_folds, validate
@@ -62,7 +62,7 @@ def fit_where_it_helps(calibrator: Calibrator, rows: Measurements, progress: Pro
     result = fit(calibrator, rows, progress)
     geometric = geometric_of(calibrator)
     if not geometric.free or _helps(
-        geometric, geometric_result(result), rows, staged_progress(progress, "few rows")
+        geometric, geometric_result(result), rows, with_stage(progress, "few rows")
     ):
         return result
     nominal = base_and_tool(geometric)
@@ -129,12 +129,12 @@ def fit_with_folds(
         IdentificationError: the rows do not determine the parameters; for a fold it is raised by the iterator.
         MemoryError: a process was killed twice with the calibration or a fold.
     """
-    validating = staged_progress(progress, "cross-validation")
+    validating = with_stage(progress, "cross-validation")
     if jobs is None or not repeats:
-        result = fit_where_it_helps(calibrator, rows, staged_progress(progress, "calibration"))
+        result = fit_where_it_helps(calibrator, rows, with_stage(progress, "calibration"))
         return result, judged_folds(calibrator, training, repeats, validating)
-    folds = fold_tasks(calibrator, training, repeats, ignore_progress)
+    folds = fold_tasks(calibrator, training, repeats, no_progress)
     progress(f"calibration and {len(folds)} folds in {jobs} processes")
-    fitting = partial(fit_where_it_helps, calibrator, rows, ignore_progress)
+    fitting = partial(fit_where_it_helps, calibrator, rows, no_progress)
     results: Iterator[Any] = run_in_processes([fitting, *folds], jobs)  # a calibration, and then folds
     return next(results), results

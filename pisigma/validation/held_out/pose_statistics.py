@@ -97,7 +97,7 @@ class PoseErrors:
             self.rotation[rows] = errors.rotation
 
     @staticmethod
-    def joined(several: Sequence["PoseErrors"]) -> "PoseErrors":
+    def concatenate(several: Sequence["PoseErrors"]) -> "PoseErrors":
         """Concatenate errors, which all have orientations or none has."""
         rotations = [errors.rotation for errors in several if errors.rotation is not None]
         return PoseErrors(
@@ -216,7 +216,7 @@ class PredictedSpread:
         return PredictedSpread(nothing, nothing.clone())
 
     @staticmethod
-    def joined(spreads: Sequence["PredictedSpread"]) -> "PredictedSpread":
+    def concatenate(spreads: Sequence["PredictedSpread"]) -> "PredictedSpread":
         """Concatenate spreads."""
         return PredictedSpread(
             torch.cat([spread.error for spread in spreads]), torch.cat([spread.sigma for spread in spreads])

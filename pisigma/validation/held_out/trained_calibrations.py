@@ -242,7 +242,7 @@ class DistanceErrors:
         return DistanceErrors(stated, errors)
 
     @staticmethod
-    def joined(parts: "Sequence[DistanceErrors]") -> "DistanceErrors":
+    def concatenate(parts: "Sequence[DistanceErrors]") -> "DistanceErrors":
         """Join the errors of several folds."""
         there = [part for part in parts if part.stated]
         stated = {pair: distance for part in there for pair, distance in part.stated.items()}

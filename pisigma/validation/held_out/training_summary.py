@@ -185,7 +185,7 @@ class ComparisonFigures(Section):
     @property
     def effects(self) -> dict[str, Effect]:
         """Effect of the correction on the RMS errors of "position" and, if measured, of "orientation"."""
-        nominal, corrected = self.nominal.by_name, self.corrected.by_name
+        nominal, corrected = self.nominal.figures_by_name, self.corrected.figures_by_name
         return {
             name: _effect(nominal[f"rms_{unit}"], corrected[f"rms_{unit}"])
             for name, unit in _QUANTITIES.items()
@@ -195,7 +195,7 @@ class ComparisonFigures(Section):
     @property
     def increased_maxima(self) -> tuple[str, ...]:
         """The quantities whose largest error the correction increases visibly."""
-        nominal, corrected = self.nominal.by_name, self.corrected.by_name
+        nominal, corrected = self.nominal.figures_by_name, self.corrected.figures_by_name
         return tuple(
             name
             for name in self.effects
@@ -214,7 +214,7 @@ class ComparisonFigures(Section):
     @property
     def verdict(self) -> str:
         """Effect of the correction on held-out rows, and whether to use it, as a sentence."""
-        nominal, corrected = self.nominal.by_name, self.corrected.by_name
+        nominal, corrected = self.nominal.figures_by_name, self.corrected.figures_by_name
         findings = []
         for name, effect in self.effects.items():
             unit = _QUANTITIES[name]

@@ -19,7 +19,7 @@ class ErrorFigures(Section):
     max_deg: float | None = None
 
     @property
-    def by_name(self) -> dict[str, float]:
+    def figures_by_name(self) -> dict[str, float]:
         """The figures that are set, by name."""
         return self.model_dump(exclude_unset=True)
 

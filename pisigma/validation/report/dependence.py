@@ -178,7 +178,7 @@ class ErrorsByName:
 
 
 @dataclass(frozen=True, eq=False)
-class Binned:
+class BinnedErrors:
     """Errors in bins of a quantity's values.
 
     Attributes:
@@ -231,7 +231,7 @@ def dependences(rows: JudgedRows, robot: Robot) -> tuple[Dependence, ...]:
     return tuple(result)
 
 
-def by_name(rows: JudgedRows, names: Sequence[str]) -> ErrorsByName:
+def group_errors_by_name(rows: JudgedRows, names: Sequence[str]) -> ErrorsByName:
     """Compute errors per name, and test whether they differ; empty if there is one name only.
 
     Args:
@@ -310,7 +310,7 @@ def root_mean_square(values: Float64[np.ndarray, " values"]) -> float:
 
 def bin_errors(
     values: Float64[np.ndarray, " rows"], errors: Float64[np.ndarray, " rows"], bins: int = MAX_BINS
-) -> Binned:
+) -> BinnedErrors:
     """Compute RMS errors in bins of equal width; of few rows in fewer bins."""
     bins = int(np.clip(len(values) // MIN_ROWS, 1, bins))
     low, high = float(values.min()), float(values.max())
@@ -318,4 +318,4 @@ def bin_errors(
     number = np.clip(np.searchsorted(edges, values, "right") - 1, 0, bins - 1)
     inside = [errors[number == k] for k in range(bins)]
     rms = [root_mean_square(those) if len(those) >= MIN_ROWS_OF_RMS else math.nan for those in inside]
-    return Binned(edges, np.array(rms), number)
+    return BinnedErrors(edges, np.array(rms), number)

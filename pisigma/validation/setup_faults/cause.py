@@ -37,10 +37,10 @@ def joints_text(joints: tuple[int, ...]) -> str:
         return f"joint {joints[0] + 1}"
     if len(joints) > 2 and joints[-1] - joints[0] == len(joints) - 1:
         return f"joints {joints[0] + 1} to {joints[-1] + 1}"
-    return f"joints {joined(str(i + 1) for i in joints)}"
+    return f"joints {join_words(str(i + 1) for i in joints)}"
 
 
-def joined(words: Iterable[str]) -> str:
+def join_words(words: Iterable[str]) -> str:
     """Join words to a list in a sentence."""
     *first, last = words
     return f"{', '.join(first)} and {last}" if first else last

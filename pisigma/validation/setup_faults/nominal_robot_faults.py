@@ -19,7 +19,7 @@ from pisigma.robot.frame_fits import LEVER_SHARE, MeasuredPoses, affine_error, b
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.kinematics.parameter_jacobian import identification_jacobian
 from pisigma.robot.robot_class import HOBBY
-from pisigma.validation.setup_faults.cause import Cause, joined
+from pisigma.validation.setup_faults.cause import Cause, join_words
 from pisigma.validation.setup_faults.explanations import (
     AS_GOOD,
     choose_simplest,
@@ -329,12 +329,12 @@ def _in_tool_frame(T: Float64[Tensor, "rows 4 4"], measured: MeasuredPoses) -> F
 def _one_name(rows: Measurements, number: Int64[Tensor, " rows"]) -> Cause:
     used, sizes = torch.unique(number, return_counts=True)
     first = [_where(rows, int((number == k).nonzero()[0, 0])) for k in used]
-    shares = joined(f"{100 * size / len(number):.0f} %" for size in sizes.tolist())
+    shares = join_words(f"{100 * size / len(number):.0f} %" for size in sizes.tolist())
     clause = f"the targets seem to be mixed up: {len(used)} targets have one name ({shares} of the rows)"
     return Cause(
         "target",
         clause,
-        f"name the targets in a column 'target'; their first rows are {joined(first)}",
+        f"name the targets in a column 'target'; their first rows are {join_words(first)}",
         float(len(used)),
         amount=float(len(used)),
     )
@@ -353,7 +353,7 @@ def _other_names(rows: Measurements, number: Int64[Tensor, " rows"], names: tupl
     clause = (
         f"the targets seem to be mixed up: {len(wrong)} of {rows.rows} rows fit another target than they name"
     )
-    return Cause("target", clause, f"check the column 'target': {joined(examples)}", 2.0)
+    return Cause("target", clause, f"check the column 'target': {join_words(examples)}", 2.0)
 
 
 def _where(rows: Measurements, row: int) -> str:

@@ -20,7 +20,7 @@ from pisigma.robot.urdf_chain import origin_of, read_chain
 from pisigma.robot.urdf_file import parse_xml, read_urdf
 from pisigma.robot.urdf_frames import Frame, frame_of, translation
 from pisigma.workbench.viewing.colors import Color
-from pisigma.workbench.viewing.surface import Surface, capsule, joined
+from pisigma.workbench.viewing.surface import Surface, capsule, join_surfaces
 
 if TYPE_CHECKING:  # names in full, which type checkers at run time find without these imports
     import trimesh
@@ -66,7 +66,7 @@ class CapsuleBody(AbstractBody):
     ) -> None:
         """Draw one mesh of all capsules; see `AbstractBody.draw`."""
         segments, radii = self._capsules.segments(torch.from_numpy(q)).numpy(), self._capsules.radius.tolist()
-        links = joined(
+        links = join_surfaces(
             [capsule(start, end, radius) for (start, end), radius in zip(segments, radii, strict=True)]
         )
         scene.add_mesh_simple(name, links.points, links.faces, color=color, opacity=opacity)
@@ -103,7 +103,7 @@ class MeshBody(AbstractBody):
         self.links: dict[str, Surface] = {}
         for element in parse_xml(path).iterchildren("{*}link"):
             if visuals := [_surface(visual, Path(path)) for visual in element.iterchildren("{*}visual")]:
-                self.links[element.get("name")] = joined(visuals)
+                self.links[element.get("name")] = join_surfaces(visuals)
         if not self.links:
             raise RobotError("no link has a <visual>", at=Place(path))
         self._drawn: dict[str, viser.MeshHandle] = {}

@@ -26,7 +26,7 @@ class Surface:
         return Surface(self.points @ R.T + t, self.faces)
 
 
-def joined(surfaces: list[Surface]) -> Surface:
+def join_surfaces(surfaces: list[Surface]) -> Surface:
     """Join several surfaces to one."""
     starts = np.cumsum([0, *(len(surface.points) for surface in surfaces)])
     faces = [surface.faces + start for surface, start in zip(surfaces, starts, strict=False)]

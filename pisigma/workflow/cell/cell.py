@@ -17,16 +17,7 @@ from pisigma.files.model_files import is_model
 from pisigma.files.progress import Progress
 from pisigma.lifetime.cell.controller import findings
 from pisigma.lifetime.cell.facts import CellStatus, status_of
-from pisigma.lifetime.cell.history import (
-    HISTORY,
-    Check,
-    Entry,
-    History,
-    ModelEntry,
-    SessionEntry,
-    Use,
-    current_time,
-)
+from pisigma.lifetime.cell.history import HISTORY, Check, Entry, History, ModelEntry, SessionEntry, Use, now
 from pisigma.lifetime.cell.layout import MODELS, PLANS
 from pisigma.measurement.camera.camera_files import CameraFiles
 from pisigma.measurement.dataset import Measurements
@@ -36,7 +27,7 @@ from pisigma.robot.description import Robot
 from pisigma.workflow.calibrate import Calibration
 from pisigma.workflow.cell.cell_file import CellFile
 from pisigma.workflow.cell.model_choice import (
-    calibrate_from_scratch,
+    calibrate_rows,
     check_of,
     entry_of,
     errors_of,
@@ -47,10 +38,7 @@ from pisigma.workflow.cell.model_choice import (
 )
 from pisigma.workflow.cell.new_cell import NewCell
 from pisigma.workflow.cell.new_files import free_path, save_new
-from pisigma.workflow.cell.sessions import (
-    ModelRows,
-    Sessions,
-)
+from pisigma.workflow.cell.sessions import ModelRows, Sessions
 from pisigma.workflow.evaluate import Evaluation, evaluate
 from pisigma.workflow.monitor import Monitoring, monitor
 from pisigma.workflow.plan import Plan, plan
@@ -176,7 +164,7 @@ class Cell:
             planned.save(path, programs)
         made = f"plan '{path.stem}' of {planned.poses + planned.checks} poses"
         of = "" if entry is None else entry.name
-        self.history.add(Check("plan", of, "", "planned", made, None, False, current_time()))
+        self.history.add(Check("plan", of, "", "planned", made, None, False, now()))
         return planned, path
 
     @cached_property
@@ -217,13 +205,11 @@ class Cell:
         """
         sessions, warnings = self.sessions.valid_sessions(), self.on_controller("calibrate", None)
         settings: CalibrationSettings = self.file.settings_of_step("calibrate", **changed)
-        result = calibrate_from_scratch(
-            self.robot, self.sessions.rows_of(sessions), settings, prior, progress
-        )
+        result = calibrate_rows(self.robot, self.sessions.rows_of(sessions), settings, prior, progress)
         result = with_warnings(result, warnings)
         doubt = "" if result.trusted else result.diagnostics[0].sentence
         if doubt and not accept_implausible:
-            self.history.add(Check("calibrate", "", "", "not_trusted", doubt, None, False, current_time()))
+            self.history.add(Check("calibrate", "", "", "not_trusted", doubt, None, False, now()))
             return result, None
         remark, better = doubt or "not verified yet", False
         if not doubt and prior is None and (in_use := self.history.in_use) is not None:
@@ -232,8 +218,8 @@ class Cell:
         p95, rms = errors_of(result)
         entry = entry_of(self.history, path, sessions, remark, p95)
         verdict = "accepted_implausible" if doubt else "trusted"
-        check = Check("calibrate", entry.name, "", verdict, doubt, p95, False, current_time(), rms)
-        self.history.add(entry, check, *([Use(entry.name, current_time(), remark)] if better else []))
+        check = Check("calibrate", entry.name, "", verdict, doubt, p95, False, now(), rms)
+        self.history.add(entry, check, *([Use(entry.name, now(), remark)] if better else []))
         return result, entry
 
     def verify(
@@ -258,10 +244,10 @@ class Cell:
         found = verify(self.model_folder(entry.name), seen.rows, settings)
         errors, moved = found.comparison.models[-1].position.statistics, found.verdict == "moved"
         found_by = ("verify", entry.name, chosen.name, found.verdict, found.sentence)
-        self.history.add(Check(*found_by, errors["p95"], moved, current_time(), errors["rms"]))
+        self.history.add(Check(*found_by, errors["p95"], moved, now(), errors["rms"]))
         in_use = self.history.in_use
         if found.accepted and (in_use is None or in_use.made < entry.made):
-            self.history.add(Use(entry.name, current_time(), f"verified with session '{chosen.name}'"))
+            self.history.add(Use(entry.name, now(), f"verified with session '{chosen.name}'"))
         return found, entry
 
     def monitor(self, progress: Progress = lambda what: None, **changed: Any) -> Monitoring:
@@ -340,7 +326,7 @@ class Cell:
         if not (result.trusted or accept_implausible):
             doubt = result.diagnostics[0].sentence
             refused = ("recalibrate", parent.name, chosen.name, "not_trusted", doubt)
-            self.history.add(Check(*refused, None, False, current_time()))
+            self.history.add(Check(*refused, None, False, now()))
             return result, None
         path = save_new(self.folder / MODELS, partial(result.save, accept_implausible=accept_implausible))
         remark, (p95, rms) = result.summary.verdict, errors_of(result)
@@ -353,10 +339,10 @@ class Cell:
             parent=parent.name,
         )
         of = ("recalibrate", entry.name, chosen.name, result.summary.kept, remark)
-        added: list[Entry] = [entry, Check(*of, p95, False, current_time(), rms)]
+        added: list[Entry] = [entry, Check(*of, p95, False, now(), rms)]
         if result.trusted:
             events = found_events(result, chosen, seen.moved, self.sessions.valid_sessions())
-            added += [Use(entry.name, current_time(), remark), *events]
+            added += [Use(entry.name, now(), remark), *events]
         self.history.add(*added)
         return result, entry
 

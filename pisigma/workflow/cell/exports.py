@@ -11,7 +11,7 @@ from pisigma.files.errors import MeasurementError, Place
 from pisigma.files.input_file import read_input
 from pisigma.lifetime.cell.controller import checked_model_folder, record_controller
 from pisigma.lifetime.cell.exports import ControllerEntry, ExportEntry
-from pisigma.lifetime.cell.history import current_time
+from pisigma.lifetime.cell.history import now
 from pisigma.workflow.cell.cell import Cell
 
 NONE = "none"
@@ -33,9 +33,7 @@ def export_from_cell(cell: Cell, form: str, request: ExportRequest) -> Exported:
     contains = export_format(form).contains_for(request)
     folder, warnings = checked_model_folder(cell.folder, f"export {contains}")
     exported = export_model(form, replace(request, model=folder))
-    cell.history.add(
-        ExportEntry(request.out.name, _sha256(request.out), form, contains, folder.name, current_time())
-    )
+    cell.history.add(ExportEntry(request.out.name, _sha256(request.out), form, contains, folder.name, now()))
     return replace(exported, warnings=(*warnings, *exported.warnings))
 
 

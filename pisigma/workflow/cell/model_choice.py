@@ -8,16 +8,7 @@ from typing import TypeVar
 from pisigma.files.errors import ModelError, Place
 from pisigma.files.model_files import model_hash
 from pisigma.files.progress import Progress
-from pisigma.lifetime.cell.history import (
-    Check,
-    Event,
-    EventKind,
-    History,
-    ModelEntry,
-    SessionEntry,
-    Use,
-    current_time,
-)
+from pisigma.lifetime.cell.history import Check, Event, EventKind, History, ModelEntry, SessionEntry, Use, now
 from pisigma.lifetime.cell.layout import MODELS
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
@@ -132,7 +123,7 @@ def check_of(
         seen: rows of the session with the names of the model.
         settings: settings of the recalibration.
     """
-    check = Check("monitor", entry.name, session.name, "implausible", "", None, False, current_time())
+    check = Check("monitor", entry.name, session.name, "implausible", "", None, False, now())
     if found.untrusted:
         return replace(check, summary=found.untrusted[0].sentence)
     judged = found.sessions[-1].session
@@ -166,13 +157,13 @@ def found_events(
     kinds: dict[str, EventKind] = {"base": "instrument", "tool": "tool"}
     note = f"found by the recalibration with session '{session.name}'"
     return [
-        Event(session.day, kind, note, current_time())
+        Event(session.day, kind, note, now())
         for what, kind in kinds.items()
         if what in moved and what not in recorded
     ]
 
 
-def calibrate_from_scratch(
+def calibrate_rows(
     robot: Robot, rows: Measurements, settings: CalibrationSettings, prior: Path | None, progress: Progress
 ) -> Calibration | Recalibration:
     """Calibrate a robot with rows that were read, from scratch or from the prior of a fleet.
@@ -209,7 +200,7 @@ def entry_of(
     return ModelEntry(
         name=path.name,
         sha256=model_hash(path),
-        made=current_time(),
+        made=now(),
         sessions=",".join(one.name for one in sessions),
         day=day,
         frame_day=newest_day(events, "instrument", day),
@@ -236,7 +227,7 @@ def put_into_use(history: History, model: str, reason: str, undo: bool = False) 
         raise ModelError(
             "the model was changed after it was made", at=Place(folder), remedy="use another model"
         )
-    history.add(Use(model, current_time(), reason, undo))
+    history.add(Use(model, now(), reason, undo))
 
 
 def with_warnings(result: Result, warnings: tuple[str, ...]) -> Result:

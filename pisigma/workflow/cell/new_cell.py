@@ -13,7 +13,7 @@ from pisigma.files.errors import ModelError, OutputError, PisigmaError, Place
 from pisigma.files.model_files import DESCRIPTION, model_hash
 from pisigma.files.output_file import write_whole
 from pisigma.files.scratch import FOLDER, remove_stale_scratch, scratch_beside
-from pisigma.lifetime.cell.history import HISTORY, History, ModelEntry, Use, current_time
+from pisigma.lifetime.cell.history import HISTORY, History, ModelEntry, Use, now
 from pisigma.lifetime.cell.layout import CELL_FILE, MODELS, PLANS, SESSIONS
 from pisigma.measurement.camera.camera_files import CameraFiles
 from pisigma.measurement.dates import is_date
@@ -122,7 +122,7 @@ class NewCell:
             day,
             remark=remark,
         )
-        History(folder / HISTORY).add(entry, *([] if doubt else [Use(name, current_time(), remark)]))
+        History(folder / HISTORY).add(entry, *([] if doubt else [Use(name, now(), remark)]))
 
     def _copied_robot(self, folder: Path) -> str:
         """Copy or write the robot file into the cell; return the entry `robot`."""

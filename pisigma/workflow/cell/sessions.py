@@ -11,16 +11,10 @@ from typing import Any
 
 import torch
 
-from pisigma.files.errors import (
-    AcceptanceError,
-    MeasurementError,
-    PisigmaError,
-    Place,
-    check_choice,
-)
+from pisigma.files.errors import AcceptanceError, MeasurementError, PisigmaError, Place, check_choice
 from pisigma.lifetime.cell.controller import Controller
 from pisigma.lifetime.cell.facts import facts_of, not_read, not_taken_in, sha256_of
-from pisigma.lifetime.cell.history import Check, Event, History, ModelEntry, SessionEntry, current_time
+from pisigma.lifetime.cell.history import Check, Event, History, ModelEntry, SessionEntry, now
 from pisigma.lifetime.cell.layout import MODELS, SESSIONS
 from pisigma.lifetime.cell.status import FOREIGN
 from pisigma.measurement.camera.camera_files import CameraFiles
@@ -147,9 +141,7 @@ class Sessions:
             self.take_in(self.folder / waiting[0])
         except PisigmaError as refusal:
             verdict = "refused" if is_measurement_file(self.folder / waiting[0]) else FOREIGN
-            refused = Check(
-                "import", "", Path(waiting[0]).stem, verdict, str(refusal), None, False, current_time()
-            )
+            refused = Check("import", "", Path(waiting[0]).stem, verdict, str(refusal), None, False, now())
             known = {(one.command, one.session, one.summary) for one in self.history.checks()}
             if (refused.command, refused.session, refused.summary) not in known:
                 self.history.add(refused)
@@ -168,7 +160,7 @@ class Sessions:
         if bool(again.all()):
             raise _known(rows)
         model, fitted, controller = self.history.in_use, False, Controller.from_history(self.history)
-        at = controller.active(day, current_time())
+        at = controller.active(day, now())
         found = controller.findings("import", model, self.history.sessions(), at).accepted(self.folder.parent)
         if model is None or found:  # with other joint zeros, the model does not describe the arm
             model, verdict = None, check_rows(rows, self.robot)
@@ -188,7 +180,7 @@ class Sessions:
         entry = SessionEntry(
             name="",
             sha256="",
-            taken_in=current_time(),
+            taken_in=now(),
             day=day,
             rows=rows.rows,
             sensor=",".join(sorted(rows.kinds)),
@@ -209,7 +201,7 @@ class Sessions:
         for file in (*not_taken_in(self.folder, known), *not_read(self.folder, known)):
             name, day = file.removesuffix(".csv"), date_in_name(file) or datetime.date.today().isoformat()
             sessions[name] = SessionEntry(
-                name, sha256_of(self.folder / file), current_time(), day, 0, "", judged_by=""
+                name, sha256_of(self.folder / file), now(), day, 0, "", judged_by=""
             )
         check_choice(MeasurementError, "session", session, tuple(sessions), Place(self.folder))
         if not reason.strip():

@@ -7,7 +7,7 @@ from pisigma.files.errors import RecipeError
 from pisigma.files.setting import HIDDEN, KEY
 
 if TYPE_CHECKING:
-    from pisigma.workflow.distilled_network import Size
+    from pisigma.workflow.distilled_network import NetworkSize
     from pisigma.workflow.solved_poses import Region
 
 
@@ -28,7 +28,7 @@ class DistillationSettings:
 
     region: Annotated["Region | None", HIDDEN] = None
     poses: int = 5000
-    size: Annotated["Size | None", HIDDEN] = None
+    size: Annotated["NetworkSize | None", HIDDEN] = None
     seed: Annotated[int, KEY] = 0
     epochs: Annotated[int, HIDDEN] = 80
 

@@ -10,7 +10,7 @@ from testing.linearised import random_joints, tracker_data
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.calibration.hybrid.calibrator import HybridCalibrator
 from pisigma.calibration.hybrid.design import Rows
-from pisigma.calibration.hybrid.refinement import Refined, linearise_rows, refine
+from pisigma.calibration.hybrid.refinement import RefinedFit, linearise_rows, refine
 from pisigma.calibration.hybrid.search import FeatureChoice, FeatureFit
 from pisigma.measurement.conditions import JointState
 from pisigma.measurement.groups import held_out_groups
@@ -22,7 +22,7 @@ ROWS = 260
 
 
 @pytest.fixture(scope="module", params=[False, True], ids=["additive", "products"])
-def refined(request: pytest.FixtureRequest) -> Refined:
+def refined(request: pytest.FixtureRequest) -> RefinedFit:
     """Large joint errors, so that one linearisation is not enough for products, which are chosen last."""
     q = random_joints(ROBOT, ROWS, 0)
     delta = 4e-3 * q.sin() + 3e-3 * (2 * q).cos()
@@ -35,7 +35,7 @@ def refined(request: pytest.FixtureRequest) -> Refined:
     return refine(solved.problem, group, choice)
 
 
-def test_residuals_at_the_solution_are_those_of_the_nonlinear_model(refined: Refined) -> None:
+def test_residuals_at_the_solution_are_those_of_the_nonlinear_model(refined: RefinedFit) -> None:
     rows, problem = refined.rows, refined.rows.problem
     assert refined.rounds >= (2 if refined.correction.orders else 1)
     (values,) = rows.values
@@ -48,12 +48,12 @@ def test_residuals_at_the_solution_are_those_of_the_nonlinear_model(refined: Ref
     assert_close((measured - predicted)[values.row], linear, atol=2e-7)
 
 
-def test_no_row_is_left_worse_than_noise_and_model_allow(refined: Refined) -> None:
+def test_no_row_is_left_worse_than_noise_and_model_allow(refined: RefinedFit) -> None:
     assert 2e-5 < refined.posterior.noise[0] < 4e-5
     assert 0 < refined.posterior.effective_unknowns < refined.design.unknowns
 
 
-def test_the_network_predicts_what_the_design_does(refined: Refined) -> None:
+def test_the_network_predicts_what_the_design_does(refined: RefinedFit) -> None:
     """Products of inputs as product units of order 2, half as many as a joint has inputs at most."""
     q, design = random_joints(ROBOT, 20, 5), refined.design
     expected = design.correction(refined.posterior.x, JointState(q))
@@ -65,20 +65,20 @@ def test_the_network_predicts_what_the_design_does(refined: Refined) -> None:
     assert bool(orders) == any(chosen.name == "products" for chosen in design.features)
 
 
-def chosen_as(refined: Refined, rows: Rows) -> FeatureChoice:
+def chosen_as(refined: RefinedFit, rows: Rows) -> FeatureChoice:
     """A choice that came to a solution on some rows."""
     fitted = FeatureFit(refined.design, refined.posterior)
     return FeatureChoice(rows, fitted, fitted, ())
 
 
-def test_a_solution_that_has_settled_is_not_linearised_again(refined: Refined) -> None:
+def test_a_solution_that_has_settled_is_not_linearised_again(refined: RefinedFit) -> None:
     again = refine(refined.rows.problem, refined.rows.group, chosen_as(refined, refined.rows))
     assert again.rounds == 1
     assert again.rows is refined.rows
     assert_close(again.point, refined.point)
 
 
-def test_rows_on_which_nothing_was_chosen_are_fitted_as_well(refined: Refined) -> None:
+def test_rows_on_which_nothing_was_chosen_are_fitted_as_well(refined: RefinedFit) -> None:
     """Chosen on every other row, it is fitted to all."""
     problem = refined.rows.problem
     half = torch.arange(0, ROWS, 2)

@@ -282,7 +282,7 @@ def test_network_inputs_are_wrapped_near_the_training_rows():
         model,
         robot=with_limits(robot, 0, -7.0, 7.0),
         starts=rows,
-        domain=type(model.domain).from_training_rows(
+        domain=type(model.domain).from_rows(
             model.network.scaled_inputs(T, rows), torch.Generator().manual_seed(0)
         ),
     )

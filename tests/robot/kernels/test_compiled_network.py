@@ -48,9 +48,7 @@ def grouped():
         networks.append(network)
     correction = CorrectionNetwork(robot.dof, groups, networks).requires_grad_(False)
     seen = correction.scaled_inputs(forward_kinematics(robot, model.starts), model.starts)
-    return replace(
-        model, network=correction, domain=Domain.from_training_rows(seen, torch.Generator().manual_seed(0))
-    )
+    return replace(model, network=correction, domain=Domain.from_rows(seen, torch.Generator().manual_seed(0)))
 
 
 @functools.cache

@@ -4,7 +4,7 @@ import torch
 from testing.simulated_arm import simulate
 
 from pisigma.calibration.hybrid.calibrator import HybridCalibrator
-from pisigma.files.progress import ignore_progress
+from pisigma.files.progress import no_progress
 from pisigma.measurement.splits import k_folds
 from pisigma.validation.held_out.calibration_validation import joined_repeats
 from pisigma.validation.held_out.few_rows import fit_with_folds
@@ -15,7 +15,7 @@ def test_processes_give_the_same_to_the_bit() -> None:
     rows, calibrator = arm.measurements, HybridCalibrator(arm.nominal)
     repeats = [k_folds(rows, 3, 0)]
     (here, judged), (there, judged_there) = (
-        fit_with_folds(calibrator, rows, rows, repeats, ignore_progress, jobs) for jobs in (None, 1)
+        fit_with_folds(calibrator, rows, rows, repeats, no_progress, jobs) for jobs in (None, 1)
     )
     assert torch.equal(here.errors_of(rows)["position"], there.errors_of(rows)["position"])
     validation = joined_repeats(rows, repeats, judged_there)

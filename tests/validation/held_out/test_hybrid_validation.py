@@ -14,7 +14,7 @@ from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.calibration.hybrid.calibrator import HybridCalibrator
 from pisigma.measurement.splits import holdout, k_folds
 from pisigma.robot import Robot
-from pisigma.validation.held_out.calibration_validation import judge_on_test_set, learning_curve, validate
+from pisigma.validation.held_out.calibration_validation import judge, learning_curve, validate
 from pisigma.validation.held_out.pose_statistics import PoseErrors, PredictedSpread, predicted_spread
 from pisigma.validation.held_out.trained_calibrations import with_frames
 
@@ -118,7 +118,7 @@ def test_rows_kept_aside(arm):
     train, test = holdout(arm.measurements, 0.3, 0)
     calibrator, seen, other = small(arm.true.nominal), *map(arm.measurements.select, (train, test))
     result = calibrator.fit(seen)
-    aside = judge_on_test_set(calibrator, result, seen, other)
+    aside = judge(calibrator, result, seen, other)
     whole = validate(calibrator, arm.measurements, [(train, test)])
     for name in ("nominal", "geometric", "hybrid"):
         assert_close(aside.models[name].position, whole.models[name].position[test], atol=1e-12)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from testing.closeness import assert_close
 
-from pisigma.workbench.viewing.surface import capsule, joined, revolve, rotation_to
+from pisigma.workbench.viewing.surface import capsule, join_surfaces, revolve, rotation_to
 
 
 def volume(surface) -> float:
@@ -29,7 +29,7 @@ def test_points_of_a_capsule_are_its_radius_from_the_segment(end):
 
 def test_surfaces_are_joined_with_their_triangles():
     first, second = (capsule(np.zeros(3), np.array([0.0, 0.0, z]), 0.1) for z in (0.5, 1.0))
-    assert_close(volume(joined([first, second])), volume(first) + volume(second), rtol=1e-12)
+    assert_close(volume(join_surfaces([first, second])), volume(first) + volume(second), rtol=1e-12)
 
 
 @pytest.mark.parametrize("direction", [(0.0, 0.0, 2.0), (0.0, 0.0, -2.0), (1.0, -2.0, 0.5)])

@@ -88,7 +88,7 @@ class Redundancy:
 
 
 @dataclass(frozen=True, eq=False)
-class Findings:
+class RankFindings:
     """Result of the rank analysis.
 
     Attributes:

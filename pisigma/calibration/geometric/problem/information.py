@@ -140,7 +140,7 @@ def _row_weights(
     """Compute 1 / standard deviation of each row for a sensor [1/m or 1/rad]; 0 where it has no value."""
     sensor = problem.sensors[number]
     distance = view.sums[number].distance[rows] / view.scales[number]
-    root = problem.loss_of(sensor).weight(distance, sensor.components).sqrt()
+    root = problem.loss_for_sensor(sensor).weight(distance, sensor.components).sqrt()
     root = root / view.variances[number].sqrt()
     if sensor.sigma is not None:
         root = root / sensor.sigma[rows]

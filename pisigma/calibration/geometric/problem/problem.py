@@ -193,7 +193,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         If the loss rejects rows, they are linearised twice; otherwise gross errors would dominate the first step.
         """
         weighted = self.with_updated_noise(self.linearise(point, None))[0]
-        losses = [self.loss_of(sensor) for sensor in self.sensors]
+        losses = [self.loss_for_sensor(sensor) for sensor in self.sensors]
         if not rejects_rows(self.sensors, losses, sensor_view_of(weighted)):
             return weighted
         return self.with_updated_noise(self.linearise(point, weighted))[0]
@@ -258,7 +258,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         """Return the difference of the free parameters from their prior means."""
         return (point - self.nominal)[self.active]
 
-    def loss_of(self, sensor: AbstractSensor) -> AbstractLoss:
+    def loss_for_sensor(self, sensor: AbstractSensor) -> AbstractLoss:
         """Return the loss function of a sensor."""
         return CERTAIN_LOSS if sensor.certain else self.loss
 
@@ -317,7 +317,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         normal.diagonal().add_(precision)
         descent.sub_(pull)
         costs = [
-            self.loss_of(sensor).cost(sums.distance / view.scales[k], sensor.components).sum()
+            self.loss_for_sensor(sensor).cost(sums.distance / view.scales[k], sensor.components).sum()
             for k, (sensor, sums) in enumerate(zip(self.sensors, view.sums, strict=True))
         ]
         misfit = (torch.stack(costs) * view.scales.square() / view.variances).sum()
@@ -378,7 +378,9 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         if view is None:
             root = torch.ones_like(distance)
         else:
-            root = self.loss_of(sensor).weight(distance / view.scales[number], sensor.components).sqrt_()
+            root = (
+                self.loss_for_sensor(sensor).weight(distance / view.scales[number], sensor.components).sqrt_()
+            )
         if sensor.sigma is not None:
             root = root / sensor.sigma[rows]
         if not everywhere:

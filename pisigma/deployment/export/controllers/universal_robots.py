@@ -12,7 +12,12 @@ from pisigma.deployment.export.controllers.controller_file import (
     untested_on_controller,
     with_frames,
 )
-from pisigma.deployment.export.controllers.ur_models import JOINTS, check_robot, convention, own_geometry
+from pisigma.deployment.export.controllers.ur_models import (
+    JOINTS,
+    check_robot,
+    controller_geometry,
+    convention,
+)
 from pisigma.deployment.export.dh_table import header_comment
 from pisigma.files.errors import Place, RobotError
 from pisigma.files.input_file import read_text
@@ -58,7 +63,7 @@ def without_beta(origins: list[Frame], own: Robot) -> Robot:
 
 def write_calibration(content: FileText) -> str:
     """Write `calibration.conf`, keeping the other lines of the controller's file if one is given."""
-    own = own_geometry(content.nominal)
+    own = controller_geometry(content.nominal)
     robot = without_beta(*own.origins(content.robot))
     difference = robot.dh - own.robot.dh
     lines = {
@@ -91,7 +96,7 @@ def read_calibration(text: str, source: str, nominal: Robot) -> Robot:
     Raises:
         RobotError: a line is missing or does not have one number per joint, or the robot cannot have such a file.
     """
-    own = own_geometry(nominal).robot
+    own = controller_geometry(nominal).robot
     dh = own.dh.copy()
     for key, column in KEYS.items():
         dh[:, column] += _numbers(text, key, source)

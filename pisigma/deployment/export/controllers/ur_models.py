@@ -56,7 +56,7 @@ _WITH_DEFAULTS = frozenset(("UR3", "UR3e", "UR5", "UR5e", "UR10", "UR10e"))
 
 
 @dataclass(frozen=True, eq=False)
-class OwnGeometry:
+class ControllerGeometry:
     """Geometry in the controller's convention, `Π RotZ(theta + q) Trans(a, 0, d) RotX(alpha)` from `base` to flange.
 
     Attributes:
@@ -137,7 +137,7 @@ def _frame_words(T: Frame) -> str:
     return ", ".join(lengths + turns)
 
 
-def own_geometry(described: Robot) -> OwnGeometry:
+def controller_geometry(described: Robot) -> ControllerGeometry:
     """Identify the model of Universal Robots that a nominal or calibrated robot belongs to, and their relative frames.
 
     Raises:
@@ -150,7 +150,7 @@ def own_geometry(described: Robot) -> OwnGeometry:
         return own
     if _has_own_convention(described):
         plain = described.with_geometry(base=np.zeros(6), tool=np.zeros(6))
-        return OwnGeometry(
+        return ControllerGeometry(
             described.name, plain, frame_of(described.base), frame_of(described.tool), described
         )
     raise RobotError(
@@ -165,7 +165,7 @@ def own_geometry(described: Robot) -> OwnGeometry:
 
 def convention(described: Robot) -> Convention:
     """Return the controller's description of an arm, and the values that its files were tested against."""
-    own = own_geometry(described)
+    own = controller_geometry(described)
     values = [_USERS[own.model]] if own.model in _USERS else []
     if own.model in _WITH_DEFAULTS:
         values.append(f"the maker's default kinematics and hash of the {own.model} ({_DEFAULTS})")
@@ -197,7 +197,7 @@ def _has_own_convention(robot: Robot) -> bool:
     )
 
 
-def _placed(model: str, own: Robot, described: Robot) -> tuple[float, OwnGeometry]:
+def _placed(model: str, own: Robot, described: Robot) -> tuple[float, ControllerGeometry]:
     """Align a model with a description, and return the mean distance [m] of their tools."""
     base, tool = _by_first_axes(own, described)
     q = torch.rand((_POSES, JOINTS), generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 6 - 3
@@ -212,7 +212,7 @@ def _placed(model: str, own: Robot, described: Robot) -> tuple[float, OwnGeometr
         robot, _ = solve_projection(ProjectionProblem(robot, q, T, ()))
         base, tool = _right(frame_of(robot.base)), _right(frame_of(robot.tool))
         distance, robot = laid(base, tool)
-    return distance, OwnGeometry(model, own, base, tool, described)
+    return distance, ControllerGeometry(model, own, base, tool, described)
 
 
 def _by_first_axes(own: Robot, described: Robot) -> tuple[Frame, Frame]:

@@ -11,7 +11,12 @@ from pisigma.deployment.export.controllers.controller_file import (
     with_frames,
 )
 from pisigma.deployment.export.controllers.universal_robots import without_beta
-from pisigma.deployment.export.controllers.ur_models import JOINTS, check_robot, convention, own_geometry
+from pisigma.deployment.export.controllers.ur_models import (
+    JOINTS,
+    check_robot,
+    controller_geometry,
+    convention,
+)
 from pisigma.deployment.export.dh_table import header_comment
 from pisigma.files.errors import RobotError
 from pisigma.files.yaml_file import Section, parse_yaml, yaml_text
@@ -79,7 +84,7 @@ ORDER = "Rotations are RotZ(yaw) RotY(pitch) RotX(roll), as URDF reads them."
 
 def write_kinematics(content: FileText) -> str:
     """Write the file; the frame after the last joint is part of the tool in the comments."""
-    origins, own = own_geometry(content.nominal).origins(content.robot)
+    origins, own = controller_geometry(content.nominal).origins(content.robot)
     links: dict[str, object] = {
         link: {column: float(value) + 0.0 for column, value in zip(COLUMNS, xyzrpy_of(origin), strict=True)}
         for link, origin in zip(LINKS, origins, strict=True)
@@ -101,7 +106,7 @@ def read_kinematics(text: str, source: str, nominal: Robot) -> Robot:
     Raises:
         RobotError: the file is not a kinematics file of the driver, or the robot has different joints.
     """
-    own = own_geometry(nominal).robot
+    own = controller_geometry(nominal).robot
     links = parse_yaml(text, KinematicsDocument, RobotError, source).kinematics
     first = ORDER in " ".join(text.replace("#", " ").split())
     candidates = [[getattr(links, link).frame(order) for link in LINKS] for order in (first, not first)]

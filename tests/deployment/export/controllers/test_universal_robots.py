@@ -23,7 +23,7 @@ from testing.refusals import refused
 from pisigma.deployment.export.controllers import universal_robots, ur_ros
 from pisigma.deployment.export.controllers.controller_file import FileText
 from pisigma.deployment.export.controllers.reading import read_controller_file
-from pisigma.deployment.export.controllers.ur_models import own_geometry
+from pisigma.deployment.export.controllers.ur_models import controller_geometry
 from pisigma.deployment.export.export_format import ExportRequest
 from pisigma.deployment.export.registry import export_model
 from pisigma.files.errors import PisigmaError, RobotError
@@ -123,7 +123,7 @@ def test_written_files_agree_with_the_makers_formula(name):
 @pytest.mark.parametrize("name", NOMINAL)
 def test_described_arms_agree_with_the_maker_in_its_frames(name, file):
     """A file of zeros, or the default kinematics, yields the maker's nominal arm in `base` for any description."""
-    described, own = Robot.load(name), own_geometry(Robot.load(name))
+    described, own = Robot.load(name), controller_geometry(Robot.load(name))
     d, a, calib = NOMINAL[name]
     q = joint_values()
     wanted = makers_formula(q, np.zeros(6), d, a, ALPHA)
@@ -259,4 +259,4 @@ def test_frames_of_a_models_file_are_those_of_the_description(tmp_path):
 @pytest.mark.parametrize("name", ["rb5", "fanuc_r2000", "kiro4"])
 def test_arms_of_other_makers_are_refused(name):
     with pytest.raises(PisigmaError):
-        own_geometry(Robot.load(name))
+        controller_geometry(Robot.load(name))
