@@ -112,7 +112,9 @@ def _stated(values: dict[str, Any], known: Mapping[str, Setting], running: Any) 
             continue
         if key in stated:
             problem = f"stated twice, by {setting.name} and by --set"
-            raise SettingError(problem, value=stated[key], option=key, remedy="omit one")
+            raise SettingError(
+                problem, expected="one value", value=stated[key], option=key, remedy="omit one"
+            )
         stated[key] = value
     return stated
 

@@ -144,6 +144,13 @@ class PisigmaError(Exception):
         other._follows = self._follows + text
         return other
 
+    def with_option(self, option: str) -> "PisigmaError":
+        """Return a copy of an error of a value with another name of its option; an error of a file is unchanged."""
+        if option == self.option or self.file is not None or self._follows:
+            return self
+        fields = {name: getattr(self, name) for name in ("expected", "value", "remedy")}
+        return type(self)(self.problem.rstrip("."), option=option, **fields)
+
     def with_place(self, at: Place, error: "type[PisigmaError] | None" = None) -> "PisigmaError":
         """Return a copy of the error with a place, for errors that are found by code that does not know the file.
 

@@ -162,7 +162,7 @@ def build_settings(group: type, stated: Mapping[str, Any], is_optional: bool = F
         is_optional: return None if nothing is stated of the class.
 
     Raises:
-        PisigmaError: some settings are stated that need others.
+        PisigmaError: some settings are stated that need others, or a value is not valid; its option is the key.
     """
     found: dict[str, Any] = {}
     for setting in settings_of(group):
@@ -182,7 +182,11 @@ def build_settings(group: type, stated: Mapping[str, Any], is_optional: bool = F
         raise PisigmaError(f"needs {names}", option=given, expected=names)
     if missing:
         raise PisigmaError(expected=f"{names} together", option=missing[0].spelling, remedy="give both")
-    return group(**found)
+    try:
+        return group(**found)
+    except PisigmaError as problem:  # its option is the name of a field
+        keys = {one.field: one.key for one in settings_of(group)}
+        raise problem.with_option(" ".join(keys.get(word, word) for word in problem.option.split())) from None
 
 
 def attributes_of(documented: type) -> dict[str, str]:

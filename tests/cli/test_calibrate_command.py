@@ -324,7 +324,8 @@ def test_options_at_fault(refuses, data, tmp_path, arguments, error, value):
 def test_parameters_and_priors_at_fault(refuses, data, tmp_path):
     command = ("calibrate", "kiro4", data, "--out", tmp_path / "arm", "--model", "geometric")
     assert "'a_9'" in refuses(*command, "--set", "free=a_9", error=IdentificationError)
-    assert "nan mm" in refuses(*command, "--set", "prior_mm=nan", error=IdentificationError)
+    option = {"error": IdentificationError, "option": "prior_mm and prior_mrad"}
+    assert "nan mm" in refuses(*command, "--set", "prior_mm=nan", **option)
     assert not (tmp_path / "arm").exists()
 
 

@@ -108,6 +108,7 @@ def test_a_camera_is_stated_once_with_paths_inside_the_cell(tmp_path):
         ("robot: ur10\nplan:\n  task: ../secret.csv\n", PlanningError, {"value": "../secret.csv"}),
         ("robot: ur10\nimport:\n  decimal: dot\n", SettingError, {"line": 3, "expected": "point or comma"}),
         ("robot: ur10\ncalibrate:\n  folds: -1\n", SettingError, {"line": 3, "value": -1}),
+        ("robot: ur10\nplan:\n  box: 1,1,1,0,0,0\n", PlanningError, {"line": 3, "option": "box"}),
         (
             "robot: ur10\nverify:\n  fit_frame: maybe\n",
             SettingError,
