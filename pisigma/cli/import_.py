@@ -100,7 +100,7 @@ def _take_in(
         )
         return
     remark = [f"Warning: {entry.remark}"] if entry.remark else []
-    print_lines([f"{entry.rows} rows taken in as session '{entry.name}'.", *remark])
+    print_lines([f"{entry.rows} rows added as session '{entry.name}'.", *remark])
     print_next(cell.status())
 
 
