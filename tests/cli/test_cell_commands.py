@@ -288,7 +288,7 @@ CELL_COMMANDS = {
     "upgrade": ("{cell}",),
     "pack": ("{cell}", "--out", "{out}/cell.zip"),
 }
-"""Arguments of every command that takes a cell; `serve` only reads it."""
+"""Arguments of every command that takes a cell; `serve`, `open` and `distill` only read it."""
 
 
 def held(cell):
@@ -314,7 +314,7 @@ def test_no_command_loses_anything(run, used, tmp_path):
         for one in getattr(command, "params", ())
         if "CELL" in str(one.metavar or one.name) or (one.name == "cell" and name != "plan")
     }
-    assert takes_cell - {"serve", "distill"} - set(CELL_COMMANDS) == set()
+    assert takes_cell - {"serve", "open", "distill"} - set(CELL_COMMANDS) == set()
     cell = tmp_path / "cell"
     shutil.copytree(used[0], cell)
     names = {
