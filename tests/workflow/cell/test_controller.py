@@ -1,6 +1,8 @@
 """Exports that are active on the controller: every command of a cell follows the table of rules."""
 
+import json
 import shutil
+import struct
 
 import pytest
 from testing.cell_rows import ROBOT, day, measured
@@ -9,6 +11,9 @@ from testing.refusals import refused
 
 import pisigma
 from pisigma.deployment.export.export_format import ExportRequest
+from pisigma.deployment.serve.binary_frames import ANSWER, BinaryFrames, Refusal
+from pisigma.deployment.serve.json_lines import JsonLines
+from pisigma.deployment.serve.metrics import Metrics
 from pisigma.deployment.serve.models import ServedModels
 from pisigma.files.errors import MeasurementError, ModelError
 from pisigma.lifetime.cell import controller
@@ -106,6 +111,17 @@ def test_joint_zeros_ask_for_a_model_that_was_measured_with_them(cell, used):
     (sentence,) = served.reload()
     assert "offsets.csv" in sentence
     assert served.is_refused
+    line = JsonLines(served, Metrics()).answer_message(b'{"ask": "models", "model": 0}')
+    assert "error" not in json.loads(line)
+    assert (
+        "offsets.csv"
+        in json.loads(JsonLines(served, Metrics()).answer_message(b'{"pose": [1, 2, 3, 0, 0, 0]}'))["error"]
+    )
+    frame = struct.pack("<4sIQII16d8d", b"PSI1", 216, 7, 0, 0, *[0.0] * 24)
+    assert ANSWER.unpack(BinaryFrames(served, Metrics()).answer_message(frame))[2:4] == (
+        7,
+        Refusal.MODEL_REFUSED,
+    )
     for use in (lambda: followed.name, lambda: pisigma.load(cell.folder), cell.verify):
         with refused(ModelError, file=cell.folder):
             use()
