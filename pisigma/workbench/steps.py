@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import Any
 
 from pisigma.deployment.export.export_format import ExportRequest
-from pisigma.deployment.export.registry import export_format, export_model
+from pisigma.deployment.export.registry import export_format
 from pisigma.deployment.export.targets import POSE_COLUMNS
-from pisigma.files.errors import PoseError
+from pisigma.files.errors import MeasurementError, OutputError, Place, PoseError, check_choice
 from pisigma.files.progress import Progress
-from pisigma.lifetime.cell.layout import newest_plan
+from pisigma.lifetime.cell.layout import EXPORTS, newest_plan
 from pisigma.measurement.csv.reading import is_measurement_file
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.growing_file import GrowingFile
@@ -25,6 +25,8 @@ from pisigma.workbench.forms import changed_settings
 from pisigma.workbench.job import Outcome
 from pisigma.workflow.calibrate import Calibration
 from pisigma.workflow.cell.cell import Cell
+from pisigma.workflow.cell.exports import export_from_cell
+from pisigma.workflow.cell.new_files import output_path
 from pisigma.workflow.import_rows import ImportProposal, import_rows, propose_import
 from pisigma.workflow.load import load, stated_pose
 from pisigma.workflow.measure import MeasuringSession
@@ -133,9 +135,9 @@ def check_rows(cell: Cell, form: Form, progress: Progress) -> tuple[Outcome, Ses
     session = MeasuringSession.read(
         newest_plan(cell.folder), cell.file.settings_of_step("measure", replan=False)
     )
-    path = cell.sessions.path(
-        next(one for one in cell.sessions.valid_sessions() if one.name == form.get("session", ""))
-    )
+    sessions, name = {one.name: one for one in cell.sessions.valid_sessions()}, form.get("session", "")
+    check_choice(MeasurementError, "session", name, tuple(sessions), Place(cell.folder))
+    path = cell.sessions.path(sessions[name])
     growing: GrowingFile = growing_file(path, session.plan.arm.robot, session.plan.settings)
     progress("checking the rows against each other")
     growth = growing.read(final=True)
@@ -147,19 +149,28 @@ def check_rows(cell: Cell, form: Form, progress: Progress) -> tuple[Outcome, Ses
     return Outcome(replace(text, blocks=(alarms, *text.blocks))), state
 
 
-def export(cell: Cell, form: Form, out: Path, files: Mapping[str, Any]) -> Outcome:
-    """Write the model in use in a format.
+def export(cell: Cell, form: Form, files: Mapping[str, Path]) -> Outcome:
+    """Write the model in use in a format, to the exports of the cell.
 
     Args:
         cell: the cell.
-        form: "format", and options of the format.
-        out: file to write.
+        form: "format", "out" (name of the file, empty for the day of today), and options of the format.
         files: uploaded files, by the options that take them.
     """
-    name = form["format"]
-    stated: dict[str, Any] = {key: form[key].strip() for key in EXPORT_OPTIONS if form.get(key, "").strip()}
-    exported = export_model(name, ExportRequest(cell.model_folder(), out, **files, **stated))
-    contents = export_format(name).contents
+    name = form.get("format", "")
+    kind = export_format(name)
+    suffix = files["program"].suffix if "program" in files else "".join(kind.suffixes[:1])
+    out = output_path(cell.folder, EXPORTS, suffix)
+    if stated := form.get("out", "").strip():
+        out = out.with_name(file_name(stated))
+        if out.exists():
+            raise OutputError(
+                "there is an export with this name", at=Place(out), remedy="choose another name"
+            )
+    options: dict[str, Any] = dict(files)
+    options |= {key: form[key].strip() for key in EXPORT_OPTIONS if form.get(key, "").strip()}
+    exported = export_from_cell(cell, name, ExportRequest(cell.folder, out, **options))
+    contents = kind.contents
     what = exported.summary or f"{contents[0].upper()}{contents[1:]}"
     verdict = Verdict(
         f"{what} written to {out.name}{exported.details}.", "", "test every program at low speed.", "File"
@@ -179,6 +190,21 @@ def try_pose(cell: Cell, form: Form) -> tuple[Outcome, Solution]:
     failed = [one for one in statuses_of(solution) if one in FAILURES]
     refusal = f"{failed[0].name.lower()}. {failed[0].sentence}" if failed else ""
     return Outcome(solution_text(solution, solver), refusal), solution
+
+
+def file_name(name: str) -> str:
+    """Return the name of a file that a person entered.
+
+    Raises:
+        OutputError: it is not a name with a suffix.
+    """
+    stem, _, suffix = name.rpartition(".")
+    is_plain = all(one.isalnum() or one in "._-" for one in name)
+    if not (stem and suffix and is_plain) or name.startswith("."):
+        raise OutputError(
+            expected="a name with a suffix, of letters, digits, . _ and -", value=name, option="out"
+        )
+    return name
 
 
 def number_of(form: Form, key: str) -> float:

@@ -1,23 +1,24 @@
 """What the tabs of a page show, read from the cell."""
 
 import shlex
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_args
 
 from pisigma.deployment.export.registry import BUILT_IN
 from pisigma.deployment.export.targets import POSE_COLUMNS
-from pisigma.files.errors import ModelError
+from pisigma.files.errors import ModelError, check_choice
 from pisigma.files.templates import template_environment
 from pisigma.lifetime.cell.facts import CellStatus
 from pisigma.lifetime.cell.history import EventKind
-from pisigma.lifetime.cell.layout import CELL_FILE, MODELS, PLANS
+from pisigma.lifetime.cell.layout import CELL_FILE, EXPORTS, MODELS, PLANS
 from pisigma.planning.plan_file import yaml_of
 from pisigma.reporting.result_text import merge_alike_warnings
 from pisigma.workbench.forms import form_of, form_of_command
 from pisigma.workbench.job import Jobs
 from pisigma.workflow.cell.cell import Cell
+from pisigma.workflow.import_rows import ImportProposal
 
 TABS = {
     "status": "Status",
@@ -37,7 +38,7 @@ TAB_OF = {
     "use": "status",
 }
 """Tab of a command that has not the name of a tab."""
-EXPORTS = tuple(name for name in BUILT_IN if name not in ("staubli", "xacro", "library", "ur-calibration"))
+FORMATS = tuple(name for name in BUILT_IN if name not in ("staubli", "xacro", "library", "ur-calibration"))
 """Formats that need no file of the controller."""
 FIGURES = (".png", ".svg")
 
@@ -76,12 +77,11 @@ class Tabs:
             tabs=TABS, name=cell.folder.resolve().name, robot=cell.robot.name, folder=str(cell.folder)
         )
 
-    def tab(self, name: str, cell: Cell, status: CellStatus, downloads: Iterable[str]) -> str:
-        """Render the content of a tab; `downloads` are the names of exported files."""
+    def tab(self, name: str, cell: Cell, status: CellStatus) -> str:
+        """Render the content of a tab."""
         context: dict[str, Any] = {
             "facts": status.facts,
             "step": status.step,
-            "downloads": tuple(downloads),
             "outcomes": self._jobs.outcomes,
             "folder": shlex.quote(str(cell.folder)),
             "forms": lambda step: form_of(step, cell.file),
@@ -89,9 +89,26 @@ class Tabs:
         }
         return self._environment.get_template(f"{name}.html.j2").render(context | _more(name, cell, status))
 
-    def proposal(self, **context: Any) -> str:
-        """Render the proposed meaning of the columns of uploaded files."""
-        return self._environment.get_template("proposal.html.j2").render(context)
+    def proposal(self, proposal: ImportProposal | None, files: Sequence[Path], numbers: str) -> str:
+        """Render the proposed meaning of the columns of uploaded files.
+
+        Args:
+            proposal: the proposal; None for a measurement file of pisigma.
+            files: the files.
+            numbers: their numbers, with commas.
+        """
+        tables = [
+            (
+                len(mapping.file.records),
+                [
+                    (one.index, one.heading, mapping.first_cell(one), one.target.text, one.reason)
+                    for one in mapping.columns
+                ],
+            )
+            for mapping in (() if proposal is None else proposal.mappings)
+        ]
+        template = self._environment.get_template("proposal.html.j2")
+        return template.render(tables=tables, files=[one.name for one in files], numbers=numbers)
 
 
 def _more(name: str, cell: Cell, status: CellStatus) -> dict[str, Any]:
@@ -107,7 +124,11 @@ def _more(name: str, cell: Cell, status: CellStatus) -> dict[str, Any]:
         case "calibrate":
             return {"figures": figures(cell, status)}
         case "deliver":
-            return {"formats": {one: BUILT_IN[one][1] for one in EXPORTS}, "columns": POSE_COLUMNS}
+            return {
+                "formats": {one: BUILT_IN[one][1] for one in FORMATS},
+                "downloads": _names(cell.folder / EXPORTS),
+                "columns": POSE_COLUMNS,
+            }
     return {}
 
 
@@ -147,20 +168,33 @@ def figures(cell: Cell, status: CellStatus) -> list[tuple[str, str]]:
     return [(models[-1].name, one.name) for one in sorted(folder.rglob("*")) if one.suffix in FIGURES]
 
 
+def _names(folder: Path) -> list[str]:
+    """Return the names of the files in a folder, the newest first; none if it does not exist."""
+    files = [one for one in folder.glob("*") if one.is_file() and not one.name.startswith(".")]
+    return [one.name for one in sorted(files, key=lambda one: one.stat().st_mtime, reverse=True)]
+
+
+FOLDERS = {"plan": PLANS, "model": MODELS, "export": EXPORTS}
+"""Folders of downloads by their kind."""
+
+
 def download_of(cell: Cell, kind: str, names: tuple[str, ...]) -> Path:
-    """Return a file of the cell that a page may download: a plan, or a figure or the card of a model.
+    """Return a file of the cell that a page may download: a plan, an export, or a figure or the card of a model.
 
     Names are compared with those of the files that exist, so that no other path can be named.
+
+    Args:
+        cell: the cell.
+        kind: a key of `FOLDERS`.
+        names: name of the file; for a model, name of the model and of the file.
 
     Raises:
         ModelError: there is no such file.
     """
-    folder = cell.folder / (PLANS if kind == "plan" else MODELS)
-    files = list(folder.glob("*" if kind == "plan" else "*/**/*"))
-    for one in files:
-        is_one = (
-            (one.name,) == names if kind == "plan" else (one.relative_to(folder).parts[0], one.name) == names
-        )
-        if is_one and one.is_file() and not one.is_symlink():
+    check_choice(ModelError, "download", kind, tuple(FOLDERS))
+    folder = cell.folder / FOLDERS[kind]
+    for one in folder.glob("*/**/*" if kind == "model" else "*"):
+        parts = one.relative_to(folder).parts
+        if (parts[0], *one.parts[-1:][: len(parts) - 1]) == names and one.is_file() and not one.is_symlink():
             return one
     raise ModelError("there is no such file", value="/".join(names))

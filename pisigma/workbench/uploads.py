@@ -53,13 +53,6 @@ class Uploads:
                 )
         return [self._files[number] for number in numbers]
 
-    def free(self, name: str) -> Path:
-        """Return a path to write a download to."""
-        self._count += 1
-        folder = Path(self._folder.name) / str(self._count)
-        folder.mkdir()
-        return folder / name
-
     def without_folder(self, text: str) -> str:
         """Return a message that names uploaded files without the folder in which they are kept."""
         return re.sub(rf"{re.escape(self._folder.name)}/\d+/", "", text)

@@ -2,6 +2,7 @@
 
 import asyncio
 import functools
+import json
 import time
 from collections.abc import Awaitable, Callable, Mapping
 from importlib import resources
@@ -12,7 +13,7 @@ import numpy as np
 from aiohttp import web
 from aiohttp.typedefs import Handler
 
-from pisigma.files.errors import OutputError, PisigmaError
+from pisigma.files.errors import PisigmaError
 from pisigma.files.progress import Progress
 from pisigma.lifetime.cell.facts import CellStatus
 from pisigma.workbench import steps
@@ -82,7 +83,6 @@ class Workbench:
         self.folder, self._status = folder, (cell.status(), time.monotonic())
         self.jobs, self._uploads = Jobs(), Uploads()
         self._tabs = Tabs(self.jobs)
-        self._downloads: dict[str, Path] = {}
         self._behind = ViserBackend("pisigma")
         try:
             self._scene = CellScene(self._behind.server)
@@ -138,9 +138,7 @@ class Workbench:
         name = request.match_info["name"]
         if name not in TABS:
             raise web.HTTPNotFound
-        text = await asyncio.to_thread(
-            lambda: self._tabs.tab(name, Cell.open(self.folder), self.status(), self._downloads)
-        )
+        text = await asyncio.to_thread(lambda: self._tabs.tab(name, Cell.open(self.folder), self.status()))
         return web.Response(text=text, content_type="text/html")
 
     @answers
@@ -171,12 +169,7 @@ class Workbench:
     @answers
     async def _download(self, request: web.Request) -> web.StreamResponse:
         kind, names = request.match_info["kind"], tuple(request.match_info["tail"].split("/"))
-        if kind == "export":
-            path = self._downloads.get("/".join(names))
-        else:
-            path = await asyncio.to_thread(lambda: download_of(Cell.open(self.folder), kind, names))
-        if path is None:
-            raise web.HTTPNotFound
+        path = await asyncio.to_thread(lambda: download_of(Cell.open(self.folder), kind, names))
         shown = "inline" if path.suffix in (".png", ".svg") else "attachment"
         response = web.FileResponse(path)
         response.headers["Content-Disposition"] = f"{shown}; filename*=UTF-8''{_quoted(path.name)}"
@@ -195,7 +188,7 @@ class Workbench:
         def propose() -> str:
             cell, files = Cell.open(self.folder), self._uploads.paths(form.get("files", "").split(","))
             proposal = steps.proposal_of(files, cell, form)
-            return self._tabs.proposal(proposal=proposal, files=files, numbers=form.get("files", ""))
+            return self._tabs.proposal(proposal, files, form.get("files", ""))
 
         return web.Response(text=await asyncio.to_thread(propose), content_type="text/html")
 
@@ -241,17 +234,14 @@ class Workbench:
         return found
 
     def export(self, cell: Cell, form: Form, progress: Progress) -> Outcome:
-        """Export the model in use as a file to download."""
+        """Export the model in use."""
         progress("exporting")
         files = {
             key: self._uploads.paths([form[key]])[0]
             for key in ("poses", "program", "frames")
             if form.get(key)
         }
-        out = self._uploads.free(_safe_name(form.get("out", "")))
-        found = steps.export(cell, form, out, files)
-        self._downloads = {out.name: out}
-        return found
+        return steps.export(cell, form, files)
 
     def try_pose(self, cell: Cell, form: Form, progress: Progress) -> Outcome:
         """Compute the joint values of a pose, and show the arm there."""
@@ -311,6 +301,7 @@ async def _form(request: web.Request) -> dict[str, str]:
     """
     try:
         values = await request.json()
+        json.dumps(values, ensure_ascii=False).encode()  # halves of characters cannot be written
     except ValueError:
         raise web.HTTPBadRequest from None
     if not isinstance(values, dict) or not all(isinstance(one, str) for one in values.values()):
@@ -321,22 +312,6 @@ async def _form(request: web.Request) -> dict[str, str]:
 def _person(request: web.Request) -> str:
     """Return the name that a person entered, or the address of the browser."""
     return request.query.get("person", "").strip()[:MAX_PERSON] or f"somebody at {request.remote}"
-
-
-def _safe_name(name: str) -> str:
-    """Return the name of a file to download.
-
-    Raises:
-        OutputError: it is not a name with a suffix.
-    """
-    stem, _, suffix = name.strip().rpartition(".")
-    if not (
-        stem and suffix and all(one.isalnum() or one in "._-" for one in name.strip())
-    ) or stem.startswith("."):
-        raise OutputError(
-            expected="a name with a suffix, of letters, digits, . _ and -", value=name, option="out"
-        )
-    return name.strip()
 
 
 def _quoted(name: str) -> str:

@@ -106,7 +106,7 @@ def test_only_files_of_the_cell_can_be_downloaded(browser_with_link, kind):
         assert browser_with_link.ask(f"/download/{kind}/{name}").status in (404, 422)
 
 
-@pytest.mark.parametrize("body", [b"", b"{", b"[]", b'{"a": 1}', b"\xff", b'{"a": {}}'])
+@pytest.mark.parametrize("body", [b"", b"{", b"[]", b'{"a": 1}', b"\xff", b'{"a": {}}', b'{"a": "\\ud800"}'])
 def test_what_is_not_a_form_is_refused(browser_with_link, bench, body):
     assert browser_with_link.ask("/step/plan", "POST", body).status == 400
     assert bench.jobs.running is None

@@ -67,7 +67,7 @@ function say(form) {  // the command line that does the same
     const option = one.dataset.option;
     if (one.dataset.word !== undefined && one.value) line += ` ${quoted(one.value)}`;
     else if (!option || one.value === "" || (one.type === "checkbox" && !one.checked)) continue;
-    else if (option.endsWith("=")) line += ` ${option}${quoted(one.value)}`;
+    else if (/[=/]$/.test(option)) line += ` ${option}${quoted(one.value)}`;
     else if (one.dataset.kind === "flag") line += one.value === "true" ? ` ${option}` : ` --no-${option.slice(2)}`;
     else if (one.dataset.kind === "switch") line += ` ${option}`;
     else line += ` ${option} ${quoted(one.type === "file" ? one.files[0].name : one.value)}`;
