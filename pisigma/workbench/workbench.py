@@ -25,6 +25,7 @@ from pisigma.workbench.tabs import TABS, Tabs, download_of
 from pisigma.workbench.uploads import Uploads
 from pisigma.workflow.cell.cell import Cell
 from pisigma.workflow.cell.cell_file import CellFile
+from pisigma.workflow.cell.exports import NONE, set_controller
 
 Form = Mapping[str, str]
 STATUS_AGE = 5.0
@@ -264,6 +265,13 @@ class Workbench:
         )
         return Outcome()
 
+    def set_controller(self, cell: Cell, form: Form, progress: Progress) -> Outcome:
+        """Record which export is active on the controller."""
+        name = form.get("export", "")
+        file = str(download_of(cell, "export", (name,))) if name else NONE
+        set_controller(cell, file, form.get("date", ""), form.get("note", ""))
+        return Outcome()
+
     def use(self, cell: Cell, form: Form, progress: Progress) -> Outcome:
         """Put a model into use."""
         warnings = cell.use(form.get("model") or None, form.get("reason", ""))
@@ -287,6 +295,7 @@ STEPS: dict[str, Callable[[Workbench, Cell, Form, Progress], Outcome]] = {
     "ik": Workbench.try_pose,
     "cell": Workbench.write_cell,
     "event": Workbench.record,
+    "controller": Workbench.set_controller,
     "use": Workbench.use,
     "session": Workbench.set_aside,
 }

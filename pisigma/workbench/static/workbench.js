@@ -72,6 +72,7 @@ function say(form) {  // the command line that does the same
     else if (one.dataset.kind === "switch") line += ` ${option}`;
     else line += ` ${option} ${quoted(one.type === "file" ? one.files[0].name : one.value)}`;
   }
+  if (form.elements.export?.value === "") line += " --export none";
   if (form.dataset.rows) line += ` --rows ${quoted(form.dataset.rows + form.elements.session.value + ".csv")}`;
   if (form.dataset.pose !== undefined) line += " --pose " + [...form.querySelectorAll("input")].map(one => one.value || "0").join(" ");
   if (form.dataset.proposal !== undefined) line += ` --cell ${quoted(document.body.dataset.folder)} --yes`;
