@@ -39,6 +39,15 @@ def model_of_calibration(
         recipe: name and SHA-256 of the recipe; empty texts without one.
     """
     made_of = kept_rows(nominal, measurements)
+    provenance = Provenance(
+        recipe=recipe[0],
+        recipe_sha256=recipe[1],
+        data_source=measurements.file_names,
+        data_sha256=measurements.content_hash(),
+        rows=measurements.rows,
+        rows_left_out=len(measurements.left_out),
+        versions=Provenance.installed_versions(),
+    )
     robot = nominal.with_geometry(base=result.robot.base, tool=result.robot.tool)
     starts = spread_rows(torch.unique(measurements.q.cpu(), dim=0))
     return CalibratedModel(
@@ -53,15 +62,7 @@ def model_of_calibration(
         bases=dict(result.bases),
         tools=dict(result.tools),
         made_of=made_of,
-        provenance=Provenance(
-            recipe=recipe[0],
-            recipe_sha256=recipe[1],
-            data_source=measurements.file_names,
-            data_sha256=measurements.content_hash(),
-            rows=measurements.rows,
-            rows_left_out=len(measurements.left_out),
-            versions=Provenance.installed_versions(),
-        ),
+        provenance=provenance,
     )
 
 
