@@ -125,10 +125,13 @@ def main() -> None:
             killed += status == -signal.SIGKILL
             if whole and status not in (0, 2, 3):  # 2 where no session is new to the model
                 faults.append(f"{name} ends with {status}")
+                print(faults[-1], flush=True)
             if fault := target.fault():
                 faults.append(f"command {number} ({name}): {fault}")
+                print(faults[-1], flush=True)
+            if number % 20 == 19:
+                print(f"{killed} of {number + 1} killed, {len(faults)} faults", file=sys.stderr, flush=True)
         print(f"{len(target.cell.history.models())} models, {len(target.cell.history.sessions())} sessions.")
-    print("\n".join(faults))
     print(f"{killed} of {wanted.count} killed, {len(faults)} faults.")
     sys.exit(1 if faults else 0)
 
