@@ -9,12 +9,14 @@ import subprocess
 import sys
 from pathlib import Path
 from types import ModuleType
+from typing import get_args
 
 import pytest
 import yaml
 from typer.main import get_command
 
 from pisigma.cli.main import app
+from pisigma.lifetime.cell.status import State
 from pisigma.measurement.csv.columns import column_choices, find_column
 from pisigma.planning.surroundings.surroundings import Surroundings, read_surroundings
 from pisigma.robot import Robot, catalogue
@@ -254,6 +256,11 @@ def test_tables_are_those_of_the_classes(monkeypatch: pytest.MonkeyPatch, page: 
     tables = _hook(hook)
     text = _text(DOCS / "reference" / f"{page}.md")
     assert tables.page_with(text, tables.tables()) == text, f"run: python docs/hooks/{hook}.py"
+
+
+def test_the_table_of_states_has_every_state_of_a_cell() -> None:
+    table = _text(DOCS / "how-to" / "cell.md").split("## States", 1)[1].split("\n## ", 1)[0]
+    assert sorted(re.findall(r"^\| `(\w+)` \|", table, flags=re.MULTILINE)) == sorted(get_args(State))
 
 
 def test_every_status_and_every_robot_is_named() -> None:
