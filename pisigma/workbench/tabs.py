@@ -10,8 +10,8 @@ from pisigma.deployment.export.registry import BUILT_IN
 from pisigma.deployment.export.targets import POSE_COLUMNS
 from pisigma.files.errors import ModelError, check_choice
 from pisigma.files.templates import template_environment
+from pisigma.lifetime.cell.events import EventKind
 from pisigma.lifetime.cell.facts import CellStatus
-from pisigma.lifetime.cell.history import EventKind
 from pisigma.lifetime.cell.layout import CELL_FILE, EXPORTS, MODELS, PLANS
 from pisigma.planning.plan_file import yaml_of
 from pisigma.reporting.result_text import merge_alike_warnings

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from pisigma.lifetime.cell.history import Event
+from pisigma.lifetime.cell.events import Event
 from pisigma.validation.held_out.model_comparison import QuantityErrors
 from pisigma.validation.iso9283.repeats import CYCLES, RepeatedPose, pooled_deviation
 from pisigma.validation.uncertainty.budget import UncertaintyBudget

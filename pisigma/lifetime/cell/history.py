@@ -10,12 +10,11 @@ from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Literal, get_args
 
 from pisigma.files.errors import MeasurementError, ModelError, OutputError, Place, check_choice
 from pisigma.lifetime.cell.database import Database, Table
+from pisigma.lifetime.cell.events import Event, check_event
 from pisigma.lifetime.cell.exports import ControllerEntry, ExportEntry
-from pisigma.measurement.dates import EXPECTED_DATE, is_date
 
 HISTORY = "history.sqlite"
 """Name of the history of a cell."""
@@ -23,15 +22,7 @@ MODEL_HISTORY = ".history.sqlite"
 """Suffix of the history of a model outside of a cell, after the name of its folder."""
 SCHEMA_VERSION = 4
 """Version of the schema. Version 1 had no monitored sessions: each model had a file for them, without a version.
-Version 2 had no exports, and changes of the model in use could not be undone."""
-
-EventKind = Literal[
-    "instrument", "tool", "mastering", "encoder", "collision", "maintenance", "firmware", "accepted"
-]
-"""What was changed: the instrument (tracker, camera, board) was set up again, the tool or reflector was exchanged, or
-the arm was changed (see `ARM_EVENTS`). "firmware" and "accepted", by a person, are only recorded."""
-ARM_EVENTS: frozenset[EventKind] = frozenset(("mastering", "encoder", "collision", "maintenance"))
-"""Events after which earlier sessions no longer describe the arm."""
+Version 2 had no exports, and changes of the model in use could not be undone. Version 3 had no scatter of models."""
 
 
 @dataclass(frozen=True)
@@ -64,40 +55,6 @@ class SessionEntry:
 
 
 @dataclass(frozen=True)
-class Event:
-    """A change of the robot, its tool or its instrument, or the acceptance of a model by a person.
-
-    Attributes:
-        day: day on which it happened (ISO 8601); sessions of that day were measured after it.
-        kind: what happened: "instrument", "tool", "mastering", "encoder", "collision", "maintenance", "firmware" or
-            "accepted".
-        note: free text.
-        recorded: time at which it was recorded (ISO 8601, UTC).
-        person: who accepted the model or reported the change; empty if that is not stated.
-        model: name of the accepted model; empty for all other kinds.
-    """
-
-    day: str
-    kind: EventKind
-    note: str
-    recorded: str
-    person: str = ""
-    model: str = ""
-
-    @property
-    def sentence(self) -> str:
-        """Day, kind and person, with the note, as one line."""
-        what = f"model '{self.model}' was accepted" if self.kind == "accepted" else self.kind
-        by, note = f" by {self.person}" if self.person else "", f" ({self.note})" if self.note else ""
-        return f"{self.day}: {what}{by}{note}."
-
-    def to_json(self) -> dict[str, str]:
-        """Return the event as plain values, without the time at which it was recorded."""
-        names = ("day", "kind", "note", "person", "model")
-        return {name: getattr(self, name) for name in names}
-
-
-@dataclass(frozen=True)
 class ModelEntry:
     """A model of the cell.
 
@@ -114,6 +71,8 @@ class ModelEntry:
         parent: name of the model that was recalibrated; empty for a calibration.
         p95_mm: 95 % quantile of the position errors of held-out rows [mm]; None if no rows were held out.
         remark: why it is or is not in use.
+        scatter_mm: standard deviation of a measured coordinate about the model [mm], from the sensor and the
+            repeatability of the robot, as the calibration identified it; None if it is unknown.
     """
 
     name: str
@@ -126,6 +85,7 @@ class ModelEntry:
     parent: str = ""
     p95_mm: float | None = None
     remark: str = ""
+    scatter_mm: float | None = None
 
     @property
     def made_of(self) -> tuple[str, ...]:
@@ -360,15 +320,9 @@ class History:
             MeasurementError: the kind is unknown, the day is not a valid date, or nobody is named who accepted.
             ModelError: no model is in use that could be accepted.
         """
-        check_choice(MeasurementError, "event", kind, get_args(EventKind))
         day, model = day or datetime.date.today().isoformat(), ""
-        if not is_date(day):
-            raise MeasurementError(expected=EXPECTED_DATE, value=day, option="--date")
+        check_event(kind, day, person)
         if kind == "accepted":
-            if not person.strip():
-                raise MeasurementError(
-                    expected="the name of the person who accepted", value=person, option="--by"
-                )
             if (entry := self.in_use) is None:
                 raise ModelError("no model of the cell is in use", at=Place(self.path.parent))
             if day < entry.made[:10]:

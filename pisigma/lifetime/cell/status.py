@@ -6,7 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 from pisigma.lifetime.cell.controller import Controller
-from pisigma.lifetime.cell.history import ARM_EVENTS, Check, Event, ModelEntry, SessionEntry
+from pisigma.lifetime.cell.events import ARM_EVENTS, Event
+from pisigma.lifetime.cell.history import Check, ModelEntry, SessionEntry
 from pisigma.lifetime.cell.layout import SESSIONS
 from pisigma.lifetime.cell.step import State, Step
 
@@ -14,6 +15,8 @@ MAX_DAYS_UNVERIFIED = 92
 """[days] Time without a session after which the model in use has to be verified again: a quarter of a year."""
 VERIFICATION_POSES = 10
 """Number of poses of a session for verification or monitoring."""
+P95_PER_SCATTER = 2.7955
+"""95 % quantile of the length of three independent normal errors, per standard deviation (chi distribution)."""
 
 ATTENTION = (
     "edited_session",
@@ -24,6 +27,7 @@ ATTENTION = (
     "moved",
     "other_joint_zeros",
     "outside_limit",
+    "limit_below_scatter",
 )
 """States in which a limit is missed, or rows or a model must not be trusted."""
 FOREIGN = "foreign"
@@ -324,6 +328,14 @@ def _outside_limit(facts: CellFacts) -> Step | None:
             f"it is not known whether model '{model.name}' meets the limit of {limit:g} mm; measure "
             f"{VERIFICATION_POSES} poses, import them, and run `{facts.command('verify')}`",
             facts.command("plan"),
+        )
+    scatter = P95_PER_SCATTER * (model.scatter_mm or 0.0)
+    if scatter > limit:
+        return Step(
+            "limit_below_scatter",
+            f"the 95 % quantile of the position errors is {p95:.3f} mm, above the limit of {limit:g} mm; the scatter "
+            f"of the sensor and of the robot alone makes {scatter:.3f} mm, which more poses do not reduce; use a more "
+            "accurate sensor, or raise limit_mm",
         )
     return Step(
         "outside_limit",

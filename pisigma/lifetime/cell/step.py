@@ -22,6 +22,7 @@ State = Literal[
     "moved",
     "older_than_evidence",
     "outside_limit",
+    "limit_below_scatter",
     "better_model",
     "verification_due",
     "up_to_date",

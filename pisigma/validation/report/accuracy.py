@@ -209,7 +209,8 @@ def limit_of(
     if accuracy is not None and accuracy.origin == "poses":
         return AccuracyLimit(of_parent=True, limitations=tuple(model.metrics.get("limitations", ())))
     scatter = None if rows is None else rows.scatter
-    noise = _identified_noise(summary) if scatter is None else scatter
+    identified = identified_scatter(summary)
+    noise = scatter if scatter is not None or identified is None else math.sqrt(3) * identified
     source: Literal["repeats", "hybrid"] = "hybrid" if scatter is None else "repeats"
     error = accuracy.figure("rms") if accuracy is not None and accuracy.unit == "mm" else 0.0
     sensors = () if summary is None else summary.noise
@@ -219,12 +220,12 @@ def limit_of(
     return AccuracyLimit(noise, source, error, sigma)
 
 
-def _identified_noise(summary: CalibrationSummary | None) -> float | None:
-    """Return the RMS length of the position noise that a hybrid identified [mm].
+def identified_scatter(summary: CalibrationSummary | None) -> float | None:
+    """Return the standard deviation of a coordinate of measured positions that a hybrid identified [mm].
 
     None of a geometric calibration, whose residuals contain what geometry cannot express as well as noise.
     """
     if summary is None or summary.hybrid is None or summary.hybrid.learned is None:
         return None
     of_points = [one.sigma_mm for one in summary.hybrid.learned.noise if one.sensor in ("position", "socket")]
-    return None if not of_points or of_points[0] is None else math.sqrt(3) * of_points[0]
+    return of_points[0] if of_points else None

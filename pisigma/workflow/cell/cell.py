@@ -216,7 +216,7 @@ class Cell:
             better, remark = is_better(self.sessions, in_use, sessions, settings, progress)
         path = save_new(self.folder / MODELS, partial(result.save, accept_implausible=accept_implausible))
         p95, rms = errors_of(result)
-        entry = entry_of(self.history, path, sessions, remark, p95)
+        entry = entry_of(self.history, path, sessions, remark, result)
         verdict = "accepted_implausible" if doubt else "trusted"
         check = Check("calibrate", entry.name, "", verdict, doubt, p95, False, now(), rms)
         self.history.add(entry, check, *([Use(entry.name, now(), remark)] if better else []))
@@ -331,12 +331,13 @@ class Cell:
         path = save_new(self.folder / MODELS, partial(result.save, accept_implausible=accept_implausible))
         remark, (p95, rms) = result.summary.verdict, errors_of(result)
         entry = replace(
-            entry_of(self.history, path, [chosen], remark, p95),
+            entry_of(self.history, path, [chosen], remark, result),
             sessions=",".join((*parent.made_of, chosen.name)),
             day=max(parent.day, chosen.day),
             frame_day=parent.frame_day,
             target_day=parent.target_day,
             parent=parent.name,
+            scatter_mm=parent.scatter_mm,
         )
         of = ("recalibrate", entry.name, chosen.name, result.summary.kept, remark)
         added: list[Entry] = [entry, Check(*of, p95, False, now(), rms)]

@@ -8,12 +8,14 @@ from typing import TypeVar
 from pisigma.files.errors import ModelError, Place
 from pisigma.files.model_files import model_hash
 from pisigma.files.progress import Progress
-from pisigma.lifetime.cell.history import Check, Event, EventKind, History, ModelEntry, SessionEntry, Use, now
+from pisigma.lifetime.cell.events import Event, EventKind
+from pisigma.lifetime.cell.history import Check, History, ModelEntry, SessionEntry, Use, now
 from pisigma.lifetime.cell.layout import MODELS
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import load_model
 from pisigma.robot.description import Robot
+from pisigma.validation.report.accuracy import identified_scatter
 from pisigma.workflow.calibrate import Calibration, calibrate
 from pisigma.workflow.cell.sessions import ModelRows, Sessions, name_since, newest_day
 from pisigma.workflow.evaluate import evaluate
@@ -193,7 +195,11 @@ def errors_of(result: Calibration | Recalibration) -> tuple[float | None, float 
 
 
 def entry_of(
-    history: History, path: Path, sessions: Sequence[SessionEntry], remark: str, p95_mm: float | None
+    history: History,
+    path: Path,
+    sessions: Sequence[SessionEntry],
+    remark: str,
+    result: Calibration | Recalibration,
 ) -> ModelEntry:
     """Return the history entry of a new model in a folder that was fitted to sessions."""
     events, day = history.events(), max(one.day for one in sessions)
@@ -205,8 +211,9 @@ def entry_of(
         day=day,
         frame_day=newest_day(events, "instrument", day),
         target_day=newest_day(events, "tool", day),
-        p95_mm=p95_mm,
+        p95_mm=errors_of(result)[0],
         remark=remark,
+        scatter_mm=identified_scatter(result.summary) if isinstance(result, Calibration) else None,
     )
 
 

@@ -13,8 +13,9 @@ import torch
 
 from pisigma.files.errors import AcceptanceError, MeasurementError, PisigmaError, Place, check_choice
 from pisigma.lifetime.cell.controller import Controller
+from pisigma.lifetime.cell.events import Event
 from pisigma.lifetime.cell.facts import facts_of, not_read, not_taken_in, sha256_of
-from pisigma.lifetime.cell.history import Check, Event, History, ModelEntry, SessionEntry, now
+from pisigma.lifetime.cell.history import Check, History, ModelEntry, SessionEntry, now
 from pisigma.lifetime.cell.layout import MODELS, SESSIONS
 from pisigma.lifetime.cell.status import FOREIGN
 from pisigma.measurement.camera.camera_files import CameraFiles

@@ -14,13 +14,13 @@ from testing.closeness import assert_close
 from testing.refusals import refused
 
 from pisigma.files.errors import MeasurementError, ModelError, OutputError
+from pisigma.lifetime.cell.events import Event
 from pisigma.lifetime.cell.history import (
     HISTORY,
     SCHEMA_VERSION,
     TABLES,
     Check,
     ControllerEntry,
-    Event,
     ExportEntry,
     History,
     ModelEntry,
@@ -159,7 +159,8 @@ def test_two_processes_lose_nothing(history):
 
 HOLD_THE_LOCK = """
 import pathlib, sys, time
-from pisigma.lifetime.cell.history import Event, History
+from pisigma.lifetime.cell.events import Event
+from pisigma.lifetime.cell.history import (History)
 with History(pathlib.Path(sys.argv[1])).database.transaction() as database:
     database.execute("INSERT INTO events (day, kind, note, recorded) VALUES ('2026-01-01', 'tool', '', '')")
     print("locked", flush=True)
@@ -168,7 +169,8 @@ with History(pathlib.Path(sys.argv[1])).database.transaction() as database:
 FILL_THE_DISK = """
 import pathlib, resource, sys
 from pisigma.files.errors import OutputError
-from pisigma.lifetime.cell.history import Event, History
+from pisigma.lifetime.cell.events import Event
+from pisigma.lifetime.cell.history import (History)
 resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, 60_000))
 history = History(pathlib.Path(sys.argv[1]))
 for number in range(1_000):

@@ -6,8 +6,9 @@ from typing import get_args
 import pytest
 
 from pisigma.lifetime.cell.controller import Controller
+from pisigma.lifetime.cell.events import ARM_EVENTS, Event
 from pisigma.lifetime.cell.exports import ControllerEntry, ExportEntry
-from pisigma.lifetime.cell.history import ARM_EVENTS, Check, Event, ModelEntry, SessionEntry
+from pisigma.lifetime.cell.history import Check, ModelEntry, SessionEntry
 from pisigma.lifetime.cell.status import (
     MAX_DAYS_UNVERIFIED,
     CellFacts,
@@ -102,6 +103,7 @@ CASES = {
         "verify",
     ),
     "outside_limit": (replace(VERIFIED, limit_mm=0.05), "plan"),
+    "limit_below_scatter": (replace(VERIFIED, limit_mm=0.05, in_use=replace(MODEL, scatter_mm=0.018)), ""),
     "verification_due": (replace(VERIFIED, today="2026-09-01"), "plan"),
     "edited_session": (replace(VERIFIED, edited=("2026-01-10",)), "session"),
     "up_to_date": (VERIFIED, ""),

@@ -1,0 +1,67 @@
+"""Events of a cell: what was changed on its robot, tool or instrument, and who accepted a model."""
+
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+from pisigma.files.errors import MeasurementError, check_choice
+from pisigma.measurement.dates import EXPECTED_DATE, is_date
+
+EventKind = Literal[
+    "instrument", "tool", "mastering", "encoder", "collision", "maintenance", "firmware", "accepted"
+]
+"""What was changed: the instrument (tracker, camera, board) was set up again, the tool or reflector was exchanged, or
+the arm was changed (see `ARM_EVENTS`). "firmware" and "accepted", by a person, are only recorded."""
+ARM_EVENTS: frozenset[EventKind] = frozenset(("mastering", "encoder", "collision", "maintenance"))
+"""Events after which earlier sessions no longer describe the arm."""
+
+
+@dataclass(frozen=True)
+class Event:
+    """A change of the robot, its tool or its instrument, or the acceptance of a model by a person.
+
+    Attributes:
+        day: day on which it happened (ISO 8601); sessions of that day were measured after it.
+        kind: what happened: "instrument", "tool", "mastering", "encoder", "collision", "maintenance", "firmware" or
+            "accepted".
+        note: free text.
+        recorded: time at which it was recorded (ISO 8601, UTC).
+        person: who accepted the model or reported the change; empty if that is not stated.
+        model: name of the accepted model; empty for all other kinds.
+    """
+
+    day: str
+    kind: EventKind
+    note: str
+    recorded: str
+    person: str = ""
+    model: str = ""
+
+    @property
+    def sentence(self) -> str:
+        """Day, kind and person, with the note, as one line."""
+        what = f"model '{self.model}' was accepted" if self.kind == "accepted" else self.kind
+        by, note = f" by {self.person}" if self.person else "", f" ({self.note})" if self.note else ""
+        return f"{self.day}: {what}{by}{note}."
+
+    def to_json(self) -> dict[str, str]:
+        """Return the event as plain values, without the time at which it was recorded."""
+        names = ("day", "kind", "note", "person", "model")
+        return {name: getattr(self, name) for name in names}
+
+
+def check_event(kind: str, day: str, person: str) -> None:
+    """Refuse an event of an unknown kind, on no valid day, or an acceptance by nobody.
+
+    Args:
+        kind: kind of the event.
+        day: day on which it happened (ISO 8601).
+        person: who accepted the model or reports the change.
+
+    Raises:
+        MeasurementError: the kind is unknown, the day is not a valid date, or nobody is named who accepted.
+    """
+    check_choice(MeasurementError, "event", kind, get_args(EventKind))
+    if not is_date(day):
+        raise MeasurementError(expected=EXPECTED_DATE, value=day, option="--date")
+    if kind == "accepted" and not person.strip():
+        raise MeasurementError(expected="the name of the person who accepted", value=person, option="--by")
