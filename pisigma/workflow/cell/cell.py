@@ -330,15 +330,7 @@ class Cell:
             return result, None
         path = save_new(self.folder / MODELS, partial(result.save, accept_implausible=accept_implausible))
         remark, (p95, rms) = result.summary.verdict, errors_of(result)
-        entry = replace(
-            entry_of(self.history, path, [chosen], remark, result),
-            sessions=",".join((*parent.made_of, chosen.name)),
-            day=max(parent.day, chosen.day),
-            frame_day=parent.frame_day,
-            target_day=parent.target_day,
-            parent=parent.name,
-            scatter_mm=parent.scatter_mm,
-        )
+        entry = entry_of(self.history, path, [chosen], remark, result, parent)
         of = ("recalibrate", entry.name, chosen.name, result.summary.kept, remark)
         added: list[Entry] = [entry, Check(*of, p95, False, now(), rms)]
         if result.trusted:

@@ -200,10 +200,20 @@ def entry_of(
     sessions: Sequence[SessionEntry],
     remark: str,
     result: Calibration | Recalibration,
+    parent: ModelEntry | None = None,
 ) -> ModelEntry:
-    """Return the history entry of a new model in a folder that was fitted to sessions."""
+    """Return the history entry of a new model.
+
+    Args:
+        history: history of the cell.
+        path: folder of the model.
+        sessions: sessions to which it was fitted.
+        remark: why it is or is not in use.
+        result: calibration or recalibration that made it.
+        parent: model that was recalibrated; None for a calibration.
+    """
     events, day = history.events(), max(one.day for one in sessions)
-    return ModelEntry(
+    entry = ModelEntry(
         name=path.name,
         sha256=model_hash(path),
         made=now(),
@@ -214,6 +224,17 @@ def entry_of(
         p95_mm=errors_of(result)[0],
         remark=remark,
         scatter_mm=identified_scatter(result.summary) if isinstance(result, Calibration) else None,
+    )
+    if parent is None:
+        return entry
+    return replace(
+        entry,
+        sessions=",".join((*parent.made_of, entry.sessions)),
+        day=max(parent.day, day),
+        frame_day=parent.frame_day,
+        target_day=parent.target_day,
+        parent=parent.name,
+        scatter_mm=parent.scatter_mm,
     )
 
 
