@@ -28,7 +28,7 @@ Hashes = Annotated[
     list[str] | None,
     typer.Option(
         "--sha256",
-        help="Refuse the models unless their model.yaml have these SHA-256, one per folder, in order.",
+        help="Refuse the models unless their model.yaml files have these SHA-256 hashes, one per folder, in order.",
     ),
 ]
 
@@ -43,7 +43,7 @@ def evaluate(
 ) -> None:
     """Compare models on measurements, with confidence intervals, and accept them or not.
 
-    Compares a single model with the nominal robot. Leaves out rows of the set "train". Exits with status 3 if a
+    Compares a single model with the nominal robot. Excludes rows of the set "train". Exits with status 3 if a
     model misses a limit, the base or the tool has moved, or the errors are too large for a calibrated robot.
     """
     from pisigma.files.model_files import check_model_hash

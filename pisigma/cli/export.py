@@ -43,7 +43,7 @@ Tip = Annotated[
 Geometry = Annotated[
     str | None,
     typer.Option(
-        help="With urdf and dh, the geometry alone (geometric, default), or that which goes with the joint correction "
+        help="With urdf and dh, the geometry alone (geometric, default), or the one of the joint correction "
         "of --format onnx (hybrid)."
     ),
 ]
@@ -60,7 +60,7 @@ TargetKind = Annotated[
         "robot."
     ),
 ]
-Branch = Annotated[str | None, typer.Option(help="With targets, branch instead of the trained one.")]
+Branch = Annotated[str | None, typer.Option(help="With targets, branch to use instead of the default.")]
 Config = Annotated[
     str | None,
     typer.Option(
@@ -75,7 +75,7 @@ Program = Annotated[
 ]
 Frames = Annotated[
     Path | None,
-    typer.Option(help="With --program, YAML file of the frames and tools that it does not define."),
+    typer.Option(help="With --program, YAML file of the frames and tools that the program does not define."),
 ]
 ToleranceMm = Annotated[
     float | None,

@@ -34,7 +34,7 @@ MaxChange = Annotated[
     float | None,
     typer.Option(
         "--max-change-mm",
-        help="With --read, refuse a file that moves the tool by more in the mean [mm]. [default: 5]",
+        help="With --read, refuse a file that moves the tool by more than this on average [mm]. [default: 5]",
         min=0.0,
     ),
 ]

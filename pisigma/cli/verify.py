@@ -21,7 +21,7 @@ Hash = Annotated[
     str | None,
     typer.Option(
         "--sha256",
-        help="Refuse the model unless its model.yaml has this SHA-256.",
+        help="Refuse the model unless its model.yaml has this SHA-256 hash.",
     ),
 ]
 Data = Annotated[
@@ -31,7 +31,7 @@ Data = Annotated[
     ),
 ]
 OfModel = Annotated[
-    str | None, typer.Option("--model", help="Model of the cell. [default: in use, else the newest]")
+    str | None, typer.Option("--model", help="Name of a model of the cell. [default: in use, else newest]")
 ]
 
 
@@ -50,7 +50,7 @@ def verify(
 
     Compares the corrected model with the nominal robot. Also says what has moved since the model was made and how to
     recalibrate, and names setup faults (units, order, signs or zeros of joints, a correction applied twice or not at
-    all) that explain large errors. Leaves out rows of the set "train". Exits with status 3 if the corrected model
+    all) that explain large errors. Excludes rows of the set "train". Exits with status 3 if the corrected model
     does not explain the measurements better, or the arm has moved.
     """
     from pisigma.files.model_files import check_model_hash

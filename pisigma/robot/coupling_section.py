@@ -44,8 +44,8 @@ class CoupledJointSection(Section):
         factors: motion of the joint [deg or mm] per 1 deg or 1 mm of the controller's value, by row name. Values that
             are not named, including the joint's own, have the factor 0. The errors of the joint may depend on the named
             values only, so a value may be named with the factor 0.
-        offset_deg: offset of a revolute joint.
-        offset_mm: offset of a prismatic joint.
+        offset_deg: offset of a revolute joint [deg].
+        offset_mm: offset of a prismatic joint [mm].
         four_bar: linkage that drives the joint, if any.
         limits_deg: mechanical stops of a revolute joint, in addition to the limits of the controller's values.
         limits_mm: mechanical stops of a prismatic joint.

@@ -21,7 +21,7 @@ class BranchSection(Section):
     """The branch of the inverse kinematics, the same for all poses of a simulation.
 
     Attributes:
-        name: name of a branch of the nominal robot's closed form; or
+        name: name of a branch of the nominal robot's closed form, instead of joint values.
         near_deg: joint values by name of a revolute joint [deg], 0 by default. With a closed form, its nearest
             reachable solution is used; without one, they are the start of the numeric solution.
         near_mm: the same for prismatic joints [mm].

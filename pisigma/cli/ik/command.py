@@ -44,7 +44,7 @@ def ik(
         typer.Option(help="CSV file of poses: x_mm,y_mm,z_mm,roll_deg,pitch_deg,yaw_deg or qx,qy,qz,qw."),
     ] = None,
     out: Annotated[Path | None, typer.Option(help="CSV file of joint values to write, with --poses.")] = None,
-    branch: Annotated[str | None, typer.Option(help="Branch to take instead of the trained one.")] = None,
+    branch: Annotated[str | None, typer.Option(help="Branch to use instead of the default.")] = None,
     all_branches: Annotated[
         bool, typer.Option("--all-branches", help="Print the solutions on all branches of --pose.")
     ] = False,

@@ -47,7 +47,7 @@ def detect(
 ) -> None:
     """Detect the corners of a board in images, to a fraction of a pixel.
 
-    Leaves out images without a whole board and blurred ones, and names them.
+    Excludes images without a whole board and blurred images, and names them.
     """
     if sheet is not None:
         _print_board(board, sheet, as_json)

@@ -25,7 +25,7 @@ Sessions = Annotated[
     list[Path] | None,
     typer.Argument(
         metavar="SESSION...",
-        help="Measurements (CSV), one file per session of five poses or more, unless of a cell.",
+        help="Measurements (CSV), one file per session of five poses or more; not needed for a cell.",
     ),
 ]
 MAX_SESSIONS = 6

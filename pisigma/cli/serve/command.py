@@ -18,7 +18,12 @@ Model = Annotated[
     Path | None,
     typer.Argument(metavar="[MODEL|CELL]", help="Model folder, or a cell.", autocompletion=complete_model),
 ]
-Pin = Annotated[bool, typer.Option("--pin", help="Keep the model that is in use in the cell at the start.")]
+Pin = Annotated[
+    bool,
+    typer.Option(
+        "--pin", help="Keep serving the model that is in use at the start, even if the cell changes it."
+    ),
+]
 Models = Annotated[Path | None, typer.Option("--models", help="Folder of model folders to serve by name.")]
 
 

@@ -41,7 +41,7 @@ def open_(
 ) -> None:
     """Open a cell as a page in the browser, until Ctrl-C.
 
-    Prints the link to the page as its first line. Only who has this link can open the page.
+    Prints the link to the page as its first line. Only somebody who has this link can open the page.
     """
     from pisigma.workbench.workbench import Workbench
 
@@ -52,7 +52,9 @@ def open_(
             print_json({"url": bench.url})
         else:
             print_line(bench.url)
-            print_line("Only who has this link can open the page. It stays until Ctrl-C.", to_stderr=True)
+            print_line(
+                "Only somebody who has this link can open the page. It stays until Ctrl-C.", to_stderr=True
+            )
         sys.stdout.flush()
         with tempfile.TemporaryDirectory(prefix="pisigma-") as folder:
             if not no_browser:

@@ -28,7 +28,7 @@ class GeometricDeviation(AbstractGeometrySource):
         kind: "geometric".
         rows: errors of theta, alpha, beta [deg] and d, a [mm], by row name.
         base: errors of x, y, z [mm], roll, pitch, yaw [deg] of the base.
-        tool: errors of the tool, as of the base.
+        tool: errors of x, y, z [mm], roll, pitch, yaw [deg] of the tool.
     """
 
     kind: Literal["geometric"]

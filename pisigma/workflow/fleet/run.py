@@ -77,7 +77,7 @@ def run_fleet(
     settings: FleetSettings = FleetSettings(),
     progress: Progress = lambda what: None,
 ) -> FleetRun:
-    """Advance all cells in a folder: calibrate, verify, monitor and recalibrate as the status of each says.
+    """Advance all cells in a folder: calibrate, verify, monitor and recalibrate as the status of each requires.
 
     See `pisigma.workflow.cell.advance.advance`. A cell with bad rows is reported and does not stop the others. What a
     cell contains is always whole, so that a later call continues after an interruption; a cell whose status names no

@@ -176,7 +176,7 @@ class GeometricRecipe(AbstractRecipe):
 
 
 class HybridSection(Section):
-    """Candidates that `HybridCalibrator` chooses from; those that do not improve the fit are left out.
+    """Candidates that `HybridCalibrator` chooses from; those that do not improve the fit are dropped.
 
     Attributes:
         features: features of the unit of order 1 to try.
