@@ -27,7 +27,7 @@ def simulate(
     at: Annotated[
         Path | None,
         typer.Option(
-            help="CSV file of joint values to measure at, or a cell with its newest plan. [default: those of the recipe]"
+            help="CSV file of joint values to measure at, or a cell with its newest plan. [default: the recipe's]"
         ),
     ] = None,
     as_json: AsJson = False,
