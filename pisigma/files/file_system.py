@@ -5,7 +5,6 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterable
-from functools import lru_cache
 from pathlib import Path
 
 from pisigma.files.errors import OutputError, Place
@@ -34,6 +33,8 @@ NETWORK_TYPES = frozenset(
 """Types of file systems that several machines can write to, by their names in mount tables."""
 MOUNTINFO = Path("/proc/self/mountinfo")
 """Table of mounts on Linux."""
+_TYPES: dict[tuple[Path, int], str | None] = {}
+"""Results of `_network_type` by table and number of the device, which changes when something else is mounted."""
 _DRIVE_REMOTE = 4
 """Result of `GetDriveTypeW` of Windows for a network drive."""
 _MACOS_MOUNT = re.compile(r"^.* on (?P<point>/.*) \((?P<type>\w+)[,)]", re.MULTILINE)
@@ -49,7 +50,13 @@ def check_local(folder: Path) -> None:
     Raises:
         OutputError: the folder is on the file system of a network.
     """
-    if folder.is_dir() and (kind := _network_type(os.path.realpath(folder), folder.stat().st_dev)):
+    try:
+        device = os.stat(folder).st_dev
+    except OSError:
+        return
+    if (MOUNTINFO, device) not in _TYPES:  # for many folders, reading the table takes longer than all else
+        _TYPES[MOUNTINFO, device] = _network_type(os.path.realpath(folder))
+    if kind := _TYPES[MOUNTINFO, device]:
         raise OutputError(
             expected="a folder on a local disk, because locks of network file systems cannot protect a history",
             value=kind,
@@ -58,13 +65,11 @@ def check_local(folder: Path) -> None:
         )
 
 
-@lru_cache
-def _network_type(folder: str, device: int) -> str | None:
+def _network_type(folder: str) -> str | None:
     """Return the type of the network file system of a folder; None for a local disk, or if the type is unknown.
 
     Args:
         folder: the real path of the folder.
-        device: number of its device, which changes when something else is mounted there.
     """
     if sys.platform == "win32":
         import ctypes

@@ -4,7 +4,8 @@ import math
 from collections.abc import Sequence
 
 from pisigma.lifetime.cell.acceptance import Acceptance
-from pisigma.reporting.tables import Table, figure_text
+from pisigma.reporting.result_text import Table
+from pisigma.reporting.tables import figure_text
 from pisigma.validation.iso9283.repeats import MIN_CYCLES, RepeatedPose, pooled_deviation
 from pisigma.validation.uncertainty.budget import COVERAGE
 

@@ -8,7 +8,8 @@ from pathlib import Path
 
 from pisigma.calibration.geometric.identifiability.pairwise import CorrelationTable
 from pisigma.reporting.rendering import sentences
-from pisigma.reporting.tables import Table, figure_text
+from pisigma.reporting.result_text import Table
+from pisigma.reporting.tables import figure_text
 from pisigma.validation.held_out.calibration_summary import (
     CalibrationSummary,
     HybridFigures,

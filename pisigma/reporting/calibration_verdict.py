@@ -3,7 +3,7 @@
 import math
 from pathlib import Path
 
-from pisigma.reporting.tables import Table
+from pisigma.reporting.result_text import Table
 from pisigma.reporting.verdict import Verdict, counted, rms_text, rounded
 from pisigma.validation.held_out.calibration_summary import CalibrationSummary, ScaleFigures
 from pisigma.validation.held_out.validation_figures import ValidationFigures

@@ -3,8 +3,8 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from pisigma.reporting.result_text import Block, table_block
-from pisigma.reporting.tables import Table, distance_table
+from pisigma.reporting.result_text import Block, Table, table_block
+from pisigma.reporting.tables import distance_table
 from pisigma.reporting.verdict import rounded
 from pisigma.validation.held_out.model_comparison import (
     Difference,

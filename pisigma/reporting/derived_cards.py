@@ -7,7 +7,8 @@ from pisigma.lifetime.recalibration.summary import RecalibrationSummary
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.model_posterior import FLEET_PRIOR
 from pisigma.reporting.rendering import write_card
-from pisigma.reporting.tables import Table, figure_text
+from pisigma.reporting.result_text import Table
+from pisigma.reporting.tables import figure_text
 from pisigma.reporting.verdict import rounded
 from pisigma.validation.held_out.distillation_summary import DistillationSummary
 

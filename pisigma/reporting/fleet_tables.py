@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from pisigma.lifetime.cell.facts import CellStatus
 from pisigma.lifetime.cell.status import ATTENTION
 from pisigma.lifetime.fleet.status import UNREADABLE, FleetStatus
-from pisigma.reporting.tables import Table
+from pisigma.reporting.result_text import Table
 from pisigma.reporting.verdict import Verdict, counted, rounded
 
 ERRORS_NOTE = (

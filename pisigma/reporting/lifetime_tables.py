@@ -6,7 +6,7 @@ from pisigma.lifetime.comparison.parameter_differences import ParameterDifferenc
 from pisigma.lifetime.monitoring.charts import Chart
 from pisigma.lifetime.monitoring.history import Record
 from pisigma.lifetime.recalibration.movement import NORMAL_95
-from pisigma.reporting.tables import Table
+from pisigma.reporting.result_text import Table
 
 
 def session_table(records: Sequence[Record]) -> Table:

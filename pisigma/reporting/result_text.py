@@ -6,6 +6,7 @@ Commands print it on a screen, and pages show it in the browser.
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from pisigma.reporting.verdict import Verdict
 
@@ -14,6 +15,18 @@ MAX_ALIKE = 10
 
 _NUMBER = re.compile(r"\d[\d,]*(?:\.\d+)?(?:e[+-]?\d+)?")
 _ROW = re.compile(r"\b(?:line|row|image) (\d+)")
+
+
+class Table(NamedTuple):
+    """A table of text.
+
+    Attributes:
+        columns: names of the columns.
+        rows: cells of each row.
+    """
+
+    columns: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
 
 
 @dataclass(frozen=True)

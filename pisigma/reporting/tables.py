@@ -1,25 +1,13 @@
 """Numbers and tables as text."""
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
 
+from pisigma.reporting.result_text import Table
 from pisigma.validation.held_out.training_summary import JointFigures
 from pisigma.validation.held_out.validation_figures import ErrorFigures, SocketDistances
 
 _STATISTICS = ("average", "deviation", "maximum")
 _SHOWN = {"rms": "RMS", "p95": "95 %", "max": "maximum"}
-
-
-class Table(NamedTuple):
-    """A table of text.
-
-    Attributes:
-        columns: names of the columns.
-        rows: cells of each row.
-    """
-
-    columns: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
 
 
 def markdown_table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

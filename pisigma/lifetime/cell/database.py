@@ -7,7 +7,7 @@ killed or whose disk was full, and SQLite's lock ends with its process.
 import sqlite3
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import MISSING, Field, asdict, dataclass, fields
+from dataclasses import MISSING, Field, asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -58,6 +58,7 @@ class Database:
     tables: Mapping[type, Table]
     version: int
     take_over: Callable[[sqlite3.Connection], Sequence[Path]]
+    _snapshot: list[sqlite3.Connection] = field(default_factory=list, repr=False, compare=False)
 
     def add(self, rows: Sequence[Any]) -> None:
         """Add rows in one transaction; a row with the same key is replaced.
@@ -136,10 +137,31 @@ class Database:
             OutputError: the file is not a database, has a newer version, cannot be opened or upgraded, or is on the
                 file system of a network.
         """
+        if self._snapshot:
+            yield self._snapshot[0]
+            return
         with self._connected() as (database, version):
             if version < self.version:
                 self._upgrade(database)
             yield database
+
+    @contextmanager
+    def snapshot(self) -> Iterator[None]:
+        """Let all reads in the block see the same state of the file, with one connection.
+
+        Raises:
+            OutputError: see `open`.
+        """
+        if not self.path.exists():
+            yield
+            return
+        with self.open() as database:
+            database.execute("BEGIN")
+            self._snapshot.append(database)
+            try:
+                yield
+            finally:
+                self._snapshot.clear()
 
     @contextmanager
     def _connected(self) -> Iterator[tuple[sqlite3.Connection, int]]:

@@ -117,6 +117,11 @@ def status_of(folder: Path) -> CellStatus:
 def facts_of(folder: Path) -> CellFacts:
     """Read the facts about a cell; see `status_of`."""
     history = History(folder / HISTORY)
+    with history.database.snapshot():
+        return _facts(folder, history)
+
+
+def _facts(folder: Path, history: History) -> CellFacts:
     sessions = history.sessions()
     stated, in_use = read_yaml(folder / CELL_FILE, _Stated, PlanningError), history.in_use
     return CellFacts(

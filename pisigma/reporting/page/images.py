@@ -12,7 +12,7 @@ from pisigma.measurement.camera.detection.detector import read_image
 from pisigma.reporting.page.figures import AFTER, BEFORE, Drawing, drawing_style
 from pisigma.reporting.page.page import data_url, read_resource
 from pisigma.reporting.rendering import render
-from pisigma.reporting.tables import Table
+from pisigma.reporting.result_text import Table
 
 WIDTH = 4.8
 """Width of a picture [inch]."""

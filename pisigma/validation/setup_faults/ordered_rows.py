@@ -1,5 +1,6 @@
 """Residuals of a calibration in the order of the file, with their derivatives."""
 
+import hashlib
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
@@ -50,6 +51,26 @@ class OrderedRows:
     derivative: Float64[np.ndarray, "rows values parameters"]
     values: int
     noise: Float64[np.ndarray, " values"]
+
+    @cached_property
+    def content(self) -> bytes:
+        """SHA-256 of all that a search depends on, with which its last result is recognised.
+
+        The same rows are calibrated with when they are added to a cell, and again for its model.
+        """
+        setup = (self.problem.frame.cpu().numpy(), self.problem.target.cpu().numpy(), self.configuration)
+        digest = hashlib.sha256(f"{self.jacobian.shape} {self.values} {self.configuration is None}".encode())
+        for one in (self.number, self.residual, self.derivative, self.jacobian, self.noise, self.precision, *setup):
+            digest.update(b"" if one is None else np.ascontiguousarray(one).tobytes())
+        return digest.digest()
+
+    def __eq__(self, other: object) -> bool:
+        """Whether a search in both has the same result."""
+        return isinstance(other, OrderedRows) and self.content == other.content
+
+    def __hash__(self) -> int:
+        """Return the hash of the content."""
+        return hash(self.content)
 
     @staticmethod
     def from_result(result: CalibrationResult | HybridResult) -> "OrderedRows | None":

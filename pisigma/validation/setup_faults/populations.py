@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
@@ -61,6 +62,9 @@ class Populations:
     log_bayes_factor: float
 
 
+@lru_cache(
+    maxsize=2
+)  # the same rows are checked when they are added to a cell and when they are calibrated with
 def find_populations(rows: OrderedRows, count: int) -> Populations | None:
     """Find the two populations that explain the residuals of a calibration best, whether likely or not.
 

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Literal
 
 import numpy as np
@@ -82,8 +82,13 @@ def find_motion(result: CalibrationResult | HybridResult) -> Motion | None:
         None if no position or orientation was measured, or if there are too few rows.
     """
     rows = OrderedRows.from_result(result)
-    if rows is None:
-        return None
+    return None if rows is None else _motion_of(rows)
+
+
+@lru_cache(
+    maxsize=2
+)  # the same rows are checked when they are added to a cell and when they are calibrated with
+def _motion_of(rows: OrderedRows) -> Motion | None:
     search = _Search(rows)
     fits = [search.fit(candidate) for candidate in search.candidates()]
     # Candidates are compared as if all values were independent: the residuals of a wrong candidate are correlated.

@@ -21,7 +21,7 @@ from pisigma.measurement.camera.solved_images import (
     calibrate_intrinsics,
 )
 from pisigma.measurement.sensors.intrinsics import CAMERA_UNITS
-from pisigma.reporting.tables import Table
+from pisigma.reporting.result_text import Table
 from pisigma.workflow.settings.images import IntrinsicsSettings
 
 OBLIQUE = np.deg2rad(15.0)

@@ -14,7 +14,7 @@ from pisigma.measurement.camera.camera import Camera
 from pisigma.measurement.camera.detection.detected_boards import DetectedBoards, predict_boards
 from pisigma.measurement.camera.detection.detector import detect_boards, image_files
 from pisigma.measurement.foreign.joining import JoinedJoints, join_joints
-from pisigma.reporting.tables import Table
+from pisigma.reporting.result_text import Table
 from pisigma.workflow.settings.images import DetectionSettings
 
 
