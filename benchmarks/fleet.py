@@ -1,12 +1,14 @@
 """Time and memory of a fleet of simulated robots, with processes and with Ray, and recovery from killed runs.
 
 Run `OMP_NUM_THREADS=1 python benchmarks/fleet.py [PART ...]` with the simulator of arms (`sim.py`) in
-`PISIGMA_SIMULATED`. Every robot is a kr10 with individual errors, measured at 100 poses.
+`PISIGMA_SIMULATED`. Every robot is a kr10 with individual errors, measured at 100 poses. The part `before` compares
+cells with the manifest of a checkout of an earlier version (`--before FOLDER`), alternately.
 """
 
 import argparse
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -15,6 +17,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
+from pyarrow import parquet
 
 SIMULATED = Path(os.environ.get("PISIGMA_SIMULATED", "../shared/simulated"))
 
@@ -36,24 +39,29 @@ def write_fleet(folder: Path, robots: int) -> None:
         np.savetxt(f"r{number:04d}.csv", rows, "%.9f", ",", header=header, comments="")
         lines.append(f"r{number:04d},kr10.urdf,r{number:04d}.csv,2026-10-01")
     Path("fleet.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    new = [sys.executable, "-m", "pisigma", "new", "--from", "fleet.csv", "--out", "cells"]
+    subprocess.run(new, check=True, stdout=subprocess.DEVNULL)
 
 
 def command(out: str, *options: str) -> list[str]:
-    """Return the command line of a run."""
-    return [sys.executable, "-m", "pisigma", "fleet", "run", "fleet.csv", "--out", out, "--json", *options]
+    """Return the command line of a run on a copy of the cells, which is made if it does not exist."""
+    if not Path(out).exists():
+        shutil.copytree("cells", out)
+    return [sys.executable, "-m", "pisigma", "fleet", "run", out, "--json", *options]
 
 
 def timed(out: str, *options: str) -> tuple[float, float]:
     """Return the seconds of a run, and the peak memory of its child processes [GB]."""
+    words = command(out, *options)
     started = time.monotonic()
-    process = subprocess.Popen(command(out, *options), stdout=subprocess.PIPE, text=True)
+    process = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
     most = 0.0
     while process.poll() is None:
         most = max(most, memory_below(process.pid))
         time.sleep(0.2)
     assert process.stdout is not None
     report = json.loads(process.stdout.read())
-    assert report["done"] == report["robots"], report["refused"]
+    assert report["done"] == report["cells"], report["refused"]
     return time.monotonic() - started, most
 
 
@@ -72,6 +80,47 @@ def memory_below(pid: int) -> float:
     return total
 
 
+def results(out: str) -> list[dict[str, object]]:
+    """Return the results of a run, without the names and hashes of models, which a kill after writing one changes."""
+    table = parquet.read_table(f"{out}/results.parquet")
+    rows: list[dict[str, object]] = table.drop_columns(["model", "model_sha256"]).to_pylist()
+    return rows
+
+
+def seconds_of(words: list[str], checkout: Path) -> float:
+    """Return the seconds of a command of a checkout."""
+    environment = os.environ | {"PYTHONPATH": os.fspath(checkout)}
+    started = time.monotonic()
+    done = subprocess.run(
+        [sys.executable, "-m", "pisigma", *words], env=environment, capture_output=True, check=False
+    )
+    assert done.returncode in (0, 3), done.stderr.decode()
+    return time.monotonic() - started
+
+
+def before(robots: int, earlier: Path, repeats: int) -> None:
+    """Compare runs and status of cells with those of a manifest in an earlier version."""
+    here, ratios = Path(__file__).resolve().parents[1], dict[str, list[float]]()
+    for number in range(repeats):
+        old, new = f"manifest{number}", f"cells{number}"
+        shutil.copytree("cells", new)
+        for name, of_manifest, of_cells in (
+            ("run", ["fleet", "run", "fleet.csv", "--out", old], ["fleet", "run", new]),
+            ("run again", ["fleet", "run", "fleet.csv", "--out", old], ["fleet", "run", new]),
+            ("status", ["fleet", "status", old], ["fleet", "status", new]),
+            ("status --json", ["fleet", "status", old, "--json"], ["fleet", "status", new, "--json"]),
+        ):
+            jobs = ["--jobs", "2"] if "run" in name else []
+            seconds = [
+                seconds_of([*of_manifest, *jobs], earlier),
+                seconds_of([*of_cells, *jobs], here),
+            ]
+            ratios.setdefault(name, []).append(seconds[1] / seconds[0])
+            print(f"{name}: manifest {seconds[0]:.1f} s, cells {seconds[1]:.1f} s", flush=True)
+    for name, found in ratios.items():
+        print(f"{robots} robots, {name}: cells take {np.median(found):.2f} times as long, of {sorted(found)}")
+
+
 def engines(robots: int) -> None:
     """Compare two processes with two workers of Ray."""
     seconds, most = timed("processes", "--jobs", "2")
@@ -80,7 +129,7 @@ def engines(robots: int) -> None:
     print(
         f"{robots} robots, Ray with 2 workers: {on_ray:.1f} s ({on_ray / seconds:.2f} times), {most:.2f} GB"
     )
-    same = Path("processes/results.parquet").read_bytes() == Path("ray/results.parquet").read_bytes()
+    same = results("processes") == results("ray")
     print(f"results are {'identical to the bit' if same else 'different'}", flush=True)
 
 
@@ -94,7 +143,7 @@ def kills(robots: int, count: int) -> None:
         process.kill()
         killed += process.wait() == -signal.SIGKILL
     timed("killed", "--jobs", "2")
-    same = Path("whole/results.parquet").read_bytes() == Path("killed/results.parquet").read_bytes()
+    same = results("whole") == results("killed")
     left = [path.name for path in Path("killed").rglob(".*") if path.is_file()]
     print(
         f"{robots} robots, killed {killed} times: {'identical to the bit' if same else 'different'}, {left} left"
@@ -104,17 +153,22 @@ def kills(robots: int, count: int) -> None:
 def main() -> None:
     """Run the requested parts."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("parts", nargs="*", help="engines, kills (default: both)")
+    parser.add_argument("parts", nargs="*", help="engines, kills (default: both), before")
+    parser.add_argument("--before", type=Path, help="checkout of an earlier version with manifests")
+    parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--robots", type=int, default=200)
     parser.add_argument("--kills", type=int, default=20)
     wanted = parser.parse_args()
     parts = wanted.parts or ["engines", "kills"]
+    earlier = wanted.before and wanted.before.resolve()
     with TemporaryDirectory() as folder:
         write_fleet(Path(folder), wanted.robots)
         if "engines" in parts:
             engines(wanted.robots)
         if "kills" in parts:
             kills(wanted.robots, wanted.kills)
+        if "before" in parts:
+            before(wanted.robots, earlier, wanted.repeats)
         os.chdir("/")
 
 

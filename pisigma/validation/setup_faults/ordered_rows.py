@@ -60,7 +60,15 @@ class OrderedRows:
         """
         setup = (self.problem.frame.cpu().numpy(), self.problem.target.cpu().numpy(), self.configuration)
         digest = hashlib.sha256(f"{self.jacobian.shape} {self.values} {self.configuration is None}".encode())
-        for one in (self.number, self.residual, self.derivative, self.jacobian, self.noise, self.precision, *setup):
+        for one in (
+            self.number,
+            self.residual,
+            self.derivative,
+            self.jacobian,
+            self.noise,
+            self.precision,
+            *setup,
+        ):
             digest.update(b"" if one is None else np.ascontiguousarray(one).tobytes())
         return digest.digest()
 
