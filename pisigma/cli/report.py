@@ -85,14 +85,17 @@ def _print(result: "Report", closing: list[str]) -> None:
 
     content, wrong = result.content, result.diagnostics
     trust = "yes: these rows were held out."
+    accepted = result.acceptance
     if wrong:
         trust = f"no: {wrong[0].sentence}"
+    elif accepted is not None and accepted.contradicted:
+        trust = f"no: {uncapitalised(contradiction(accepted))}"
     elif not content.verdict.held_out:
         trust = "with caution: no held-out rows were judged."
     first, *others = content.advice or ("read the page.",)
     verdict = Verdict(result.verdict, trust, uncapitalised(first))
     blocks = [sentences("further advice", (f"- {one}" for one in others), "  ")]
-    if (accepted := result.acceptance) is not None:
+    if accepted is not None:
         columns, rows = budget_table(accepted)
         lacking = ", ".join(dict.fromkeys(line.partition(":")[0] for line in accepted.not_stated))
         blocks += [
