@@ -81,7 +81,7 @@ def _acceptance(cell: "Cell | None") -> "Acceptance | None":
 
 def _print(result: "Report", closing: list[str]) -> None:
     """Print the verdict of the page, and what it advises to measure."""
-    from pisigma.reporting.acceptance_tables import acceptance_sentences, budget_table
+    from pisigma.reporting.acceptance_tables import acceptance_sentences, budget_table, contradiction
 
     content, wrong = result.content, result.diagnostics
     trust = "yes: these rows were held out."

@@ -30,6 +30,9 @@ def test_errors_that_the_budget_does_not_explain_end_with_3(run, tmp_path):
     assert 'id="acceptance"' in text
     assert "Ada &lt;i&gt;" in text
     assert "<b>7</b>" not in text
+    screen = run("report", cell, "--out", page)
+    assert screen.exit_code == 3
+    assert "Trust: no: the measured errors" in screen.stdout
 
 
 def test_a_cell_whose_errors_are_explained_ends_with_0(run, tmp_path):
