@@ -304,7 +304,7 @@ class Sessions:
         return rows
 
     def rows_for(self, model: ModelEntry, rows: Measurements, day: str) -> ModelRows:
-        """Return rows with the names of a model's frame and target, and what was moved since the model.
+        """Return rows with the names of a model's frame and target, and what was moved between them and the model.
 
         Args:
             model: the model.
@@ -313,7 +313,11 @@ class Sessions:
         """
         events = self.history.events()
         changed = {"base": "instrument", "tool": "tool"}
-        moved = tuple(what for what, kind in changed.items() if model.day < newest_day(events, kind, day))
+        moved = tuple(
+            what
+            for what, kind in changed.items()
+            if newest_day(events, kind, day) != newest_day(events, kind, model.day)
+        )
         return ModelRows(with_setup_names(rows, model.frame_day, model.target_day), moved)
 
 

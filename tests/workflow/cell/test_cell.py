@@ -180,6 +180,8 @@ def test_sessions_before_and_after_an_event_of_the_instrument_are_in_two_frames(
     again, _ = cell.verify()
     assert again.settings.fit_frame
     assert again.verdict == "better"
+    older = cell.take_in(measured(12, 5), day="2026-01-12")
+    assert cell.sessions.rows_for(entry, cell.sessions.as_measured(older), older.day).fit_frame
     cell.history.record("mastering", "2026-02-10")
     assert cell.status().step.state == "no_plan"
     with refused(MeasurementError):
