@@ -83,7 +83,7 @@ def _suspects(explained: ExplainedRows[What]) -> list[dict[int, float]]:
         if number in values.wrong or not bool(chosen.any()):
             continue
         sigma = explained.deviation[chosen]
-        # The block of V^-1 is the precision of these values given all others: they are judged as if left out.
+        # The block of V^-1 is the precision of these values given all others: they are judged as if held out.
         eigenvalues, U = torch.linalg.eigh(inverse[chosen][:, chosen] * sigma * sigma[:, None])
         squares = (U.t() @ (a[chosen] * sigma)).square() / eigenvalues.clamp(min=1e-300)
         raised = evidence_gains(FACTORS, eigenvalues.clamp(min=0.0), squares)

@@ -71,7 +71,7 @@ class PisigmaError(Exception):
     """Base class of every error that pisigma raises on purpose.
 
     The message is built from the fields: ``expected a length > 0, got -3 mm (cell.yaml, line 12); give a positive
-    length.`` It is always `make_printable`. All fields are attributes, so that callers need not parse the message.
+    length.`` It is printable, see `make_printable`. All fields are attributes, so that callers need not parse it.
 
     Attributes:
         file: the file at fault; None if there is none.

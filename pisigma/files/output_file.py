@@ -49,7 +49,7 @@ def check_output(
             raise _refusal(path, problem, expected="a writable folder", value=str(path.parent))
         check_conflicts(path, inputs)
     except OSError as problem:
-        raise not_writable(path, problem) from None
+        raise write_failure(path, problem) from None
 
 
 def _refusal(path: Path, problem: str, expected: str, value: str) -> OutputError:
@@ -96,10 +96,10 @@ def writing_whole(path: Path) -> Iterator[TextIO]:
             scratch.chmod(0o644)
             os.replace(scratch, target)
     except OSError as problem:
-        raise not_writable(path, problem) from None
+        raise write_failure(path, problem) from None
 
 
-def not_writable(path: str | os.PathLike[str], problem: OSError) -> OutputError:
+def write_failure(path: str | os.PathLike[str], problem: OSError) -> OutputError:
     """Return the error of an output that the operating system does not let us write."""
     return OutputError(
         f"the output cannot be written: {problem.strerror}",

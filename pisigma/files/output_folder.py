@@ -8,7 +8,7 @@ from pathlib import Path
 from pisigma.files.conflicts import Input, check_conflicts
 from pisigma.files.errors import OutputError, Place
 from pisigma.files.model_files import MODEL_FILES, is_model
-from pisigma.files.output_file import not_writable
+from pisigma.files.output_file import write_failure
 from pisigma.files.scratch import ASIDE, FOLDER, KEPT, remove_stale_scratch, scratch_beside
 
 MAX_NEW_FOLDERS = 100
@@ -50,7 +50,7 @@ def check_folder(
         with scratch_beside(parent / target.name, FOLDER):
             pass
     except OSError as problem:
-        raise not_writable(folder, problem) from None
+        raise write_failure(folder, problem) from None
 
 
 def _check_content(
@@ -127,7 +127,7 @@ def staged_folder(
             _check_content(folder, target, overwrite, names)  # files may have been added meanwhile
             _replace(scratch, target)
     except OSError as problem:
-        raise not_writable(folder, problem) from None
+        raise write_failure(folder, problem) from None
 
 
 def _replace(scratch: Path, target: Path) -> None:

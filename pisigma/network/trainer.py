@@ -20,7 +20,7 @@ from lightning.pytorch.callbacks import ModelCheckpoint, RichProgressBar
 from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
 
 from pisigma.files.errors import Place, TrainingError
-from pisigma.files.output_file import not_writable
+from pisigma.files.output_file import write_failure
 
 SAVED = 20
 """Number of checkpoints of a training."""
@@ -71,7 +71,7 @@ class Checkpoints:
             self.folder.mkdir(parents=True, exist_ok=True)
             self.file.unlink(missing_ok=True)
         except OSError as problem:
-            raise not_writable(self.folder, problem) from None
+            raise write_failure(self.folder, problem) from None
 
     def _check(self) -> None:
         expected, remedy = "an interrupted training", "run without --resume"

@@ -182,7 +182,7 @@ class CameraProspects:
         def rms(better: RobotPosterior) -> float:
             return rms_of(better.given_poses(q).tool(task))
 
-        def seen_by(corner_noise: float, repeatability: Repeatability) -> RobotPosterior:
+        def posterior_with(corner_noise: float, repeatability: Repeatability) -> RobotPosterior:
             better = replace(sight, corner_noise=corner_noise, repeatability=repeatability)
             return replace(posterior, instrument=replace(posterior.instrument, sight=better))
 
@@ -198,8 +198,8 @@ class CameraProspects:
         return CameraProspects(
             rms_of(after.tool(task)),
             rms_of(after.given_poses(more).tool(task)) if len(more) else rms_of(after.tool(task)),
-            rms(seen_by(EXACT_CORNERS, sight.repeatability)),
-            rms(seen_by(sight.corner_noise, EXACT_ROBOT)),
+            rms(posterior_with(EXACT_CORNERS, sight.repeatability)),
+            rms(posterior_with(sight.corner_noise, EXACT_ROBOT)),
             float(views.margin_in_image(arm, q).min()),
             _unidentifiable(arm, sight.is_fixed),
         )

@@ -80,7 +80,7 @@ def _draw_calibration(
     if validation is not None:
         lengths = {name: errors.position.numpy() for name, errors in validation.all_errors.items()}
         figures.draw_held_out(lengths, folder / model_files.HELD_OUT_PNG)
-        spread = validation.all_spread
+        spread = validation.predicted_spread
         if spread is not None and spread.values:
             figures.draw_spread(spread, folder / model_files.SPREAD_PNG)
     if isinstance(result, HybridResult) and result.learned is not None:

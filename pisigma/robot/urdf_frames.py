@@ -57,7 +57,9 @@ def xyzrpy_of(T: Frame) -> Float64[np.ndarray, " 6"]:
     left = rotation(2, -roll)[:3, :3] @ R
     pitch = math.atan2(-left[2, 0], left[0, 0])
     yaw = math.atan2(-left[1, 2], left[1, 1])
-    return np.array([*(clean_length(v) for v in T[:3, 3]), *(clean_angle(v) for v in (roll, pitch, yaw))])
+    return np.array(
+        [*(zero_if_rounding(v) for v in T[:3, 3]), *(snap_right_angle(v) for v in (roll, pitch, yaw))]
+    )
 
 
 def inverse(T: Frame) -> Frame:
@@ -68,12 +70,12 @@ def inverse(T: Frame) -> Frame:
     return result
 
 
-def clean_length(value: float) -> float:
+def zero_if_rounding(value: float) -> float:
     """Replace a length that is a rounding error by 0."""
     return 0.0 if abs(value) <= ROUNDING else float(value)
 
 
-def clean_angle(value: float) -> float:
+def snap_right_angle(value: float) -> float:
     """Replace an angle [rad] that is a multiple of 90 deg up to a rounding error by that multiple, in (-pi, pi]."""
     quarters = round(value / (math.pi / 2))
     if abs(value - quarters * (math.pi / 2)) > ROUNDING:

@@ -20,12 +20,12 @@ from pisigma.robot.urdf_chain import Chain, ChainJoint
 from pisigma.robot.urdf_frames import (
     ROUNDING,
     Frame,
-    clean_angle,
-    clean_length,
     inverse,
     rotation,
     row_frame,
+    snap_right_angle,
     xyzrpy_of,
+    zero_if_rounding,
 )
 
 NEARLY_PARALLEL = 0.1
@@ -111,7 +111,7 @@ def _mimics(joints: tuple[ChainJoint, ...], rows: list[Row]) -> list[CoupledJoin
 
 def _urdf_origin(frame: Frame) -> tuple[float, float, float]:
     """Return the position of a joint's origin [m] in the frame of its row; `frame` is the inverse pose."""
-    x, y, z = (clean_length(value) for value in inverse(frame)[:3, 3])
+    x, y, z = (zero_if_rounding(value) for value in inverse(frame)[:3, 3])
     return x, y, z
 
 
@@ -133,7 +133,7 @@ def _turned_to(axis: Vector) -> Frame:
     """Return a rotation about y and then x that maps the z axis to a given one."""
     x, y, z = (float(value) for value in axis)
     about_x, about_y = math.atan2(-y, z), math.atan2(x, math.hypot(y, z))
-    T: Frame = rotation(0, clean_angle(about_x)) @ rotation(1, clean_angle(about_y))
+    T: Frame = rotation(0, snap_right_angle(about_x)) @ rotation(1, snap_right_angle(about_y))
     return T
 
 
@@ -166,19 +166,19 @@ def _row_to(z: Vector, point: Vector, nearly_parallel: float) -> Parameters:
     sine = math.hypot(z[0], z[1])
     if sine < nearly_parallel:
         foot = point - point[2] / z[2] * z
-        a = clean_length(math.hypot(foot[0], foot[1]))
+        a = zero_if_rounding(math.hypot(foot[0], foot[1]))
         theta, d = (math.atan2(foot[1], foot[0]) if a else 0.0), 0.0
     else:
         normal = np.array([-z[1], z[0]]) / sine
-        a = clean_length(float(normal @ point[:2]))
+        a = zero_if_rounding(float(normal @ point[:2]))
         if a < 0 or (a == 0 and (normal[0] < -ROUNDING or (normal[0] <= ROUNDING and normal[1] < 0))):
             normal, a = -normal, abs(a)
         theta = math.atan2(normal[1], normal[0])
-        d = clean_length(point[2] - (z[0] * point[0] + z[1] * point[1]) / sine**2 * z[2])
-    theta = clean_angle(theta)
+        d = zero_if_rounding(point[2] - (z[0] * point[0] + z[1] * point[1]) / sine**2 * z[2])
+    theta = snap_right_angle(theta)
     x, y, up = rotation(2, -theta)[:3, :3] @ z
-    beta = clean_angle(math.atan2(x, math.hypot(y, up))) if sine < nearly_parallel else 0.0
-    return theta, d, a, clean_angle(math.atan2(-y, up)), beta
+    beta = snap_right_angle(math.atan2(x, math.hypot(y, up))) if sine < nearly_parallel else 0.0
+    return theta, d, a, snap_right_angle(math.atan2(-y, up)), beta
 
 
 def _last_row(T_row_tip: Frame) -> Parameters:
@@ -186,5 +186,5 @@ def _last_row(T_row_tip: Frame) -> Parameters:
     off_axis = max(math.hypot(*T_row_tip[:2, 2]), math.hypot(*T_row_tip[:2, 3]))
     if off_axis > ROUNDING:
         return 0.0, 0.0, 0.0, 0.0, 0.0
-    theta = clean_angle(math.atan2(T_row_tip[1, 0], T_row_tip[0, 0]))
-    return theta, clean_length(T_row_tip[2, 3]), 0.0, 0.0 if T_row_tip[2, 2] > 0 else math.pi, 0.0
+    theta = snap_right_angle(math.atan2(T_row_tip[1, 0], T_row_tip[0, 0]))
+    return theta, zero_if_rounding(T_row_tip[2, 3]), 0.0, 0.0 if T_row_tip[2, 2] > 0 else math.pi, 0.0

@@ -214,7 +214,7 @@ def _kept(
         try:
             return alone, _kept_model(alone, parent, adaptation, rows, calibrator, progress)
         except IdentificationError:  # too few rows
-            choice = choice.with_least_error
+            choice = choice.smallest_error_choice
     return choice, _kept_model(choice, parent, adaptation, rows, calibrator, progress)
 
 

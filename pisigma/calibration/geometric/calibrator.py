@@ -14,8 +14,8 @@ from pisigma.calibration.geometric.identifiability.plausibility import refuse_im
 from pisigma.calibration.geometric.identifiability.redundancy import (
     RankFindings,
     Redundancy,
+    additional_columns,
     find_redundancy,
-    rank_extension,
 )
 from pisigma.calibration.geometric.identifiability.sufficiency import (
     candidates_at_start,
@@ -260,6 +260,6 @@ class GeometricCalibrator:
         if self.elimination != "exact" or not others or len(kept) >= most:
             return rough, findings, active
         now = information(problem, here.point, unknowns + kept + others, sensor_view_of(here))
-        columns = rank_extension(without_sensor_unknowns(setup, now), len(kept))
+        columns = additional_columns(without_sensor_unknowns(setup, now), len(kept))
         extended = [(kept + others)[i] for i in columns]
         return rough, replace(findings, extended=extended), [*active, *extended]

@@ -164,7 +164,7 @@ class JsonLines(AbstractProtocol):
         model = self._models.find_model(request.get("model"))
         slow = not model.is_fast or task == "path" or read_flag(request, "accuracy")
         solve = {"pose": _solve, "path": _follow}.get(task, _forward)
-        names = model.short_name if request.get("brief") else model.whole_name
+        names = model.short_name if request.get("brief") else model.full_name
         return (lambda: solve(model, request)), slow, names
 
     def _question(self, request: dict[str, Any]) -> tuple[_Job, bool]:

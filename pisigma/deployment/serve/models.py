@@ -58,7 +58,7 @@ class ServedModel:
         return bytes.fromhex(self.sha256)[:8]
 
     @cached_property
-    def whole_name(self) -> dict[str, str]:
+    def full_name(self) -> dict[str, str]:
         """What names the model in answers."""
         return {"model": self.name}
 

@@ -107,11 +107,11 @@ def fleet_prior(name: str, robot: Robot, fleet: Sequence[Measurements]) -> Fleet
 def class_population(robot: Robot) -> Population:
     """Return the distribution of errors of a robot's class, see `pisigma.robot.robot_class`."""
     uncertainty = RobotPosterior.from_robot(robot).uncertainty
-    usual = of_arm(uncertainty.root, uncertainty.space).square().sum(1)
+    usual = select_arm_rows(uncertainty.root, uncertainty.space).square().sum(1)
     return Population(torch.zeros_like(usual), usual.diag(), uncertainty.space.arm_size)
 
 
-def of_arm(
+def select_arm_rows(
     root: Float64[Tensor, "unknowns directions"], space: ParameterSpace
 ) -> Float64[Tensor, "arm directions"]:
     """Select the rows of the arm's parameters and weights, without those of base, tool and sensors."""
@@ -251,7 +251,7 @@ class FleetConsistency:
             IdentificationError: the rows do not determine the robot's base and tool.
         """
         posterior = ModelPosterior.from_model(model)
-        root = of_arm(posterior.root, posterior.space)
+        root = select_arm_rows(posterior.root, posterior.space)
         nominal = posterior.space.robot
         errors = torch.from_numpy(posterior.geometry.robot.dh - nominal.dh)
         mean = torch.cat([errors.flatten(), posterior.weights])

@@ -128,7 +128,7 @@ class Session:
             return "nothing moved beyond its uncertainty."
         # of a base or a tool that moved, not its rotation where only its origin did, and the other way round
         clear = [one for one in self.moved if one.is_significant or not is_frame(one.what)] or self.moved
-        moved = (f"{one.sentence} ({shown_probability(one.probability)})" for one in clear)
+        moved = (f"{one.sentence} ({format_probability(one.probability)})" for one in clear)
         return f"{'; '.join(moved)}."
 
     @property
@@ -371,7 +371,7 @@ def _joints(solved: _Solved) -> list[DriftGroup]:
     return [replace(group, size=ZERO_PRIOR) for group in groups if group.what.startswith("joint ")]
 
 
-def shown_probability(probability: float | None) -> str:
+def format_probability(probability: float | None) -> str:
     """Write a probability as a percentage that is never rounded to 100 %; "unknown" for None."""
     if probability is None:
         return "unknown"

@@ -67,7 +67,7 @@ class CandidateChoice:
         return old is not None and new is not None and self.kept != "old" and old > MIN_RATIO * new
 
     @property
-    def with_least_error(self) -> "CandidateChoice":
+    def smallest_error_choice(self) -> "CandidateChoice":
         """The choice of the candidate with the smallest error, by however little."""
         sizes = {name: size for name, size in self.rms.items() if size is not None}
         return replace(self, kept=min(sizes, key=lambda name: sizes[name])) if sizes else self

@@ -8,7 +8,7 @@ from dataclasses import replace
 import torch
 
 from pisigma.files.errors import IdentificationError, ModelError
-from pisigma.lifetime.monitoring.session import Session, is_frame, judge_session, shown_probability
+from pisigma.lifetime.monitoring.session import Session, format_probability, is_frame, judge_session
 from pisigma.lifetime.recalibration.movement import Movement
 from pisigma.lifetime.recalibration.recalibration_problem import frame_keys
 from pisigma.measurement.dataset import Measurements
@@ -108,7 +108,7 @@ def motion_text(motion: Session) -> str:
     for one in motion.moved:
         amounts.setdefault((one.what, one.probability), []).append(one.size)
     text = join_words(
-        f"{_subject(what)} by {join_words(those)} (probability {shown_probability(probability)})"
+        f"{_subject(what)} by {join_words(those)} (probability {format_probability(probability)})"
         for (what, probability), those in amounts.items()
     )
     return f"{text[:1].upper()}{text[1:]}"

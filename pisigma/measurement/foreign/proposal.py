@@ -84,7 +84,7 @@ class Proposal:
                 names.setdefault(heading.name, []).append(index)
         return names
 
-    def put_group(
+    def assign_columns(
         self, group: Mapping[str, str], names: Mapping[str, list[int]], side: _Side, reason: str
     ) -> None:
         """Decide columns by their names; of commanded and measured ones, keep those of one side."""
@@ -259,7 +259,7 @@ def _take_joints(proposal: Proposal) -> None:
     reason = f"name of {proposal.maker.name}" if proposal.maker else "heading"
     reason += ", counted from 0" if shift else ""
     group = {name: f"q{number + shift}" for name, number in best.items()}
-    proposal.put_group(group, names, "commanded", reason)
+    proposal.assign_columns(group, names, "commanded", reason)
 
 
 def _take_position(proposal: Proposal) -> None:
@@ -272,7 +272,7 @@ def _take_position(proposal: Proposal) -> None:
         if {proposal.headings[index].side for name in missing for index in names[name]} == {"commanded"}:
             proposal.leave_out(missing, names, "commanded, not measured")
         else:
-            proposal.put_group(missing, names, "measured", "heading")
+            proposal.assign_columns(missing, names, "measured", "heading")
 
 
 def _take_rotation(proposal: Proposal, rotation: str | None) -> None:
@@ -297,7 +297,7 @@ def _take_rotation(proposal: Proposal, rotation: str | None) -> None:
         encoding = ROTATIONS[chosen]
         quantities = encoding.columns or encoding.quantities()
         group = dict(zip(matches[chosen], quantities, strict=True))
-        proposal.put_group(group, names, "measured", f"{chosen}: {encoding.meaning}")
+        proposal.assign_columns(group, names, "measured", f"{chosen}: {encoding.meaning}")
     elif rotation is None:
         proposal.rotations = tuple(matches)
 

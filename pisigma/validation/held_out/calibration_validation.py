@@ -82,7 +82,7 @@ class CalibrationValidation:
         }
 
     @property
-    def all_spread(self) -> PredictedSpread | None:
+    def predicted_spread(self) -> PredictedSpread | None:
         """Position errors and their predicted standard deviations in all repeats; None without a hybrid."""
         spreads = [repeat.spread for repeat in self.repeats if repeat.spread is not None]
         return PredictedSpread.concatenate(spreads) if spreads else None
@@ -103,8 +103,8 @@ class CalibrationValidation:
                 for name in self.models
             }
         figures |= {name: errors.figures for name, errors in self.all_errors.items()}
-        if self.all_spread is not None:
-            figures |= self.all_spread.in_file_units()
+        if self.predicted_spread is not None:
+            figures |= self.predicted_spread.in_file_units()
         if (distances := distance_figures([one.distances for one in self.repeats])) is not None:
             figures["socket_distance"] = distances.model_dump(exclude_unset=True)
         counts = {"frames_fitted": self.frames_fitted, "sockets_held_out": self.sockets_held_out}

@@ -36,7 +36,7 @@ def advance(cell: Cell, prior: Path | None = None, progress: Progress = lambda w
             done.add(step.command)
             progress(step.verb)
             _take(cell, step.verb, shlex.split(step.command)[3:], prior)
-        elif not cell.sessions.take_in_next():
+        elif not cell.sessions.add_next_file():
             return status_of(cell.folder)
         else:
             done.clear()

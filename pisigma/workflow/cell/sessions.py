@@ -14,7 +14,7 @@ import torch
 from pisigma.files.errors import AcceptanceError, MeasurementError, PisigmaError, Place, check_choice
 from pisigma.lifetime.cell.controller import Controller
 from pisigma.lifetime.cell.events import Event
-from pisigma.lifetime.cell.facts import facts_of, not_read, not_taken_in, sha256_of
+from pisigma.lifetime.cell.facts import facts_of, not_taken_in, sha256_of, unimported_files
 from pisigma.lifetime.cell.history import Check, History, ModelEntry, SessionEntry, now
 from pisigma.lifetime.cell.layout import MODELS, SESSIONS
 from pisigma.lifetime.cell.status import FOREIGN
@@ -69,7 +69,7 @@ class Sessions:
         robot: the nominal robot.
         cameras: cameras and boards that measure; None without cameras.
         history: history of the cell.
-        one_by_one: whether files in the folder are added by `take_in_next` only, and not by every step.
+        one_by_one: whether files in the folder are added by `add_next_file` only, and not by every step.
     """
 
     def __init__(self, cell: Path, robot: Robot, cameras: CameraFiles | None, history: History) -> None:
@@ -129,7 +129,7 @@ class Sessions:
             raise _known(rows)
         return entry
 
-    def take_in_next(self) -> bool:
+    def add_next_file(self) -> bool:
         """Add the oldest file in the folder that has not been added yet; return whether there was one.
 
         Raises:
@@ -199,7 +199,7 @@ class Sessions:
         """
         sessions = {one.name: one for one in self.history.sessions()}
         known = tuple(sessions.values())
-        for file in (*not_taken_in(self.folder, known), *not_read(self.folder, known)):
+        for file in (*not_taken_in(self.folder, known), *unimported_files(self.folder, known)):
             name, day = file.removesuffix(".csv"), date_in_name(file) or datetime.date.today().isoformat()
             sessions[name] = SessionEntry(
                 name, sha256_of(self.folder / file), now(), day, 0, "", judged_by=""
@@ -221,7 +221,7 @@ class Sessions:
         Raises:
             MeasurementError: there is none.
         """
-        while not self.one_by_one and self.take_in_next():
+        while not self.one_by_one and self.add_next_file():
             pass
         sessions = list(facts_of(self.folder.parent).valid_sessions)
         if not sessions:

@@ -229,7 +229,7 @@ def dependency_sentence(members: list[Parameter], coefficients: list[float]) -> 
     return f"{text} is identified, the single values are not"
 
 
-def rank_extension(information: Information, kept: int) -> list[int]:
+def additional_columns(information: Information, kept: int) -> list[int]:
     """Find columns that the data determine in addition to the kept ones.
 
     Nominal axes are exactly parallel or intersect exactly, but real ones do not, so dependencies of the nominal robot
