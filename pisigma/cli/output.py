@@ -152,7 +152,7 @@ def command_line(context: typer.Context, files: Collection[str] = ("out",)) -> s
 
 
 def _rich_lines(table: "Table", width: int) -> list[str]:
-    """Lay out a table as text: rich's own printing ends the process where nobody reads."""
+    """Lay out a table as text: rich's own printing ends the process if the output has no reader."""
     from rich.console import Console
 
     console = Console(highlight=False)

@@ -54,7 +54,10 @@ def check_local(folder: Path) -> None:
         device = os.stat(folder).st_dev
     except OSError:
         return
-    if (MOUNTINFO, device) not in _TYPES:  # for many folders, reading the table takes longer than all else
+    if (
+        MOUNTINFO,
+        device,
+    ) not in _TYPES:  # for many folders, reading the table takes longer than everything else
         _TYPES[MOUNTINFO, device] = _network_type(os.path.realpath(folder))
     if kind := _TYPES[MOUNTINFO, device]:
         raise OutputError(

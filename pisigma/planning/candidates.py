@@ -177,7 +177,7 @@ def _repeats(q: Float64[Tensor, "poses dof"]) -> Bool[Tensor, " poses"]:
 def spread(
     arm: ArmInSurroundings, q: Float64[Tensor, "poses dof"], count: int, others: Float64[Tensor, "others dof"]
 ) -> Int64[Tensor, " chosen"]:
-    """Select poses spread over the workspace: each time the one farthest from all that are selected or given.
+    """Select poses spread over the workspace: each time the one farthest from all selected or given poses.
 
     Distances are those of the reflector's positions and of the joint values, each over its standard deviation (Kennard
     and Stone 1969, Technometrics 11(1)).

@@ -1,4 +1,4 @@
-"""Plan files: a CSV with the poses, and a YAML next to it with all that is needed to replan."""
+"""Plan files: a CSV with the poses, and a YAML file next to it with everything that replanning needs."""
 
 import csv
 import io

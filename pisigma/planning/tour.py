@@ -96,7 +96,7 @@ def plan_tour(
         q: joint values of the poses, all of them free [rad or m].
         pace: speeds and settling time.
         start: current joint values of the robot [rad or m]; None for any.
-        stages: ascending numbers of poses that are measured before all that follow in `q`: (20, 40) means the first 20
+        stages: ascending numbers of poses that are measured before all later ones in `q`: (20, 40) means the first 20
             poses, then the next 20, then the others, each stage in an order of short duration.
     """
     poses = q if start is None else torch.cat([start[None], q])

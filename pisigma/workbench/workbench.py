@@ -310,7 +310,7 @@ async def _form(request: web.Request) -> dict[str, str]:
     """
     try:
         values = await request.json()
-        json.dumps(values, ensure_ascii=False).encode()  # halves of characters cannot be written
+        json.dumps(values, ensure_ascii=False).encode()  # lone surrogates cannot be encoded
     except ValueError:
         raise web.HTTPBadRequest from None
     if not isinstance(values, dict) or not all(isinstance(one, str) for one in values.values()):

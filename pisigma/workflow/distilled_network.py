@@ -93,7 +93,7 @@ def choose_network(
     search: tuple[int, int],
     progress: Progress,
 ) -> tuple[CorrectionNetwork, tuple[SizeFigures, ...]]:
-    """Return the smallest network that is about as good as the best, and the figures of all that were tried.
+    """Return the smallest network that is about as good as the best, and the figures of all candidates.
 
     Args:
         parent: the model that is distilled.

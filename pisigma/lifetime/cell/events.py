@@ -50,7 +50,7 @@ class Event:
 
 
 def check_event(kind: str, day: str, person: str) -> None:
-    """Refuse an event of an unknown kind, on no valid day, or an acceptance by nobody.
+    """Refuse an event of an unknown kind or with an invalid date, or an acceptance without a person.
 
     Args:
         kind: kind of the event.

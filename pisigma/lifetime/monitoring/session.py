@@ -230,7 +230,7 @@ class _Solved:
         return any(is_frame(one.group.what) and one.size >= MIN_MOVE for one in self.probable_movements)
 
     def arm_with(self, motions: tuple[DriftGroup, ...]) -> AdaptedArm:
-        """Return the arm with moved bases and tools and some movements fitted; all else as in the model."""
+        """Return the arm with moved bases and tools and some movements fitted; the rest is that of the model."""
         return AdaptedArm.from_unknowns(self.problem, self.unknowns(motions))
 
     def score_ratio(self, before: tuple[DriftGroup, ...], after: tuple[DriftGroup, ...]) -> float:
@@ -241,7 +241,7 @@ class _Solved:
         return first / second if second > 0 else 1.0
 
     def unknowns(self, motions: tuple[DriftGroup, ...]) -> Float64[Tensor, " unknowns"]:
-        """Return the mean of the unknowns with moved bases and tools and some movements; all else as in the model."""
+        """Return the mean unknowns with moved bases and tools and some movements; the rest is that of the model."""
         standing = tuple(group for group in self.problem.groups if group.fixed_size)
         drift = Drift((*standing, *motions), self.noise * self.explanation.noise_factor)
         shift: Tensor = PosteriorUpdate(self.problem.root[:, :0], self.values, drift).shift

@@ -97,9 +97,9 @@ SummaryMovement = Annotated[Movement, BeforeValidator(_fields), PlainSerializer(
 def significant_movements(adaptation: Adaptation) -> tuple[Movement, ...]:
     """Return the movements above `CLEAR` standard deviations: joints first, then lengths and angles, bases and tools.
 
-    The shift of a joint zero is estimated without a prior, together with all else that has drifted. It counts in the
-    positive direction of the joint: a joint with the shift 0.1 deg is 0.1 deg beyond the value that its controller
-    shows.
+    The shift of a joint zero is estimated without a prior, together with everything else that has drifted. It is
+    positive in the positive direction of the joint: a joint with the shift 0.1 deg is 0.1 deg beyond the value that
+    its controller shows.
     """
     moved: list[Movement] = []
     for number, group in enumerate(adaptation.drift.groups):

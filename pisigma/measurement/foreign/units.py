@@ -56,7 +56,7 @@ AMBIGUOUS = {
     "grad": "degrees in German, gradians in other languages",
     "grade": "degrees in Italian, gradians in French",
 }
-"""Ambiguous spellings of units and their meanings; `--unit` or `--map` has to state which one is meant."""
+"""Ambiguous spellings of units and their meanings; `--unit` or `--map` has to state the meaning."""
 _MAX_COMMENT = 500
 """Number of characters of a comment that are searched for units."""
 

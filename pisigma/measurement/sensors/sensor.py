@@ -48,7 +48,7 @@ class UnknownGroup:
         columns: names of one owner's unknowns. If the first ones are x, y, z, they are a point in the owner's frame
             [m]; all others are the same in every frame.
         owners: names of the owners of such unknowns, such as the anchors.
-        frames: per owner, the frame in which it is.
+        frames: per owner, the frame that contains it.
         angles: the columns that are angles [rad]; the others are lengths [m].
         units: units of columns that are neither, "px" or "1" (dimensionless).
     """

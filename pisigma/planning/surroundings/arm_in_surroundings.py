@@ -146,7 +146,7 @@ class ArmInSurroundings:
         return Faults(tuple(chunks[0]), torch.cat([torch.stack([*chunk.values()], 1) for chunk in chunks]))
 
     def smallest_clearance(self, q: Float64[Tensor, "poses dof"]) -> Float64[Tensor, " poses"]:
-        """Compute the smallest distance between the links and all that they must not touch, minus the clearance [m].
+        """Compute the smallest distance of the links from everything they must not touch, minus the clearance [m].
 
         Negative where the clearance is not kept, infinite where there is nothing to touch.
         """
@@ -184,7 +184,7 @@ class ArmInSurroundings:
         return faults
 
     def _gaps(self, segments: Float64[Tensor, "poses pieces 2 3"]) -> dict[str, Float64[Tensor, " poses"]]:
-        """Compute distances between the links and all that they must not touch, minus the clearance [m]."""
+        """Compute distances between the links and everything that they must not touch, minus the clearance [m]."""
         clearance, radius = self.surroundings.clearance, self.capsules.radius
         infinite = segments.new_full((len(segments), 1), torch.inf)
         gaps = {"links of the robot touch each other": _least(self._apart(segments) - self.room, infinite)}

@@ -1,4 +1,4 @@
-"""Checks of rows and calibrations: one question a file, a calibration or rows under a model in, diagnostics out.
+"""Checks of rows and calibrations. Each file answers one question about them and returns diagnostics.
 
 | question | before a calibration (nominal robot) | after it (linearised residuals) | rows under a model |
 |---|---|---|---|

@@ -16,7 +16,7 @@ from pisigma.validation.iso9283.pose import barycentre, position_accuracy, posit
 CYCLES = 30
 """Number of repeats of a pose that ISO 9283:1998 asks for."""
 MIN_CYCLES = 10
-"""Number of repeats below which RP is not computed: of few, the spread of their distances is far too small."""
+"""Number of repeats below which RP is not computed, because the spread of few distances is far too small."""
 
 
 @dataclass(frozen=True)

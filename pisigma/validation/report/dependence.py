@@ -311,7 +311,7 @@ def root_mean_square(values: Float64[np.ndarray, " values"]) -> float:
 def bin_errors(
     values: Float64[np.ndarray, " rows"], errors: Float64[np.ndarray, " rows"], bins: int = MAX_BINS
 ) -> BinnedErrors:
-    """Compute RMS errors in bins of equal width; of few rows in fewer bins."""
+    """Compute RMS errors in bins of equal width, fewer bins for few rows."""
     bins = int(np.clip(len(values) // MIN_ROWS, 1, bins))
     low, high = float(values.min()), float(values.max())
     edges = np.linspace(low, high if high > low else low + 1.0, bins + 1)

@@ -54,7 +54,7 @@ class OrderedRows:
 
     @cached_property
     def content(self) -> bytes:
-        """SHA-256 of all that a search depends on, with which its last result is recognised.
+        """SHA-256 of everything that a search depends on, which identifies its last result.
 
         The same rows are calibrated with when they are added to a cell, and again for its model.
         """

@@ -65,7 +65,7 @@ def check_rewriting(request: ExportRequest) -> None:
 
 
 def rewrite_program(request: ExportRequest) -> Exported:
-    """Rewrite the targets of a program that are understood, and report the changes and all that is left unchanged.
+    """Rewrite the targets of a program that are understood, and report what was changed and what was not.
 
     Raises:
         OutputError: the program cannot be read, or has no target whose frame and tool are stated.
@@ -146,7 +146,7 @@ def _exported(
 
 
 def _warnings(corrected: CorrectedProgram, source: str) -> tuple[str, ...]:
-    """Return warnings on the branches of the targets, and on all that was left unchanged."""
+    """Return warnings on the branches of the targets, and on everything that was left unchanged."""
     sentences = [
         f"Targets are corrected for the branch {' and '.join(corrected.branches) or 'of the model'}. The program's "
         "configuration was not checked: if the arm is in another configuration, state --branch."
