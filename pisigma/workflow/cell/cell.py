@@ -271,7 +271,7 @@ class Cell:
             seen = self.sessions.rows_for(entry, self.sessions.as_measured(one), one.day)
             moved = {"moved": ",".join(seen.moved)} if seen.moved else {}
             settings = replace(
-                self.file.settings_of_step("monitor", **changed, **moved), cameras=None, dates=(one.day,)
+                self.file.settings_of_step("monitor", **(moved | changed)), cameras=None, dates=(one.day,)
             )
             rows = replace(seen.rows, date=None)
             found = monitor(self.model_folder(entry.name), [rows], settings, progress)
