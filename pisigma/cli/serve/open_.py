@@ -1,6 +1,5 @@
 """`pisigma open`: a cell as a page in the browser."""
 
-import contextlib
 import signal
 import sys
 import tempfile
@@ -46,7 +45,8 @@ def open_(
     from pisigma.workbench.workbench import Workbench
 
     ended = threading.Event()
-    signal.signal(signal.SIGTERM, lambda *_: ended.set())
+    for name in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(name, lambda *_: ended.set())
     with Workbench(cell, address.host, address.port) as bench:
         if as_json:
             print_json({"url": bench.url})
@@ -59,8 +59,7 @@ def open_(
         with tempfile.TemporaryDirectory(prefix="pisigma-") as folder:
             if not no_browser:
                 _open_browser(bench.url, Path(folder))
-            with contextlib.suppress(KeyboardInterrupt):
-                ended.wait()
+            ended.wait()
 
 
 def _open_browser(url: str, folder: Path) -> None:
