@@ -45,17 +45,14 @@ def status(
 
 def _status(path: Path, as_json: bool) -> set[str]:
     """Print the status of a cell or of a folder of cells; return the states."""
-    from pisigma.lifetime.cell.layout import is_cell
-    from pisigma.workflow.cell.cell import Cell
-
-    if is_cell(path):
-        one = Cell.open(path).status()
-        if as_json:
-            print_json(one.to_json())
-        else:
-            _print_status(one)
-        return {one.step.state}
-    return set(show_fleet(path, as_json=as_json).states)
+    if (cell := cell_at(path)) is None:
+        return set(show_fleet(path, as_json=as_json).states)
+    one = cell.status()
+    if as_json:
+        print_json(one.to_json())
+    else:
+        _print_status(one)
+    return {one.step.state}
 
 
 def _print_status(status: "CellStatus") -> None:
