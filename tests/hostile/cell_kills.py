@@ -23,8 +23,8 @@ from pisigma.lifetime.cell.history import HISTORY
 from pisigma.model.folder.model_folder import load_model
 from pisigma.workflow.cell.cell import Cell
 
-SECONDS = 8.0
-"""Of a command, to begin with."""
+LONGER = 1.1
+"""Factor on the time of a command that was killed, so that some end before they are killed on a busy machine."""
 COMMANDS = ("import", "monitor", "recalibrate", "import", "verify", "calibrate", "use", "event", "plan")
 
 
@@ -104,21 +104,23 @@ class KilledCell:
 
 
 def main() -> None:
-    """Kill commands in turn, at any time; run each to its end at last."""
+    """Run each command once, kill commands in turn at any time, and run each to its end at last."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--count", type=int, default=200)
     parser.add_argument("--seed", type=int, default=0)
     wanted = parser.parse_args()
     rng, faults, killed = np.random.default_rng(wanted.seed), list[str](), 0
-    seconds = dict.fromkeys(COMMANDS, SECONDS)
+    seconds: dict[str, float] = {}
     with tempfile.TemporaryDirectory() as temporary:
         target = KilledCell(Path(temporary))
-        for number in range(wanted.count + len(COMMANDS)):
-            name, whole = COMMANDS[number % len(COMMANDS)], number >= wanted.count
+        for number in range(wanted.count + 2 * len(COMMANDS)):
+            name = COMMANDS[number % len(COMMANDS)]
+            whole = not len(COMMANDS) <= number < wanted.count + len(COMMANDS)
             began, process = time.monotonic(), target.start(number)
             if not whole:
-                time.sleep(seconds[name] * float(rng.uniform(0.2, 1.0)))
+                time.sleep(seconds[name] * float(rng.uniform(0.2, 1.2)))
                 process.kill()
+                seconds[name] *= LONGER
             status = process.wait()
             if status != -signal.SIGKILL:
                 seconds[name] = time.monotonic() - began
@@ -130,7 +132,11 @@ def main() -> None:
                 faults.append(f"command {number} ({name}): {fault}")
                 print(faults[-1], flush=True)
             if number % 20 == 19:
-                print(f"{killed} of {number + 1} killed, {len(faults)} faults", file=sys.stderr, flush=True)
+                print(
+                    f"{killed} of {number + 1 - len(COMMANDS)} killed, {len(faults)} faults",
+                    file=sys.stderr,
+                    flush=True,
+                )
         print(f"{len(target.cell.history.models())} models, {len(target.cell.history.sessions())} sessions.")
     print(f"{killed} of {wanted.count} killed, {len(faults)} faults.")
     sys.exit(1 if faults else 0)
