@@ -112,7 +112,7 @@ def budget_table(acceptance: Acceptance) -> Table:
 
 
 def comparison_table(acceptance: Acceptance) -> Table:
-    """Return predicted figures beside those measured on a session that the model was not fitted to [mm]."""
+    """Return predicted figures next to those measured on a session that the model was not fitted to [mm]."""
     budget, measured = acceptance.budget, acceptance.measured
     predicted: Sequence[float] = (math.nan,) * 3
     if budget.components:

@@ -102,7 +102,7 @@ def _start(folder: Path, out: str, *, full: bool = False) -> subprocess.Popen[st
 
     def limit() -> None:
         if full:
-            resource.setrlimit(resource.RLIMIT_FSIZE, (MAX_FILE_SIZE, LARGEST_FILE))
+            resource.setrlimit(resource.RLIMIT_FSIZE, (MAX_FILE_SIZE, MAX_FILE_SIZE))
 
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
     return subprocess.Popen(command, cwd=folder, text=True, preexec_fn=limit, **pipes)
