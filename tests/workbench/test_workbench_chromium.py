@@ -133,7 +133,7 @@ def test_from_a_plan_to_a_corrected_pose(browser, cells, simulated, tmp_path):
         page.set_input_files("[data-upload=poses]", tmp_path / "poses.csv")
         do(page, "export", out="job.src")
         with page.expect_download() as started:
-            page.click("text=job.src >> nth=-1")
+            page.click(".files a >> text=job.src")
         written = export(command_cell, tmp_path / "poses.csv", tmp_path / "job.src")
         assert Path(started.value.path()).read_bytes() == written.read_bytes()
 
