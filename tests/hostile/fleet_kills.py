@@ -26,7 +26,7 @@ from testing.simulated_arm import simulate
 from pisigma.workflow.cell.new_cell import NewCell
 from pisigma.workflow.fleet.manifest import new_cells
 
-MAX_FILE_SIZE = 12_000
+MAX_FILE_SIZE = 40_000
 """Simulated space of a full disk [bytes]: histories and models do not fit."""
 
 
