@@ -73,6 +73,7 @@ class ModelEntry:
         remark: why it is or is not in use.
         scatter_mm: standard deviation of a measured coordinate about the model [mm], from the sensor and the
             repeatability of the robot, as the calibration identified it; None if it is unknown.
+        has_posterior: whether it keeps the posterior of its parameters, which `monitor` and `recalibrate` need.
     """
 
     name: str
@@ -86,6 +87,7 @@ class ModelEntry:
     p95_mm: float | None = None
     remark: str = ""
     scatter_mm: float | None = None
+    has_posterior: bool = True
 
     @property
     def made_of(self) -> tuple[str, ...]:

@@ -247,6 +247,9 @@ def _after(facts: CellFacts, last: Check, failed: tuple[str, ...]) -> Step | Non
             facts.command("session", last.session, "--set-aside", last.verdict),
         )
     if last.recalibrate:
+        if any(one.name == last.model and not one.has_posterior for one in facts.models):
+            why = f"{last.summary.rstrip('.')}; record the change with `pisigma event`, then measure and calibrate"
+            return Step("moved", why, facts.command("plan"))
         state: State = "older_than_evidence" if last.verdict == "unchanged" else "moved"
         return Step(state, last.summary, facts.command("recalibrate"))
     if last.verdict in failed and not any(one.made >= last.checked for one in facts.models):
@@ -268,7 +271,7 @@ def _other_joint_zeros(facts: CellFacts) -> Step | None:
     tried = [one for one in facts.checks_of(model.name, "recalibrate") if one.session == new[-1].name]
     if tried and tried[-1].verdict in NOT_TRUSTED:
         return _calibrate(facts, state, why)
-    return Step(state, why, facts.command("recalibrate"))
+    return Step(state, why, facts.command("recalibrate" if model.has_posterior else "calibrate"))
 
 
 def _session_not_judged(facts: CellFacts) -> Step | None:
@@ -278,7 +281,9 @@ def _session_not_judged(facts: CellFacts) -> Step | None:
     new = [one for one in facts.new_sessions(model) if one.name not in judged]
     if not new:
         return None
-    verb = "verify" if facts.limit_mm is not None and _p95(facts, model) is None else "monitor"
+    verb = "monitor" if model.has_posterior else "verify"
+    if facts.limit_mm is not None and _p95(facts, model) is None:
+        verb = "verify"
     return Step(
         "session_not_judged",
         f"session '{new[-1].name}' has not been compared with model '{model.name}'",
@@ -355,7 +360,7 @@ def _verification_due(facts: CellFacts) -> Step | None:
     return Step(
         "verification_due",
         f"the last session is {age} days old; measure {VERIFICATION_POSES} poses and run "
-        f"`{facts.command('monitor')}`",
+        f"`{facts.command('monitor' if model.has_posterior else 'verify')}`",
         facts.command("plan"),
     )
 

@@ -157,7 +157,7 @@ class Cell:
         """
         facts = self.status().facts
         entry, settings = facts.in_use or facts.newest_model, self.file.plan_settings(facts, **changed)
-        subject = self.robot if entry is None else self.model_folder(entry.name)
+        subject = self.model_folder(entry.name) if entry is not None and entry.has_posterior else self.robot
         planned = plan(subject, settings, self.file.document.surroundings, progress)
         with self.history.database.transaction():  # no other process chooses the same name meanwhile
             path = free_path(self.folder / PLANS, datetime.date.today().isoformat(), ".csv")

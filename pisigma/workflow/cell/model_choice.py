@@ -224,6 +224,7 @@ def entry_of(
         p95_mm=errors_of(result)[0],
         remark=remark,
         scatter_mm=identified_scatter(result.summary) if isinstance(result, Calibration) else None,
+        has_posterior=result.model.uncertainty is not None,
     )
     if parent is None:
         return entry

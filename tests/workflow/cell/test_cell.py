@@ -177,6 +177,8 @@ def test_sessions_before_and_after_an_event_of_the_instrument_are_in_two_frames(
     assert not verification.settings.fit_frame
     cell.history.record("instrument", "2026-02-02")
     cell.take_in(measured(12, 4), day="2026-02-03")
+    assert cell.status().step.command.split()[1] == "verify"  # a geometric model has no posterior to monitor
+    cell.plan(count=4, candidates=60)
     again, _ = cell.verify()
     assert again.settings.fit_frame
     assert again.verdict == "better"
