@@ -4,7 +4,7 @@
 
 Arms, cameras, boards and noise are those of `camera.py`, with fixed intrinsics. mixed: a fixed camera with the
 board on the flange, two cameras, and a camera with 10 positions of a tracker (0.02 mm), each compared with its parts.
-wrong: 5 % of the corners off by 5 px and three images with two joint values exchanged. bent: a board bowed by 0.3 mm,
+wrong: 5 % of the corners off by 5 px and three images with two joint values swapped. bent: a board bowed by 0.3 mm,
 taken as flat and with its flatness stated. gears: joints with two harmonics of 0.015 deg, 150 images, the
 hybrid compared with the geometry alone. Errors are those of the target's position over 400 postures of the whole joint
 space after the best rigid alignment, pooled over draws.

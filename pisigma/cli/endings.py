@@ -39,7 +39,7 @@ PluginFiles = Annotated[
     typer.Option(
         "--plugin",
         metavar="FILE",
-        help="Python file of plug-ins to run with your permissions. It registers sensors, features and others. May be "
+        help="Python file that registers sensors, features or other plug-ins; it runs with your permissions. May be "
         "repeated.",
     ),
 ]

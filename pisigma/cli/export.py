@@ -80,7 +80,7 @@ Frames = Annotated[
 ToleranceMm = Annotated[
     float | None,
     typer.Option(
-        help="With --program, largest distance of the tool from a straight line between way points [mm]. [default: 0.1]"
+        help="With --program, largest distance of the tool from a straight line between waypoints [mm]. [default: 0.1]"
     ),
 ]
 CountsPerTurn = Annotated[

@@ -263,9 +263,10 @@ class _SameJoints:
         )
 
     def repeat_probability(self, values: RowValues, deviation: float) -> Float64[Tensor, " rows"]:
-        """Return the probability that a repeated measurement reads the same, to the coarsest rounding at these joints.
+        """Return the probability that a repeated measurement gives the same reading.
 
-        Rows without a reading, as at sockets, are compared by their joint values.
+        The rounding is the coarsest one among the rows with the same joint values. Rows without a reading, as at
+        sockets, are compared by their joint values.
         """
         steps = torch.stack(
             [one.scatter_reduce(0, self.group, one, "amax")[self.group] for one in values.steps.unbind(1)], 1

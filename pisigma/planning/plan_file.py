@@ -51,7 +51,7 @@ class PlanDocument(Section):
         model: folder of the model that was planned for, relative to this file; None for a nominal robot.
         settings: settings of the plan, with paths relative to this file.
         cell: surroundings of the robot.
-        way_points: way points between poses where the straight joint motion is not free.
+        way_points: waypoints between poses where the straight joint motion is not free.
     """
 
     poses: str

@@ -1,4 +1,4 @@
-"""Order of the poses of a plan, way points between them, and the duration."""
+"""Order of the poses of a plan, waypoints between them, and the duration."""
 
 import math
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ from pisigma.robot.description import Robot
 FIRST_STAGE = 20
 """Poses of the first calibration of a robot that was never measured; fewer do not determine its unknowns."""
 MAX_REORDERINGS = 8
-"""Attempts to avoid blocked motions by another order; the remaining ones get way points."""
+"""Attempts to avoid blocked motions by another order; the remaining ones get waypoints."""
 MIN_SPEED = 1e-3
 """[rad/s or m/s] Smallest valid speed."""
 MAX_SETTLING = 3600.0
@@ -64,11 +64,11 @@ class Pace:
 
 @dataclass(frozen=True, eq=False)
 class Tour:
-    """An order of poses with way points.
+    """An order of poses with waypoints.
 
     Attributes:
         order: indices of the poses in their order, without those that no free motion leads to.
-        before: way points before each pose in this order [rad or m]; mostly none.
+        before: waypoints before each pose in this order [rad or m]; mostly none.
         left_out: indices of the poses that no free motion was found to.
         seconds: total duration [s].
     """
@@ -89,7 +89,7 @@ def plan_tour(
     """Order poses for a short duration, with collision-free motions.
 
     Nearest neighbour, then 2-opt (Croes 1958, Operations Research 6(6)), on the duration of the straight joint motions.
-    Blocked motions are made expensive and the order is improved again; those that remain get way points.
+    Blocked motions are made expensive and the order is improved again; those that remain get waypoints.
 
     Args:
         motions: motions of the robot in its surroundings, which keep the results of earlier tours.
@@ -191,7 +191,7 @@ def _two_opt(seconds: Float64[np.ndarray, "poses poses"], order: np.ndarray, fix
 def _with_way_points(
     motions: Motions, poses: Float64[Tensor, "poses dof"], order: np.ndarray, pace: Pace, fixed_start: bool
 ) -> Tour:
-    """Insert way points where a motion is blocked, and leave out poses that cannot be reached."""
+    """Insert waypoints where a motion is blocked, and leave out poses that cannot be reached."""
     stops, before, left_out = [int(order[0])], [poses[:0]], []
     for stop in order[1:].tolist():
         points = motions.points_between(poses[stops[-1]], poses[stop])

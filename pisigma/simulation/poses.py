@@ -118,7 +118,7 @@ class JointsRandom(Section):
         if len(kept) < self.count:
             raise RecipeError(
                 option="joints_random",
-                expected=f"{self.count} of {len(many)} draws within the stops of robot '{robot.name}'",
+                expected=f"{self.count} of {len(many)} random joint vectors within the stops of robot '{robot.name}'",
                 value=len(kept),
                 remedy="narrow the ranges",
             )

@@ -220,7 +220,7 @@ class TouchCandidatesSection(Section):
         raise RecipeError(
             option="touches",
             expected=f"{share[lacking]} touches of robot '{robot.name}' along {'xyz'[lacking]} of jig "
-            f"'{placement.name}' (of {MAX_DRAWS * CANDIDATES_PER_DRAW} drawn)",
+            f"'{placement.name}' (of {MAX_DRAWS * CANDIDATES_PER_DRAW} random ones)",
             value=len(of_axis[lacking]),
             remedy="place the jig nearer, allow more tilt, choose a smaller margin, travel or shaft, or another branch",
         )

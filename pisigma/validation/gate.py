@@ -63,7 +63,7 @@ def check_rows(
     """Check rows before they are used, against a model or a nominal robot.
 
     Against a nominal robot, or the mean robot of a fleet, the spread of the positions is compared with that of the
-    robot's poses; with at least 6 rows other robots of the catalogue are tried, with 8 signs and exchanges of joint
+    robot's poses; with at least 6 rows other robots of the catalogue are tried, with 8 signs and swaps of joint
     columns, with 12 the rows are used for a calibration that is checked by `CHECKS`, and with 24 for setup faults.
 
     Args:

@@ -63,7 +63,7 @@ class Calibration(AbstractModelResult):
         result: the geometric or hybrid calibration that the model was built from.
         rows: measurements that it was calibrated with.
         validation: errors of held-out rows; None without a validation.
-        test: errors of the rows of the set "test"; None without such rows.
+        test: errors of the rows of the set "test"; None without rows of this set.
         held_out: all held-out rows with their errors, as in the model folder; None without a validation.
         summary: all figures.
         texts: description, and what was not validated.

@@ -40,7 +40,7 @@ def plan_text(planned: Plan, files: Sequence[Path]) -> ResultText:
     short = rows if len(rows) <= MAX_POINTS else [*rows[:: -(-len(rows) // MAX_POINTS)], rows[-1]]
     weak = ["What the expected error will mostly come from:", *(f"- {line}" for line in planned.weak)]
     points = sum(map(len, planned.stored.way_points))
-    lines = [planned.candidates.sentence, f"The poses are joined with {counted(points, 'way point')}."]
+    lines = [planned.candidates.sentence, f"The poses are joined with {counted(points, 'waypoint')}."]
     return ResultText(
         _plan_verdict(planned, files[0]),
         tuple(planned.warnings),
@@ -52,7 +52,7 @@ def plan_text(planned: Plan, files: Sequence[Path]) -> ResultText:
         ),
         (
             *([table_block(f"{title}, all", columns, rows)] if len(short) < len(rows) else []),
-            sentences("candidates and way points", lines),
+            sentences("candidates and waypoints", lines),
         ),
         (f"Written to {', '.join(map(str, files))}.",),
     )

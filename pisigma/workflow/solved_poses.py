@@ -182,7 +182,7 @@ def _too_few(
         low, high = (", ".join(f"{value * 1e3:g}" for value in region.box[i::2]) for i in (0, 1))
         where = f"between ({low}) and ({high}) mm"
     return IdentificationError(
-        f"robot '{ik.model.robot.name}' reaches only {have} of {drawn} poses drawn {where} ({reasons})",
+        f"robot '{ik.model.robot.name}' reaches only {have} of {drawn} random poses {where} ({reasons})",
         value={name: number for name, number in refused.items() if number},
         remedy="choose a region that it reaches, in the base frame of the model, with the orientations of the measured "
         "poses",

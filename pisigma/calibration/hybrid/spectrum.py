@@ -50,7 +50,7 @@ def find_spectral_lines(
 
 
 def log_number_of_orders(joints: int) -> float:
-    """Return the logarithm of the number of orders of all joints, any of which may be a line."""
+    """Return the logarithm of the number of candidate lines: every order of every joint."""
     return math.log(joints * HIGHEST)
 
 

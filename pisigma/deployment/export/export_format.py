@@ -27,7 +27,7 @@ class ExportRequest:
         config: configuration of the arm, for Cartesian targets of FANUC.
         program: existing program whose targets are rewritten.
         frames: file of frames and tools that `program` does not state.
-        tolerance_mm: largest deviation of the tool from a straight line between way points of `program` [mm].
+        tolerance_mm: largest deviation of the tool from a straight line between waypoints of `program` [mm].
         counts_per_turn: comma-separated encoder counts per turn of every joint, for counts.
         present_counts: comma-separated present counts of the controller, for counts.
         payload_kg: mass that the robot carries [kg].

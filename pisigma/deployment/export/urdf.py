@@ -72,7 +72,7 @@ def text_in_urdf(
         comments: sentences for the head of the file.
 
     Returns:
-        The text; None without such a file.
+        The text; None without a URDF file.
     """
     source = _SOURCE.search(nominal.source)
     like = request.like or (request.model / DRAWING if nominal.urdf else None)

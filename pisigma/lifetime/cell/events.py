@@ -9,7 +9,7 @@ from pisigma.measurement.dates import EXPECTED_DATE, is_date
 EventKind = Literal[
     "instrument", "tool", "mastering", "encoder", "collision", "maintenance", "firmware", "accepted"
 ]
-"""What was changed: the instrument (tracker, camera, board) was set up again, the tool or reflector was exchanged, or
+"""What was changed: the instrument (tracker, camera, board) was set up again, the tool or reflector was replaced, or
 the arm was changed (see `ARM_EVENTS`). "firmware" and "accepted", by a person, are only recorded."""
 ARM_EVENTS: frozenset[EventKind] = frozenset(("mastering", "encoder", "collision", "maintenance"))
 """Events after which earlier sessions no longer describe the arm."""

@@ -133,7 +133,7 @@ class Session:
 
     @property
     def unobservable(self) -> tuple[str, ...]:
-        """Sentences on the joints whose zeros the rows do not determine, and why."""
+        """Sentences about the joints whose zeros the rows do not determine, and why."""
         last, sentences = len(self.observable), []
         for number, observable in enumerate(self.observable, 1):
             frame = {1: "base", last: "tool"}.get(number, "")
@@ -366,7 +366,7 @@ def _zeros(solved: _Solved) -> JointZeros:
 
 
 def _joints(solved: _Solved) -> list[DriftGroup]:
-    """Return the groups of all joint zeros with the prior `ZERO_PRIOR`."""
+    """Return the groups of all joint zeros, with their prior set to `ZERO_PRIOR`."""
     groups = solved.problem.groups
     return [replace(group, size=ZERO_PRIOR) for group in groups if group.what.startswith("joint ")]
 

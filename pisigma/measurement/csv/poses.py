@@ -113,7 +113,7 @@ def _bounded_lines(file: TextIO, source: str) -> Iterator[str]:
         line = file.readline(_MAX_LINE)
         if len(line) == _MAX_LINE:
             raise MeasurementError(
-                expected=f"a line of less than {_MAX_LINE:,} characters",
+                expected=f"a line of fewer than {_MAX_LINE:,} characters",
                 at=Place(source, number),
                 remedy="write one line per pose",
             )

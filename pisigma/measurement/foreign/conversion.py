@@ -124,7 +124,7 @@ def check_complete(mapping: FileMapping) -> None:
             at=mapping.place_of(lacking[0]),
             option="--unit",
             value=",".join(likely.values()),
-            remedy=f"state it, --unit {','.join(likely.values())} if that is right, or "
+            remedy=f"state the unit with --unit {','.join(likely.values())}, if that is right, or with "
             f"--map '{mapping.key(lacking[0])}={first.text}'",
         )
 

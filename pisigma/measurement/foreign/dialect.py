@@ -208,7 +208,7 @@ def _check_decimal(dialect: Dialect, rows: Sequence[tuple[int, list[str]]], sour
     k = is_mixed.index(True) if any(is_mixed) else next(k for k, ours in enumerate(signed) if ours)
     number, cell = signed[k][0]
     raise MeasurementError(
-        f"'{cell}' may have decimals or a group of thousands",
+        f"'{cell}' is ambiguous: '{sign}' may be a decimal or a thousands separator",
         at=Place(source, number, k + 1),
         value=cell,
         remedy="state --set decimal=point or --set decimal=comma",

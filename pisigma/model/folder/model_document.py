@@ -153,7 +153,7 @@ def write_document(text: str, compiled_sha256: str | None, path: Path) -> None:
 
     Args:
         text: text from `document_text`.
-        compiled_sha256: hash of `compiled.npz`; None without such a file.
+        compiled_sha256: hash of `compiled.npz`; None without this file.
         path: file to write.
     """
     text = f"{text}compiled_sha256: {compiled_sha256 or 'null'}\n"

@@ -30,7 +30,7 @@ Motion = Callable[[Values], tuple[Any, Any]]
 
 
 class ControllerValues:
-    """Solver in DH values, with wider limits than the controller's, that wraps the solutions into the latter.
+    """Solver in DH values, with wider limits than the controller's, that wraps the solutions into these.
 
     Full turns of coupled joints change several of the controller's values. If a solution cannot be wrapped into the
     controller's limits, the other branches are tried, in their order or with `near` the nearest first.

@@ -1,4 +1,4 @@
-"""Straight joint motions between poses: whether they are collision-free, and way points where they are not."""
+"""Straight joint motions between poses: whether they are collision-free, and waypoints where they are not."""
 
 import torch
 from jaxtyping import Bool, Float64
@@ -9,9 +9,9 @@ from pisigma.planning.surroundings.arm_in_surroundings import ArmInSurroundings
 MIN_STEP = 1e-3
 """[m] Motion of any point of the robot below which a piece is not divided further, nor below half the clearance."""
 MAX_WAY_POINTS_TRIED = 60
-"""Poses that are tried as way points of a motion; ten times as many pairs of them are tried."""
+"""Poses that are tried as waypoints of a motion; ten times as many pairs of them are tried."""
 BATCH = 20
-"""Way points that are checked together."""
+"""Waypoints that are checked together."""
 SAMPLE = 50
 """Poses to which motions are checked, to find which of two poses is harder to leave."""
 
@@ -21,7 +21,7 @@ class Motions:
 
     Attributes:
         arm: the robot in its surroundings.
-        pool: joint values of free poses that can be way points [rad or m].
+        pool: joint values of free poses that can be waypoints [rad or m].
     """
 
     def __init__(self, arm: ArmInSurroundings, pool: Float64[Tensor, "free dof"]) -> None:
@@ -44,7 +44,7 @@ class Motions:
     def points_between(
         self, start: Float64[Tensor, " dof"], end: Float64[Tensor, " dof"]
     ) -> Float64[Tensor, "points dof"] | None:
-        """Return the way points of a motion, empty if it is free without; None if none were found."""
+        """Return the waypoints of a motion, empty if it is free without; None if none were found."""
         if bool(self.are_free(start[None], end[None])):
             return self.pool[:0]
         (pair,) = zip(_names(start[None]), _names(end[None]), strict=True)
@@ -93,16 +93,16 @@ def way_points(
     end: Float64[Tensor, " dof"],
     pool: Float64[Tensor, "poses dof"],
 ) -> Float64[Tensor, "points dof"] | None:
-    """Find one or two way points that make a motion collision-free, the shortest way among those that are tried.
+    """Find one or two waypoints that make a motion collision-free, the shortest way among those that are tried.
 
     Args:
         arm: the robot in its surroundings.
         start: joint values at the start [rad or m].
         end: joint values at the end [rad or m].
-        pool: joint values of free poses that can be way points [rad or m].
+        pool: joint values of free poses that can be waypoints [rad or m].
 
     Returns:
-        Joint values of the way points [rad or m]; None if no way was found.
+        Joint values of the waypoints [rad or m]; None if no way was found.
     """
     to, back = _travel(arm, start, pool), _travel(arm, pool, end)
     tried = (to + back).argsort()[:MAX_WAY_POINTS_TRIED]

@@ -47,7 +47,7 @@ def all_branches(
     Args:
         arms: the arms, for limits.
         form: the nominal arm with canonical twists.
-        T: wanted T_base_tool.
+        T: target T_base_tool.
         only: the only requested branch, -1 for all, NEAREST for all with the nearest joint values of those that do
             not reach the pose. The first joint value of other branches is NaN.
         rounding: relative size below which a cosine beyond 1 or a length is a rounding error of T.

@@ -35,7 +35,7 @@ def solve_pose(description: Record, memory: Record, has_near: bool, branch: int,
 
     Args:
         description: the calibrated arm.
-        memory: working memory, with the checked wanted T_base_tool and the reference joint values.
+        memory: working memory, with the checked target T_base_tool and the reference joint values.
         has_near: whether there are reference joint values.
         branch: index of the requested branch, or -1.
         out: `(2 · dof + 5,)`, output: commanded and nominal joint values [rad or m], distance [m] and angle [rad]

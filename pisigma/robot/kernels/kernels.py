@@ -47,7 +47,7 @@ def run(
         memory: struct of working memory.
         task: SOLVE, EVALUATE or FORWARD.
         rows: number of poses.
-        T: `(rows, 4, 4)`: wanted poses (input) or poses (output).
+        T: `(rows, 4, 4)`: target poses (input) or poses (output).
         near: `(near_rows, dof)`: reference joint values [rad or m].
         near_rows: 0, 1 or the number of poses.
         approach: `(approach_rows, dof)`: approach directions of the joints, +1 or -1, 0 if not stated.

@@ -88,10 +88,10 @@ DESCRIPTION = np.dtype([(part, np.dtype(fields)) for part, fields in zip(PARTS, 
 
 MEMORY = np.dtype(
     _floats(
-        pose=(4, 4),  # the wanted pose
+        pose=(4, 4),  # the target pose
         near=(DOF,),  # reference joint values
         approach=(DOF,),  # approach direction of every joint: +1 or -1, 0 if not stated
-        rounding=(),  # relative size of rounding errors of the wanted poses
+        rounding=(),  # relative size of rounding errors of the target poses
         solution=(DOF,),  # joint values found
         nominal=(DOF,),  # those of the nominal arm
         axes=(DOF, 6),  # of the joints: direction and origin
@@ -136,7 +136,7 @@ MEMORY = np.dtype(
         upright=(3,),
         bend=(3,),
         lateral=(3,),
-        level=(4, 4),  # the wanted pose, modified for the nominal arm
+        level=(4, 4),  # the target pose, modified for the nominal arm
         candidates=(CANDIDATES, DOF),  # starts, the most promising first
         rank=(CANDIDATES,),
         preferred=(DOF,),  # preferred joint values of a redundant arm

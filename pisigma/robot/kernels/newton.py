@@ -31,7 +31,7 @@ def newton(description: Record, memory: Record, arm: int, T: Array, q: Array, to
         description: the calibrated arm.
         memory: working memory.
         arm: index of the arm.
-        T: wanted T_base_tool.
+        T: target T_base_tool.
         q: initial joint values [rad or m], overwritten by the best found.
         tolerance: residuals at convergence [m and rad].
     """

@@ -42,10 +42,10 @@ def _near_pi(R: Array, x: float, y: float, z: float, cosine: float) -> tuple[flo
 
 @kernel
 def pose_error(wanted: Array, actual: Array, R: Array, error: Array) -> None:
-    """Compute the displacement from the actual to the wanted pose in the base frame.
+    """Compute the displacement from the actual to the target pose in the base frame.
 
     Args:
-        wanted: `(3 or 4, 4)`: wanted pose.
+        wanted: `(3 or 4, 4)`: target pose.
         actual: `(3, 4)`: actual pose.
         R: `(3, 3)`, overwritten.
         error: `(6,)`, output: translation [m] and rotation vector [rad].

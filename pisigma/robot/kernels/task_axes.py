@@ -103,7 +103,7 @@ def in_task_axes(arms: Record, memory: Record, T: Array, error: Array, raw: bool
     Args:
         arms: the arms.
         memory: working memory with the reached pose `T`, the Jacobian `J` and the joint axes.
-        T: wanted T_base_tool.
+        T: target T_base_tool.
         error: output of `pose_error`; overwritten.
         raw: whether to keep all axes, without weights.
     """
@@ -130,7 +130,7 @@ def in_task_axes(arms: Record, memory: Record, T: Array, error: Array, raw: bool
 
 @kernel
 def _relative(reached: Array, T: Array, R: Array) -> None:
-    """Write the rotation from the reached to the wanted tool frame, in the former."""
+    """Write the rotation from the reached to the target tool frame, expressed in the reached frame."""
     for i in range(3):
         for k in range(3):
             R[i, k] = reached[0, i] * T[0, k] + reached[1, i] * T[1, k] + reached[2, i] * T[2, k]
@@ -298,7 +298,7 @@ def free_orientations(memory: Record) -> int:
 
 @kernel
 def orient(memory: Record, index: int) -> None:
-    """Write the wanted pose with the tool rotated about its free axes into `memory.level`."""
+    """Write the target pose with the tool rotated about its free axes into `memory.level`."""
     free = free_orientations(memory) > _TURNS
     turn, axis = index * 2 * math.pi / _TURNS, max(memory.pivot, 0)
     if free:

@@ -82,7 +82,8 @@ class RandomViews(Section):
                 return far_apart(torch.stack(chosen), self.count)
         raise RecipeError(
             option="poses",
-            expected=f"{needed} of {MAX_ATTEMPTS * needed} drawn views of the board that robot '{robot.name}' reaches",
+            expected=f"at least {needed} of {MAX_ATTEMPTS * needed} random views of the board within reach of robot "
+            f"'{robot.name}'",
             value=len(chosen),
             remedy="check the positions of board and camera, and the distances",
         )

@@ -65,7 +65,7 @@ def diagnosed_lengths(
 ) -> tuple[tuple[Diagnostic, ...], tuple[SetupFault, ...]]:
     """Report what is wrong with rows without positions whose errors are too large for wear.
 
-    The hypotheses are a reversed sign of every joint, an exchange of two neighbouring joints, a moved zero of every
+    The hypotheses are a reversed sign of every joint, a swap of two neighbouring joints, a moved zero of every
     joint and another tool, one at a time.
 
     Args:

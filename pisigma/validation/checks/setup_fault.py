@@ -107,7 +107,7 @@ def size_of_positions(robot: Robot, rows: Measurements) -> Iterator[Diagnostic]:
 
 
 def joint_columns(robot: Robot, rows: Measurements) -> Iterator[Diagnostic]:
-    """Try a reversed sign of every joint and an exchange of two neighbours, with base and tool fitted each time.
+    """Try a reversed sign of every joint and a swap of two neighbours, with base and tool fitted each time.
 
     With at least `MIN_ROWS_NOMINAL` rows, `find_nominal_robot_faults` tries many more hypotheses instead.
     """

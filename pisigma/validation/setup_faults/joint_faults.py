@@ -24,7 +24,7 @@ GRADIANS = 0.9
 ZERO_TOLERANCE = math.radians(0.5)
 """[rad] A zero closer than this to a multiple of 90 deg is set to that multiple."""
 MAX_ORDERS = 5040
-"""Number of orders of seven joints; with more joints, only pairs are exchanged."""
+"""Number of orders of seven joints; with more joints, only pairs are swapped."""
 MAX_ZEROS = 4**7
 SCREEN_ROWS = 32
 """Rows that every map is tried on."""
@@ -75,7 +75,7 @@ class JointMaps:
 
 
 def signs_and_exchanges(dof: int) -> JointMaps:
-    """List a reversed sign of every joint, and every exchange of two neighbouring joints."""
+    """List a reversed sign of every joint, and every swap of two neighbouring joints."""
     signs = JointMaps.scaled(1 - 2 * torch.eye(dof, dtype=torch.float64))
     order = torch.arange(dof).repeat(dof - 1, 1)
     pairs = torch.stack([torch.arange(dof - 1), torch.arange(1, dof)], 1)
@@ -94,7 +94,7 @@ def reversed_signs(dof: int) -> JointMaps:
 
 
 def other_orders(dof: int) -> JointMaps:
-    """List all orders of the joints; for more than seven joints, the exchanges of two."""
+    """List all orders of the joints; for more than seven joints, the swaps of two."""
     orders = torch.arange(dof).repeat(math.comb(dof, 2), 1)
     pairs = torch.combinations(torch.arange(dof))
     orders = orders.scatter(1, pairs, pairs.flip(1))
@@ -114,7 +114,7 @@ def coupled_joints(dof: int) -> JointMaps:
 
 
 def other_units(robot: Robot) -> JointMaps:
-    """List exchanged units: degrees and radians (or gradians) of revolute joints, mm and m of prismatic ones."""
+    """List swapped units: degrees and radians (or gradians) of revolute joints, mm and m of prismatic ones."""
     turning = [1.0 if turns else 0.0 for turns in robot.revolute]
     rows = [[GRADIANS ** (sign * turns) for turns in turning] for sign in (1, -1) if any(turning)]
     for revolute, per_unit in ((True, math.degrees(1)), (False, 1e3)):

@@ -99,7 +99,7 @@ def _check_frames(calibrated: str, compared: str) -> None:
         raise RecipeError(
             expected=f"the calibrated frame '{calibrated}'",
             value=compared,
-            remedy="name the same frame in both",
+            remedy="name the same frame in measurements and held_out",
         )
 
 

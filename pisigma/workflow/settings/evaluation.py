@@ -95,7 +95,7 @@ class EvaluationSettings:
     Attributes:
         limits: limits of acceptance of every model, except the references.
         fit_frame: fit the sensor's frame to these rows, because the sensor was moved. Needs 6 poses or more.
-        fit_tool: fit the reflector's position to these rows, because it was exchanged. Needs 6 poses or more.
+        fit_tool: fit the reflector's position to these rows, because it was replaced. Needs 6 poses or more.
         bootstrap: how confidence intervals are computed.
         cameras: cameras and boards, for files of detected board corners.
         socket_distances: known distance between two sockets [m], such as */0,*/1,50. An asterisk stands for the same

@@ -17,7 +17,7 @@ class VerificationSettings:
 
     Attributes:
         fit_frame: fit the sensor's frame to these rows, because the sensor was moved. Needs 6 poses or more.
-        fit_tool: fit the reflector's position to these rows, because it was exchanged. Needs 6 poses or more.
+        fit_tool: fit the reflector's position to these rows, because it was replaced. Needs 6 poses or more.
         seed: random seed of the resamples for confidence intervals.
         cameras: cameras and boards, for files of detected board corners.
         socket_distances: known distance between two sockets [m], such as */0,*/1,50. An asterisk stands for the same

@@ -1,4 +1,4 @@
-"""Programs of planned poses wait at poses and pass way points."""
+"""Programs of planned poses wait at poses and pass waypoints."""
 
 from pathlib import Path
 
@@ -22,7 +22,7 @@ PLAN = StoredPlan(
     torch.tensor([4, 7]),
     (Q[:0], Q[1:3]),
 )
-STOPS = ["pose 1", "way point", "way point", "pose 2"]
+STOPS = ["pose 1", "waypoint", "waypoint", "pose 2"]
 
 
 @pytest.mark.parametrize(

@@ -238,7 +238,10 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
     def _prior_scales(
         self, view: SensorView, off: Tensor, covariance: Tensor, refine: bool
     ) -> Float64[Tensor, " groups"]:
-        """Estimate the prior scales; during a search together with the step they lead to, for linear residuals."""
+        """Estimate the prior scales; during a search, jointly with the step that they lead to.
+
+        Residuals are linearised for that.
+        """
         floor, prior = (
             1.0 if self.prior_sizes == "widened" else SMALLEST_PRIOR,
             (self._prior, self.prior_group),

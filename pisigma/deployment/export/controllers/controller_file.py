@@ -74,7 +74,7 @@ class Convention:
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """Sentences on what the file was tested against, and on the frames of its poses."""
+        """Sentences about what the file was tested against, and about the frames of its poses."""
         tried = (
             f"Reading and writing were tested against {self.published}."
             if self.published

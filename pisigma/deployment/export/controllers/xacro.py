@@ -50,7 +50,7 @@ FILE = ControllerFile(
     suffixes=(".xacro",),
     source="Written from the published description (wiki.ros.org/xacro), and expanded with the package xacro 2.1.1.",
     relies=(
-        "The origins of the joints are properties, so one calibration can be exchanged for another; `xacro FILE` "
+        "The origins of the joints are properties, so one calibration can be replaced by another; `xacro FILE` "
         "expands it. The link calibrated_frame is the frame of the poses, calibrated_tool the tool.",
     ),
     text=write_overlay,

@@ -1,4 +1,4 @@
-"""Planned poses as programs that stop at every pose for its measurement and use way points around obstacles."""
+"""Planned poses as programs that stop at every pose for its measurement and use waypoints around obstacles."""
 
 from pathlib import Path
 
@@ -30,7 +30,7 @@ def planned_program(plan: StoredPlan, path: Path) -> str:
     q, labels, waits = [], [], []
     for order, pose, points in zip(plan.numbers, plan.q, plan.way_points, strict=True):
         q += [*points, pose]
-        labels += ["way point"] * len(points) + [f"pose {order}"]
+        labels += ["waypoint"] * len(points) + [f"pose {order}"]
         waits += [0.0] * len(points) + [plan.settings.settling_s]
     title = f"{len(plan.q)} planned poses of robot {robot.name}, by pisigma {__version__}."
     heading = [title, TEST, COUNTING.format(robot=robot.name)]

@@ -1,4 +1,4 @@
-"""Correction of a program's targets, with way points where a move would leave its line or arc."""
+"""Correction of a program's targets, with waypoints where a move would leave its line or arc."""
 
 import difflib
 import math
@@ -30,9 +30,9 @@ _LINE_NUMBER = re.compile(r"(?m)^ *\d+:")
 STRAIGHT = 1e-4
 """Sine of the angle between the chords to the second and the third point below which they define no arc."""
 
-COLLINEAR = "the points of the arc are collinear or coincide, so it has no way points"
+COLLINEAR = "the points of the arc are collinear or coincide, so it has no waypoints"
 OTHER_ORIENTATION = (
-    "the orientation at the via point of the arc is not between start and end, so it has no way points"
+    "the orientation at the via point of the arc is not between start and end, so it has no waypoints"
 )
 
 Points = Float64[Tensor, "arcs 3"]
@@ -45,7 +45,7 @@ class CorrectedProgram:
     Attributes:
         text: text of the program.
         statuses: line and status of every target.
-        way_points: number of inserted way points.
+        way_points: number of inserted waypoints.
         left: line and reason of everything that was left unchanged.
         largest_shift: largest shift of a target [m].
         branches: names of the branches of the corrected targets.
@@ -97,7 +97,7 @@ class ProgramCorrection:
     Attributes:
         solver: corrected inverse kinematics of the model.
         branch: branch to use instead of the trained one.
-        tolerance: largest deviation of the tool from a straight line or an arc between way points [m].
+        tolerance: largest deviation of the tool from a straight line or an arc between waypoints [m].
     """
 
     solver: CorrectedIK
@@ -175,11 +175,11 @@ class ProgramCorrection:
         return _round(start, via, end, _steps(start, end, length))[0]
 
     def way_points(self, move: PathMove, there: CommandedPoses) -> list[Frame] | str:
-        """Return the way points of a move, see `PathMove.way_points`, or the reason why it is not split."""
+        """Return the waypoints of a move, see `PathMove.way_points`, or the reason why it is not split."""
         if not there.all_reached:
-            return f"the {_kind(move)} has poses that are not reached, so it has no way points"
+            return f"the {_kind(move)} has poses that are not reached, so it has no waypoints"
         if len(there.branches) > 1:
-            return f"the {_kind(move)} changes from one branch to another, so it has no way points"
+            return f"the {_kind(move)} changes from one branch to another, so it has no waypoints"
         whole = stride = len(there.T) - 1
         least = 2 if move.circular else 1
         while stride > least and _off(there.T, stride, move.circular) > self.tolerance:
@@ -195,7 +195,7 @@ def _kind(move: PathMove) -> str:
 def _edits(
     reached: Sequence[tuple[Pose, CommandedPoses]], cuts: Sequence[tuple[PathMove, list[Frame]]]
 ) -> list[Edit]:
-    """Return the edits of targets and way points; the last way point of an arc replaces its via point."""
+    """Return the edits of targets and waypoints; the last waypoint of an arc replaces its via point."""
     added = [edit for move, way in cuts for edit in move.way_points(way)]
     replaced = [edit.span for edit in added if edit.span[0] < edit.span[1]]
     corrected = [Edit(pose.span, pose.write(there.T[0])) for pose, there in reached]
@@ -237,7 +237,7 @@ def _distance(start: Float64[Tensor, "1 4 4"], end: Float64[Tensor, "1 4 4"]) ->
 
 
 def _turn(start: Float64[Tensor, "ways 4 4"], end: Float64[Tensor, "ways 4 4"]) -> Float64[Tensor, "ways 3"]:
-    """Compute rotation vectors from start to end poses [rad], in the frames of the former."""
+    """Compute rotation vectors from start to end poses [rad], in the frames of the start poses."""
     return rotation_vector(start[:, :3, :3].mT @ end[:, :3, :3])
 
 

@@ -139,7 +139,7 @@ def _exported(
             *_warnings(corrected, str(request.program)),
         ),
         summary=f"Program with {reached} corrected targets (by {shift:.3f} mm at most) "
-        f"and {corrected.way_points} way points",
+        f"and {corrected.way_points} waypoints",
         shortfall=_shortfall(corrected, str(request.program)),
         shown=diff,
     )

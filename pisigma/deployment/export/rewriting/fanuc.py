@@ -122,7 +122,7 @@ class _Reader:
             cuttable = isinstance(pose, Pose) and (circular or move["kind"] == "L")
             if move["kind"] == "A":
                 self.scan.leave_unchanged(
-                    line.start(), "arcs of A have no way points, only their poses are corrected"
+                    line.start(), "arcs of A have no waypoints, only their poses are corrected"
                 )
             cut = partial(self._way_points, line, move, match, len(names)) if cuttable and match else None
             self.scan.move(line.start(), pose, frame, tool, cut, circular)
@@ -156,7 +156,7 @@ class _Reader:
         count: int,
         poses: Sequence[Frame],
     ) -> list[Edit]:
-        """Return lines and positions of way points, with the speed of the move and continuous termination."""
+        """Return lines and positions of waypoints, with the speed of the move and continuous termination."""
         speed = re.match(r"(?:\s*:\s*P\[[^\]]*\])?\s*(\S+)", move["rest"])
         span = _VALUES.match(self.text, match.start("body"))
         assert span is not None

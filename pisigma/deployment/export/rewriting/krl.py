@@ -61,7 +61,7 @@ _FRAMES_OF_MOVES = ("$BASE", "$TOOL")
 
 
 FIXED_TOOL = "the tool is fixed and the workpiece moves"
-STATED_ARC = "the angle of the arc or its orientation is stated, so it has no way points"
+STATED_ARC = "the angle of the arc or its orientation is stated, so it has no waypoints"
 
 
 def scan_krl(text: str, stated: FrameFile) -> ScannedProgram:
@@ -84,7 +84,7 @@ _FRAMES = re.compile(
 def scan_krl_data(text: str, stated: FrameFile) -> ScannedProgram:
     """Scan a data list (`.dat`): points of inline forms, whose frame and tool are in the `FDAT` of their name.
 
-    The moves are in the program that belongs to it, so they have no way points.
+    The moves are in the program that belongs to it, so they have no waypoints.
 
     Args:
         text: text of the data list.
@@ -196,7 +196,7 @@ class _Reader:
         return self.names.target(name[0]) if name else COMPUTED
 
     def _way_points(self, move: re.Match[str], operands: Sequence[int], poses: Sequence[Frame]) -> list[Edit]:
-        """Return straight moves or arcs to all way points, with approximate positioning."""
+        """Return straight moves or arcs to all waypoints, with approximate positioning."""
         start = self.scan.line_start(move.start())
         word = self.text[start : operands[0]]
         smooth = "" if re.match(r"\s*S(LIN|CIRC)", word, re.IGNORECASE) else " C_DIS"

@@ -173,11 +173,11 @@ class _Reader:
             circular, cut = index == 1, None
             if isinstance(pose, Pose) and (circular or kind[1].upper() == "L"):
                 if timed:
-                    self.scan.leave_unchanged(match.start(), "the move has a time, so it has no way points")
+                    self.scan.leave_unchanged(match.start(), "the move has a time, so it has no waypoints")
                 elif circular and _TURNING.search(self.text):
                     self.scan.leave_unchanged(
                         match.start(),
-                        "the module states the orientation along arcs, so they have no way points",
+                        "the module states the orientation along arcs, so they have no waypoints",
                     )
                 else:
                     cut = partial(self._way_points, match, spans, count, pose)
@@ -208,7 +208,7 @@ class _Reader:
         pose: Pose,
         poses: Sequence[Frame],
     ) -> list[Edit]:
-        """Repeat the move before itself for every way point, as fly-by points."""
+        """Repeat the move before itself for every waypoint, as fly-by points."""
         start = self.scan.line_start(move.start())
         text, (begin, end) = self.scan.text, pose.span
         literal = _TARGET.search(text, text.rfind("[", 0, begin))

@@ -70,7 +70,7 @@ class PathMove:
         via: via point of an arc; None for a straight move, or if the program does not state it.
         end: target of the move.
         circular: whether it is an arc.
-        way_points: function that returns the edits for way points, which are poses of the end's tool in the end's
+        way_points: function that returns the edits for waypoints, which are poses of the end's tool in the end's
             frame. An arc is split into arcs: the poses alternate between via and end points, and the last one is the
             new via point of the move itself.
     """
@@ -204,7 +204,7 @@ class Scan:
             pose: the pose, or the reason why it is not understood; likewise `frame` and `tool`.
             frame: frame of the pose, relative to the origin of the robot description.
             tool: tool, relative to the last row of the robot description.
-            way_points: function for the way points of a straight move or an arc, see `PathMove`.
+            way_points: function for the waypoints of a straight move or an arc, see `PathMove`.
             circular: whether it is the end of an arc, whose via point is the previous target.
         """
         start, via = self._last_two if circular else (self._last_two[1], None)
@@ -285,7 +285,7 @@ def _stripped(text: str, start: int, end: int) -> tuple[int, int]:
 
 
 def groups_of(poses: Sequence[_Item], count: int) -> list[Sequence[_Item]]:
-    """Group way points, or their names, by inserted move: one each, or two for arcs; see `PathMove`."""
+    """Group waypoints, or their names, by inserted move: one each, or two for arcs; see `PathMove`."""
     return [poses[first : first + count] for first in range(0, len(poses) - count + 1, count)]
 
 

@@ -43,7 +43,7 @@ _TURNING = re.compile(r"mode\s*=\s*(?!0$)")
 _Span = tuple[int, int]
 
 BLEND = 1e-3
-"""[m] Blend radius at way points, smaller if they are close together."""
+"""[m] Blend radius at waypoints, smaller if they are close together."""
 
 
 def scan_urscript(text: str, stated: FrameFile) -> ScannedProgram:
@@ -112,16 +112,16 @@ class _Reader:
     def _cut(
         self, call: re.Match[str], spans: Sequence[_Span], operands: Sequence[_Span], pose: Pose | str
     ) -> Callable[[Sequence[Frame]], list[Edit]] | None:
-        """Return the function that inserts way points, or None if that is not possible."""
+        """Return the function that inserts waypoints, or None if that is not possible."""
         rest = [self.text[slice(*span)] for span in spans[len(operands) :]]
         if isinstance(pose, str) or call["name"] == "servoc":
             return None
         if any(re.match(r"t\s*=", argument) for argument in rest):
-            self.scan.leave_unchanged(call.start(), "the move has a time, so it has no way points")
+            self.scan.leave_unchanged(call.start(), "the move has a time, so it has no waypoints")
             return None
         if sum("=" not in argument for argument in rest) > 2 or any(map(_TURNING.match, rest)):
             self.scan.leave_unchanged(
-                call.start(), "an unnamed radius or a mode is stated, so the move has no way points"
+                call.start(), "an unnamed radius or a mode is stated, so the move has no waypoints"
             )
             return None
         return partial(self._way_points, call, spans, operands, rest, pose)
@@ -155,7 +155,7 @@ class _Reader:
         pose: Pose,
         poses: Sequence[Frame],
     ) -> list[Edit]:
-        """Repeat the move before itself for every way point, with a small blend radius."""
+        """Repeat the move before itself for every waypoint, with a small blend radius."""
         start, count = self.scan.line_start(call.start()), len(operands)
         ends = torch.stack([*poses[count - 1 :: count], pose.T])[:, :3, 3]
         nearest = float((ends[1:] - ends[:-1]).norm(dim=-1).min())

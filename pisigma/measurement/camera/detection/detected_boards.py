@@ -78,7 +78,7 @@ class DetectedBoards:
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """Sentences on the images and those that are left out; requires a usable board."""
+        """Sentences about the used and the left-out images; requires a usable board."""
         boards = self.boards
         count = sum(len(board.corners) for board in boards.values())
         used = [one for one in self.images if one.name in boards]

@@ -106,7 +106,7 @@ class ThreeParallelArm(AbstractClosedForm):
     """Arm with twists 90, 0, 0, 90, -90 deg (each modulo 180 deg) whose axes 5 and 6 meet, such as UR and RB robots.
 
     Axis 2 is normal to the plane in which joints 2 to 4 move. The height of the intersection of axes 5 and 6 above this
-    plane determines joint 1, the direction of axis 2 in the wanted frame determines joints 5 and 6; two links in the
+    plane determines joint 1, the direction of axis 2 in the target frame determines joints 5 and 6; two links in the
     plane remain (Hawkins 2013, "Analytic inverse kinematics for the Universal Robots UR-5/UR-10 arms", here for any a_1
     to a_4, d_1 to d_6, a_6, offsets, directions, base and tool).
 
@@ -164,7 +164,7 @@ class ThreeParallelArm(AbstractClosedForm):
         return [t_1, arm.first, t_3, t_234 - arm.first - t_3, t_5, t_6], arm.reached & reachable, singular
 
     def _solve_wrist(self, R: Columns, t_1: Tensor, wrist: Scalar) -> tuple[Tensor, Tensor, Tensor]:
-        """Solve joints 5 and 6, and |s_5|: axis 2 in the wanted frame is `(s_5 c_6, -s_5 s_6, c_5)`."""
+        """Solve joints 5 and 6, and |s_5|: axis 2 in the target frame is `(s_5 c_6, -s_5 s_6, c_5)`."""
         cos, sin = torch.cos(t_1), torch.sin(t_1)
         x, y, z = (sin * R[j][0] - cos * R[j][1] for j in range(3))
         sine = torch.hypot(x, y)

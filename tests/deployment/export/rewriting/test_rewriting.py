@@ -64,7 +64,7 @@ def test_the_real_tool_reaches_the_programmed_poses(language, arm, tmp_path):
 
 @pytest.mark.parametrize("language", LANGUAGES, ids=lambda language: language.suffix)
 def test_straight_moves_stay_straight(language, arm, tmp_path):
-    """Between way points a controller moves on the line between commanded poses, and the real tool nearly so."""
+    """Between waypoints a controller moves on the line between commanded poses, and the real tool nearly so."""
     request = program(language, arm, tmp_path)
     exported = export_model("targets", request)
     after = scanned(request.out, request.frames)
