@@ -39,8 +39,8 @@ PluginFiles = Annotated[
     typer.Option(
         "--plugin",
         metavar="FILE",
-        help="Python file that registers sensors, features or other plug-ins; it runs with your permissions. May be "
-        "repeated.",
+        help="Python file of plug-ins, run with your permissions. It can register sensors, features or other "
+        "extensions. May be repeated.",
     ),
 ]
 
