@@ -68,11 +68,13 @@ class DualRegression(AbstractRegression):
         # Both matrices are symmetric, so the trace of their product needs only one triangle.
         traces = self.K @ (P.flatten().index_select(0, self._pairs) * self._counts)
         determined[prior.classes :] = prior.sizes[prior.classes :].square() * traces
+        # Parameters without a prior have precision 0; their constant term is left out.
         stated = precision[:active]
         evidence = float(self.y @ alpha) + log_det - float(stated[stated > 0].log().sum())
+        # |V| contains the noise of all values; repeated poses count as fewer independent ones (`SensorCount`).
         evidence += log_noise(self.sensors, noise) - float(variance.log().sum())
-        misfit = self._by_sensor((variance * alpha).square())
         # Residuals are variance · alpha; the leverage of a value is 1 - variance · P_ii.
+        misfit = self._by_sensor((variance * alpha).square())
         used = self._by_sensor(1 - variance * P.diagonal())
         return Posterior(x, -0.5 * evidence, prior, noise, square, determined, misfit, used)
 

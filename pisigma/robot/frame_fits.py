@@ -69,6 +69,7 @@ class MeasuredPoses:
         """Root mean square distance [m] from the mean pose, as `squared_errors` measures it."""
         off = (self.position - self.position.mean(0)).square().sum(-1).mean()
         R = self.rotation[self.has_rotation]
+        # Mean of |R - mean R|² / 2, because |R|² = 3.
         turn = (3 - R.mean(0).square().sum()) / 2 if len(R) else torch.zeros(())
         return float((off + self.lever**2 * turn * self.has_rotation.double().mean()).sqrt())
 
@@ -83,10 +84,12 @@ def best_base(
     T: Float64[Tensor, "*batch rows 4 4"], measured: MeasuredPoses
 ) -> Float64[Tensor, "*batch 4 4"]:
     """Find the transform X that minimises the distance of `X T` to measured poses (weighted orthogonal Procrustes)."""
+    # The best shift makes the mean positions equal, so only the rotation remains to be found.
     middle, wanted = T[..., :3, 3].mean(-2, keepdim=True), measured.position.mean(0)
     M = (measured.position - wanted).mT @ (T[..., :3, 3] - middle)
     if bool(measured.has_rotation.any()):
         weight = measured.has_rotation.to(T)[:, None, None]
+        # As in `squared_errors`, every column of a rotation counts as a point of weight lever² / 2.
         M = M + measured.lever**2 / 2 * (weight * measured.rotation @ T[..., :3, :3].mT).sum(-3)
     R = nearest_rotation(M)
     return transform(R, wanted - (R @ middle.mT)[..., 0])
@@ -97,6 +100,7 @@ def best_tool(
 ) -> Float64[Tensor, "*batch 4 4"]:
     """Find the transform X that minimises the distance of `T X` to measured poses; a translation without rotations."""
     R = T[..., :3, :3]
+    # `T X` is separable: its position depends on the tool's translation only, its rotation on the tool's rotation.
     offset = (R.mT @ (measured.position - T[..., :3, 3])[..., None])[..., 0].mean(-2)
     if not bool(measured.has_rotation.any()):
         return transform(torch.eye(3).to(T), offset)
@@ -196,6 +200,7 @@ def _affine_solution(
 ) -> tuple[Float64[Tensor, "*batch rows 13"], Float64[Tensor, "*batch 13 3"]]:
     """Solve `position = A X` for the regressors `A = (vec(R), p, 1)`; returns both."""
     A = torch.cat([T[..., :3, :3].flatten(-2), T[..., :3, 3], torch.ones_like(T[..., :1, 0])], -1)
+    # Columns of equal size make the ridge below independent of units.
     size = A.square().sum(-2, keepdim=True).sqrt().clamp(min=1e-12)
     scaled = A / size
     normal = scaled.mT @ scaled + 1e-12 * torch.eye(A.shape[-1]).to(A)
@@ -226,6 +231,7 @@ def _affine_base_and_tool(
         R_base = bases.take_along_dim(best, -3)[..., 0, :, :]
         R_tool = Z.take_along_dim(best, -3)[..., 0, :, :].mT
     elif T.shape[-3] > AFFINE_UNKNOWNS:
+        # In `position = R_base p + ...` the coefficients of p are those of R_base.
         R_base = nearest_rotation(_affine_solution(T, position)[1][..., 9:12, :].mT)
     else:
         R_base = best_base(T, measured)[..., :3, :3]
@@ -256,6 +262,7 @@ def frame_columns(
     eye, none = torch.eye(3).to(T).expand(R_flange.shape), torch.zeros_like(R_flange)
     weight = measured.lever * measured.has_rotation.to(T)[..., None]
     turn = rotation_vector(measured.rotation @ (R_flange @ tool[..., :3, :3]).mT)
+    # The tool turns about its origin, in the axes of the flange, which does not move the position.
     J = torch.cat([eye, -skew(arm), R_flange, none], -1)
     J = torch.cat([J, weight[..., None] * torch.cat([none, eye, none, R_flange], -1)], -2)
     return J, torch.cat([measured.position - arm - base[..., :3, 3], weight * turn], -1)
@@ -290,6 +297,7 @@ def base_and_tool_step(
         J, residual = J - along @ (along.mT @ J), residual - along @ (along.mT @ residual)
     J, residual = J.flatten(-3, -2), residual.flatten(-3, -2)
     normal = J.mT @ J
+    # The constant keeps unknowns without effect solvable, such as the tool's rotation without orientations.
     scale = normal.diagonal(dim1=-2, dim2=-1) * damping[..., None] + 1e-12 * T.shape[-3]
     step: Tensor = torch.linalg.solve(normal + torch.diag_embed(scale), J.mT @ residual)
     return step[..., 0]

@@ -272,7 +272,9 @@ def forecast_of(records: Sequence[Record], limit_mm: float) -> Forecast:
     passed = bool(rms[-1] > limit_mm)
     date = earliest = None
     if not passed and bool((rms > 0).all()) and len(torch.unique(months)) >= MIN_SESSIONS:
+        # The RMS of n values has a relative standard deviation of sqrt(1 / 2n).
         spread = rms * torch.tensor([math.sqrt(0.5 / one.session.values) for one in records]).double()
+        # A jump must exceed the usual noise between sessions; the fit of the line estimates its scatter below.
         usual = rms * torch.tensor([_log_spread(one) for one in records]).double()
         columns = torch.stack([torch.ones_like(months), months - months[-1]], 1)
         events, _ = Series(rms, usual.square().diag()).events(columns[:, :1], columns[:, 1:])
@@ -286,6 +288,7 @@ def forecast_of(records: Sequence[Record], limit_mm: float) -> Forecast:
         deviation *= max(
             1.0, math.sqrt(float(left) / spare)
         )  # sessions scatter more than their few rows explain
+        # Without a significant rise there is no date; the earliest one has the largest slope of the 95 % interval.
         if slope > NORMAL_95 * deviation:
             date = _after(last.date, (limit_mm - now) / slope)
             earliest = _after(last.date, (limit_mm - now) / (slope + NORMAL_95 * deviation))

@@ -236,6 +236,7 @@ def solve(motion: Motion, T: Float64[np.ndarray, "rows 4 4"], start: Values) -> 
         A, b = J * weight[:, None], error * weight
         normal = A.mT @ A
         # Damping vanishes with the error, so convergence is quadratic near the solution.
+        # The constant keeps the normal matrix regular for redundant axes and at a singularity.
         damping = 1e-3 * (b * b).sum(-1) + 1e-15
         normal += damping[:, None, None] * np.eye(q.shape[1])
         step = np.linalg.solve(normal, (A.mT @ b[..., None]))[..., 0]

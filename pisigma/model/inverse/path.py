@@ -15,14 +15,15 @@ from pisigma.robot.kinematics.tolerances import LIMIT_TOLERANCE
 Array = Any
 
 JUMP = 1e6
-"""[rad²] Cost of a jump, more than the sum of squared joint motions of any path."""
+"""[rad²] Cost of a jump, as much as 100 million joint motions of 0.1 rad."""
 _LIMITS = 1e8
-"""[rad²] Cost of a pose outside joint limits."""
+"""[rad²] Cost of a pose outside joint limits, as much as 100 jumps."""
 _NONE = 1e12
-"""[rad²] Cost of a pose without a solution."""
+"""[rad²] Cost of a pose without a solution, as much as 10,000 poses outside joint limits."""
 _SMALL = 0.1
 """[rad or m] A smaller step on one branch never counts as a jump."""
 CHUNK = 8_192
+"""Steps whose transitions between all pairs of branches are in memory at the same time."""
 _TURN = 2 * math.pi
 _OTHER_BRANCH = 1e4
 """[rad²] Cost of a start on another branch than the requested one; less than that of a jump."""
@@ -315,8 +316,8 @@ def poses_halfway(T: Array, U: Array) -> Array:
 def choose_branches(q: Array, status: Array, jumps: Array, first: Array, revolute: Array) -> Array:
     """Choose the branch of every pose by dynamic programming over all branches.
 
-    The sum of squared joint motions, plus `JUMP` for every jump, is minimised. A pose outside joint limits costs more
-    than any number of jumps, and one without a solution more than any number of poses outside joint limits.
+    The sum of squared joint motions, plus `JUMP` for every jump, is minimised. A pose outside joint limits costs as
+    much as 100 jumps, and one without a solution as much as 10,000 poses outside joint limits.
 
     Args:
         q: `(poses, branches, dof)` solutions [rad or m], NaN where there is none.

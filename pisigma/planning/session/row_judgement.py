@@ -170,6 +170,7 @@ class RowModel:
         # The row itself must not enter the scale that it is compared with.
         left = CLASS_VALUES + len(kept) - determined - torch.where(self.kept, count, 0.0)
         misfit = self.misfit
+        # At least 1, the scale of the class: rows that happen to agree must not make the limits stricter.
         whole = ((CLASS_VALUES + misfit - torch.where(self.kept, square, 0.0)) / left).clamp(min=1.0)
         # For rows that do not count, the scale is at least the one that left-out errors of the kept rows show.
         each = float((CLASS_VALUES + square.sum()) / (CLASS_VALUES + count.sum()))

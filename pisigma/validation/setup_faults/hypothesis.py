@@ -202,15 +202,19 @@ def _shifted_from_a_row(
     for at_start, end in ((True, chosen[:third] - MARGIN), (False, chosen[-third:] - MARGIN)):
         base, tool = best_base_and_tool(T[0][end], measured.select(end))
         errors = {shift: measured.squared_errors(base @ poses @ tool) for shift, poses in T.items()}
+        # Errors on both sides add up: the best change has the largest sum of gains from it to the end.
+        # With base and tool of the last rows, the rows before the change are shifted, so the sign reverses.
         for shift in SHIFTS:
             gain = errors[0] - errors[shift] if at_start else errors[shift] - errors[0]
             change = int(gain.flip(0).cumsum(0).flip(0).argmax())
             place = rows.place(int(inner[change]))
             where = f"after about {place}" if at_start else f"before about {place}"
             clause = f"{where} the joint values are shifted by {_count(shift)} relative to the measurements"
+            # The change is between two rows, hence the half.
             kept = chosen[(chosen - inner[change] + 0.5).abs() > abs(shift)]
             behind = kept >= inner[change]
             q = torch.where((behind == at_start)[:, None], rows.q[kept + shift], rows.q[kept])
+            # More complex than a shift of all rows (1.0), which is chosen if both explain as much.
             yield q, measured.select(kept - MARGIN), Cause("rows", clause, _ADVICE, 1.5)
 
 
@@ -292,10 +296,12 @@ def _turned(
     T = forward_kinematics(robot, q)
     J = joint_jacobian(robot, q)[1]
     axis = J[:, 3:, joint]
+    # axis × (axis × lever) is minus the lever normal to the axis: foot is the point of the axis nearest to the flange.
     foot = T[:, :3, 3] + torch.linalg.cross(axis, J[:, :3, joint])
     tip, R = T @ tool, base[:3, :3]
     position = (measured.position - base[:3, 3]) @ R
     pairs = [(tip[:, :3, 3] - foot, position - foot, torch.ones(len(q)).double())]
+    # `squared_errors` has |dR|² / 2, about the angle squared, so every column weighs lever² / 2.
     weight = measured.has_rotation * measured.lever**2 / 2
     pairs += [(tip[:, :3, k], measured.rotation[:, :, k] @ R, weight) for k in range(3)]
     sine, cosine = torch.zeros(2, len(q)).double()
@@ -304,6 +310,7 @@ def _turned(
         cosine = cosine + w * ((a * b).sum(-1) - (axis * a).sum(-1) * (axis * b).sum(-1))
     turned = q.clone()
     turned[:, joint] += torch.atan2(sine, cosine)
+    # For positions the tip's lever is parallel to the measured one after the turn, and only the direction is used.
     shift = torch.linalg.cross(axis, position - foot)
     return turned, torch.cat([shift @ R.mT, axis @ R.mT], 1)
 

@@ -323,6 +323,7 @@ def two_populations(residuals: Float64[np.ndarray, "rows components"]) -> Mixtur
     """
     rows, components = residuals.shape
     centred = residuals - residuals.mean(0)
+    # Without a floor the likelihood is unbounded: a population could shrink to one row or to a plane.
     floor = (FLOOR * np.abs(centred).max() + 1e-15) ** 2 * np.eye(components)
     # Start with the two halves along the first principal axis: two clusters separate along it.
     key = centred @ np.linalg.svd(centred, full_matrices=False)[2][0]
@@ -340,6 +341,7 @@ def two_populations(residuals: Float64[np.ndarray, "rows components"]) -> Mixtur
     # Log likelihoods of both models without their common constant; the BIC counts mean, covariance and share below.
     alone = np.linalg.slogdet(centred.T @ centred / rows + floor)[1]
     gain = np.logaddexp(*logs).sum() + rows / 2 * (alone + components)
+    # Scatters within a factor of 2 (geometric mean) count as equal: then the smaller population is the odd one.
     alike = abs(determinants[1] - determinants[0]) < 2 * components * math.log(2.0)
     far = int(np.argmin(counts) if alike else np.argmax(determinants))
     return Mixture(

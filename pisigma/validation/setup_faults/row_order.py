@@ -192,6 +192,7 @@ class _Search:
                 yield candidate.from_row(self._best_step(self.rows.clipped, candidate))
                 time = (2 * np.arange(count) + 1) / count - 1
                 for degree in DEGREES:
+                    # A constant motion is one of base or tool, which the calibration fits.
                     yield replace(candidate, course=legvander(time, degree)[:, 1:])
 
     def frame_starts(self, candidate: _Candidate) -> Iterator[_Candidate]:
@@ -298,6 +299,7 @@ class _Search:
         """
         if fit.effective > MAX_USED * self.rows.values:
             return -math.inf
+        # Neither correlated values nor repeats of a configuration bring more information than one pose each.
         values = max(
             min(
                 (self.rows.values - self.rows.effective_parameters) / values_per_independent,
@@ -305,11 +307,13 @@ class _Search:
             ),
             1.0,
         )
+        # Without a motion, at the candidate's scale: residuals of the calibration or of a refit, whichever cost less.
         before = min(
             float(fit.robust_costs(residual).sum())
             for residual in (self.rows.residual, self.fit_without_motion.after)
         )
         left = float(fit.robust_costs(fit.after).sum()) / max(before, 1e-300)
+        # Liang et al. 2008, eq. 6, with g = values and left = 1 - R².
         gain = (values - len(fit.motion)) * math.log1p(values) - values * math.log1p(values * min(left, 1.0))
         return gain / 2 - math.log(fit.candidate.candidates_tried)
 
@@ -338,6 +342,7 @@ class _Search:
         candidate = fit.candidate
         weight = fit.weights[candidate.index]
         left = (weight * fit.after[candidate.index] ** 2).sum(0) / np.maximum(weight.sum(0), 1e-300)
+        # Base and tool absorb the mean shift in a fit without the motion, so only its variance adds to the errors.
         parts = zip(_sensors(fit.shifts.var(0)[None]), _sensors(left[None]), strict=True)
         factor = max(math.sqrt(1 + added.sum() / max(rest.sum(), 1e-300)) for added, rest in parts)
         course = candidate.course - candidate.course[0]
@@ -349,6 +354,7 @@ class _Search:
             names = self.rows.problem.space.frames
             anchor = self.rows.result.solved.setup.anchors.bases[candidate.number].cpu().numpy()
             center = self._center(self.rows.number[candidate.index[candidate.first or 0 :]])
+            # The base turns about its anchor, so the shift of the measured points is that of their centre.
             lever = anchor[:3, :3].T @ (center - anchor[:3, 3])
             shift = anchor[:3, :3] @ (shift + np.cross(turn, lever))
         return Motion(

@@ -275,6 +275,7 @@ def _angle_disagreement(
 
     def excess(logarithm: float) -> float:
         """Compute observed minus expected change of the lengths for a factor `exp(logarithm)` on the variance."""
+        # With A = I and R = diag(gain) / factor: cov x - cov y = diag(share), and moved = x - y.
         share = gain.clip(0.0) / (gain.clip(0.0) + math.exp(logarithm))
         moved = share * lengths - (1 - share) * angles * math.exp(-logarithm)
         return float(moved @ Q @ moved) - float(Q.diagonal() @ share)
@@ -282,6 +283,7 @@ def _angle_disagreement(
     low, high = 0.0, math.log(MAX_DISAGREEMENT)
     if excess(low) <= 0:
         return 1.0
+    # Bisection keeps excess > 0 at low, and excess <= 0 at high unless that is the largest factor.
     while high - low > 1e-3:
         middle = (low + high) / 2
         low, high = (middle, high) if excess(middle) > 0 else (low, middle)

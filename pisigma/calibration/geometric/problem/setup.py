@@ -351,6 +351,7 @@ def coordinate_change(
         # Shifts of a base are in the axes of its anchor.
         change[first : first + 3, first : first + 3] = anchor[:3, :3]
         # Angular velocities agree in both coordinates up to the anchor; the axes convert them from and to rpy.
+        # At a pitch of 90 deg roll and yaw have the same axis: the pseudo-inverse then returns the smallest changes.
         back = torch.linalg.pinv(turning_axes(user_bases[k, 3:]), rtol=1e-9)
         turns = slice(first + 3, first + 6)
         change[turns, turns] = back @ anchor[:3, :3] @ turning_axes(bases[k, 3:])
@@ -359,6 +360,7 @@ def coordinate_change(
         back = torch.linalg.pinv(turning_axes(user_tools[k, 3:]), rtol=1e-9)
         change[first : first + 3, first : first + 3] = back @ turning_axes(tools[k, 3:])
     for own in space.unknowns:
+        # Shifts of points are in the axes of their frame's anchor too.
         if own.has_point:
             for k, number in enumerate(setup.unknown_frames[own.name].tolist()):
                 first = space.indices_of(own.name).start + len(own.columns) * k

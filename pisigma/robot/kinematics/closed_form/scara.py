@@ -22,8 +22,10 @@ def scara_branches(form: Any, P: Any, only: int, rounding: float, q: Any) -> Non
     """Compute both branches; see `AbstractClosedForm.compiled`."""
     nearest = only < -1
     margin = NEAREST_MARGIN if nearest else 0.0
+    # Four joints cannot tilt the tool: its axis must be parallel to axis 1 and point the same way.
     if not nearest and (math.hypot(P[0, 2], P[1, 2]) > max(TILT_TOLERANCE, rounding) or P[2, 2] <= 0):
         return
+    # The second link is the diagonal from axis 2 to axis 4, across the rows of joints 2 and 3.
     x, y = form.a[1] + form.a[2] * math.cos(form.theta[2]), form.a[2] * math.sin(form.theta[2])
     length, angle = math.hypot(x, y), math.atan2(y, x)
     zero = form.sign[0] * form.offset[0]
@@ -37,6 +39,7 @@ def scara_branches(form: Any, P: Any, only: int, rounding: float, q: Any) -> Non
             t_2 = elbow - angle
             q[branch, 0], q[branch, 1] = first, t_2
             q[branch, 2] = P[2, 3] - form.d[0] - form.d[1]
+            # All axes are parallel, so the angles of the revolute joints add up to that of the tool.
             q[branch, 3] = math.atan2(P[1, 0], P[0, 0]) - first - t_2 - form.theta[2]
 
 
@@ -79,6 +82,7 @@ class Scara(AbstractClosedForm):
         arm = solve_two_link(x, y, rows.a[0], length, signs[0], rows.variable_at_zero(0), self.margin)
         t_2 = arm.elbow - angle
         d_3 = z - rows.d[0] - rows.d[1]
+        # All axes are parallel, so the angles of the revolute joints add up to that of the tool.
         t_4 = torch.atan2(r_10, r_00) - arm.first - t_2 - rows.theta[2]
         tilt = torch.hypot(r_02, r_12)
         upright = (tilt <= max(TILT_TOLERANCE, rounding(x.dtype))) & (r_22 > 0)

@@ -43,9 +43,11 @@ def _spherical_joints(form: Any, P: Any, t: Any, only: int, branch: int, roundin
     m_01 = xx * P[0, 1] + xy * P[1, 1] + xz * P[2, 1]
     m_10, m_11 = s_1 * P[0, 0] - c_1 * P[1, 0], s_1 * P[0, 1] - c_1 * P[1, 1]
     sine = math.hypot(m_02, m_12)
+    # A straight wrist leaves joint 4 free: its joint value is then 0 on the `no_flip` branch.
     t_4 = form.sign[3] * form.offset[3] if sine <= rounding else math.atan2(-m_12, -m_02)
     t_5 = math.atan2(sine, m_22)
     cos, sin = math.cos(t_4), math.sin(t_4)
+    # The row of RotZ(-t_4) · M without t_5 is (s_6, c_6, 0): exact for a straight wrist too.
     t_6 = math.atan2(cos * m_10 - sin * m_00, cos * m_11 - sin * m_01)
     for flip in range(2):
         if only < 0 or only == branch + flip:
@@ -59,6 +61,7 @@ def spherical_wrist_branches(form: Any, P: Any, only: int, rounding: float, q: A
     """Compute all eight branches; see `AbstractClosedForm.compiled`."""
     a, d, nearest = form.a, form.d, only < -1
     margin = NEAREST_MARGIN if nearest else 0.0
+    # The second link is the diagonal from axis 3 to the wrist centre, at (a_3, d_4) in the axes of row 3.
     forearm, side = math.hypot(a[2], d[3]), d[1] + d[2]
     scale = abs(a[0]) + abs(a[1]) + forearm + abs(side)
     far, azimuth, reachable, on_axis = first_joint(
@@ -72,8 +75,11 @@ def spherical_wrist_branches(form: Any, P: Any, only: int, rounding: float, q: A
         shoulder, elbow = 1.0 - 2 * (pair // 2), 1.0 - 2 * (pair % 2)
         ahead = shoulder * far
         t_1 = azimuth - math.atan2(side, ahead)
+        # On axis 1 atan2 of two rounding errors is arbitrary: back is half a turn from the azimuth.
         if shoulder < 0 and on_axis:
             t_1 = azimuth - math.pi
+        # The twist of -90 deg turns y of the plane downwards: a positive elbow angle puts the elbow above the line.
+        # Reaching backwards and a negative first link each reverse that.
         upwards = shoulder * elbow * math.copysign(1.0, a[1])
         zero = form.sign[1] * form.offset[1]
         t_2, bend, reached = two_link(
@@ -140,6 +146,7 @@ class SphericalWristArm(AbstractClosedForm):
         x, y, z = p
         zero = self.rows.variable_at_zero(0)
         t_1, ahead, beside_axis = solve_first_joint(x, y, d_2 + d_3, scale, shoulder, zero, self.margin)
+        # The second link is the diagonal (a_3, d_4); the plane's y axis points downwards, hence d_1 - z.
         arm = solve_two_link(
             ahead - a_1,
             d_1 - z,
@@ -165,8 +172,10 @@ class SphericalWristArm(AbstractClosedForm):
         m_22 = -s_23 * along[2] - c_23 * R[2][2]
         sine = torch.hypot(m_0[2], m_1[2])
         t_4 = torch.atan2(-m_1[2], -m_0[2])
+        # A straight wrist leaves joint 4 free: its joint value is then 0 on the `no_flip` branch.
         t_4 = torch.where(sine <= rounding(sine.dtype), self.rows.variable_at_zero(3), t_4)
         cos, sin = torch.cos(t_4), torch.sin(t_4)
+        # The row of RotZ(-t_4) · M without t_5 is (s_6, c_6, 0): exact for a straight wrist too.
         t_6 = torch.atan2(cos * m_1[0] - sin * m_0[0], cos * m_1[1] - sin * m_0[1])
         flip = math.pi / 2 * (1 - wrist)
         return [t_4 + flip, wrist * torch.atan2(sine, m_22), t_6 + flip], sine < singular_tolerance(

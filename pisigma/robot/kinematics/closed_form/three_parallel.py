@@ -37,8 +37,10 @@ def _plane_joints(
     t_1, t_5, t_6 = t
     a, y, zero = form.a, P[2, 3] - form.d[0], form.sign[1] * form.offset[1]
     along, across, b = a[3], -form.d[4], abs(a[2])
+    # A straight wrist leaves joint 6 free: if axis 4 is out of reach, it turns until axis 4 just is within reach.
     for attempt in range(2):
         s_6, c_6 = math.sin(t_6), math.cos(t_6)
+        # Axis 5 in the wanted pose, turned back by joint 6, is (s_234, -c_234) in the plane of joints 2 to 4.
         u, v = -s_6 * P[0, 0] - c_6 * P[0, 1], -s_6 * P[1, 0] - c_6 * P[1, 1]
         t_234 = math.atan2(math.cos(t_1) * u + math.sin(t_1) * v, s_6 * P[2, 0] + c_6 * P[2, 1])
         c, s = math.cos(t_234), math.sin(t_234)
@@ -46,12 +48,14 @@ def _plane_joints(
         first, bend, reached = two_link(x_4, y_4, a[1], b, upwards, zero, rounding, margin)
         turned = attempt == 1 or not free or math.hypot(along, across) == 0.0
         if reached or (margin > 0.0 and turned):
+            # `two_link` takes a positive length: a negative second link points the other way.
             t_3 = bend - (math.pi if a[2] < 0 else 0.0)
             q[0], q[1], q[2] = t_1, first, t_3
             q[3], q[4], q[5] = t_234 - first - t_3, t_5, t_6
             return
         if turned:
             return
+        # Law of cosines: distance of axis 4 from axis 2, and the hand angle at which the elbow just reaches it.
         hand, far = math.hypot(along, across), math.hypot(x, y)
         turn = t_234 + math.atan2(across, along) - math.atan2(y, x)
         nearest, farthest = (
@@ -61,7 +65,9 @@ def _plane_joints(
         square = far * far + hand * hand - 2 * far * hand * math.cos(turn)
         square = min(max(square, nearest * nearest), farthest * farthest)
         cosine = (far * far + hand * hand - square) / (2 * (far if far > 0 else 1.0) * hand)
+        # Axis 4 stays on its side of the line from axis 2 to the wrist: of both solutions this turns less.
         change = math.copysign(math.acos(min(max(cosine, -1.0), 1.0)), math.sin(turn)) - turn
+        # The pose fixes t_234 + t_6 if axis 6 is parallel to axis 4 (t_5 = 0), and t_234 - t_6 if it is opposite (pi).
         t_6 -= math.copysign(1.0, math.cos(t_5)) * change
 
 
@@ -81,9 +87,11 @@ def three_parallel_branches(form: Any, P: Any, only: int, rounding: float, q: An
             continue
         ahead = far * (1.0 - 2 * shoulder)
         t_1 = azimuth + math.atan2(side, ahead)
+        # On axis 1 atan2 of two rounding errors is arbitrary: back is half a turn from the azimuth.
         if shoulder == 1 and on_axis:
             t_1 = azimuth + math.pi
         s_1, c_1 = math.sin(t_1), math.cos(t_1)
+        # Axis 2, the normal of the plane, in the wanted frame: (s_5 c_6, -s_5 s_6, c_5) determines joints 5 and 6.
         u, v, w = s_1 * P[0, 0] - c_1 * P[1, 0], s_1 * P[0, 1] - c_1 * P[1, 1], s_1 * P[0, 2] - c_1 * P[1, 2]
         sine = math.hypot(u, v)
         for wrist in range(2):
@@ -96,6 +104,8 @@ def three_parallel_branches(form: Any, P: Any, only: int, rounding: float, q: An
             for elbow in range(2):
                 branch = 4 * shoulder + 2 * elbow + wrist
                 if only < 0 or only == branch:
+                    # y of the plane points up: a positive elbow angle puts the elbow below the line outwards.
+                    # Reaching backwards and a negative first link each reverse that.
                     upwards = -(1.0 - 2 * shoulder) * (1.0 - 2 * elbow) * math.copysign(1.0, a[1])
                     ahead_of_2, out = ahead - a[0], q[branch]
                     _plane_joints(form, P, (t_1, t_5, t_6), ahead_of_2, upwards, free, margin, rounding, out)
@@ -152,12 +162,14 @@ class ThreeParallelArm(AbstractClosedForm):
         t_1, ahead, reachable = solve_first_joint(p[0], p[1], side, self._scale, shoulder, zero, self.margin)
         t_5, t_6, straight = self._solve_wrist(columns, t_1, wrist)
         x, y = ahead - self.rows.a[0], p[2] - self.rows.d[0]
+        # The plane's y axis points up; see `three_parallel_branches` for the sign.
         upwards = -math.copysign(1.0, self.rows.a[1]) * shoulder * elbow
         arm, t_234 = self._solve_plane(columns, t_1, t_6, x, y, upwards)
         free = (straight <= rounding(x.dtype)) & ~arm.reached
         if free.any():
             t_6 = torch.where(free, self._turned_wrist(t_234, t_5, t_6, x, y), t_6)
             arm, t_234 = self._solve_plane(columns, t_1, t_6, x, y, upwards)
+        # `solve_two_link` takes a positive length: a negative second link points the other way.
         t_3 = arm.elbow - (math.pi if self.rows.a[2] < 0 else 0.0)
         tolerance = singular_tolerance(x.dtype)
         singular = arm.singular | (ahead.abs() < tolerance * self._scale) | (straight < tolerance)
@@ -208,4 +220,5 @@ class ThreeParallelArm(AbstractClosedForm):
         safe = torch.where(far > 0, far, torch.ones_like(far))
         cosine = ((far * far + hand * hand - wanted) / (2 * safe * hand)).clamp(-1, 1)
         change = torch.copysign(torch.acos(cosine), torch.sin(turn)) - turn
+        # The pose fixes t_234 + t_6 if axis 6 is parallel to axis 4 (t_5 = 0), and t_234 - t_6 if it is opposite (pi).
         return t_6 - torch.sign(torch.cos(t_5)) * change

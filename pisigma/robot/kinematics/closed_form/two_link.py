@@ -73,6 +73,7 @@ def solve_first_joint(
     on_axis = torch.hypot(x, y) <= rounding(x.dtype) * scale
     azimuth = torch.where(on_axis, free, torch.atan2(y, x))
     angle = azimuth - torch.atan2(torch.full_like(ahead, side), ahead)
+    # On axis 1 ahead is 0 or -0, and atan2 of two rounding errors arbitrary: back is half a turn from the azimuth.
     back = azimuth - math.copysign(math.pi, side)
     return torch.where(on_axis & ahead.signbit(), back, angle), ahead, reached
 
@@ -98,8 +99,10 @@ def solve_two_link(
     cosine = (x * x + y * y - (a * a + b * b)) / (2 * a * b)
     reached = cosine.abs() <= 1 + rounding(x.dtype)
     cosine = cosine.clamp(margin - 1, 1 - margin)
+    # (1 - c)(1 + c) keeps its digits near a stretched arm, where 1 - c² cancels.
     sine = elbow_sign * ((1 - cosine) * (1 + cosine)).sqrt()
     on_axis = torch.hypot(x, y) <= rounding(x.dtype) * (abs(a) + b)
+    # Angle from the first link to the line to the point.
     free = torch.atan2(b * sine, a + b * cosine)
     first = torch.where(on_axis, first_when_free, torch.atan2(y, x) - free)
     return TwoLink(first, torch.atan2(sine, cosine), reached, sine.abs() < singular_tolerance(x.dtype))
@@ -113,9 +116,11 @@ def two_link(
     cosine = (x * x + y * y - (a * a + b * b)) / (2 * a * b)
     reached = abs(cosine) <= 1 + rounding
     cosine = min(max(cosine, margin - 1), 1 - margin)
+    # (1 - c)(1 + c) keeps its digits near a stretched arm, where 1 - c² cancels.
     sine = elbow_sign * math.sqrt((1 - cosine) * (1 + cosine))
     first = free
     if math.sqrt(x * x + y * y) > rounding * (abs(a) + b):
+        # The second angle is that from the first link to the line to the point.
         first = math.atan2(y, x) - math.atan2(b * sine, a + b * cosine)
     return first, math.atan2(sine, cosine), reached
 
