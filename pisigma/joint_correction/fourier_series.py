@@ -79,6 +79,7 @@ def add_series(arms: Any, correction: Any, first: int, memory: Any, q: Any) -> N
         for k in range(harmonics - 1, -1, -1):
             start = first + 1 + 2 * MAX_JOINTS * k + j
             a, b = values[start : start + 4], values[start + MAX_JOINTS : start + MAX_JOINTS + 4]
+            # s and c are b_k+1 of the sines and of the cosines, u and v are b_k+2.
             u_0, s_0 = s_0, t_0 * s_0 + (a[0] - u_0)
             u_1, s_1 = s_1, t_1 * s_1 + (a[1] - u_1)
             u_2, s_2 = s_2, t_2 * s_2 + (a[2] - u_2)
@@ -107,6 +108,7 @@ def add_series_slope(arms: Any, correction: Any, first: int, memory: Any, q: Any
         for k in range(harmonics - 1, -1, -1):
             start, times = first + 1 + 2 * MAX_JOINTS * k + j, k + 1.0
             a, b = values[start : start + 4], values[start + MAX_JOINTS : start + MAX_JOINTS + 4]
+            # The derivative of a sin(k θ) + b cos(k θ) is k a cos(k θ) - k b sin(k θ).
             u_0, s_0 = s_0, t_0 * s_0 - (times * b[0] + u_0)
             u_1, s_1 = s_1, t_1 * s_1 - (times * b[1] + u_1)
             u_2, s_2 = s_2, t_2 * s_2 - (times * b[2] + u_2)

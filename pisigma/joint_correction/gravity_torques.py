@@ -40,6 +40,7 @@ def add_gravity(arms: Any, correction: Any, first: int, memory: Any, q: Any) -> 
         zx, zy, zz = sign * own[0], sign * own[1], sign * own[2]
         u, v, w = 0.0, 0.0, 0.0
         force = 0.0
+        # Joint j carries the bodies from its own row on.
         for k in range(j, dof):
             start, frame = first + 3 + 4 * (dof * j + k), memory.frames[k]
             weight = correction.values[start : start + 4]

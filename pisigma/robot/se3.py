@@ -87,6 +87,7 @@ def quaternion_from_rotation(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*
 def rotation_from_vector(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
     """Return the rotation of a rotation vector [rad] (Rodrigues), with finite gradients at zero."""
     square = (vector * vector).sum(-1)
+    # Below it the next terms of the series are less than rounding; a safe square keeps both gradients finite.
     small = square < 1e-8
     safe = torch.where(small, torch.ones_like(square), square)
     angle = safe.sqrt()
@@ -111,6 +112,7 @@ def rotation_vector(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]
     positive = sine_square > 0
     sine = torch.where(positive, sine_square, torch.ones_like(sine_square)).sqrt()
     angle = torch.atan2(torch.where(positive, sine, torch.zeros_like(sine)), cosine)
+    # asin(s) / (2 s) = 1/2 + s² / 12 + ..., where the quotient would be 0 / 0.
     factor = torch.where(sine_square > 1e-8, angle / (2 * sine), 0.5 + sine_square / 12)
     ordinary = factor[..., None] * twice_sine_axis
     near_pi = (cosine < -0.99)[..., None]

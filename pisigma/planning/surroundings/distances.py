@@ -23,6 +23,7 @@ def segment_distance(first: Segments, second: Segments) -> Float64[Tensor, "*_ba
     a, b, e = (u * u).sum(-1), (u * v).sum(-1), (v * v).sum(-1)
     c, f = (u * w).sum(-1), (v * w).sum(-1)
     determinant = a * e - b * b
+    # Parallel lines are equally near everywhere: any s will do, as clamped t and then s follow from it.
     parallel = determinant <= 1e-12 * a * e
     s = torch.where(parallel, 0.0, (b * f - c * e) / torch.where(parallel, 1.0, determinant)).clamp(0, 1)
     t = ((b * s + f) / e.clamp(min=MIN_SQUARED_LENGTH)).clamp(0, 1)
@@ -47,6 +48,7 @@ def box_distance(segments: Segments, half_size: Float64[Tensor, "*#batch 3"]) ->
     planes = [torch.where(level, 0.0, (face - start) / steps).clamp(0, 1) for face in (-half_size, half_size)]
     first = torch.zeros_like(planes[0][..., :1])
     t = torch.cat([first, *planes, first + 1.0], -1)
+    # Half the slope of the squared distance at both ends and at every plane.
     slope = torch.zeros_like(t)
     for s, u, half in zip(
         *(values[..., None].unbind(-2) for values in (start, along, half_size)), strict=True
@@ -56,6 +58,7 @@ def box_distance(segments: Segments, half_size: Float64[Tensor, "*#batch 3"]) ->
     low, high = torch.where(falling, t, 0.0).amax(-1), torch.where(falling, 1.0, t).amin(-1)
     before = torch.where(falling, slope, -torch.inf).amax(-1)
     behind = torch.where(falling, torch.inf, slope).amin(-1)
+    # Where it never rises the end is nearest, where it never falls the start.
     share = torch.where(behind.isinf(), 1.0, before / (before - torch.where(behind.isinf(), 0.0, behind)))
     share = torch.where(before.isinf(), 0.0, share)
     nearest = start + (low + share * (high - low))[..., None] * along

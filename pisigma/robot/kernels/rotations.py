@@ -61,6 +61,7 @@ def pose_error(wanted: Array, actual: Array, R: Array, error: Array) -> None:
 def rotation_from_vector(x: float, y: float, z: float, R: Array) -> None:
     """Write the rotation `(3, 3)` of a rotation vector [rad] (Rodrigues)."""
     square = x * x + y * y + z * z
+    # For small angles the series: its next terms are less than rounding, and the quotients would be 0 / 0.
     first, second = 1 - square / 6, 0.5 - square / 24
     if square >= 1e-8:
         angle = math.sqrt(square)

@@ -274,6 +274,7 @@ def _straighten(form: Record, T: Array, out: Array) -> float:
         u[i] = T[i, 0] * form.last[0, 2] + T[i, 1] * form.last[1, 2] + T[i, 2] * form.last[2, 2]
     cosine = u[0] * v[0] + u[1] * v[1] + u[2] * v[2]
     x, y, z = u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]
+    # With w = u × v the rotation from u to v is cos · I + [w] + w wᵀ / (1 + cos); opposite axes have no unique one.
     share = 1 / max(1 + cosine, 1e-6)
     for k in range(4):
         a, b, c = T[0, k], T[1, k], T[2, k]

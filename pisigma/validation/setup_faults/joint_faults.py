@@ -295,8 +295,10 @@ def _best_zeros(robot: Robot, errors_of: Callable[[JointMaps], Float64[Tensor, "
         tried = by[:, None] + width[:, None] * grid
         errors = errors_of(moved_zeros(joints, tried.flatten(), dof)).reshape(tried.shape)
         by = tried.gather(1, errors.argmin(1, keepdim=True))[:, 0]
+        # The minimum is near the best point: two steps of the grid on either side.
         width = width * 2 / STEPS
     near = (by / QUARTER).round() * QUARTER
+    # -180 deg and 180 deg are the same zero.
     near = torch.where(near < -1.5 * QUARTER, -near, near)
     turning = torch.tensor(robot.revolute)
     by = torch.where(turning & (wrap_to_pi(by - near).abs() < ZERO_TOLERANCE) & (near != 0), near, by)

@@ -257,6 +257,7 @@ class _Em:
         wX, wZ = X * np.repeat(total, values)[:, None], Z * np.repeat(second, values)[:, None]
         mixed, flat = wX.T @ Z if not Z.shape[1] else X.T @ wZ, self.r.ravel()
         data = np.block([[wX.T @ X, mixed], [mixed.T, wZ.T @ Z]])
+        # The data are not divided by the variance, so the precision of the prior is multiplied by it.
         normal = data + np.diag(self.precision * state.variance)
         inverse = inverse_of(normal)
         x = inverse @ np.concatenate([wX.T @ flat, wZ.T @ flat])
@@ -266,6 +267,7 @@ class _Em:
         variance = max(float((probability * state.weights * squares).sum()) / self.r.size, 1e-12)
         share = float(np.clip(state.probability.mean(), 1e-3, 1 - 1e-3))
         fresh, log_likelihood = self.probabilities(x, share, variance)
+        # Expected weight of a row under the t distribution: outliers have less.
         weights = (TAILS + values) / (TAILS + squares / variance)
         return _State(fresh, weights, x, share, variance, used, log_likelihood)
 

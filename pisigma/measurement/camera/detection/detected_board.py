@@ -249,9 +249,11 @@ def _saddle(
     for line in (2, 3):
         cos, sin = np.cos(state[:, line, None]), np.sin(state[:, line, None])
         distance = (cos * off[..., 1] - sin * off[..., 0]) / blur
+        # An edge between -1 and 1 blurred by a normal distribution is erf(d / sqrt(2)), at a distance of d blurs.
         steps.append(erf(distance / np.sqrt(2)))
         slopes.append(np.sqrt(2 / np.pi) * np.exp(-(distance**2) / 2))
         alongs.append((cos * off[..., 0] + sin * off[..., 1]) / blur)
+        # Derivatives of d: by the corner (sin, -cos) / blur, by the angle -along, by the logarithm of the blur -d.
         normals.append((sin / blur, -cos / blur, distance))
     by = np.empty((*x.shape[:2], 5))
     first, second = slopes[0] * steps[1], steps[0] * slopes[1]
