@@ -118,7 +118,7 @@ def session(arm: Arm, how: str) -> tuple[int, float]:
             q=q,
             check=torch.zeros(count, dtype=torch.bool),
             candidate=torch.arange(count),
-            way_points=(q[:0],) * count,
+            waypoints=(q[:0],) * count,
         )
     rule = MeasureSettings(limit_mm=LIMIT_MM, least_gain_mm=0.0, replan=how == "planned")
     measuring, rows = MeasuringSession(stored, rule), None

@@ -30,7 +30,7 @@ YAML_SUFFIX = ".plan.yaml"
 """Suffix of the YAML: that of `poses.csv` is `poses.plan.yaml`."""
 
 
-class WayPoint(Section):
+class Waypoint(Section):
     """Joint values through which the robot moves to a pose.
 
     Attributes:
@@ -59,7 +59,7 @@ class PlanDocument(Section):
     model: str | None = None
     settings: PlanSettings
     cell: Surroundings = Surroundings()
-    way_points: tuple[WayPoint, ...] = ()
+    way_points: tuple[Waypoint, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +73,7 @@ class StoredPlan:
         q: joint values [rad or m].
         check: whether each pose tests the calibration (set "test") or is calibrated with ("train").
         candidate: row of each pose in the file of candidates, or its number among the random poses; from 1.
-        way_points: joint values through which the robot moves to each pose [rad or m]; mostly none.
+        waypoints: joint values through which the robot moves to each pose [rad or m]; mostly none.
         number: number of each pose, kept in parts of the plan; () where they count from 1.
     """
 
@@ -83,7 +83,7 @@ class StoredPlan:
     q: Float64[Tensor, "poses dof"]
     check: Bool[Tensor, " poses"]
     candidate: Int64[Tensor, " poses"]
-    way_points: tuple[Float64[Tensor, "_points dof"], ...]
+    waypoints: tuple[Float64[Tensor, "_points dof"], ...]
     number: tuple[int, ...] = ()
 
     @property
@@ -98,7 +98,7 @@ class StoredPlan:
             q=self.q[poses],
             check=self.check[poses],
             candidate=self.candidate[poses],
-            way_points=tuple(self.way_points[pose] for pose in poses.tolist()),
+            waypoints=tuple(self.waypoints[pose] for pose in poses.tolist()),
             number=tuple(self.numbers[pose] for pose in poses.tolist()),
         )
 
@@ -136,7 +136,7 @@ class StoredPlan:
         if self.model is not None:
             document["model"] = os.path.relpath(self.model, folder)
         document["cell"] = self.arm.surroundings.model_dump(mode="json", exclude_none=True)
-        points = zip(self.numbers, map(self._in_file_units, self.way_points), strict=True)
+        points = zip(self.numbers, map(self._in_file_units, self.waypoints), strict=True)
         document["way_points"] = [{"before": n, "joints": joints} for n, rows in points for joints in rows]
         return document | {"robot": robot_document(self.arm.nominal)}
 

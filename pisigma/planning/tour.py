@@ -107,7 +107,7 @@ def plan_tour(
     for start_of_stage, end in pairwise([0, *ends]):
         stage = np.concatenate([order[-1:], np.arange(start_of_stage, end) + first])
         order = np.concatenate([order[:-1], _ordered(motions, poses, seconds, stage, len(order) > 0)])
-    return _with_way_points(motions, poses, order, pace, start is not None)
+    return _with_waypoints(motions, poses, order, pace, start is not None)
 
 
 def order_of_use(chosen: int, check: int) -> Int64[Tensor, " poses"]:
@@ -188,7 +188,7 @@ def _two_opt(seconds: Float64[np.ndarray, "poses poses"], order: np.ndarray, fix
     return order
 
 
-def _with_way_points(
+def _with_waypoints(
     motions: Motions, poses: Float64[Tensor, "poses dof"], order: np.ndarray, pace: Pace, fixed_start: bool
 ) -> Tour:
     """Insert waypoints where a motion is blocked, and leave out poses that cannot be reached."""

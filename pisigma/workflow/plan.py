@@ -127,7 +127,7 @@ class Plan:
             "limit_mm": settings.limit_mm,
             "poses_needed": self.needed,
             "minutes": self.travel / 60,
-            "way_points": sum(map(len, self.stored.way_points)),
+            "way_points": sum(map(len, self.stored.waypoints)),
             "weak": list(self.weak),
             "warnings": list(self.warnings),
             **({} if self.camera is None else {"camera": self.camera.to_json()}),

@@ -39,7 +39,7 @@ def plan_text(planned: Plan, files: Sequence[Path]) -> ResultText:
     title = "expected errors of the tool's position by number of poses"
     short = rows if len(rows) <= MAX_POINTS else [*rows[:: -(-len(rows) // MAX_POINTS)], rows[-1]]
     weak = ["What the expected error will mostly come from:", *(f"- {line}" for line in planned.weak)]
-    points = sum(map(len, planned.stored.way_points))
+    points = sum(map(len, planned.stored.waypoints))
     lines = [planned.candidates.sentence, f"The poses are joined with {counted(points, 'waypoint')}."]
     return ResultText(
         _plan_verdict(planned, files[0]),

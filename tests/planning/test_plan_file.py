@@ -48,7 +48,7 @@ def test_a_plan_is_the_same_after_writing_and_reading(stored: StoredPlan, tmp_pa
     assert_close(read.q, stored.q, atol=1e-8)
     assert read.check.tolist() == [False, True, False, False]
     assert read.candidate.tolist() == stored.candidate.tolist()
-    for points, written in zip(read.way_points, stored.way_points, strict=True):
+    for points, written in zip(read.waypoints, stored.waypoints, strict=True):
         assert_close(points, written, atol=1e-8)
 
 

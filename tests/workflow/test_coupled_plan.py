@@ -29,7 +29,7 @@ def test_a_plan_holds_the_controllers_values_within_its_limits(tmp_path: Path) -
     assert_close(torch.deg2rad(torch.tensor(written, dtype=torch.float64)), robot.to_controller(q), atol=1e-7)
     again = read_plan(tmp_path / "plan.csv")
     assert_close(again.q, q, atol=1e-7)
-    assert_close(again.way_points[0], q[:1], atol=1e-7)
+    assert_close(again.waypoints[0], q[:1], atol=1e-7)
 
 
 def test_the_operator_is_told_what_the_controller_shows() -> None:

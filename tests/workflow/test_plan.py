@@ -43,9 +43,7 @@ def test_every_planned_pose_is_reachable_free_and_seen(planned: Plan):
 
 
 def test_every_motion_is_free(planned: Plan):
-    stops = [
-        torch.cat([p, q[None]]) for p, q in zip(planned.stored.way_points, planned.stored.q, strict=True)
-    ]
+    stops = [torch.cat([p, q[None]]) for p, q in zip(planned.stored.waypoints, planned.stored.q, strict=True)]
     path = torch.cat(stops)
     steps = np.linspace(0, 1, 12)[:, None]
     for start, end in zip(path[:-1].numpy(), path[1:].numpy(), strict=True):
@@ -84,7 +82,7 @@ def test_the_measured_plan_is_a_measurement_file(planned: Plan, tmp_path: Path):
     assert (train.rows, test.rows) == (11, 3)
     script = (tmp_path / "poses.script").read_text()
     assert script.count("sleep(3.0)") == 14
-    assert script.count("movej") == 14 + sum(map(len, planned.stored.way_points))
+    assert script.count("movej") == 14 + sum(map(len, planned.stored.waypoints))
     assert "WAIT SEC 3.0" in (tmp_path / "poses.src").read_text()
 
 

@@ -256,7 +256,7 @@ class FurtherPoses:
             q=torch.cat([plan.q[first], q[way.order]]),
             check=torch.cat([plan.check[first], use[way.order] >= count]),
             candidate=torch.cat([plan.candidate[first], number[way.order]]),
-            way_points=(plan.way_points[int(first)], *way.before),
+            waypoints=(plan.waypoints[int(first)], *way.before),
             number=(),
         )
 

@@ -8,7 +8,7 @@ from pisigma.planning.surroundings.arm_in_surroundings import ArmInSurroundings
 
 MIN_STEP = 1e-3
 """[m] Motion of any point of the robot below which a piece is not divided further, nor below half the clearance."""
-MAX_WAY_POINTS_TRIED = 60
+MAX_WAYPOINTS_TRIED = 60
 """Poses that are tried as waypoints of a motion; ten times as many pairs of them are tried."""
 BATCH = 20
 """Waypoints that are checked together."""
@@ -49,7 +49,7 @@ class Motions:
             return self.pool[:0]
         (pair,) = zip(_names(start[None]), _names(end[None]), strict=True)
         if pair not in self._points:
-            self._points[pair] = way_points(self.arm, start, end, self.pool)
+            self._points[pair] = waypoints(self.arm, start, end, self.pool)
         return self._points[pair]
 
     def is_harder_to_leave(self, pose: Float64[Tensor, " dof"], other: Float64[Tensor, " dof"]) -> bool:
@@ -87,7 +87,7 @@ def is_free(
     return free
 
 
-def way_points(
+def waypoints(
     arm: ArmInSurroundings,
     start: Float64[Tensor, " dof"],
     end: Float64[Tensor, " dof"],
@@ -105,7 +105,7 @@ def way_points(
         Joint values of the waypoints [rad or m]; None if no way was found.
     """
     to, back = _travel(arm, start, pool), _travel(arm, pool, end)
-    tried = (to + back).argsort()[:MAX_WAY_POINTS_TRIED]
+    tried = (to + back).argsort()[:MAX_WAYPOINTS_TRIED]
     pool, to, back = pool[tried], to[tried], back[tried]
     reached, left = torch.zeros(2, len(pool), dtype=torch.bool)
     for some in torch.split(torch.arange(len(pool)), BATCH):
@@ -118,7 +118,7 @@ def way_points(
         return None
     first, second = torch.cartesian_prod(first, second).unbind(-1)
     length = to[first] + _travel(arm, pool[first], pool[second]) + back[second]
-    shortest = length.argsort()[: 10 * MAX_WAY_POINTS_TRIED]
+    shortest = length.argsort()[: 10 * MAX_WAYPOINTS_TRIED]
     for some in torch.split(shortest, BATCH):
         free = is_free(arm, pool[first[some]], pool[second[some]])
         if bool(free.any()):

@@ -34,7 +34,7 @@ STOPS = ["pose 1", "waypoint", "waypoint", "pose 2"]
         ("go.ls", "  !", "WAIT 2.50(sec)"),
     ],
 )
-def test_a_program_passes_way_points_and_waits_at_poses(name: str, label: str, wait: str):
+def test_a_program_passes_waypoints_and_waits_at_poses(name: str, label: str, wait: str):
     lines = planned_program(PLAN, Path(name)).replace("\r\n", "\n").splitlines()
     at = [
         number

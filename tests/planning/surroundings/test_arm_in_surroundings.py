@@ -7,7 +7,7 @@ from testing.cells import CELL, is_collision_free, is_visible
 from testing.closeness import assert_close
 
 from pisigma.planning.surroundings.arm_in_surroundings import ArmInSurroundings
-from pisigma.planning.surroundings.motion import Motions, is_free, way_points
+from pisigma.planning.surroundings.motion import Motions, is_free, waypoints
 from pisigma.planning.surroundings.surroundings import LinkSection, Surroundings
 from pisigma.robot import Robot
 
@@ -79,15 +79,15 @@ def test_a_motion_is_free_where_all_poses_on_it_are():
     assert bool((least[~free] < 0).all())
 
 
-def test_way_points_avoid_obstacles():
+def test_waypoints_avoid_obstacles():
     q = Q[ARM.smallest_clearance(Q) >= 0]
     blocked = (~is_free(ARM, q[:20], q[20:40])).nonzero()[:, 0].tolist()
     start, end = q[blocked[0]], q[20 + blocked[0]]
-    points = way_points(ARM, start, end, q)
+    points = waypoints(ARM, start, end, q)
     assert points is not None
     path = torch.cat([start[None], points, end[None]])
     assert bool(is_free(ARM, path[:-1], path[1:]).all())
-    assert way_points(ARM, start, end, q[:0]) is None
+    assert waypoints(ARM, start, end, q[:0]) is None
 
 
 def test_checked_motions_are_kept_in_both_directions():

@@ -28,7 +28,7 @@ def planned_program(plan: StoredPlan, path: Path) -> str:
     check_program(path, robot, False, None)
     language = LANGUAGES[path.suffix.lower()]
     q, labels, waits = [], [], []
-    for order, pose, points in zip(plan.numbers, plan.q, plan.way_points, strict=True):
+    for order, pose, points in zip(plan.numbers, plan.q, plan.waypoints, strict=True):
         q += [*points, pose]
         labels += ["waypoint"] * len(points) + [f"pose {order}"]
         waits += [0.0] * len(points) + [plan.settings.settling_s]

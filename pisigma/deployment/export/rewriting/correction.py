@@ -45,7 +45,7 @@ class CorrectedProgram:
     Attributes:
         text: text of the program.
         statuses: line and status of every target.
-        way_points: number of inserted waypoints.
+        waypoints: number of inserted waypoints.
         left: line and reason of everything that was left unchanged.
         largest_shift: largest shift of a target [m].
         branches: names of the branches of the corrected targets.
@@ -53,7 +53,7 @@ class CorrectedProgram:
 
     text: str
     statuses: tuple[tuple[int, Status], ...]
-    way_points: int
+    waypoints: int
     left: tuple[tuple[int, str], ...]
     largest_shift: float
     branches: tuple[str, ...]
@@ -118,7 +118,7 @@ class ProgramCorrection:
             [*(target.pose.T[None] for target in targets), *paths.values()],
         )
         points = {
-            move: self.way_points(move, there)
+            move: self.waypoints(move, there)
             for move, there in zip(paths, answers[len(targets) :], strict=True)
         }
         reasons = {move.line: why for move, why in (ways | points).items() if isinstance(why, str)}
@@ -174,8 +174,8 @@ class ProgramCorrection:
         length = float(arc.angle * arc.radius.norm())
         return _round(start, via, end, _steps(start, end, length))[0]
 
-    def way_points(self, move: PathMove, there: CommandedPoses) -> list[Frame] | str:
-        """Return the waypoints of a move, see `PathMove.way_points`, or the reason why it is not split."""
+    def waypoints(self, move: PathMove, there: CommandedPoses) -> list[Frame] | str:
+        """Return the waypoints of a move, see `PathMove.waypoints`, or the reason why it is not split."""
         if not there.all_reached:
             return f"the {_kind(move)} has poses that are not reached, so it has no waypoints"
         if len(there.branches) > 1:
@@ -196,7 +196,7 @@ def _edits(
     reached: Sequence[tuple[Pose, CommandedPoses]], cuts: Sequence[tuple[PathMove, list[Frame]]]
 ) -> list[Edit]:
     """Return the edits of targets and waypoints; the last waypoint of an arc replaces its via point."""
-    added = [edit for move, way in cuts for edit in move.way_points(way)]
+    added = [edit for move, way in cuts for edit in move.waypoints(way)]
     replaced = [edit.span for edit in added if edit.span[0] < edit.span[1]]
     corrected = [Edit(pose.span, pose.write(there.T[0])) for pose, there in reached]
     return added + [

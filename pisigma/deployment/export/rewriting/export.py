@@ -125,7 +125,7 @@ def _exported(
                 {"line": line, "status": status.name.lower()} for line, status in corrected.unreached
             ],
             "branches": list(corrected.branches),
-            "way_points": corrected.way_points,
+            "way_points": corrected.waypoints,
             "tolerance_mm": tolerance_mm,
             "largest_shift_mm": shift,
             "left_alone": [{"line": line, "reason": reason} for line, reason in corrected.left],
@@ -139,7 +139,7 @@ def _exported(
             *_warnings(corrected, str(request.program)),
         ),
         summary=f"Program with {reached} corrected targets (by {shift:.3f} mm at most) "
-        f"and {corrected.way_points} waypoints",
+        f"and {corrected.waypoints} waypoints",
         shortfall=_shortfall(corrected, str(request.program)),
         shown=diff,
     )

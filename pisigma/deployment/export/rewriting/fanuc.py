@@ -124,7 +124,7 @@ class _Reader:
                 self.scan.leave_unchanged(
                     line.start(), "arcs of A have no waypoints, only their poses are corrected"
                 )
-            cut = partial(self._way_points, line, move, match, len(names)) if cuttable and match else None
+            cut = partial(self._waypoints, line, move, match, len(names)) if cuttable and match else None
             self.scan.move(line.start(), pose, frame, tool, cut, circular)
 
     def _stated(self, kind: str, index: str, position: int) -> Frame | str:
@@ -148,7 +148,7 @@ class _Reader:
         T = transform_from_xyzrpy(torch.stack([x, y, z, r, p, w]))
         return Pose(values.span("six"), T, partial(_written, values["six"]))
 
-    def _way_points(
+    def _waypoints(
         self,
         line: re.Match[str],
         move: re.Match[str],

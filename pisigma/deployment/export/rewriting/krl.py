@@ -178,7 +178,7 @@ class _Reader:
                 if circular and (len(spans) > 2 or _TURNING.search(self.text)):
                     self.scan.leave_unchanged(match.start(), STATED_ARC)
                 else:
-                    cut = partial(self._way_points, match, operands)
+                    cut = partial(self._waypoints, match, operands)
             self.scan.move(match.start(), pose, *self._frames(match["target"]), cut, circular)
 
     def _frames(self, target: str) -> tuple[Frame | str, Frame | str]:
@@ -195,7 +195,7 @@ class _Reader:
         name = _NAME.match(self.text, start)
         return self.names.target(name[0]) if name else COMPUTED
 
-    def _way_points(self, move: re.Match[str], operands: Sequence[int], poses: Sequence[Frame]) -> list[Edit]:
+    def _waypoints(self, move: re.Match[str], operands: Sequence[int], poses: Sequence[Frame]) -> list[Edit]:
         """Return straight moves or arcs to all waypoints, with approximate positioning."""
         start = self.scan.line_start(move.start())
         word = self.text[start : operands[0]]

@@ -180,7 +180,7 @@ class _Reader:
                         "the module states the orientation along arcs, so they have no waypoints",
                     )
                 else:
-                    cut = partial(self._way_points, match, spans, count, pose)
+                    cut = partial(self._waypoints, match, spans, count, pose)
             self.scan.move(match.start(), pose, frame, tool, cut, circular)
 
     def _target(self, expression: str, span: tuple[int, int]) -> Pose | str:
@@ -200,7 +200,7 @@ class _Reader:
             self.stated.tool(words[0]) if tool is None else tool,
         )
 
-    def _way_points(
+    def _waypoints(
         self,
         move: re.Match[str],
         spans: Sequence[tuple[int, int]],

@@ -70,7 +70,7 @@ class PathMove:
         via: via point of an arc; None for a straight move, or if the program does not state it.
         end: target of the move.
         circular: whether it is an arc.
-        way_points: function that returns the edits for waypoints, which are poses of the end's tool in the end's
+        waypoints: function that returns the edits for waypoints, which are poses of the end's tool in the end's
             frame. An arc is split into arcs: the poses alternate between via and end points, and the last one is the
             new via point of the move itself.
     """
@@ -80,7 +80,7 @@ class PathMove:
     via: Target | None
     end: Target
     circular: bool
-    way_points: Callable[[Sequence[Frame]], list[Edit]]
+    waypoints: Callable[[Sequence[Frame]], list[Edit]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,7 +194,7 @@ class Scan:
         pose: Pose | str,
         frame: Frame | str,
         tool: Frame | str,
-        way_points: Callable[[Sequence[Frame]], list[Edit]] | None = None,
+        waypoints: Callable[[Sequence[Frame]], list[Edit]] | None = None,
         circular: bool = False,
     ) -> None:
         """Record a move to a pose.
@@ -204,7 +204,7 @@ class Scan:
             pose: the pose, or the reason why it is not understood; likewise `frame` and `tool`.
             frame: frame of the pose, relative to the origin of the robot description.
             tool: tool, relative to the last row of the robot description.
-            way_points: function for the waypoints of a straight move or an arc, see `PathMove`.
+            waypoints: function for the waypoints of a straight move or an arc, see `PathMove`.
             circular: whether it is the end of an arc, whose via point is the previous target.
         """
         start, via = self._last_two if circular else (self._last_two[1], None)
@@ -224,8 +224,8 @@ class Scan:
             self.leave_unchanged(position, "the pose is used with several frames or tools")
             self.mark_not_understood(pose)
             return
-        if way_points is not None:
-            self._moves.append(PathMove(self.line_number(position), start, via, target, circular, way_points))
+        if waypoints is not None:
+            self._moves.append(PathMove(self.line_number(position), start, via, target, circular, waypoints))
         self._last_two = (self._last_two[0], target)
 
     def program(

@@ -124,7 +124,7 @@ class _Reader:
                 call.start(), "an unnamed radius or a mode is stated, so the move has no waypoints"
             )
             return None
-        return partial(self._way_points, call, spans, operands, rest, pose)
+        return partial(self._waypoints, call, spans, operands, rest, pose)
 
     def _target(self, span: _Span) -> tuple[Pose | str, Frame | str, _Span]:
         """Return the pose of an argument, its frame, and its span."""
@@ -146,7 +146,7 @@ class _Reader:
             return _pose(self.text, span)
         return self.names.get(expression, target)
 
-    def _way_points(
+    def _waypoints(
         self,
         call: re.Match[str],
         spans: Sequence[_Span],

@@ -190,7 +190,7 @@ def test_all_kinds_of_moves_are_found():
     assert [move.line for move in program.moves] == [4, 5]
 
 
-def test_arcs_without_way_points_are_reported():
+def test_arcs_without_waypoints_are_reported():
     text = fanuc("A P[1] 100mm/sec CNT50")
     assert 3 in dict(scan_fanuc(text, FRAMES).left)
 
