@@ -12,7 +12,7 @@ from pisigma.model.inverse.written_model import check_written
 
 
 @dataclass(frozen=True)
-class Upgraded:
+class UpgradeResult:
     """Result of `upgrade`.
 
     Attributes:
@@ -26,7 +26,7 @@ class Upgraded:
     after: int = SCHEMA_VERSION
 
 
-def upgrade(path: str | os.PathLike[str]) -> Upgraded:
+def upgrade(path: str | os.PathLike[str]) -> UpgradeResult:
     """Convert a model folder or a cell to the present formats; the history then names the upgraded models.
 
     Args:
@@ -45,5 +45,5 @@ def upgrade(path: str | os.PathLike[str]) -> Upgraded:
         sha256 = model_hash(folder)
         models.append(upgrade_folder(folder, check_written))
         if history.path.exists():
-            history.rename_model(sha256, model_hash(folder))
-    return Upgraded(tuple(models), before)
+            history.replace_model_hash(sha256, model_hash(folder))
+    return UpgradeResult(tuple(models), before)

@@ -43,6 +43,6 @@ def test_a_cell_of_an_earlier_version_is_upgraded_with_its_models(run, older):
 
 def test_the_history_follows_a_model_whose_folder_was_upgraded(older):
     history = History(older / HISTORY)
-    history.rename_model(history.models()[0].sha256, "new")
+    history.replace_model_hash(history.models()[0].sha256, "new")
     assert history.models()[0].sha256 == "new"
     assert {one.model_sha256 for one in history.monitored_sessions()} == {"new"}

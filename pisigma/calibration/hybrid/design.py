@@ -328,7 +328,7 @@ class AbstractDesignRegression(AbstractRegression):
             parts.append(self.held_out_errors(rest, [groups]))
         return HeldOutErrors.concatenate(parts)
 
-    def initial_prior_sizes(
+    def evidence_gain(
         self, posterior: Posterior, design: Design, features: AbstractFeature
     ) -> tuple[float, Float64[Tensor, " groups"] | None]:
         """Compute the gain of log evidence by additional features, with all other prior sizes and the noise fixed.

@@ -124,10 +124,10 @@ class NormalEquations(PrimalRegression, AbstractDesignRegression):
             M.addmm_(S.t(), S, alpha=-1)
         return HeldOutErrors.from_fit(M, torch.cat(r), torch.cat(number), self.sensors)
 
-    def initial_prior_sizes(
+    def evidence_gain(
         self, posterior: Posterior, design: Design, features: AbstractFeature
     ) -> tuple[float, Tensor | None]:
-        """See `AbstractDesignRegression.initial_prior_sizes`.
+        """See `AbstractDesignRegression.evidence_gain`.
 
         The other unknowns are eliminated from the normal equations (Schur complement), so that only the weights of the
         features remain.

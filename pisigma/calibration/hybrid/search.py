@@ -221,7 +221,7 @@ class FeatureSearch:
             for scale in dict.fromkeys((tuple(self.prior_scale), usual)):
                 best = self._from_usual_sizes(together, scale, best)
         for chosen in last:
-            gain, sizes = self._regression.initial_prior_sizes(best.posterior, best.design, chosen)
+            gain, sizes = self._regression.evidence_gain(best.posterior, best.design, chosen)
             if gain > CLEARLY / 2:
                 best = self._tried([*best.design.features, chosen], best, sizes, least_gain=CLEAR_GAIN)
         return best

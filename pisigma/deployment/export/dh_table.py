@@ -81,7 +81,7 @@ def header_comment(sentences: tuple[str, ...]) -> str:
 def _write(request: ExportRequest) -> Exported:
     model = request.load()
     chosen = chosen_geometry(model, request.geometry)
-    write = dh_csv if request.as_csv else dh_yaml
+    write = dh_csv if request.is_csv else dh_yaml
     return Exported(
         write(chosen.robot, chosen.comments), model_facts(model) | {"geometry": chosen.name}, chosen.comments
     )

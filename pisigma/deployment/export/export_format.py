@@ -57,7 +57,7 @@ class ExportRequest:
         return tuple(name for name in OPTIONS if getattr(self, name) is not None)
 
     @property
-    def as_csv(self) -> bool:
+    def is_csv(self) -> bool:
         """Whether the file is a table."""
         return self.out.suffix.lower() == ".csv"
 

@@ -5,10 +5,10 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from jaxtyping import Float64
 
+from pisigma.deployment.export.approximation import Departure, approximate_model, joint_offsets
 from pisigma.deployment.export.dh_table import TABLE_SUFFIXES, csv_table, header_comment, parameter_columns
 from pisigma.deployment.export.export_format import Exported, ExportFormat, ExportRequest, model_facts
 from pisigma.deployment.export.geometry import offset_remarks
-from pisigma.deployment.export.projection import Departure, joint_offsets, project_model
 from pisigma.files.errors import RobotError
 from pisigma.files.yaml_file import yaml_text
 from pisigma.model.calibrated_model import CalibratedModel
@@ -41,14 +41,14 @@ class JointOffsets:
 
 
 def fit_joint_offsets(model: CalibratedModel) -> JointOffsets:
-    """Fit joint offsets, base and tool of the nominal robot to a model; see `project_model`.
+    """Fit joint offsets, base and tool of the nominal robot to a model; see `approximate_model`.
 
     Raises:
         ModelError: the model has no stored joint values, or no predictions at them.
         RobotError: see `joints_by_axes`.
     """
     nominal = model.robot
-    fit = project_model(model, nominal, joint_offsets(nominal))
+    fit = approximate_model(model, nominal, joint_offsets(nominal))
     return JointOffsets(
         robot=fit.robot,
         values=offsets_between(nominal, fit.robot),
@@ -146,7 +146,7 @@ def _joints(offsets: JointOffsets) -> list[dict[str, object]]:
 def _write(request: ExportRequest) -> Exported:
     model = request.load()
     offsets, sentences = fit_joint_offsets(model), offset_remarks(model)
-    text = (offsets_csv if request.as_csv else offsets_yaml)(offsets, sentences)
+    text = (offsets_csv if request.is_csv else offsets_yaml)(offsets, sentences)
     return Exported(text, model_facts(model) | offsets.departures(), (*sentences, *offset_sentences(offsets)))
 
 

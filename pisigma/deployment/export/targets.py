@@ -92,7 +92,7 @@ def _check_options(request: ExportRequest) -> None:
     kind = request.targets
     if kind is not None:
         check_choice(OutputError, "--targets", kind, KINDS)
-    if request.as_csv:
+    if request.is_csv:
         for name, value in (("--targets", kind), ("--config", request.config)):
             if value is not None:
                 raise OutputError(
@@ -109,7 +109,7 @@ def _write(request: ExportRequest) -> Exported:
         return rewrite_program(request)
     _check_options(request)
     assert request.poses is not None  # checked in `_check`
-    table, cartesian = request.as_csv, request.targets == "cartesian"
+    table, cartesian = request.is_csv, request.targets == "cartesian"
     solver = load(request.model)
     if request.conditions:
         solver = solver.under(**request.conditions)

@@ -296,7 +296,7 @@ class History:
                 self.database.insert(database, [session, *also])
         return known is None
 
-    def rename_model(self, before: str, after: str) -> None:
+    def replace_model_hash(self, before: str, after: str) -> None:
         """Replace the SHA-256 of a model whose folder was upgraded.
 
         Raises:

@@ -20,7 +20,7 @@ from pisigma.measurement.sensors.sensor import (
     Unknowns,
     Values,
     component_along,
-    names_of,
+    distinct_names,
     numbers_of,
     owners_of,
     unit_vectors,
@@ -62,7 +62,7 @@ class AnchorSensor(AbstractSensor):
     def build(cls, rows: SensorRows) -> "AnchorSensor | None":
         """Gather the distances from anchors."""
         data = rows.measurements
-        names = names_of(data.anchor)
+        names = distinct_names(data.anchor)
         if data.distance is None or not names:
             return None
         number = rows.numbers(data.anchor, names)
@@ -105,7 +105,7 @@ class AnchorSensor(AbstractSensor):
         Raises:
             IdentificationError: a distance contradicts most of the others, or an anchor has too few.
         """
-        names = names_of(measurements.anchor)
+        names = distinct_names(measurements.anchor)
         if measurements.distance is None or not names:
             return None
         values = torch.zeros(len(names), 4, dtype=torch.float64)

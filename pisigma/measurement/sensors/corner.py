@@ -33,7 +33,7 @@ from pisigma.measurement.sensors.sensor import (
     UnknownDerivative,
     Unknowns,
     Values,
-    names_of,
+    distinct_names,
 )
 from pisigma.robot.kinematics.parameter_jacobian import ToolMotion
 from pisigma.robot.se3 import rotation_from_vector
@@ -143,10 +143,10 @@ class CornerSensor(AbstractSensor):
             rotation.permute(1, 2, 0).contiguous(),
             rotated.permute(1, 2, 0),
             present,
-            camera=rows.numbers(of_camera, names_of(of_camera)),
+            camera=rows.numbers(of_camera, distinct_names(of_camera)),
             at=at.t(),
             by_intrinsics=(weight @ by).permute(1, 2, 0),
-            board=rows.numbers(of_board, names_of(of_board)),
+            board=rows.numbers(of_board, distinct_names(of_board)),
             by_scale=by_scale,
         )
 
@@ -189,7 +189,7 @@ class CornerSensor(AbstractSensor):
         return rotation_difference(self.rotation[..., rows], motion.rotation)
 
 
-def position_deviations(measurements: Measurements) -> Float64[Tensor, "rows 3"]:
+def position_sigmas(measurements: Measurements) -> Float64[Tensor, "rows 3"]:
     """Return standard deviations of positions relative to the noise of a corner; NaN in rows of other sensors."""
     weight = _scaled_weights(measurements)
     from_image = measurements.is_measured("corner")

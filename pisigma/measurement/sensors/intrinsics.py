@@ -22,7 +22,7 @@ from pisigma.measurement.sensors.sensor import (
     UnknownGroup,
     Unknowns,
     Values,
-    names_of,
+    distinct_names,
     numbers_of,
     owners_of,
 )
@@ -177,7 +177,7 @@ def scale_deviations(measurements: Measurements) -> Float64[Tensor, " boards"]:
     names, stated = boards(measurements), texts_of(measurements, SCALE_COLUMN)
     other_lengths = bool((~measurements.is_measured("corner") & ~measurements.is_measured("rotation")).any())
     usual = USUAL_SCALE if other_lengths else 0.0
-    texts = [stated[(names or ()).index(board)] for board in names_of(names)]
+    texts = [stated[(names or ()).index(board)] for board in distinct_names(names)]
     return torch.tensor([float(text) if text else usual for text in texts], dtype=torch.float64)
 
 
@@ -216,7 +216,7 @@ class IntrinsicsSensor(AbstractSensor):
             return None
         images = ImageIntrinsics.from_texts(texts_of(data, INTRINSICS_COLUMN))
         noise = torch.nan_to_num(rows.readings(NOISE_COLUMN), nan=1.0)
-        number = numbers_of(names, names_of(names), data.rows).numpy()
+        number = numbers_of(names, distinct_names(names), data.rows).numpy()
         owners = np.full(data.rows, -1)
         roots, means = np.zeros((NUMBERS, NUMBERS, data.rows)), np.zeros((NUMBERS, data.rows))
         for camera in range(number.max() + 1):
@@ -260,7 +260,7 @@ class IntrinsicsSensor(AbstractSensor):
         if names is None:
             return None
         images = ImageIntrinsics.from_texts(texts_of(measurements, INTRINSICS_COLUMN))
-        first = [names.index(name) for name in names_of(names)]
+        first = [names.index(name) for name in distinct_names(names)]
         return InitialUnknowns(
             torch.from_numpy(images.stated[first]), torch.from_numpy(images.sigma[first] > 0)
         )
@@ -298,7 +298,7 @@ class BoardScaleSensor(AbstractSensor):
             return None
         noise = torch.nan_to_num(rows.readings(NOISE_COLUMN), nan=1.0)
         owner, weight = torch.full((data.rows,), -1).to(noise.device), torch.zeros_like(noise)
-        for number, name in enumerate(names_of(names)):
+        for number, name in enumerate(distinct_names(names)):
             row, deviation = names.index(name), float(deviations[number])
             if deviation > 0:
                 owner[row], weight[row] = number, noise[row] / deviation

@@ -17,7 +17,7 @@ from pisigma.measurement.sensors.sensor import (
     Unknowns,
     Values,
     component_along,
-    names_of,
+    distinct_names,
     unit_vectors,
 )
 from pisigma.robot.kinematics.parameter_jacobian import ToolMotion
@@ -78,7 +78,7 @@ class PairSensor(AbstractSensor):
         """
         if measurements.pair is None or measurements.distance is None:
             return None
-        rows = torch.arange(0, 2 * len(names_of(measurements.pair)), 2)
+        rows = torch.arange(0, 2 * len(distinct_names(measurements.pair)), 2)
         apart = (T[rows, :3, 3] - T[rows + 1, :3, 3]).norm(dim=-1)
         distance = measurements.distance.cpu()[rows]
         error = (distance - apart).abs()

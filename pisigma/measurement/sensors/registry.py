@@ -18,7 +18,13 @@ from pisigma.measurement.sensors.corner import CornerSensor, as_poses
 from pisigma.measurement.sensors.intrinsics import BoardScaleSensor, IntrinsicsSensor
 from pisigma.measurement.sensors.pair import PairSensor
 from pisigma.measurement.sensors.pose import PositionSensor, RotationSensor
-from pisigma.measurement.sensors.sensor import AbstractSensor, SensorRows, UnknownGroup, names_of, numbers_of
+from pisigma.measurement.sensors.sensor import (
+    AbstractSensor,
+    SensorRows,
+    UnknownGroup,
+    distinct_names,
+    numbers_of,
+)
 from pisigma.measurement.sensors.socket import SocketSensor
 from pisigma.measurement.sensors.touch import TouchSensor
 from pisigma.robot.kinematics.parameter_jacobian import ToolMotion
@@ -100,7 +106,7 @@ def pairs_first(measurements: Measurements, rows: Int64[Tensor, " rows"]) -> Int
     """Sort rows such that pairs come first, with their rows next to each other; the others keep their order."""
     if measurements.pair is None:
         return rows
-    order = names_of(measurements.pair)
+    order = distinct_names(measurements.pair)
     number = numbers_of(measurements.pair, order, measurements.rows).to(rows.device)[rows]
     number = torch.where(number < 0, len(order), number)
     return rows[torch.sort(number, stable=True).indices]

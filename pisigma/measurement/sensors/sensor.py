@@ -275,7 +275,7 @@ def numbers_of(names: tuple[str, ...] | None, order: Sequence[str], rows: int) -
     return torch.tensor([numbers.get(name, -1) for name in names or ()], dtype=torch.int64)
 
 
-def names_of(names: tuple[str, ...] | None) -> tuple[str, ...]:
+def distinct_names(names: tuple[str, ...] | None) -> tuple[str, ...]:
     """Return the different names except "", in the order of their first row."""
     return tuple(name for name in dict.fromkeys(names or ()) if name)
 
@@ -284,7 +284,7 @@ def owners_of(
     measurements: Measurements, names: tuple[str, ...] | None
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return the different names and the frame of the first row of each."""
-    owners = names_of(names)
+    owners = distinct_names(names)
     return owners, tuple(measurements.frame[(names or ()).index(owner)] for owner in owners)
 
 

@@ -20,7 +20,7 @@ from pisigma.measurement.sensors.sensor import (
     UnknownGroup,
     Unknowns,
     Values,
-    names_of,
+    distinct_names,
     numbers_of,
     owners_of,
     unit_vectors,
@@ -63,7 +63,7 @@ class SocketSensor(AbstractSensor):
         present = rows.measurements.is_measured("socket")
         if not bool(present.any()):
             return None
-        return cls(rows.numbers(names, names_of(names)), present, rows.sigma(present))
+        return cls(rows.numbers(names, distinct_names(names)), present, rows.sigma(present))
 
     def residual(self, motion: ToolMotion, unknowns: Unknowns, rows: slice) -> Values:
         """Return the socket's position minus the tool's [m]."""
@@ -94,7 +94,7 @@ class SocketSensor(AbstractSensor):
         Raises:
             IdentificationError: by the nominal robot, the rows of one socket are far from each other.
         """
-        names = names_of(measurements.socket)
+        names = distinct_names(measurements.socket)
         if not names:
             return None
         socket = numbers_of(measurements.socket, names, measurements.rows)
@@ -166,7 +166,7 @@ class SocketDistanceSensor(AbstractSensor):
         """
         if not distances:
             return None
-        order = names_of(measurements.socket)
+        order = distinct_names(measurements.socket)
         rows, device = measurements.rows, measurements.q.device
         first, second = (torch.full((rows,), -1, dtype=torch.int64) for _ in range(2))
         measured = torch.zeros(rows, dtype=torch.float64)

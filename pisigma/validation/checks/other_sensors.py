@@ -21,7 +21,7 @@ from pisigma.validation.held_out.model_comparison import ModelComparison, ModelF
 from pisigma.validation.setup_faults.cause import Cause, length_text
 from pisigma.validation.setup_faults.explanations import PLAUSIBLE_SHARE
 from pisigma.validation.setup_faults.hypothesis import COLLAPSED
-from pisigma.validation.setup_faults.joint_faults import joint_causes, signs_and_exchanges
+from pisigma.validation.setup_faults.joint_faults import joint_causes, signs_and_swaps
 from pisigma.validation.setup_faults.setup_fault import SetupFault, fault_of_cause
 from pisigma.validation.setup_faults.setup_faults import unexplained
 
@@ -107,7 +107,7 @@ def diagnosed_lengths(
 def _fault(model: CalibratedModel, rows: Measurements, free: Collection[str]) -> SetupFault | None:
     """Find the fault that explains the errors best; None if none does."""
     before, dof = _rms(_errors(model, rows)), rows.dof
-    maps = signs_and_exchanges(dof)
+    maps = signs_and_swaps(dof)
     found = [
         (_rms(_errors(model, replace(rows, q=q))), joint_causes(maps, number, model.robot)[0])
         for number, q in enumerate(maps.apply(rows.q))

@@ -15,7 +15,7 @@ from pisigma.validation.checks.check import FITTED, CheckedCalibration, RowsUnde
 from pisigma.validation.held_out.diagnostic import Diagnostic, Severity
 from pisigma.validation.setup_faults.explanations import position_spread
 from pisigma.validation.setup_faults.hypothesis import COLLAPSED
-from pisigma.validation.setup_faults.joint_faults import joint_causes, signs_and_exchanges
+from pisigma.validation.setup_faults.joint_faults import joint_causes, signs_and_swaps
 from pisigma.validation.setup_faults.nominal_robot_faults import (
     MIN_ROWS_NOMINAL,
     are_unrelated,
@@ -117,7 +117,7 @@ def joint_columns(robot: Robot, rows: Measurements) -> Iterator[Diagnostic]:
     here, usual = _errors(robot, group, group.q[None])[0], usual_error(robot, group.q)
     if not here > usual:
         return
-    maps = signs_and_exchanges(robot.dof)
+    maps = signs_and_swaps(robot.dof)
     found = [
         (left, joint_causes(maps, number, robot)[0])
         for number, left in enumerate(_errors(robot, group, maps.apply(group.q)))

@@ -14,7 +14,7 @@ from pisigma.calibration.hybrid.uncertainty import PositionUncertainty
 from pisigma.estimation.covariance_root import CovarianceRoot
 from pisigma.files.errors import MeasurementError, Place
 from pisigma.measurement.dataset import Measurements
-from pisigma.measurement.sensors.corner import position_deviations
+from pisigma.measurement.sensors.corner import position_sigmas
 from pisigma.measurement.sensors.intrinsics import NOISE_COLUMN
 from pisigma.model.calibrated_model import CalibratedModel, nominal_poses_of_rows, poses_of_rows
 from pisigma.robot.se3 import rotation_vector
@@ -309,7 +309,7 @@ def image_deviation(measurements: Measurements) -> float:
     noise = measurements.readings.get(NOISE_COLUMN)
     if not isinstance(noise, Tensor):
         return 0.0
-    by_image = position_deviations(measurements) * noise[:, None]
+    by_image = position_sigmas(measurements) * noise[:, None]
     return float(by_image.square().sum(1).nanmean().sqrt())
 
 
@@ -334,7 +334,7 @@ def _noise(result: CalibrationResult | HybridResult, measurements: Measurements)
         sigma = one.sigma if learned is None else learned.noise[one.sensor]
         stated = measurements.sigma_position
         if one.sensor == "corner":
-            by_image = position_deviations(measurements).cpu()
+            by_image = position_sigmas(measurements).cpu()
             deviation = torch.where(by_image.isnan(), deviation, sigma * by_image)
         elif one.sensor == "position" and one.unit != "stated":
             deviation += sigma

@@ -73,7 +73,7 @@ class Accuracy:
         return float(getattr(self.models[model] if model else self.model_figures, f"{statistic}_{self.unit}"))
 
     @property
-    def factor(self) -> float | None:
+    def improvement_factor(self) -> float | None:
         """RMS error of the nominal robot over that of the model; None without a nominal robot."""
         if "nominal" not in self.models or len(self.models) < 2 or not self.figure("rms") > 0:
             return None

@@ -83,9 +83,9 @@ def choose_simplest(fault_hypotheses: Sequence[Hypothesis], most: float) -> list
     ]
     best = min((other.error for other in explaining), default=0.0)
     explaining = [other for other in explaining if other.error <= AS_GOOD * best]
-    simplest = min((other.size for other in explaining), default=0.0)
+    simplest = min((other.complexity for other in explaining), default=0.0)
     chosen: dict[object, Hypothesis] = {}
-    for other in sorted((o for o in explaining if o.size <= simplest), key=lambda other: other.error):
+    for other in sorted((o for o in explaining if o.complexity <= simplest), key=lambda other: other.error):
         chosen.setdefault(tuple((cause.kind, cause.joints) for cause in other.causes), other)
     return list(chosen.values())
 
@@ -95,7 +95,7 @@ def fault_hypotheses(
 ) -> Iterator[Hypothesis]:
     """Yield all hypotheses that may explain the errors to `most` [m]; the first is that nothing is wrong."""
     yield from frame_hypotheses(arm, some, here, most)
-    for measured, cause in units_and_frames(here.measured, here.T[:, :3, 3], "corner" in some.kinds):
+    for measured, cause in measured_pose_faults(here.measured, here.T[:, :3, 3], "corner" in some.kinds):
         yield from frame_hypotheses(arm, some, replace(here, measured=measured, causes=(cause,)), most)
     if arm.model is not None:
         for T, cause in _other_corrections(arm.model, some):
@@ -207,7 +207,7 @@ def _moved(
     return Cause(kind, clause, advice, 2.0, amount=float(shift))
 
 
-def units_and_frames(
+def measured_pose_faults(
     measured: MeasuredPoses, predicted: Float64[Tensor, "rows 3"], by_images: bool
 ) -> Iterator[tuple[MeasuredPoses, Cause]]:
     """Yield positions in other units, mirrored positions and orientations, and inverse poses.

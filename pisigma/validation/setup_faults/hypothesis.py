@@ -127,7 +127,7 @@ class Hypothesis:
     fitted: int = 0
 
     @property
-    def size(self) -> float:
+    def complexity(self) -> float:
         """Complexity of the causes; frame and tool together count less than separately, as a new setup has both."""
         kinds = {cause.kind for cause in self.causes}
         return sum(cause.size for cause in self.causes) - (1 if {"frame", "tool"} <= kinds else 0)

@@ -74,7 +74,7 @@ class JointMaps:
         return JointMaps(self.matrix[index], self.offset[index])
 
 
-def signs_and_exchanges(dof: int) -> JointMaps:
+def signs_and_swaps(dof: int) -> JointMaps:
     """List a reversed sign of every joint, and every swap of two neighbouring joints."""
     signs = JointMaps.scaled(1 - 2 * torch.eye(dof, dtype=torch.float64))
     order = torch.arange(dof).repeat(dof - 1, 1)

@@ -161,10 +161,10 @@ def _named_otherwise(robot: Robot, measurements: Measurements, usual: float) -> 
 def _labelled(
     rows: Measurements, T: Float64[Tensor, "rows 4 4"], measured: MeasuredPoses
 ) -> list[Hypothesis]:
-    """Make hypotheses from other names of targets; see `better_labellings`."""
+    """Make hypotheses from other names of targets; see `target_labellings`."""
     return [
         Hypothesis(rows.q, one.T, measured, (one.cause,), 3 * one.targets)
-        for one in better_labellings(rows, T, measured)
+        for one in target_labellings(rows, T, measured)
     ]
 
 
@@ -271,7 +271,7 @@ class Labelling:
     targets: int
 
 
-def better_labellings(
+def target_labellings(
     rows: Measurements, T: Float64[Tensor, "rows 4 4"], measured: MeasuredPoses
 ) -> Iterator[Labelling]:
     """Find targets from the measurements alone, as clusters of the measured points of the tool.

@@ -145,7 +145,7 @@ def test_first_sizes_say_nearly_what_the_whole_fit_gains() -> None:
     largest = NormalEquations.from_rows(Design(arm.rows.problem, (*design.features, products)), arm.rows)
     own = largest.select(design)
     before = own.maximise_evidence(design.prior(arm.prior_scale), arm.noise, 400, 1e-6)
-    gain, sizes = largest.initial_prior_sizes(before, design, products)
+    gain, sizes = largest.evidence_gain(before, design, products)
     assert sizes is not None
     assert len(sizes) == robot.dof
     held = largest.design.prior_like(design, before.prior)

@@ -74,7 +74,7 @@ def test_more_features_are_fitted_at_once() -> None:
     found = ValueCovariance.from_rows(case.design, case.rows)
     small = Design(case.rows.problem, case.design.features[:2])
     posterior = found.select(small).solve(small.prior((1.0,) * 4), case.noise)
-    assert found.initial_prior_sizes(posterior, small, case.design.features[2]) == (math.inf, None)
+    assert found.evidence_gain(posterior, small, case.design.features[2]) == (math.inf, None)
 
 
 def test_values_that_are_not_finite_are_refused() -> None:

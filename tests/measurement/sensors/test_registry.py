@@ -29,7 +29,7 @@ from pisigma.measurement.sensors import (
     Unknowns,
     register_sensor,
 )
-from pisigma.measurement.sensors.sensor import component_along, names_of, numbers_of, owners_of
+from pisigma.measurement.sensors.sensor import component_along, distinct_names, numbers_of, owners_of
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.kinematics.parameter_jacobian import ToolMotion
 
@@ -115,7 +115,7 @@ class HeightGauge(AbstractSensor):
         names = gauges(rows.measurements)
         measured = torch.where(present, rows.readings("height") - rows.bases[:, 2, 3], 0.0)
         up = rows.bases[:, 2, :3].t()
-        return cls(measured, up, rows.numbers(names, names_of(names)), present, rows.sigma(present))
+        return cls(measured, up, rows.numbers(names, distinct_names(names)), present, rows.sigma(present))
 
     def residual(self, motion: ToolMotion, unknowns: Unknowns, rows: slice) -> Tensor:
         predicted = (self.up[:, rows] * motion.position).sum(0) - unknowns["gauge"][0, self.gauge[rows]]
@@ -139,7 +139,7 @@ class HeightGauge(AbstractSensor):
     def initial_guess(
         cls, measurements: pisigma.Measurements, T: Tensor, reach: float
     ) -> InitialUnknowns | None:
-        names = names_of(gauges(measurements))
+        names = distinct_names(gauges(measurements))
         if not names:
             return None
         number = numbers_of(gauges(measurements), names, measurements.rows)

@@ -50,7 +50,12 @@ def test_figures_of_other_rows_agree_with_numpy(hybrid, tmp_path):
         assert_close(getattr(first.models["hybrid"], name), value, rtol=1e-12)
     after = next(layer for layer in content.map.layers if layer.key == "after")
     assert_close(after.values, error, rtol=1e-12)
-    assert_close(first.factor, first.models["nominal"].rms_mm / first.models["hybrid"].rms_mm, rtol=0, atol=0)
+    assert_close(
+        first.improvement_factor,
+        first.models["nominal"].rms_mm / first.models["hybrid"].rms_mm,
+        rtol=0,
+        atol=0,
+    )
     assert content.verdict.held_out
     assert first.models["nominal"].rms_mm > 2 * first.models["hybrid"].rms_mm
 
@@ -100,7 +105,7 @@ def test_a_model_in_another_frame_is_worse_than_nominal(hybrid, tmp_path):
     rows = measured(hybrid[0], 60, seed=9)
     moved = replace(rows, position=rows.position + 0.05)
     content = report_content(hybrid[1], tmp_path, moved)
-    factor = content.accuracies[0].factor
+    factor = content.accuracies[0].improvement_factor
     assert factor < 1
     assert f"{1 / factor:.1f} times" in content.verdict.sentence
 

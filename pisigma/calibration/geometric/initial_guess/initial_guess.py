@@ -23,7 +23,7 @@ from pisigma.calibration.geometric.problem.parameters import ParameterSpace
 from pisigma.files.errors import IdentificationError, Place, nearest_choice
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.sensors.registry import SENSORS
-from pisigma.measurement.sensors.sensor import names_of, numbers_of
+from pisigma.measurement.sensors.sensor import distinct_names, numbers_of
 from pisigma.measurement.sensors.socket import means_by_number
 from pisigma.robot.description import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
@@ -205,7 +205,7 @@ def _from_sockets(
 ) -> dict[str, np.ndarray]:
     """Add tools without a guess, from the sockets that their ball was measured in."""
     tools = dict(tools)
-    socket = numbers_of(measurements.socket, names_of(measurements.socket), measurements.rows)
+    socket = numbers_of(measurements.socket, distinct_names(measurements.socket), measurements.rows)
     target = numbers_of(measurements.target, space.targets, measurements.rows)
     for number, name in enumerate(space.targets):
         rows = (socket >= 0) & (target == number)

@@ -19,7 +19,7 @@ from pisigma.measurement.sensors.anchor import (
     anchor_from_distances,
     stated_position,
 )
-from pisigma.measurement.sensors.sensor import names_of, numbers_of
+from pisigma.measurement.sensors.sensor import distinct_names, numbers_of
 from pisigma.robot.description import Robot
 from pisigma.robot.se3 import rotation_from_rpy, rpy_from_rotation
 
@@ -198,7 +198,7 @@ def base_from_anchors(
         nominal_base: x, y, z [m], roll, pitch, yaw [rad] of the nominal base, for what the anchors do not determine.
     """
     seen, stated = [], []
-    for name in names_of(measurements.anchor):
+    for name in distinct_names(measurements.anchor):
         rows = [
             row
             for row, anchor in enumerate(measurements.anchor or ())
@@ -261,11 +261,11 @@ def _distances_of(measurements: Measurements, T: Tensor, target: str) -> _Distan
         return _Distances(R[:0], p[:0], torch.zeros(0, dtype=torch.int64), p[:0, 0])
     distance = measurements.distance.cpu()
     own = torch.tensor([name == target for name in measurements.target]) & torch.isfinite(distance)
-    number = numbers_of(measurements.anchor, names_of(measurements.anchor), measurements.rows)
+    number = numbers_of(measurements.anchor, distinct_names(measurements.anchor), measurements.rows)
     known, counts = torch.unique(number[own & (number >= 0)], return_counts=True)
     wires = own & torch.isin(number, known[counts >= MIN_DISTANCES])
     anchor = torch.unique(number[wires], return_inverse=True)[1]
-    first = torch.arange(0, 2 * len(names_of(measurements.pair)), 2)
+    first = torch.arange(0, 2 * len(distinct_names(measurements.pair)), 2)
     first = first[own[first] & own[first + 1]]
     return _Distances(
         torch.cat([R[wires], R[first] - R[first + 1]]),

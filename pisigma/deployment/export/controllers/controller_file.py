@@ -7,10 +7,10 @@ from dataclasses import asdict, dataclass, field, replace
 import numpy as np
 from jaxtyping import Float64
 
+from pisigma.deployment.export.approximation import all_parameter_indices, approximate_model
 from pisigma.deployment.export.export_format import Exported, ExportFormat, ExportRequest, model_facts
 from pisigma.deployment.export.geometry import condition_remarks, corrects_joints, frame_remarks
 from pisigma.deployment.export.joint_offsets import departure_sentence
-from pisigma.deployment.export.projection import project_model, whole_geometry
 from pisigma.files.errors import RobotError
 from pisigma.lifetime.cell.exports import Contents
 from pisigma.robot.description import Robot
@@ -114,7 +114,7 @@ class ControllerFile:
     read: Callable[[str, str, Robot], Robot] | None
     check: Callable[[Robot], None]
     convention: Callable[[Robot], Convention] = Convention
-    parameters: Callable[[Robot], Sequence[int]] = whole_geometry
+    parameters: Callable[[Robot], Sequence[int]] = all_parameter_indices
     options: frozenset[str] = field(default_factory=frozenset)
     refuse: Callable[[ExportRequest], None] = lambda request: None
     contains: Contents = "kinematics"
@@ -143,7 +143,7 @@ class ControllerFile:
         parameters = self.parameters(nominal)
         whole = len(parameters) == nominal.dh.size
         start = model.calibrated if whole and model.calibrated is not None else nominal
-        fit = project_model(model, start, parameters)
+        fit = approximate_model(model, start, parameters)
         draft, held = FileText(fit.robot, nominal, request), fit.robot
         if self.read is not None:
             held = self.read(self.text(draft), str(request.out), nominal)

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64, Int64
 
+from pisigma.deployment.export.approximation import joint_offsets
 from pisigma.deployment.export.controllers.controller_file import (
     ControllerFile,
     FileText,
@@ -14,7 +15,6 @@ from pisigma.deployment.export.controllers.offset_table import read_offsets
 from pisigma.deployment.export.dh_table import csv_table, parameter_columns
 from pisigma.deployment.export.export_format import ExportRequest
 from pisigma.deployment.export.joint_offsets import joints_by_axes, offsets_between
-from pisigma.deployment.export.projection import joint_offsets
 from pisigma.files.errors import OutputError
 from pisigma.robot.description import Robot
 from pisigma.robot.row import FRAME_COLUMNS, in_file_units

@@ -5,8 +5,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from pisigma.deployment.export.approximation import joint_offsets
 from pisigma.deployment.export.joint_offsets import joints_by_axes
-from pisigma.deployment.export.projection import joint_offsets
 from pisigma.files.errors import Place, RobotError
 from pisigma.files.yaml_file import plain_content
 from pisigma.robot.description import Robot

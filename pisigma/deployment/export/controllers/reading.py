@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from pisigma.deployment.export.approximation import Departure, departure_from_nominal
 from pisigma.deployment.export.controllers import staubli, universal_robots, ur_ros
 from pisigma.deployment.export.controllers.controller_file import (
     ControllerFile,
@@ -11,7 +12,6 @@ from pisigma.deployment.export.controllers.controller_file import (
     with_frames,
 )
 from pisigma.deployment.export.controllers.offset_table import read_offsets
-from pisigma.deployment.export.projection import Departure, departure_from_nominal
 from pisigma.files.errors import Place, RobotError
 from pisigma.files.input_file import read_text
 from pisigma.robot.description import Robot

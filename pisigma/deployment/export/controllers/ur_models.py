@@ -6,8 +6,8 @@ import numpy as np
 import torch
 from jaxtyping import Float64
 
+from pisigma.deployment.export.approximation import ApproximationProblem, solve_approximation
 from pisigma.deployment.export.controllers.controller_file import Convention, Frames, check_plain_joints
-from pisigma.deployment.export.projection import ProjectionProblem, solve_projection
 from pisigma.files.errors import RobotError
 from pisigma.robot.chains import joint_origins
 from pisigma.robot.description import Robot
@@ -209,7 +209,7 @@ def _placed(model: str, own: Robot, described: Robot) -> tuple[float, Controller
 
     distance, robot = laid(base, tool)
     if _EXACT < distance < 4 * FARTHEST:
-        robot, _ = solve_projection(ProjectionProblem(robot, q, T, ()))
+        robot, _ = solve_approximation(ApproximationProblem(robot, q, T, ()))
         base, tool = _right(frame_of(robot.base)), _right(frame_of(robot.tool))
         distance, robot = laid(base, tool)
     return distance, ControllerGeometry(model, own, base, tool, described)

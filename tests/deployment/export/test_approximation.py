@@ -6,11 +6,11 @@ import torch
 from testing.closeness import assert_close
 from testing.models import joints_around
 
-from pisigma.deployment.export.projection import (
-    ProjectionProblem,
+from pisigma.deployment.export.approximation import (
+    ApproximationProblem,
+    all_parameter_indices,
     joint_offsets,
-    solve_projection,
-    whole_geometry,
+    solve_approximation,
 )
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
@@ -21,8 +21,8 @@ def test_the_fit_is_a_minimum():
     nominal, random = Robot.load("ur10"), np.random.default_rng(0)
     true = nominal.with_geometry(nominal.dh + random.normal(0, 2e-3, nominal.dh.shape))
     q = joints_around("ur10", 200, spread=0.8)
-    problem = ProjectionProblem(nominal, q, forward_kinematics(true, q), joint_offsets(nominal))
-    fitted, seen = solve_projection(problem)
+    problem = ApproximationProblem(nominal, q, forward_kinematics(true, q), joint_offsets(nominal))
+    fitted, seen = solve_approximation(problem)
     assert seen == (False, True, True, True, True, False)
     missing, J = problem.residual(fitted)
     free = torch.tensor([*seen, *[True] * 12])
@@ -31,10 +31,10 @@ def test_the_fit_is_a_minimum():
     assert missing.norm() < problem.residual(nominal)[0].norm() / 1.5
 
 
-@pytest.mark.parametrize("free", [joint_offsets, whole_geometry])
+@pytest.mark.parametrize("free", [joint_offsets, all_parameter_indices])
 def test_the_derivative_agrees_with_finite_differences(free):
     robot, q = Robot.load("kiro3"), joints_around("kiro3", 4)
-    problem = ProjectionProblem(robot, q, forward_kinematics(robot, q), free(robot))
+    problem = ApproximationProblem(robot, q, forward_kinematics(robot, q), free(robot))
     _, J = problem.residual(robot)
     for i in range(J.shape[1]):
         step = torch.zeros(J.shape[1], dtype=torch.float64)
@@ -48,6 +48,8 @@ def test_all_parameters_reproduce_any_geometry():
     true = nominal.with_geometry(nominal.dh + random.normal(0, 2e-3, nominal.dh.shape))
     q = joints_around("ur10", 200, spread=0.8)
     T = forward_kinematics(true, q)
-    fitted, observable = solve_projection(ProjectionProblem(nominal, q, T, whole_geometry(nominal)))
+    fitted, observable = solve_approximation(
+        ApproximationProblem(nominal, q, T, all_parameter_indices(nominal))
+    )
     assert sum(observable) == 18  # 4 n + 6 of an arm with n joints, of which base and tool have 12
     assert_close(forward_kinematics(fitted, q), T, atol=1e-8)

@@ -1,4 +1,4 @@
-"""Projection of a model: the robot with few free parameters that approximates it best."""
+"""Geometric approximation of a model: the robot with few free parameters that approximates it best."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -42,13 +42,13 @@ def joint_offsets(robot: Robot) -> tuple[int, ...]:
     )
 
 
-def whole_geometry(robot: Robot) -> tuple[int, ...]:
+def all_parameter_indices(robot: Robot) -> tuple[int, ...]:
     """Return the indices into the flattened `Robot.dh` of all parameters."""
     return tuple(range(robot.dh.size))
 
 
 @dataclass(frozen=True, eq=False)
-class ProjectionProblem:
+class ApproximationProblem:
     """Least-squares fit of some parameters, base and tool of a robot to poses.
 
     Attributes:
@@ -96,7 +96,7 @@ class ProjectionProblem:
         )
 
 
-def solve_projection(problem: ProjectionProblem) -> tuple[Robot, tuple[bool, ...]]:
+def solve_approximation(problem: ApproximationProblem) -> tuple[Robot, tuple[bool, ...]]:
     """Minimise the sum of squares from the initial robot by Levenberg-Marquardt steps.
 
     Returns:
@@ -178,7 +178,7 @@ class Departure:
 
 
 @dataclass(frozen=True, eq=False)
-class Projection:
+class GeometricApproximation:
     """Robot that approximates a model best, and held-out poses for its evaluation.
 
     Attributes:
@@ -214,12 +214,12 @@ def departure_from_nominal(robot: Robot, nominal: Robot) -> Departure:
     low, high = torch.from_numpy(nominal.limits.clip(-torch.pi, torch.pi)).unbind(1)
     share = torch.rand((POSES, nominal.dof), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     q = low + share * (high - low)
-    return Projection(robot, (), q, forward_kinematics(robot, q)).deviation_of(nominal)
+    return GeometricApproximation(robot, (), q, forward_kinematics(robot, q)).deviation_of(nominal)
 
 
-def project_model(
+def approximate_model(
     model: CalibratedModel, start: Robot, parameters: Sequence[int], seed: int = 0
-) -> Projection:
+) -> GeometricApproximation:
     """Fit parameters, base and tool of a robot to a model by least squares.
 
     Angles are weighted by half the robot's reach. The poses are predictions of the model in its calibrated region, at
@@ -235,8 +235,8 @@ def project_model(
         ModelError: the model has no stored joint values, or no predictions at them.
     """
     generator = torch.Generator().manual_seed(seed)
-    problem = ProjectionProblem(start, *_poses(model, generator), parameters)
-    return Projection(*solve_projection(problem), *_poses(model, generator))
+    problem = ApproximationProblem(start, *_poses(model, generator), parameters)
+    return GeometricApproximation(*solve_approximation(problem), *_poses(model, generator))
 
 
 def _poses(
