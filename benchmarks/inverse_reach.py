@@ -146,7 +146,7 @@ def report_tasks(rows: int) -> None:
         model = make_model(robot, 24, rng)
         kernels = CompiledIK.from_model(model)
         T = kernels.forward(draw_joints(model.robot, rows, rng).numpy())[0]
-        axes = task_axes(kernels.axes, ignored)
+        axes = task_axes(kernels.task_axes, ignored)
         if "yaw" in axes.ignored:
             angles = rng.uniform(-math.pi, math.pi, rows)
             T = T @ np.stack([transform_of((0, 0, 0, angle, 0, 0)) for angle in angles])
@@ -170,7 +170,7 @@ def report_branches(rows: int, starts: int = 40) -> None:
     every = kernels.all_branches(T, threads=1)
     took = (time.perf_counter() - start) / rows * 1e6
     begun = draw_joints(model.robot, rows * starts, rng).reshape(rows * starts, 6)
-    arm = NumericArm(model.robot, model.identified, model.hybrid, kernels.axes)
+    arm = NumericArm(model.robot, model.identified, model.hybrid, kernels.task_axes)
     q, reached = arm.reach(torch.from_numpy(np.repeat(T, starts, 0)), begun)
     off = np.sin((q.numpy().reshape(rows, starts, 1, 6) - every.q[:, None]) / 2)
     missed = np.nan_to_num(np.abs(off).max(-1), nan=1.0).min(-1) > 1e-4

@@ -240,7 +240,7 @@ def _solve(model: ServedModel, request: dict[str, Any]) -> tuple[str, dict[str, 
     if model.byte_solver is not None and request.keys() <= _PLAIN:
         near_bytes = b"" if near is None else struct.pack(f"<{len(near)}d", *near)
         row = model.byte_solver.solve_packed(_POSE.pack(*entries), near_bytes)
-        values = _record(model, row, model.ik.axes.ignored)
+        values = _record(model, row, model.ik.task_axes.ignored)
     else:
         approach = read_numbers(request, "approach", len(model.ik.joints)) if "approach" in request else None
         ik, T = _for_task(model, request), np.reshape(entries, (4, 4))

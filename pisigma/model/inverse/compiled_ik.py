@@ -38,7 +38,7 @@ class CompiledIK:
         branches: names of the branches.
         joints: names of the joints.
         belongs_to: SHA-256 of the model folder of the same state; "" without a folder.
-        axes: axes of the tool that are constrained unless a task states others.
+        task_axes: axes of the tool that are constrained unless a task states others.
     """
 
     def __init__(
@@ -62,7 +62,7 @@ class CompiledIK:
         self._none = np.zeros((0, len(self.joints)))
         self._row = ctypes.c_double * (2 * len(self.joints) + 5)
         whole = description.network.used and not description.forms.closed_forms
-        self.axes = WHOLE if whole else default_axes(len(self.joints))
+        self.task_axes = WHOLE if whole else default_axes(len(self.joints))
         self._kernels = load_kernels(description.forms)
         self._threads = threading.local()
 
@@ -111,7 +111,7 @@ class CompiledIK:
                 INVALID_POSE.
             approach: `(dof,)`: +1 or -1 for the direction in which every joint moves to the pose, 0 if it is not known.
             owner: see `Solution`.
-            axes: axes of the tool that are constrained; None for the arm's `axes`.
+            axes: axes of the tool that are constrained; None for the arm's `task_axes`.
 
         Raises:
             PoseError: the matrix is not a valid pose, a shape is wrong, or there is no such branch.
@@ -147,7 +147,7 @@ class CompiledIK:
         try:
             solve, arguments, out = self._threads.packed
         except AttributeError:
-            out, axes = self._row(), self.axes.row.tobytes()
+            out, axes = self._row(), self.task_axes.row.tobytes()
             solve = partial(self._kernels, IGNORED, IGNORED, self._address, self._memory(), arrays.SOLVE, 1)
             arguments = b"", 0, axes, bool(axes), arrays.ANY_BRANCH, True, False, out, 1
             self._threads.packed = solve, arguments, out
@@ -237,11 +237,11 @@ class CompiledIK:
 
     def _checked(self, axes: TaskAxes | None) -> TaskAxes:
         """Return the constrained axes; models that correct by the whole pose accept only the default ones."""
-        if axes is None or not self.description.network.used or axes == self.axes:
-            return axes or self.axes
+        if axes is None or not self.description.network.used or axes == self.task_axes:
+            return axes or self.task_axes
         raise PoseError(
             f"model '{self.name}' corrects nominal joint values as a function of the whole pose, so only the default "
-            f"axes ({', '.join(self.axes.ignored) or 'none'}) can be ignored",
+            f"axes ({', '.join(self.task_axes.ignored) or 'none'}) can be ignored",
             value=axes.ignored,
             option="ignore_axes",
             remedy="calibrate a hybrid",

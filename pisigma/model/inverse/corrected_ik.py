@@ -165,15 +165,21 @@ class CorrectedIK(AbstractInverse):
             return task.controller.solve(T_base_tool, near, self, branch, throw=throw, approach=approach)
         kernels = self.compiled
         if isinstance(T_base_tool, np.ndarray) and T_base_tool.shape == (4, 4) and kernels is not None:
-            return kernels.solve(T_base_tool, near, branch, throw, approach, self, task.axes)
+            return kernels.solve(T_base_tool, near, branch, throw, approach, self, task.task_axes)
         T, single, tensor = pose_array(T_base_tool)
         if T.ndim == 2 and not single and kernels is not None:
-            solution = kernels.solve(T, near, branch, throw, approach, self, task.axes)
+            solution = kernels.solve(T, near, branch, throw, approach, self, task.task_axes)
         else:
             solution = (kernels or self.numeric).solve_batch(
-                T, near=near, branch=branch, throw=throw, approach=approach, single=single, axes=task.axes
+                T,
+                near=near,
+                branch=branch,
+                throw=throw,
+                approach=approach,
+                single=single,
+                axes=task.task_axes,
             )
-        return self._like(tensor, solution, task.axes)
+        return self._like(tensor, solution, task.task_axes)
 
     def all_branches(self, T_base_tool: Any, *, approach: Any = None) -> Solution:
         """Find solutions on every branch, as `(*batch, branches)`; see `__call__` and `for_task`.
@@ -186,8 +192,8 @@ class CorrectedIK(AbstractInverse):
             return self.controller.all_branches(T_base_tool, self, approach=approach)
         T, single, tensor = pose_array(T_base_tool)
         route = self.compiled or self.numeric
-        every = route.all_branches(T, approach=approach, single=single, axes=self.axes)
-        return self._like(tensor, every, self.axes)
+        every = route.all_branches(T, approach=approach, single=single, axes=self.task_axes)
+        return self._like(tensor, every, self.task_axes)
 
     def path(
         self, T_base_tool: Any, *, near: Any = None, branch: str | None = None
@@ -286,11 +292,11 @@ class CorrectedIK(AbstractInverse):
         return None if forward and self.compiled.description.network.used else self.compiled
 
     @cached_property
-    def axes(self) -> TaskAxes:
+    def task_axes(self) -> TaskAxes:
         """Axes of the tool that are constrained unless a call states others."""
         if self.controller is not None:
-            return self.controller.ik.axes
-        return self.numeric.axes if self.compiled is None else self.compiled.axes
+            return self.controller.ik.task_axes
+        return self.numeric.task_axes if self.compiled is None else self.compiled.task_axes
 
     def for_task(
         self,
@@ -327,7 +333,9 @@ class CorrectedIK(AbstractInverse):
                 option="elbow_angle",
                 remedy="omit it for other robots",
             )
-        return self.with_axes(task_axes(self.axes, ignore_axes, tolerance_mm, tolerance_deg, elbow_angle))
+        return self.with_axes(
+            task_axes(self.task_axes, ignore_axes, tolerance_mm, tolerance_deg, elbow_angle)
+        )
 
     def with_axes(self, axes: TaskAxes) -> "CorrectedIK":
         """Return a copy in which other axes of the tool are constrained.
@@ -336,7 +344,7 @@ class CorrectedIK(AbstractInverse):
             PoseError: the robot has passive joints, which are solved in the default axes only.
         """
         ik = copy(self)
-        ik.axes = axes
+        ik.task_axes = axes
         if self.controller is not None:
             ik.controller = self.controller.with_axes(axes)
         return ik

@@ -42,7 +42,7 @@ class NumericIK:
         model: calibrated model.
         branches: names of the branches.
         order: indices of the branches: those of training rows, most frequent first, then the others.
-        axes: axes of the tool that are constrained.
+        task_axes: axes of the tool that are constrained.
     """
 
     def __init__(self, model: CalibratedModel, axes: TaskAxes | None = None) -> None:
@@ -72,16 +72,16 @@ class NumericIK:
         self.order = (*trained, *(index for index in range(len(self.branches)) if index not in trained))
         self._trained = torch.tensor(trained)
         whole = model.network is not None and self._solver is None
-        self.axes = axes or (TaskAxes() if whole else default_axes(model.robot.dof))
-        if self.axes.elbow_angle is not None:
+        self.task_axes = axes or (TaskAxes() if whole else default_axes(model.robot.dof))
+        if self.task_axes.elbow_angle is not None:
             raise PoseError(
                 f"is supported only by compiled kernels, which are not available for model '{model.name}'",
-                value=self.axes.elbow_angle,
+                value=self.task_axes.elbow_angle,
                 option="elbow_angle",
                 remedy="omit it",
             )
         self._network = model.network if model.calibrated is None else None
-        self._arm = NumericArm(model.robot, model.identified, model.hybrid, self.axes)
+        self._arm = NumericArm(model.robot, model.identified, model.hybrid, self.task_axes)
         self._spare = self._arm.has_spare_joints and self._network is None
         self._stored = StoredStarts(model.identified, model.starts.double().cpu())
 
@@ -105,7 +105,7 @@ class NumericIK:
             throw: whether invalid poses and joint values raise an error.
             approach: `(*batch, dof)` or `(dof,)`.
             single: whether the poses were rounded to float32; None to infer it from their type.
-            axes: axes of the tool that are constrained; None for `axes`.
+            axes: axes of the tool that are constrained; None for `task_axes`.
         """
         if branch is not None:
             check_choice(PoseError, "branch", branch, self.branches)
@@ -149,7 +149,7 @@ class NumericIK:
         solve: Callable[["NumericIK", Tensor], Solution],
     ) -> Solution:
         """Solve rows of poses, grouped by their approach directions."""
-        ik = self if axes is None or axes == self.axes else NumericIK(self.model, axes)
+        ik = self if axes is None or axes == self.task_axes else NumericIK(self.model, axes)
         hybrid, rows = self.model.hybrid, torch.arange(len(poses.T))
         if approach is None or hybrid is None or not len(rows):
             return solve(ik, rows)
@@ -158,7 +158,7 @@ class NumericIK:
         parts = []
         for kind, side in enumerate(kinds):
             model = replace(self.model, hybrid=replace(hybrid, approach=side))
-            parts.append(solve(NumericIK(model, ik.axes), (index == kind).nonzero()[:, 0]))
+            parts.append(solve(NumericIK(model, ik.task_axes), (index == kind).nonzero()[:, 0]))
         place = index.argsort(stable=True).argsort()
         return parts[0].map(lambda *values: torch.cat(values)[place], *parts[1:])
 
@@ -184,7 +184,7 @@ class NumericIK:
             starts = torch.cat([starts, near[:, None]], 1)
         numeric = self._solver is None or self._spare
         if numeric:
-            few = self._stored.q[self._stored.nearest(T, tolerances.ATTEMPTS, self.axes)]
+            few = self._stored.q[self._stored.nearest(T, tolerances.ATTEMPTS, self.task_axes)]
             starts = torch.cat([starts, few], 1)
         unknown = branch.new_full((len(T), starts.shape[1] - branch.shape[1]), -1)
         every, rank = self._solved(T, starts, torch.cat([branch, unknown], 1), near)
@@ -192,7 +192,7 @@ class NumericIK:
         if not len(lost):
             return every, rank
         attempts = tolerances.MORE_ATTEMPTS if numeric else tolerances.ATTEMPTS
-        more = self._stored.q[self._stored.nearest(T[lost], attempts, self.axes)]
+        more = self._stored.q[self._stored.nearest(T[lost], attempts, self.task_axes)]
         starts = more.new_full((len(T), *more.shape[1:]), torch.nan).index_copy(0, lost, more)
         others, ranks = self._solved(T, starts, branch.new_full(starts.shape[:2], -1), near)
         return every.map(lambda *values: torch.cat(values, 1), others), torch.cat([rank, ranks], 1)
@@ -204,12 +204,12 @@ class NumericIK:
         """
         if self._solver is None:
             return T.new_zeros(len(T), 0, self.model.robot.dof), torch.zeros(len(T), 0, dtype=torch.int64)
-        if len(self.model.robot.joints) == 4 and all(self.axes.tolerance[3:5]):
+        if len(self.model.robot.joints) == 4 and all(self.task_axes.tolerance[3:5]):
             T = self._solver.upright_poses(T)
         q, near_rows = self._solver.solve(T.float() if single else T).q.double(), self._solver.start_values(T)
         reached, robot = torch.isfinite(q).all(-1), self.model.identified
         each = T[:, None].expand(*near_rows.shape[:-1], 4, 4).reshape(-1, 4, 4)
-        off, _ = task_error(self.axes, each, forward_kinematics(robot, near_rows.reshape(-1, robot.dof)))
+        off, _ = task_error(self.task_axes, each, forward_kinematics(robot, near_rows.reshape(-1, robot.dof)))
         off = off * off.new_tensor([*[1 / robot.reach] * 3, 1, 1, 1]) * off.new_tensor(self._arm.weights)
         plausible = (off.norm(dim=-1) <= tolerances.BRANCH_MISS).reshape(reached.shape)
         q = torch.where(reached[..., None], q, torch.where(plausible[..., None], near_rows, torch.nan))
@@ -274,18 +274,18 @@ class NumericIK:
         status = torch.where(singular < tolerances.SINGULAR_TOLERANCE, int(Status.SINGULAR), status)
         status = torch.where(inside, status, int(Status.OUTSIDE_JOINT_LIMITS))
         error = self._error(T, self.model.forward(commanded))
-        reached = reached & tolerated(self.axes, error.nan_to_num())
-        error = torch.where(torch.tensor(self.axes.free), 0.0 * error, error)
+        reached = reached & tolerated(self.task_axes, error.nan_to_num())
+        error = torch.where(torch.tensor(self.task_axes.free), 0.0 * error, error)
         left = error[:, :3].norm(dim=-1), error[:, 3:].norm(dim=-1)
         rank = self._rank(T, commanded, branch, near) + torch.where(inside, 0.0, _OUTSIDE)
         solution = Solution(commanded, nominal, branch, self.branches, status, *left, measure)
-        return replace(solution, ignored_axes=self.axes.ignored), torch.where(reached, rank, _LOST)
+        return replace(solution, ignored_axes=self.task_axes.ignored), torch.where(reached, rank, _LOST)
 
     def _nominal(self, T: Tensor, q: Tensor, known: Tensor) -> Tensor:
         """Return the nominal arm's joint values near q, or q itself where `known`; NaN without a solution."""
         if self.model.calibrated is None:
             return q
-        solved = solve_numeric(self.model.robot, T, q, axes=self.axes, weights=self._arm.weights)
+        solved = solve_numeric(self.model.robot, T, q, axes=self.task_axes, weights=self._arm.weights)
         found = torch.where((solved.status != Status.NOT_CONVERGED)[:, None], solved.q, torch.nan)
         return torch.where(known[:, None], q, found)
 
@@ -311,7 +311,7 @@ class NumericIK:
         """Compute the residuals [m, rad] in the axes of the tool; NaN where the model has no prediction."""
         known = torch.isfinite(reached).flatten(1).all(-1)[:, None]
         safe = torch.nan_to_num(reached)
-        error = pose_error(T, safe) if self.axes.whole else task_error(self.axes, T, safe)[0]
+        error = pose_error(T, safe) if self.task_axes.whole else task_error(self.task_axes, T, safe)[0]
         return torch.where(known, error, torch.nan)
 
     def _rank(self, T: Tensor, q: Tensor, branch: Tensor, near: Tensor | None) -> Tensor:

@@ -97,7 +97,7 @@ def follow_path(
     if branch is not None:
         check_choice(PoseError, "branch", branch, ik.branches)
     near_rows = None if near is None else np.asarray(ik.postures.check_near(near), dtype=np.float64)
-    on_branches = ik.closed_form and len(ik.joints) <= ik.axes.free.count(False)
+    on_branches = ik.closed_form and len(ik.joints) <= ik.task_axes.free.count(False)
     guide = _guide(ik, T, near_rows, branch) if on_branches else _one_by_one(ik, T, near_rows)
     solution = _solve(ik, T, guide, _approaches(guide, near_rows))
     return JointPath(solution, _switches(ik, T, np.asarray(solution.q), solution))

@@ -39,7 +39,7 @@ class AbstractInverse(ABC):
 
     @property
     @abstractmethod
-    def axes(self) -> TaskAxes:
+    def task_axes(self) -> TaskAxes:
         """Axes of the tool that are constrained."""
 
     @property

@@ -91,12 +91,12 @@ TASKS = [
 @pytest.mark.parametrize(("name", "ignored"), TASKS)
 def test_reachable_poses_are_reached_in_the_constrained_axes(name, ignored):
     ik = CorrectedIK(model_of(name)).for_task(ignored)
-    T = wanted(name, 150, ik.axes)
+    T = wanted(name, 150, ik.task_axes)
     solution = ik(T)
-    assert solution.ignored_axes == ik.axes.ignored
+    assert solution.ignored_axes == ik.task_axes.ignored
     reached = np.isin(solution.status, (Status.REACHED, Status.OUTSIDE_DOMAIN, Status.SINGULAR))
     assert reached.mean() > 0.99
-    assert_close(errors(name, T[reached], solution.q[reached], ik.axes), 0.0, atol=1e-10)
+    assert_close(errors(name, T[reached], solution.q[reached], ik.task_axes), 0.0, atol=1e-10)
     assert np.nanmax(solution.position_residual) < 1e-10
     assert np.nanmax(solution.rotation_residual) < 1e-10
 
@@ -194,7 +194,7 @@ def test_the_elbow_angle_is_reached(angle):
 
 def test_all_solutions_of_an_arm_without_closed_form_differ():
     ik = CorrectedIK(model_of("panda"))
-    T = wanted("panda", 10, ik.axes)
+    T = wanted("panda", 10, ik.task_axes)
     every = ik.all_branches(T)
     assert every.q.shape == (10, 8, 7)
     reached = np.isfinite(every.q).all(-1)

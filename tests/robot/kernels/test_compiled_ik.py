@@ -42,8 +42,8 @@ def _both(name, arms, rows=40, near=False, **kind):
 
 def _left(kernels, model, q, T):
     """Return pose errors in the tool axes that are not free: all six except for a SCARA."""
-    error, _ = task_error(kernels.axes, T, model.forward(torch.from_numpy(q)))
-    return error[:, ~torch.tensor(kernels.axes.free)]
+    error, _ = task_error(kernels.task_axes, T, model.forward(torch.from_numpy(q)))
+    return error[:, ~torch.tensor(kernels.task_axes.free)]
 
 
 KINDS = [(False, True, 1.0), (True, True, 0.5), (True, False, 1.0)]

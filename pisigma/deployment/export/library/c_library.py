@@ -120,8 +120,10 @@ def model_file(model: CalibratedModel) -> bytes:
     segments = _segments(packed)
     sizes = DESCRIPTION.itemsize, MEMORY.itemsize, model.robot.dof, len(branches), len(segments), len(names)
     axes = np.zeros(8)
-    axes[: compiled.axes.row.size] = compiled.axes.row.ravel()
-    head = _HEAD.pack(b"PSIGIK01", layout_key(), *sizes, arm, *bounds.ravel(), len(compiled.axes.row), *axes)
+    axes[: compiled.task_axes.row.size] = compiled.task_axes.row.ravel()
+    head = _HEAD.pack(
+        b"PSIGIK01", layout_key(), *sizes, arm, *bounds.ravel(), len(compiled.task_axes.row), *axes
+    )
     content = head + names + b"".join(segments)
     return content + struct.pack("=I", zlib.crc32(content))
 
