@@ -108,7 +108,7 @@ def test_the_correction_depends_on_the_approach_direction(monkeypatch):
     def with_backlash(arm, q):
         return plain(arm, q) + (0.0 if arm.approach is None else 1e-3 * arm.approach)
 
-    monkeypatch.setattr(HybridArm, "delta", with_backlash)
+    monkeypatch.setattr(HybridArm, "joint_correction", with_backlash)
     ik, T = NumericIK(model).solve_batch, model.forward(q)
     near, sides = (
         ik(T, near=q),
