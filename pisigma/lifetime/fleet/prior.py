@@ -206,10 +206,12 @@ def evidence_of(
     kept = torch.cat([X[:, : space.arm_size], X[:, len(space.parameters) :]], 1)
     inner = others.t() @ others
     inner.diagonal().add_(RELOCATION_PRIOR["m"] ** -2)
+    # Every robot has its own base, tool and sensor unknowns: they are eliminated (Schur complement).
     taken = torch.linalg.solve(inner, others.t() @ torch.cat([kept, y[:, None]], 1))
     normal = kept.t() @ kept - kept.t() @ others @ taken[:, :-1]
     descent = kept.t() @ y - kept.t() @ others @ taken[:, -1]
     normal = (normal + normal.t()) / 2
+    # Linearised at the mean, the residuals determine errors minus mean: add the mean.
     return RobotEvidence(normal, descent + normal @ mean, adaptation.noise)
 
 

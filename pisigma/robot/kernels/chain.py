@@ -37,6 +37,7 @@ def walk(arms: Record, arm: int, q: Array, axes: Array, T: Array) -> None:
             else:
                 d += value
             joint += 1
+        # The frame's rows a, b, c follow RotZ(theta), Trans(a, 0, d), RotX(alpha) and RotY(beta) in turn.
         ax, ay = cos * ax + sin * ay, cos * ay - sin * ax
         bx, by = cos * bx + sin * by, cos * by - sin * bx
         cx, cy = cos * cx + sin * cy, cos * cy - sin * cx
@@ -180,6 +181,7 @@ def cosines_sines(turns: Array, offset: float) -> None:
         cosine = 4.16666666666666019037e-02 + z * (-1.38888888888741095749e-03 + z * cosine)
         cosine = 1.0 - (0.5 * z - z * z * cosine)
         quadrant = quarters - 4.0 * math.floor(quarters * 0.25)
+        # An odd number of quarter turns swaps sine and cosine.
         odd = quadrant == 1.0 or quadrant == 3.0
         first, second = sine if odd else cosine, cosine if odd else sine
         turns[0, b] = -first if quadrant == 1.0 or quadrant == 2.0 else first
