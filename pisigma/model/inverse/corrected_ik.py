@@ -158,6 +158,7 @@ class CorrectedIK(AbstractInverse):
             PoseError: a matrix is not a valid pose, `near` is far outside the joint limits, or an argument is invalid.
         """
         task = self.for_task(ignore_axes, tolerance_mm, tolerance_deg, elbow_angle)
+        axes = task.task_axes
         if near is not None:
             near = self.postures.check_near(near, throw)
         approach = checked_approach(approach)
@@ -165,21 +166,15 @@ class CorrectedIK(AbstractInverse):
             return task.controller.solve(T_base_tool, near, self, branch, throw=throw, approach=approach)
         kernels = self.compiled
         if isinstance(T_base_tool, np.ndarray) and T_base_tool.shape == (4, 4) and kernels is not None:
-            return kernels.solve(T_base_tool, near, branch, throw, approach, self, task.task_axes)
+            return kernels.solve(T_base_tool, near, branch, throw, approach, self, axes)
         T, single, tensor = pose_array(T_base_tool)
         if T.ndim == 2 and not single and kernels is not None:
-            solution = kernels.solve(T, near, branch, throw, approach, self, task.task_axes)
+            solution = kernels.solve(T, near, branch, throw, approach, self, axes)
         else:
             solution = (kernels or self.numeric).solve_batch(
-                T,
-                near=near,
-                branch=branch,
-                throw=throw,
-                approach=approach,
-                single=single,
-                axes=task.task_axes,
+                T, near=near, branch=branch, throw=throw, approach=approach, single=single, axes=axes
             )
-        return self._like(tensor, solution, task.task_axes)
+        return self._like(tensor, solution, axes)
 
     def all_branches(self, T_base_tool: Any, *, approach: Any = None) -> Solution:
         """Find solutions on every branch, as `(*batch, branches)`; see `__call__` and `for_task`.
@@ -333,9 +328,8 @@ class CorrectedIK(AbstractInverse):
                 option="elbow_angle",
                 remedy="omit it for other robots",
             )
-        return self.with_axes(
-            task_axes(self.task_axes, ignore_axes, tolerance_mm, tolerance_deg, elbow_angle)
-        )
+        axes = task_axes(self.task_axes, ignore_axes, tolerance_mm, tolerance_deg, elbow_angle)
+        return self.with_axes(axes)
 
     def with_axes(self, axes: TaskAxes) -> "CorrectedIK":
         """Return a copy in which other axes of the tool are constrained.
