@@ -92,7 +92,7 @@ def test_rendered_images_are_those_of_the_poses(recipe: GeometricRecipe, robot: 
 
     half = {"width": 960, "height": 600, "fx": 700.0, "fy": 700.0, "cx": 480.0, "cy": 300.0}
     section = images(recipe, camera=half)
-    found = detect_checkerboard(next(section.rendered(robot)), section.board.board())
+    found = detect_checkerboard(next(section.render(robot)), section.board.board())
     assert isinstance(found, DetectedBoard)
     T_board_camera = robot.forward(section.joints_read(robot))[0].numpy()
     seen = (section.board.board().corners - T_board_camera[:3, 3]) @ T_board_camera[:3, :3]
