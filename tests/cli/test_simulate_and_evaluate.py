@@ -68,7 +68,7 @@ def test_poses_before_and_after(run, trained, held_out):
     model = load_model(trained[0] / "model")
     by_hand = compare_on(model, Measurements.read_csv(held_out, model.robot))
     for kind in ("nominal", "corrected"):
-        assert printed[kind] == pytest.approx(getattr(by_hand, kind).figures.by_name, rel=1e-12)
+        assert printed[kind] == pytest.approx(getattr(by_hand, kind).figures.figures_by_name, rel=1e-12)
 
 
 def without(path, target, *columns):
@@ -194,6 +194,6 @@ def test_rows_that_the_model_does_not_predict_are_left_out_of_both(run, held_out
     rows = Measurements.read_csv(held_out, model.robot)
     predicted = torch.isfinite(model.forward(rows.q)).flatten(1).all(-1)
     assert int((~predicted).sum()) == lost
-    kept = compare_on(replace(model, network=None), rows.select(predicted)).nominal.figures.by_name
+    kept = compare_on(replace(model, network=None), rows.select(predicted)).nominal.figures.figures_by_name
     assert printed["nominal"] == pytest.approx(kept, rel=1e-9)
     assert f"Warning: {lost} rows" in run("evaluate", tmp_path, held_out).stdout

@@ -121,7 +121,7 @@ class DenseRegression(AbstractDesignRegression):
             repetition = error.new_tensor([one.repetition for one in self.sensors])[sensor]
             spread = (1 + repetition * (variance - 1).clamp(min=0)).sqrt()
             parts.append(HeldOutErrors(error * repetition.sqrt(), spread, sensor))
-        return HeldOutErrors.joined(parts)
+        return HeldOutErrors.concatenate(parts)
 
     def _solution(self, prior: GaussianPrior, noise: Sequence[float]) -> tuple[Tensor, Tensor, Tensor]:
         """Return the unknowns, the root of their covariance, and the undetermined directions."""

@@ -66,7 +66,7 @@ def test_pose_errors_are_lengths_and_angles(generator):
     assert_close(errors.position, shift.norm(dim=-1), atol=1e-12)
     assert_close(errors.rotation, turn.norm(dim=-1), atol=1e-9)
     assert PoseErrors.from_prediction(measured(moved, q, orientation=False), T).rotation is None
-    assert {"rms_mm", "rms_deg"} < set(errors.figures.by_name)
+    assert {"rms_mm", "rms_deg"} < set(errors.figures.figures_by_name)
 
 
 def test_pose_errors_need_positions():

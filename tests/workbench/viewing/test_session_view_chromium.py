@@ -58,13 +58,13 @@ def text_with(page, rows):
 
 def test_rows_appear_as_they_come(browser, view):
     arm = arm_beside_tracker()
-    view.show(session_state(arm, 5))
+    view.show_state(session_state(arm, 5))
     with opened(browser, view) as page:
         first = text_with(page, 5)
         assert "Next: pose 6 of 30 (check)" in first
         assert "RMS 0." not in first
         page.wait_for_selector("canvas")
-        view.show(replace(session_state(arm, 20, wrong=19), base=np.eye(4)))
+        view.show_state(replace(session_state(arm, 20, wrong=19), base=np.eye(4)))
         shown = text_with(page, 20)
         for sentence in (
             "20 rows (3 of them check), 1 of them not counted",
@@ -75,11 +75,11 @@ def test_rows_appear_as_they_come(browser, view):
             "Coverage of the joints",
         ):
             assert sentence in shown
-        view.show(session_state(arm, 30))
+        view.show_state(session_state(arm, 30))
         assert "Next" not in text_with(page, 30)
         assert page.inner_text("[data-action=stop]").strip() == "Stop: the limit is reached."
         alarm = Alarm(3, "unreadable", HOSTILE, False)
-        view.show(replace(session_state(arm, 9), advice=Advice("repeat", HOSTILE), alarms=(alarm,)))
+        view.show_state(replace(session_state(arm, 9), advice=Advice("repeat", HOSTILE), alarms=(alarm,)))
         text_with(page, 9)
         assert "</script><script>alert(1)</script>" in page.inner_text("[data-action=repeat]")
 
