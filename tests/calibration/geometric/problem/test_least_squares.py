@@ -35,7 +35,9 @@ class Curve(AbstractLeastSquares[torch.Tensor]):
         J = torch.tensor(slopes, dtype=torch.float64) / SIGMA
         return Linearisation(point, r @ r, -J.mT @ r, J.mT @ J, r @ r, ROUNDING, None)
 
-    def with_updated_noise(self, linearisation: Linearisation[torch.Tensor]) -> tuple[Linearisation[torch.Tensor], bool]:
+    def with_updated_noise(
+        self, linearisation: Linearisation[torch.Tensor]
+    ) -> tuple[Linearisation[torch.Tensor], bool]:
         return linearisation, True
 
     def apply_step(self, point: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
@@ -56,7 +58,9 @@ class Swinging(AbstractLeastSquares[torch.Tensor]):
         r = torch.stack([point[0] - believed, torch.ones(()).double()])
         return Linearisation(point, r @ r, -r[:1], torch.eye(1).double(), r @ r, ROUNDING, believed)
 
-    def with_updated_noise(self, linearisation: Linearisation[torch.Tensor]) -> tuple[Linearisation[torch.Tensor], bool]:
+    def with_updated_noise(
+        self, linearisation: Linearisation[torch.Tensor]
+    ) -> tuple[Linearisation[torch.Tensor], bool]:
         other = replace(linearisation, detail=-float(linearisation.detail))
         return self.linearise(linearisation.point, other), False
 
