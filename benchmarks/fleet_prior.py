@@ -18,6 +18,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from testing.fleet_robots import GEARS, NOISE, NOMINAL, common_errors, common_gears, rows_of
 
+from pisigma.calibration.hybrid.noise import CalibrationNoise
 from pisigma.estimation.population import Population
 from pisigma.lifetime.fleet.prior import FleetPrior, fleet_prior, mean_robot
 from pisigma.lifetime.recalibration.adaptation import Adaptation, adapt
@@ -57,7 +58,9 @@ def true_prior(individual: float, gears: float) -> CalibratedModel:
         deviations.append(deviation[feature.used])
     variance = torch.cat(deviations).square() + NOTHING**2
     population = Population(torch.cat(means), variance.diag(), size)
-    return mean_robot("true", posterior, population, [rows_of(0, 60, 0)], {"position": NOISE})
+    return mean_robot(
+        "true", posterior, population, [rows_of(0, 60, 0)], CalibrationNoise({"position": NOISE})
+    )
 
 
 def begun_with(prior: CalibratedModel, rows: Measurements) -> Adaptation:

@@ -124,13 +124,13 @@ def main() -> None:
                 together = Judged(
                     torch.cat([one.geometric for one in cases]),
                     torch.cat([one.hybrid for one in cases]),
-                    PredictedSpread.joined([one.spread for one in cases]),
+                    PredictedSpread.concatenate([one.spread for one in cases]),
                 )
                 if len(cases) > 1:
                     print_line(f"{group}, all", together, "")
                 ratios.append(float((together.hybrid.mean() / together.geometric.mean()).sqrt()))
                 spreads.append(together.spread)
-        coverage = PredictedSpread.joined(spreads).coverage
+        coverage = PredictedSpread.concatenate(spreads).coverage
         mean = math.exp(sum(map(math.log, ratios)) / len(ratios))
         print(
             f"{part}: geometric mean of the ratios {mean:.3f}, worst {max(ratios):.3f}, 95 %: {coverage:.1%}\n"

@@ -112,7 +112,7 @@ def candidates_of(result: Recalibration, few: Measurements, others: Measurements
     """Return RMS position errors of every candidate [mm]; infinite if the rows do not determine it."""
     adaptation, errors = result.adaptation, {}
     errors["recalibrated"] = rms_mm(adaptation.errors_of(others)["position"])
-    old = adapt(adaptation.problem.with_fixed_arm(), adaptation.noise)
+    old = adapt(adaptation.problem.with_fixed_arm(), adaptation.drift.noise)
     errors["old"] = rms_mm(old.errors_of(others)["position"])
     try:
         scratch = fit(HybridCalibrator(Robot.load("ur10")), few, lambda what: None)
