@@ -14,10 +14,15 @@ from pisigma.files.errors import PlanningError
 from pisigma.files.yaml_file import read_yaml
 from pisigma.lifetime.cell.controller import Controller, records
 from pisigma.lifetime.cell.history import HISTORY, Check, History, ModelEntry, SessionEntry
-from pisigma.lifetime.cell.layout import CELL_FILE, PLANS, SESSIONS
+from pisigma.lifetime.cell.layout import CELL_FILE, PLANS, SESSIONS, newest_plan
 from pisigma.lifetime.cell.status import CellFacts, next_step
 from pisigma.lifetime.cell.step import Step
 from pisigma.measurement.dates import date_in_name
+
+BEFORE_FIT = ("plan", "import")
+"""Commands whose checks conclude nothing from measured rows."""
+MIN_MEASURED_SHARE = 0.9
+"""Smallest share of the poses of a plan after which it counts as measured; some poses may be out of sight."""
 
 
 @dataclass(frozen=True)
@@ -122,7 +127,7 @@ def facts_of(folder: Path) -> CellFacts:
 
 
 def _facts(folder: Path, history: History) -> CellFacts:
-    sessions = history.sessions()
+    sessions, checks = history.sessions(), history.checks()
     stated, in_use = read_yaml(folder / CELL_FILE, _Stated, PlanningError), history.in_use
     return CellFacts(
         folder=os.fspath(folder),
@@ -131,15 +136,32 @@ def _facts(folder: Path, history: History) -> CellFacts:
         edited=edited_sessions(folder / SESSIONS, sessions),
         events=history.events(),
         models=history.models(),
-        checks=history.checks(),
+        checks=checks,
         in_use=in_use,
         limit_mm=stated.limit_mm,
         today=datetime.date.today().isoformat(),
         not_taken_in=not_taken_in(folder / SESSIONS, sessions),
         not_read=unimported_files(folder / SESSIONS, sessions),
         plans_nothing=stated.plans_nothing(in_use),
+        incomplete=_incomplete(folder, sessions, checks),
         controller=Controller.from_history(history),
     )
+
+
+def _incomplete(folder: Path, sessions: Sequence[SessionEntry], checks: Sequence[Check]) -> str:
+    """Return how many poses of the newest plan were measured, if too few and nothing was concluded yet; else ""."""
+    planned = [one.checked for one in checks if one.command == "plan"]
+    if not planned or not any((folder / PLANS).glob("*.csv")):
+        return ""
+    made = planned[-1]
+    if any(one.checked > made and one.command not in BEFORE_FIT for one in checks):
+        return ""
+    measured = sum(one.rows for one in sessions if one.taken_in > made and not one.set_aside)
+    with newest_plan(folder).open(encoding="utf-8") as file:
+        poses = sum(bool(line.strip()) for line in file) - 1
+    if not 0 < measured < MIN_MEASURED_SHARE * poses:
+        return ""
+    return f"{measured} of {poses} poses of the newest plan have been measured"
 
 
 def sha256_of(path: Path) -> str:

@@ -54,6 +54,7 @@ class CellFacts:
         not_taken_in: names of the files in `sessions/` that are not in the history yet, by their dates.
         not_read: names of the files in `sessions/` that are not measurement files and were not imported.
         plans_nothing: why no poses can be planned; "" if they can.
+        incomplete: how many poses of the newest plan have been measured, if they are too few; else "".
         controller: what was active on the controller when.
     """
 
@@ -70,6 +71,7 @@ class CellFacts:
     not_taken_in: tuple[str, ...] = ()
     not_read: tuple[str, ...] = ()
     plans_nothing: str = ""
+    incomplete: str = ""
     controller: Controller = field(default_factory=Controller)
 
     @property
@@ -126,6 +128,9 @@ def valid_sessions(
 def next_step(facts: CellFacts) -> Step:
     """Return the step of the first rule that applies, in the order of `RULES`; a plan is measured before the next."""
     step = due_step(facts)
+    if facts.incomplete and step.verb in ("calibrate", "verify", "monitor"):
+        why = f"{facts.incomplete}; measure and import the others, or continue with `{step.command}`"
+        return Step("session_incomplete", why, facts.import_command())
     if step.command != facts.command("plan"):
         return step
     if facts.unmeasured_plan:

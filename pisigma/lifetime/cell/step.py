@@ -12,6 +12,7 @@ State = Literal[
     "file_refused",
     "no_plan",
     "not_measured",
+    "session_incomplete",
     "not_calibrated",
     "not_trusted",
     "not_verified",

@@ -55,6 +55,7 @@ OFFSETS = Controller(
 CASES = {
     "no_plan": (EMPTY, "plan"),
     "not_measured": (PLANNED, "import"),
+    "session_incomplete": (replace(MEASURED, incomplete="3 of 50 poses"), "import"),
     "not_taken_in": (replace(PLANNED, not_taken_in=("2026-01-10.csv",)), "import"),
     "file_refused": (
         replace(

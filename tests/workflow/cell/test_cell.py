@@ -190,6 +190,16 @@ def test_sessions_before_and_after_an_event_of_the_instrument_are_in_two_frames(
         cell.calibrate()
 
 
+def test_a_plan_is_measured_whole_or_the_other_poses_are_asked_for(tmp_path):
+    cell = Cell.create(tmp_path / "cell", "ur10")
+    cell.plan(count=40, check=0, candidates=100)
+    cell.take_in(measured(20, 1), day=day(2))
+    step = cell.status().step
+    assert (step.state, step.command.split()[1]) == ("session_incomplete", "import")
+    cell.take_in(measured(16, 2), day=day(1))
+    assert cell.status().step.state == "not_calibrated"
+
+
 def test_a_file_in_the_folder_of_sessions_is_taken_in_by_the_next_step(tmp_path):
     cell = Cell.create(tmp_path / "cell", "ur10")
     measured(40, 1).write_csv(cell.folder / "sessions" / "by hand 2026-01-10.csv", ROBOT)
