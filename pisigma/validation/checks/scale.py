@@ -172,7 +172,7 @@ MIN_DEVIATIONS = 5.0
 
 
 def check_scale_of_rows(judged: RowsUnderModel) -> Iterator[Diagnostic]:
-    """Fit a factor on the measured positions together with base and tool, and compares it with moved joint zeros."""
+    """Fit a factor on the measured positions together with base and tool, and compare it with moved joint zeros."""
     usual = float(judged.predicted_deviation.square().mean().sqrt())
     single = len(set(judged.rows.frame)) == len(set(judged.rows.target)) == 1
     if not single or 3 * judged.rows.rows < 2 * FITTED or not usual > 0:

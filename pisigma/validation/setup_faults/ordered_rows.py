@@ -59,7 +59,9 @@ class OrderedRows:
         The same rows are calibrated with when they are added to a cell, and again for its model.
         """
         setup = (self.problem.frame.cpu().numpy(), self.problem.target.cpu().numpy(), self.configuration)
-        digest = hashlib.sha256(f"{self.jacobian.shape} {self.values} {self.configuration is None}".encode())
+        names = (self.problem.space.frames, self.problem.space.targets)  # a result states them
+        counts = (self.jacobian.shape, self.values, self.configuration is None)
+        digest = hashlib.sha256(repr((names, counts)).encode())
         for one in (
             self.number,
             self.residual,

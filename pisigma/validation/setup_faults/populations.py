@@ -62,9 +62,8 @@ class Populations:
     log_bayes_factor: float
 
 
-@lru_cache(
-    maxsize=2
-)  # the same rows are checked when they are added to a cell and when they are calibrated with
+# the same rows are checked when they are added to a cell and when they are calibrated with
+@lru_cache(maxsize=2)
 def find_populations(rows: OrderedRows, count: int) -> Populations | None:
     """Find the two populations that explain the residuals of a calibration best, whether likely or not.
 

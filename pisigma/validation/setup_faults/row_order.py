@@ -85,9 +85,8 @@ def find_motion(result: CalibrationResult | HybridResult) -> Motion | None:
     return None if rows is None else _motion_of(rows)
 
 
-@lru_cache(
-    maxsize=2
-)  # the same rows are checked when they are added to a cell and when they are calibrated with
+# the same rows are checked when they are added to a cell and when they are calibrated with
+@lru_cache(maxsize=2)
 def _motion_of(rows: OrderedRows) -> Motion | None:
     search = _Search(rows)
     fits = [search.fit(candidate) for candidate in search.candidates()]

@@ -86,6 +86,15 @@ def test_a_frame_that_moved_is_found_with_its_row_and_amount(turned: bool, first
     assert_close(sigma, 5e-5, rtol=0.2)
 
 
+def test_the_same_rows_under_other_names_have_a_motion_of_their_own_frame() -> None:
+    """A search is not repeated for the same rows; a cell renames frames after a change of the instrument."""
+    simulated = arm()
+    rows = frame_moved(simulated.measurements, 40)
+    named = [replace(rows, frame=(name,) * rows.rows) for name in ("", "since 2026-03-02")]
+    motions = [find_motion(GeometricCalibrator(simulated.nominal).fit(one)) for one in named]
+    assert [None if one is None else one.name for one in motions] == ["", "since 2026-03-02"]
+
+
 def test_a_tool_that_moved_is_distinguished_from_a_frame() -> None:
     simulated = arm()
     (diagnostic,) = found(simulated.nominal, tool_moved(simulated, 40))

@@ -43,7 +43,7 @@ def without_beta(origins: list[Frame], own: Robot) -> Robot:
     by less than 90 deg is used.
 
     Args:
-        origins: frames of the joints, see `OwnGeometry.origins`.
+        origins: frames of the joints, see `ControllerGeometry.origins`.
         own: nominal robot with the base and tool that belong to them.
     """
     plain = robot_of_origins(own, origins, np.eye(4), TILTED)
