@@ -103,7 +103,7 @@ def by_opencv(cell: Cell, draw: Draw) -> list[Robot]:
     board = invert(rows.T).numpy()
     robots = []
     for name in METHODS:
-        R, t = cv2.calibrateHandEye(
+        R, t = cv2.calibrateHandEye(  # type: ignore[attr-defined]  # not in the stubs
             list(flange[:, :3, :3]),
             list(flange[:, :3, 3]),
             list(board[:, :3, :3]),

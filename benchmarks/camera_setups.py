@@ -90,8 +90,8 @@ class Arm:
         """Return positions of a reflector on the flange."""
         position = forward_kinematics(self.with_frames(None, REFLECTOR), q)[:, :3, 3]
         noise = TRACKER_NOISE * torch.from_numpy(self.rng.standard_normal((len(q), 3)))
-        names = {"frame": ("tracker",) * len(q), "target": ("reflector",) * len(q)}
-        return Measurements(q, position + noise, **names)
+        frame, target = ("tracker",) * len(q), ("reflector",) * len(q)
+        return Measurements(q, position + noise, frame=frame, target=target)
 
     def error(self, estimated: Robot, postures: Tensor, on_flange: np.ndarray) -> float:
         """Return the position error of a target on the flange [m], with the estimated tool of an arm."""
@@ -108,6 +108,7 @@ def fixed_views(robot: Robot, count: int, rng: np.random.Generator) -> Tensor:
     """Return joint values [rad] at which the fixed camera sees the board on the flange."""
     solver, chosen = closed_form_solver(robot), list[Tensor]()
     T_base_board = transform_from_xyzrpy(IN_BASE)
+    assert solver is not None  # a UR5
     for q in views(robot, 3 * count, rng):
         T_board_camera = invert(T_base_board) @ forward_kinematics(
             robot.with_geometry(tool=ON_FLANGE.numpy()), q

@@ -88,8 +88,10 @@ def judged(case: Case) -> Judged:
     began = time.perf_counter()
     result = HybridCalibrator(case.robot).fit(case.train)
     seconds = time.perf_counter() - began
-    square = [model.errors_of(case.test)["position"].square().sum(1) for model in (result.geometric, result)]
-    one = Judged(*square, predicted_spread(result, case.test))
+    geometric, hybrid = (
+        model.errors_of(case.test)["position"].square().sum(1) for model in (result.geometric, result)
+    )
+    one = Judged(geometric, hybrid, predicted_spread(result, case.test))
     print_line(
         case.name, one, f"{seconds:5.1f} s  {[trial.name for trial in result.trials if trial.kept][-1]}"
     )

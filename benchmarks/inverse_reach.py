@@ -59,7 +59,7 @@ def rounded_urdf(folder: Path) -> str:
 
 def joints_in_domain(model: CalibratedModel, rows: int, rng: np.random.Generator) -> torch.Tensor:
     """Return random joint values [rad or m] within the domain of the correction."""
-    if model.network is None:
+    if model.network is None or model.domain is None:
         return draw_joints(model.robot, rows, rng)
     lower, upper = model.starts.aminmax(dim=0)
     drawn = torch.from_numpy(rng.uniform(size=(4 * rows, model.robot.dof)))

@@ -149,8 +149,8 @@ def main() -> None:
         solver(tensors)
         rate = max(rate, len(T) / (time.perf_counter() - start))
     print(f"tensors, any branch, {len(os.sched_getaffinity(0))} threads: {rate:,.0f} poses/s")
-    with tempfile.TemporaryDirectory() as folder:
-        file, pose = str(Path(folder) / "compiled.npz"), str(Path(folder) / "T.npy")
+    with tempfile.TemporaryDirectory() as scratch:
+        file, pose = str(Path(scratch) / "compiled.npz"), str(Path(scratch) / "T.npy")
         save_compiled(model, file)
         np.save(pose, T[0])
         script = COLD.format(file=file, pose=pose)

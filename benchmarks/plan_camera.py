@@ -70,11 +70,13 @@ class Bench:
     def with_candidates(candidates: int) -> "Bench":
         """Draw the candidates."""
         with TemporaryDirectory() as folder:
-            files = [Path(folder, f"{name}.yaml") for name in ("camera", "board")]
-            for file, content in zip(files, (CAMERA, BOARD), strict=True):
+            camera_file, board_file = Path(folder, "camera.yaml"), Path(folder, "board.yaml")
+            for file, content in ((camera_file, CAMERA), (board_file, BOARD)):
                 file.write_text(yaml.safe_dump(content))
             settings = PlanSettings(
-                sensor="camera", camera=CameraSettings(*map(str, files)), candidates=candidates
+                sensor="camera",
+                camera=CameraSettings(str(camera_file), str(board_file)),
+                candidates=candidates,
             )
             arm, instrument = ArmInSurroundings.from_robot(Robot.load("ur5"), CELL), instrument_of(settings)
             drawn, views = find_candidates(settings, arm), views_of(settings, arm)

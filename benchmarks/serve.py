@@ -24,7 +24,9 @@ import struct
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -102,7 +104,7 @@ def ask(
     options: argparse.Namespace,
     seconds: float,
     number: int,
-    queue: object,
+    queue: "multiprocessing.Queue[Any]",
 ) -> None:
     """Run client `number`; put its times [µs] and the number of lost or wrong answers into the queue."""
     times, bad = [], 0
@@ -121,7 +123,7 @@ def ask(
             times.append(1e6 * (time.perf_counter() - begun))
             bad += not right(kind, answer, index, wanted[index], per_unit)
             turn += period
-    queue.put((times, bad))  # type: ignore[attr-defined]
+    queue.put((times, bad))
 
 
 def measure(kind: str, port: int, options: argparse.Namespace, seconds: float) -> tuple[np.ndarray, str]:
@@ -129,7 +131,7 @@ def measure(kind: str, port: int, options: argparse.Namespace, seconds: float) -
     ik = pisigma.load(options.model)
     poses, near, wanted = poses_of(ik)
     sent, per_unit = messages(kind, ik, poses, near), np.where(ik.revolute, 180 / np.pi, 1e3)
-    queue = multiprocessing.Queue()
+    queue: multiprocessing.Queue[Any] = multiprocessing.Queue()
     arguments = kind, port, sent, wanted, per_unit, options, seconds
     clients = [multiprocessing.Process(target=ask, args=(*arguments, i, queue)) for i in range(CLIENTS)]
     for client in clients:
@@ -166,15 +168,19 @@ def answer_line(ik: pisigma.CorrectedIK, message: bytes) -> bytes:
     return json.dumps(said).encode() + b"\n"
 
 
-def bare_loop(model: str, kind: str, stored: bool, polling: float, queue: object) -> None:
+def bare_loop(
+    model: str, kind: str, stored: bool, polling: float, queue: "multiprocessing.Queue[int]"
+) -> None:
     """Answer all clients by a solve or a stored answer, without any check; put the port into the queue."""
     ik = pisigma.load(model)
-    answer = functools.partial(answer_frame if kind == "binary" else answer_line, ik)
+    answer: Callable[[bytes], bytes] = functools.partial(
+        answer_frame if kind == "binary" else answer_line, ik
+    )
     if stored:
         poses, near, _ = poses_of(ik)
         answer = {message: answer(message) for message in messages(kind, ik, poses, near)}.__getitem__
     listener, waiting, last = socket.create_server(("127.0.0.1", 0)), select.epoll(), 0.0
-    queue.put(listener.getsockname()[1])  # type: ignore[attr-defined]
+    queue.put(listener.getsockname()[1])
     streams = {stream.fileno(): stream for stream, _ in (listener.accept() for _ in range(CLIENTS))}
     for number, stream in streams.items():
         stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -209,7 +215,7 @@ def inside(json_port: int) -> str:
 def compare(kind: str, ports: dict[str, int], pid: int, options: argparse.Namespace) -> None:
     """Measure a protocol of the server, after the minimal loops."""
     for name, stored in (("stored answers", True), ("one solve", False)):
-        queue = multiprocessing.Queue()
+        queue: multiprocessing.Queue[int] = multiprocessing.Queue()
         arguments = options.model, kind, stored, options.poll_ms / 1e3, queue
         bare = multiprocessing.Process(target=bare_loop, args=arguments, daemon=True)
         bare.start()

@@ -27,11 +27,10 @@ def position_error(model: CalibratedModel, q: np.ndarray, x: np.ndarray) -> floa
         q: joint values of the poses [rad or m], shape (poses, dof).
         x: true positions [m], shape (poses, 3).
     """
-    names = {
-        "frame": (([*model.bases] or [""])[-1],) * len(q),
-        "target": (([*model.tools] or [""])[-1],) * len(q),
-    }
-    rows = Measurements(q=torch.from_numpy(q), position=torch.from_numpy(x), **names)
+    frame, target = (([*names] or [""])[-1:] * len(q) for names in (model.bases, model.tools))
+    rows = Measurements(
+        q=torch.from_numpy(q), position=torch.from_numpy(x), frame=tuple(frame), target=tuple(target)
+    )
     return rms_after_fit(poses_of_rows(model, rows)[:, :3, 3].numpy(), x)
 
 
