@@ -211,7 +211,7 @@ def choose_final_correction(
 ) -> FinalCorrection | None:
     """Find the largest part of the selected features that increases no sensor's errors, with exact fits of each part.
 
-    Leave-out errors by linearisation are those of an exact fit only if the linearisation is accurate. It is for many
+    Held-out errors by linearisation are those of an exact fit only if the linearisation is accurate. It is for many
     poses or positions. For few of them, or for other sensors, the rows of the search are held out again, fold by fold,
     of exact fits with and without the correction. A part is accepted if it increases the errors and held-out errors of
     no sensor, and clearly reduces the held-out errors of one.
