@@ -15,7 +15,7 @@ from dataclasses import MISSING, dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Annotated, Any, ForwardRef, Literal, Union, get_args, get_origin
 
-from pisigma.files.errors import PisigmaError
+from pisigma.files.errors import PisigmaError, SettingError
 
 UNITS = {"mm": ("m", 1e-3), "mrad": ("rad", 1e-3), "deg": ("rad", math.pi / 180.0), "ms": ("s", 1e-3)}
 """Units of the command line, with the unit of the setting and the conversion factor."""
@@ -162,7 +162,8 @@ def build_settings(group: type, stated: Mapping[str, Any], is_optional: bool = F
         is_optional: return None if nothing is stated of the class.
 
     Raises:
-        PisigmaError: some settings are stated that need others, or a value is not valid; its option is the key.
+        PisigmaError: some settings are stated that need others, or a value is not valid, such as a number that is not
+            finite; its option is the key.
     """
     found: dict[str, Any] = {}
     for setting in settings_of(group):
@@ -171,6 +172,8 @@ def build_settings(group: type, stated: Mapping[str, Any], is_optional: bool = F
                 found[setting.field] = built
         elif setting.key in stated:
             value = stated[setting.key]
+            if isinstance(value, float) and not math.isfinite(value):
+                raise SettingError(expected="a finite number", value=value, option=setting.key)
             found[setting.field] = setting.read(tuple(value) if isinstance(value, list) else value)
     if is_optional and not found:
         return None

@@ -58,6 +58,9 @@ def checked_values(
             raise refused(key, key, f"one of {', '.join(known)}", problem=problem, remedy=remedy)
         kind = known[key].kind
         single = _listed(value, kind)
+        several = single if isinstance(single, list | tuple) else (single,)
+        if kind is not bool and any(isinstance(one, bool) for one in several):  # pydantic reads true as 1
+            raise refused(key, single, _type_text(kind))
         try:
             converted = TypeAdapter(kind).validate_python(single)
         except ValidationError:

@@ -51,7 +51,9 @@ def form_of(step: str, file: CellFile) -> list[Field]:
     return [
         Field(
             one.key,
-            f"--set {one.key}=" if one.option.is_key else one.name,
+            f"--set {one.key}="
+            if one.option.is_key or one.default is False
+            else one.name,  # no option switches off
             one.help,
             _kind(one),
             tuple(map(str, get_args(one.kind))) if get_origin(one.kind) is Literal else (),
@@ -101,4 +103,4 @@ def _kind(setting: Setting) -> str:
 def _text(value: object) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
-    return "" if value is None else f"{value:g}" if isinstance(value, float) else str(value)
+    return "" if value is None else f"{value:.12g}" if isinstance(value, float) else str(value)

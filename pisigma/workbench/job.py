@@ -92,32 +92,39 @@ class Jobs:
         self.running: Job | None = None
         self.outcomes: dict[str, Outcome] = {}
         self.version = self.ended = 0
-        self._lock, self._thread = threading.Lock(), threading.Thread()
+        self._lock, self._thread, self._closed = threading.Lock(), threading.Thread(), False
 
     def start(self, step: str, person: str, command: str, work: Work) -> None:
         """Start a step in a thread.
 
         Raises:
-            BusyError: another step runs.
+            BusyError: another step runs, or the server ends.
         """
         with self._lock:
-            if self.running is not None:
+            if self.running is not None or self._closed:
                 raise BusyError
             self.running = job = Job(step, person, command)
             self._thread = threading.Thread(target=self._run, args=(job, work), daemon=True)
             self._thread.start()
             self.version += 1
 
-    def stop(self, person: str) -> None:
-        """Stop the running step when it next says what it does; it leaves nothing half written."""
+    def stop(self, person: str, number: str) -> None:
+        """Stop the running step when it next says what it does; it leaves nothing half written.
+
+        Args:
+            person: who stops it.
+            number: number of steps that had ended when the person decided; after its end, no later step is stopped.
+        """
         with self._lock:
-            if self.running is not None:
+            if self.running is not None and number == str(self.ended):
                 self.running.stopped_by = person
                 self.version += 1
 
     def close(self) -> None:
         """Stop the running step, and wait for its end."""
-        self.stop("the end of the server")
+        with self._lock:
+            self._closed = True
+        self.stop("the end of the server", str(self.ended))
         if self._thread.is_alive():
             self._thread.join()
 
@@ -125,7 +132,9 @@ class Jobs:
         try:
             found = work(job.progress)
         except StoppedError:
-            found = Outcome(refusal=f"stopped by {job.stopped_by}; nothing was written.", stopped=True)
+            found = Outcome(
+                refusal=f"stopped by {job.stopped_by}; nothing was left half written.", stopped=True
+            )
         except ImportError as problem:
             found = Outcome(refusal=str(missing_extra(problem) or problem))
         except Exception as problem:

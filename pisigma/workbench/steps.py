@@ -70,7 +70,7 @@ def verify(cell: Cell, form: Form, progress: Progress) -> Outcome:
 def monitor(cell: Cell, form: Form, progress: Progress) -> Outcome:
     """Compare every new session with the model in use."""
     found = cell.monitor(progress, **changed_settings("monitor", form))
-    check = cell.history.checks()[-1]
+    check = next(one for one in reversed(cell.history.checks()) if one.command == "monitor")
     verdict = Verdict(check.summary, check.verdict.replace("_", " "), cell.status().step.reason)
     text = ResultText(verdict, tuple(found.warnings), (sentences("what has changed", found.sentences),))
     return Outcome(text)

@@ -1,5 +1,6 @@
 """What the tabs of a page show, read from the cell."""
 
+import hashlib
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -100,15 +101,13 @@ class Tabs:
         tables = [
             (
                 len(mapping.file.records),
-                [
-                    (one.index, one.heading, mapping.first_cell(one), one.target.text, one.reason)
-                    for one in mapping.columns
-                ],
+                [(one, mapping.key(one), mapping.first_cell(one)) for one in mapping.columns],
             )
             for mapping in (() if proposal is None else proposal.mappings)
         ]
         template = self._environment.get_template("proposal.html.j2")
-        return template.render(tables=tables, files=[one.name for one in files], numbers=numbers)
+        names = [one.name for one in files]
+        return template.render(tables=tables, files=names, words=shlex.join(names), numbers=numbers)
 
 
 def _more(name: str, cell: Cell, status: CellStatus) -> dict[str, Any]:
@@ -117,7 +116,8 @@ def _more(name: str, cell: Cell, status: CellStatus) -> dict[str, Any]:
         case "status":
             return {"timeline": timeline(status), "kinds": get_args(EventKind)}
         case "cell":
-            return {"text": (cell.folder / CELL_FILE).read_text(encoding="utf-8")}
+            text = (cell.folder / CELL_FILE).read_text(encoding="utf-8")
+            return {"text": text, "seen": digest_of(text)}
         case "plan":
             plans = sorted((cell.folder / PLANS).glob("*.csv"), reverse=True)
             return {"plans": [(one.name, yaml_of(one).name) for one in plans]}
@@ -130,6 +130,11 @@ def _more(name: str, cell: Cell, status: CellStatus) -> dict[str, Any]:
                 "columns": POSE_COLUMNS,
             }
     return {}
+
+
+def digest_of(text: str) -> str:
+    """Return the SHA-256 of a text, by which a change since it was shown is noticed."""
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def timeline(status: CellStatus) -> list[TimelineEntry]:

@@ -1,7 +1,9 @@
 """Files that a page received, under names of their own in a folder that only this user can enter."""
 
+import itertools
 import re
 import tempfile
+import threading
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -9,7 +11,8 @@ from pisigma.files.errors import MeasurementError, make_printable
 
 MAX_FILES = 20
 """Number of files that are kept; the oldest is removed first."""
-MAX_NAME = 100
+MAX_NAME = 60
+"""Longest name [characters]; file systems accept 255 bytes, and a character has up to four."""
 
 
 class Uploads:
@@ -18,7 +21,8 @@ class Uploads:
     def __init__(self) -> None:
         self._folder = tempfile.TemporaryDirectory(prefix="pisigma-")  # with mode 0700
         self._files: dict[str, Path] = {}
-        self._count = 0
+        self._lock = threading.Lock()
+        self._numbers = map(str, itertools.count(1))  # several files may arrive at once
 
     def add(self, name: str, content: bytes) -> str:
         """Keep a file; return the number by which it is asked for.
@@ -30,15 +34,17 @@ class Uploads:
         shown = make_printable(name.replace("\\", "/").rpartition("/")[2].replace("\0", ""))[
             -MAX_NAME:
         ].strip(". ")
-        self._count += 1
-        folder = Path(self._folder.name) / str(self._count)
+        number = next(self._numbers)
+        folder = Path(self._folder.name) / number
         folder.mkdir()
         path = folder / (shown or "upload.csv")
         path.write_bytes(content)
-        self._files[str(self._count)] = path
-        while len(self._files) > MAX_FILES:
-            self._files.pop(next(iter(self._files))).unlink()
-        return str(self._count)
+        with self._lock:
+            self._files[number] = path
+            removed = [self._files.pop(one) for one in [*self._files][:-MAX_FILES]]
+        for one in removed:
+            one.unlink()
+        return number
 
     def paths(self, numbers: Sequence[str]) -> list[Path]:
         """Return the files with some numbers.

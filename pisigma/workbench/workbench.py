@@ -3,6 +3,8 @@
 import asyncio
 import functools
 import json
+import math
+import threading
 import time
 from collections.abc import Awaitable, Callable, Mapping
 from importlib import resources
@@ -13,15 +15,16 @@ import numpy as np
 from aiohttp import web
 from aiohttp.typedefs import Handler
 
-from pisigma.files.errors import PisigmaError
+from pisigma.files.errors import PisigmaError, Place, PlanningError
 from pisigma.files.progress import Progress
 from pisigma.lifetime.cell.facts import CellStatus
+from pisigma.lifetime.cell.layout import CELL_FILE
 from pisigma.workbench import steps
 from pisigma.workbench.cell_scene import CellScene
 from pisigma.workbench.job import BusyError, Jobs, Outcome
 from pisigma.workbench.server.front_server import FrontServer
 from pisigma.workbench.server.viser_server import ViserBackend
-from pisigma.workbench.tabs import TABS, Tabs, download_of
+from pisigma.workbench.tabs import TABS, Tabs, digest_of, download_of
 from pisigma.workbench.uploads import Uploads
 from pisigma.workflow.cell.cell import Cell
 from pisigma.workflow.cell.cell_file import CellFile
@@ -82,6 +85,7 @@ class Workbench:
         """
         cell = Cell.open(folder)
         self.folder, self._status = folder, (cell.status(), time.monotonic())
+        self._reading = threading.Lock()
         self.jobs, self._uploads = Jobs(), Uploads()
         self._tabs = Tabs(self.jobs)
         self._behind = ViserBackend("pisigma")
@@ -122,12 +126,13 @@ class Workbench:
 
     def status(self) -> CellStatus:
         """Return the status of the cell, which is read again after some seconds and after every step."""
-        found, when = self._status
-        if time.monotonic() - when > STATUS_AGE:
-            before, found = found, Cell.open(self.folder).status()
-            self._status = found, time.monotonic()
-            self.jobs.version += found != before
-        return found
+        with self._reading:
+            found, when = self._status
+            if time.monotonic() - when > STATUS_AGE:
+                before, found = found, Cell.open(self.folder).status()
+                self._status = found, time.monotonic()
+                self.jobs.version += found != before
+            return found
 
     @answers
     async def _page(self, request: web.Request) -> web.StreamResponse:
@@ -195,7 +200,7 @@ class Workbench:
 
     @answers
     async def _stop(self, request: web.Request) -> web.StreamResponse:
-        self.jobs.stop(_person(request))
+        self.jobs.stop(_person(request), (await _form(request)).get("ended", ""))
         return web.json_response({})
 
     @answers
@@ -210,7 +215,8 @@ class Workbench:
             except PisigmaError as problem:
                 return Outcome(refusal=self._uploads.without_folder(str(problem)))
             finally:
-                self._status = Cell.open(self.folder).status(), time.monotonic()
+                with self._reading:  # a reading that began before the end of the step is out of date
+                    self._status = self._status[0], -math.inf
 
         self.jobs.start(name, _person(request), form.pop("command", "")[:MAX_COMMAND], run)
         return web.json_response({"started": name})
@@ -253,7 +259,14 @@ class Workbench:
         return found
 
     def write_cell(self, cell: Cell, form: Form, progress: Progress) -> Outcome:
-        """Write `cell.yaml`, if it is valid."""
+        """Write `cell.yaml`, if it is valid and is still the file that the person saw."""
+        path = cell.folder / CELL_FILE
+        if form.get("seen") != digest_of(path.read_text(encoding="utf-8")):
+            raise PlanningError(
+                "the file has been changed since it was shown here",
+                at=Place(path),
+                remedy="copy your text, open the tab again, and repeat your changes there",
+            )
         CellFile.write(cell.folder, form.get("text", ""))
         self._scene.show_cell(Cell.open(cell.folder))
         return Outcome()

@@ -16,7 +16,8 @@ from pisigma.cli.main import app
 from pisigma.cli.settings_options import takes_settings
 from pisigma.deployment.serve import settings as serve_settings
 from pisigma.files.errors import PisigmaError, SettingError
-from pisigma.files.setting import FILE, KEY, Option, settings_of
+from pisigma.files.setting import FILE, KEY, Option, by_key, flat_settings, settings_of
+from pisigma.files.setting_values import checked_values, read_assignments
 from pisigma.planning import plan_settings
 from pisigma.workflow import settings as of_commands
 
@@ -116,6 +117,36 @@ def test_keys_are_settings(built):
     assert with_keys("lines=3", "lines=4", "quick=true") == Settings(lines=(3, 4), quick=True)
     lens = built("--file", "a.yaml", "--set", "sheet=b=c.yaml", "--set", "depth_mm=0").lens
     assert lens == Lens("a.yaml", "b=c.yaml", depth=0.0)
+
+
+@pytest.mark.parametrize("value", ["nan", "inf", "-inf"])
+@pytest.mark.parametrize("words", [("--width-mm",), ("--set", "width_mm="), ("--set", "depth_mm=")])
+def test_numbers_are_finite(built, words, value):
+    *option, last = words
+    stated = (*option, f"{last}{value}") if option else (last, value)
+    key = (option and last[:-1]) or "width_mm"
+    with refused(SettingError, option=key):
+        built("--file", "a.yaml", "--sheet", "b.yaml", *stated)
+
+
+@pytest.mark.parametrize("value", [True, False, [True]])
+@pytest.mark.parametrize("key", ["count", "width_mm", "lines", "class", "file"])
+def test_truth_in_a_file_is_not_a_number_or_a_text(key, value):
+    known = by_key(Settings)
+    with refused(SettingError, option=key):
+        dict(checked_values({key: value}, known, lambda key: None))
+
+
+@pytest.mark.parametrize("key", [one.key for one in flat_settings(Settings)])
+def test_no_setting_gets_an_empty_value_by_accident(key):
+    """An empty text is a text; everything else is refused, and so are several values of a single one."""
+    known = by_key(Settings)
+    for stated in ([f"{key}="], [f"{key}=2", f"{key}=3"]):
+        is_stated = "text" if len(stated) == 1 else "list"
+        takes = {"class": "text", "file": "text", "sheet": "text", "marks": "list", "lines": "list"}.get(key)
+        if takes != is_stated:
+            with refused(SettingError, option=key):
+                read_assignments(stated, known, "--set")
 
 
 def test_shells_complete_keys():

@@ -1,9 +1,12 @@
 """The page of a cell by its requests: what it shows, what it refuses, and that nothing is half written."""
 
+import html
 import json
 import re
+import shlex
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from urllib.parse import quote
 
 import pytest
@@ -15,7 +18,7 @@ from testing.report import HOSTILE
 pytest.importorskip("viser", reason="the extra view is not installed")
 
 from pisigma.lifetime.cell.layout import CELL_FILE
-from pisigma.workbench.job import Outcome
+from pisigma.workbench.job import BusyError, Jobs, Outcome
 from pisigma.workbench.tabs import TABS
 from pisigma.workbench.workbench import STEPS, Workbench
 from pisigma.workflow.cell.cell import Cell
@@ -61,6 +64,11 @@ def ended(browser, bench, name, **form) -> Outcome:
     while bench.jobs.ended == before:
         time.sleep(0.02)
     return bench.jobs.outcomes[name]
+
+
+def seen(browser):
+    """Return the digest of `cell.yaml` that the page shows."""
+    return re.search('name="seen" value="([^"]*)"', browser.ask("/tab/cell").body.decode())[1]
 
 
 def upload(browser, name, content):
@@ -126,7 +134,7 @@ def test_a_wrong_setting_is_refused_with_its_name(browser_with_link, bench, cell
 def test_an_invalid_cell_file_is_not_written(browser_with_link, bench, cell, text):
     before = (cell.folder / CELL_FILE).read_bytes()
     files = sorted(cell.folder.iterdir())
-    assert ended(browser_with_link, bench, "cell", text=text).refusal
+    assert ended(browser_with_link, bench, "cell", text=text, seen=seen(browser_with_link)).refusal
     assert (cell.folder / CELL_FILE).read_bytes() == before
     assert sorted(cell.folder.iterdir()) == files
 
@@ -134,9 +142,58 @@ def test_an_invalid_cell_file_is_not_written(browser_with_link, bench, cell, tex
 def test_a_setting_can_be_changed(browser_with_link, bench, cell):
     before = (cell.folder / CELL_FILE).read_text()
     text = before.replace("limit_mm: 0.5", "limit_mm: 0.4")
-    assert ended(browser_with_link, bench, "cell", text=text).refusal == ""
+    first = seen(browser_with_link)
+    assert ended(browser_with_link, bench, "cell", text=text, seen=first).refusal == ""
     assert Cell.open(cell.folder).file.document.limit_mm == 0.4
-    ended(browser_with_link, bench, "cell", text=before)
+    for stale in (first, ""):
+        assert "changed since" in ended(browser_with_link, bench, "cell", text=before, seen=stale).refusal
+    assert Cell.open(cell.folder).file.document.limit_mm == 0.4
+    assert ended(browser_with_link, bench, "cell", text=before, seen=seen(browser_with_link)).refusal == ""
+
+
+def test_a_cell_file_that_breaks_during_a_step_is_named_as_the_fault(
+    browser_with_link, bench, cell, monkeypatch
+):
+    path = cell.folder / CELL_FILE
+    before = path.read_text()
+    monkeypatch.setitem(STEPS, "plan", lambda *_: path.write_text("{") and Outcome())
+    try:
+        assert ended(browser_with_link, bench, "plan").refusal == ""
+        assert browser_with_link.ask("/state").status == 422
+        found = ended(browser_with_link, bench, "verify")
+        assert CELL_FILE in found.refusal
+        assert "defect" not in found.refusal
+    finally:
+        path.write_text(before)
+    assert browser_with_link.ask("/state").status == 200
+
+
+def test_files_that_arrive_at_once_keep_their_contents(browser_with_link, bench):
+    def one(number):
+        content = f"{number}".encode() * 300_000
+        return content, upload(browser_with_link, f"{number}.csv", content)
+
+    with ThreadPoolExecutor(6) as pool:
+        found = list(pool.map(one, range(12)))
+    for content, number in found:
+        (path,) = bench._uploads.paths([number])
+        assert path.read_bytes() == content
+
+
+@pytest.mark.parametrize("name", ["測" * 200, "a" * 1000, "..", "../..", "\0", "", "x\ny", "a; b'c\".csv"])
+def test_every_name_of_an_upload_is_accepted(browser_with_link, bench, name):
+    number = upload(browser_with_link, quote(name, safe=""), b"A1,X\n1,2\n")
+    (path,) = bench._uploads.paths([number])
+    assert path.parent.name == number
+    shown = browser_with_link.ask("/propose", "POST", json.dumps({"files": number})).body.decode()
+    command = re.search(r'data-command="([^"]*)"', shown)
+    assert command is None or shlex.split(html.unescape(command[1])) == ["pisigma", "import", path.name]
+
+
+def test_columns_state_their_keys_for_the_command(browser_with_link):
+    number = upload(browser_with_link, "twice.csv", b"P,X,X\n1,2,3\n")
+    shown = browser_with_link.ask("/propose", "POST", json.dumps({"files": number})).body.decode()
+    assert re.findall('data-key="([^"]*)"', shown) == ["P", "2", "3"]
 
 
 def test_an_upload_is_shown_and_added_as_the_command_would(browser_with_link, bench, cell, tmp_path):
@@ -199,7 +256,10 @@ def test_one_acts_and_others_see_who(browser_with_link, bench, cell, monkeypatch
     assert refused.status == 409
     assert "Ada" in json.loads(refused.body)["error"]
     before = bench.jobs.ended
-    assert browser_with_link.ask("/stop?person=Bo", "POST", b"{}").status == 200
+    for stale in ({}, {"ended": str(before - 1)}):  # of somebody who saw an earlier step
+        assert browser_with_link.ask("/stop?person=Cy", "POST", json.dumps(stale)).status == 200
+    assert state(browser_with_link)["running"]["stopped_by"] == ""
+    assert browser_with_link.ask("/stop?person=Bo", "POST", json.dumps({"ended": str(before)})).status == 200
     go_on.set()
     while bench.jobs.ended == before:
         time.sleep(0.02)
@@ -216,3 +276,10 @@ def test_a_defect_ends_the_step_only(browser_with_link, bench, monkeypatch, caps
     assert "ZeroDivisionError" in ended(browser_with_link, bench, "verify").refusal
     assert "Traceback" in capsys.readouterr().err
     assert browser_with_link.ask("/tab/verify").status == 200
+
+
+def test_no_step_starts_once_the_server_ends():
+    jobs = Jobs()
+    jobs.close()
+    with pytest.raises(BusyError):
+        jobs.start("plan", "Ada", "", lambda progress: Outcome())

@@ -60,7 +60,9 @@ class Access:
         A redirect would be a part of the navigation from the foreign page with the link, to which a strict cookie is
         not sent; hence a page that is left at once.
         """
-        if not secrets.compare_digest(request.match_info["token"].encode(), self.token.encode()):
+        if not secrets.compare_digest(
+            request.match_info["token"].encode(errors="replace"), self.token.encode()
+        ):
             raise web.HTTPForbidden(text=FORBIDDEN)
         page = (
             '<!doctype html><title>pisigma</title><link rel="icon" href="data:,">'
@@ -81,7 +83,7 @@ class Access:
         if request.match_info.get("token") is not None:
             return
         cookie = request.cookies.get(COOKIE, "")
-        if not secrets.compare_digest(cookie.encode(), self.cookie.encode()):
+        if not secrets.compare_digest(cookie.encode(errors="replace"), self.cookie.encode()):
             raise web.HTTPForbidden(text=FORBIDDEN)
         if not is_same_origin(request):
             raise web.HTTPForbidden(text="The request comes from another page.")
@@ -123,6 +125,6 @@ def is_same_origin(request: web.Request) -> bool:
     is_socket = request.headers.get("Upgrade", "").lower() == "websocket"
     if origin is None and (is_socket or request.method not in SAFE_METHODS):
         return False
-    if origin is not None and urlsplit(origin).netloc.lower() != request.host.lower():
+    if origin is not None and origin.partition("://")[2].lower() != request.host.lower():
         return False
     return request.headers.get("Sec-Fetch-Site", "none") in ("none", "same-origin")

@@ -20,7 +20,7 @@ async function ask(path, body, type = "application/json") {
 const steps = (path, form) => ask(`${path}?person=${encodeURIComponent(person.value)}`, JSON.stringify(form));
 
 async function show(name, keep = false) {
-  const kept = keep ? [...content.querySelectorAll("form")].map(form => [form.dataset.step, values(form)]) : [];
+  const kept = keep ? [...content.querySelectorAll("form")].filter(isEdited).map(form => [form.dataset.step, values(form)]) : [];
   const opened = keep ? [...content.querySelectorAll("details")].map(one => one.open) : [];
   const proposal = keep && content.querySelector("#proposal")?.firstElementChild;
   const top = content.scrollTop;
@@ -41,8 +41,11 @@ async function show(name, keep = false) {
   lock();
 }
 
+// A text is kept while a person changes it, with the digest of the file that it was made from, until it has been saved.
+const isEdited = form => form.elements.text?.value !== form.elements.text?.defaultValue || !form.elements.text;
+
 function fill(form, fields) {
-  if (!form || form.dataset.fixed !== undefined) return;
+  if (!form || form.dataset.fixed !== undefined || (fields.text !== undefined && fields.text === form.elements.text.defaultValue)) return;
   for (const one of form.elements) if (one.name in fields && one.type !== "hidden") {
     if (one.type === "checkbox") one.checked = true; else one.value = fields[one.name];
   }
@@ -73,10 +76,13 @@ function say(form) {  // the command line that does the same
     else line += ` ${option} ${quoted(one.type === "file" ? one.files[0].name : one.value)}`;
   }
   if (form.elements.export?.value === "") line += " --export none";
-  if (form.dataset.rows) line += ` --rows ${quoted(form.dataset.rows + form.elements.session.value + ".csv")}`;
+  if (form.dataset.rows !== undefined) line += ` --rows ${quoted(`${document.body.dataset.folder}/sessions/${form.elements.session.value}.csv`)}`;
   if (form.dataset.pose !== undefined) line += " --pose " + [...form.querySelectorAll("input")].map(one => one.value || "0").join(" ");
+  const stated = [...form.elements].filter(one => one.dataset.key && one.value.trim());
+  if (stated.length) line += ` --map ${quoted(stated.map(one => `${one.dataset.key}=${one.value.trim()}`).join(","))}`;
   if (form.dataset.proposal !== undefined) line += ` --cell ${quoted(document.body.dataset.folder)} --yes`;
-  code.textContent = line;
+  const isOne = new Set(stated.map(one => one.dataset.file)).size < 2;
+  code.textContent = isOne ? line : "";  // a command has one --map for all files
 }
 
 function fault(form, problem) {
@@ -169,7 +175,7 @@ document.querySelector("nav").addEventListener("keydown", event => {
   const step = { ArrowRight: 1, ArrowLeft: -1 }[event.key], all = [...document.querySelectorAll("[role=tab]")];
   if (step) { const one = all[(all.findIndex(one => one.dataset.tab === tab) + step + all.length) % all.length]; one.focus(); show(one.dataset.tab); }
 });
-document.getElementById("stop").addEventListener("click", () => steps("stop", {}).then(poll));
+document.getElementById("stop").addEventListener("click", () => steps("stop", { ended: document.body.dataset.ended }).then(poll));
 content.addEventListener("submit", event => { event.preventDefault(); start(event.target); });
 content.addEventListener("input", event => { if (event.target.form) say(event.target.form); });
 content.addEventListener("change", event => { if (event.target.id === "files") propose(); else if (event.target.form) say(event.target.form); });

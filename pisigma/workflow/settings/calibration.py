@@ -19,7 +19,15 @@ ModelKind = Literal["hybrid", "geometric"]
 
 
 def free_parameters(stated: str) -> str | tuple[str, ...]:
-    """Return the free parameters from "identifiable", "joint_offsets" or comma-separated names."""
+    """Return the free parameters from "identifiable", "joint_offsets" or comma-separated names.
+
+    Raises:
+        IdentificationError: the text names nothing.
+    """
+    if not stated.strip():
+        raise IdentificationError(
+            expected="identifiable, joint_offsets or names of parameters", value=stated, option="free"
+        )
     return stated if stated in ("identifiable", "joint_offsets") else names(stated)
 
 
