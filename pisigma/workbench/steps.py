@@ -131,7 +131,7 @@ def take_in(files: list[Path], cell: Cell, form: Form) -> Outcome:
 
 
 def check_rows(cell: Cell, form: Form, progress: Progress) -> tuple[Outcome, SessionState]:
-    """Judge the rows of a session against the newest plan, as `measure --once --no-replan` does."""
+    """Judge the rows of a session against the newest plan, as `measure --once --set replan=false` does."""
     session = MeasuringSession.read(
         newest_plan(cell.folder), cell.file.settings_of_step("measure", replan=False)
     )

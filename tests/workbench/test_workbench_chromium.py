@@ -1,11 +1,11 @@
 """A cell in headless Chromium: from a plan to a corrected pose by clicks and keys, with the bits of the commands."""
 
 import math
-from contextlib import closing, contextmanager
 from pathlib import Path
 
 import pytest
 from testing.models import no_type_checker
+from testing.workbench_page import opened, show, upload_file
 
 pytest.importorskip("viser", reason="the extra view is not installed")
 
@@ -47,32 +47,6 @@ def cells(simulated, tmp_path, blank_pictures) -> tuple[Cell, Cell]:
     return made[0], made[1]
 
 
-@contextmanager
-def opened(browser, url):
-    """The page without its scene, which has a test of its own, and what went wrong on it."""
-    faults = []
-    with closing(browser.new_context(viewport={"width": 800, "height": 900})) as context:
-        page = context.new_page()
-        page.set_default_timeout(60_000)
-        page.on("console", lambda one: faults.append(one.text) if one.type == "error" else None)
-        page.on("pageerror", lambda error: faults.append(str(error)))
-        origin = url.partition("/open/")[0]
-        page.on(
-            "request", lambda one: None if one.url.startswith((origin, "data:")) else faults.append(one.url)
-        )
-        page.route("**/scene/**", lambda route: route.fulfill(body="", content_type="text/html"))
-        page.goto(url)
-        page.wait_for_selector("form[data-step=plan]")
-        yield page
-        assert faults == []
-
-
-def show(page, tab):
-    """Open a tab."""
-    page.click(f"#tab-{tab}")
-    page.wait_for_selector(f"#tab-{tab}[aria-selected=true]")
-
-
 def do(page, step, **fields):
     """Fill a form, press its button with a key and wait for the end; return what the page says."""
     for name, value in fields.items():
@@ -87,8 +61,7 @@ def do(page, step, **fields):
 def upload(page, path):
     """Upload rows and add them to the cell."""
     show(page, "measure")
-    page.set_input_files("#files", path)
-    page.wait_for_selector("#proposal form")
+    upload_file(page, path)
     return do(page, "import")
 
 
