@@ -2,6 +2,7 @@
 
 import datetime
 import os
+import shlex
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -14,7 +15,7 @@ from pisigma.files.errors import MeasurementError, ModelError, Place
 from pisigma.files.model_files import model_hash
 from pisigma.files.output_file import check_page, write_whole
 from pisigma.files.progress import Progress
-from pisigma.lifetime.cell.layout import history_of_model
+from pisigma.lifetime.cell.layout import cell_of_model, history_of_model
 from pisigma.lifetime.monitoring.charts import FALSE_ALARMS_PER_YEAR, SESSIONS_PER_YEAR, Chart
 from pisigma.lifetime.monitoring.history import (
     Record,
@@ -99,6 +100,7 @@ class Monitoring:
         warnings: warnings, one sentence each.
         cameras: cameras and boards of files of detected board corners.
         untrusted: sessions of this call that must not be trusted.
+        cell: folder of the cell of the model; None if it is outside of a cell.
         seconds: computing time [s].
     """
 
@@ -112,6 +114,7 @@ class Monitoring:
     warnings: tuple[str, ...]
     cameras: CameraFiles | None = None
     untrusted: tuple[UntrustedSession, ...] = ()
+    cell: Path | None = None
     seconds: float = field(default=0.0)
 
     @property
@@ -155,6 +158,10 @@ class Monitoring:
         advice: tuple[str, ...] = ()
         if (best := self.advised_session) is not None:
             command = RecalibrationSettings(cameras=self.cameras).command(self.model.name, best.file)
+            if (
+                self.cell is not None
+            ):  # a model folder that the cell does not know would never be put into use
+                command = shlex.join(["pisigma", "recalibrate", os.fspath(self.cell)])
             advice = (
                 f"Recalibrating pays: errors like those of {best.file} are expected to fall from "
                 f"{best.session.rms * 1e3:.3f} to {best.session.rms_after * 1e3:.3f} mm; run "
@@ -230,8 +237,8 @@ def monitor(
     warnings: list[str] = []
     trusted: list[Record] = []
     untrusted: list[UntrustedSession] = []
-    folder = folder if settings.history else None
-    earlier = () if folder is None else read_sessions(history_of_model(folder), model_hash(folder))
+    history = history_of_model(folder) if folder is not None and settings.history else None
+    earlier = () if folder is None or history is None else read_sessions(history, model_hash(folder))
     for date, day in _by_day(rows, settings.dates):
         progress(f"{Path(day.source).name}, {date}")
         warnings += row_warnings(loaded.robot, day)
@@ -258,8 +265,8 @@ def monitor(
     if not (trusted or untrusted):
         raise MeasurementError(f"expected new rows, got none: {' '.join(warnings)}", expected="new rows")
     records = new = sorted_sessions(trusted)
-    if folder is not None:
-        records = store_sessions(history_of_model(folder), model_hash(folder), new)
+    if folder is not None and history is not None:
+        records = store_sessions(history, model_hash(folder), new)
         warnings += [
             f"{one.file}: its session in the history was left out: expected {EXPECTED_DATE}, got {one.date}; monitor "
             "its rows again with --dates to correct the date."
@@ -278,6 +285,7 @@ def monitor(
         warnings=tuple(dict.fromkeys(warnings)),
         cameras=settings.cameras,
         untrusted=tuple(untrusted),
+        cell=None if folder is None else cell_of_model(folder),
         seconds=time.perf_counter() - started,
     )
 

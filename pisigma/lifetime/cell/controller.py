@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Literal, get_args
 
 from pisigma.files.errors import MeasurementError, ModelError, Place
+from pisigma.lifetime.cell.events import ARM_EVENTS, Event
 from pisigma.lifetime.cell.exports import ON_CONTROLLER, Contents, ControllerEntry, ExportEntry
 from pisigma.lifetime.cell.history import HISTORY, History, ModelEntry, SessionEntry, now
 from pisigma.lifetime.cell.layout import is_cell, model_folder
@@ -223,6 +224,19 @@ class Findings:
                 f"{cell} controller --export FILE|none`",
             )
         return self.warnings
+
+
+def valid_sessions(
+    sessions: tuple[SessionEntry, ...], events: tuple[Event, ...], controller: Controller
+) -> tuple[SessionEntry, ...]:
+    """Return the sessions that describe the present arm.
+
+    They are not set aside, and were measured since the last event that changed the arm, with the joint zeros that are
+    active on the controller now.
+    """
+    since = max((one.day for one in events if one.kind in ARM_EVENTS), default="")
+    present = [one for one in sessions if not one.set_aside and one.day >= since]
+    return tuple(one for one in present if controller.is_present(one))
 
 
 def _hash(active: dict[Contents, Active]) -> str:

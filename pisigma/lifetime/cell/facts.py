@@ -16,7 +16,7 @@ from pisigma.lifetime.cell.controller import Controller, records
 from pisigma.lifetime.cell.history import HISTORY, Check, History, ModelEntry, SessionEntry
 from pisigma.lifetime.cell.layout import CELL_FILE, PLANS, SESSIONS, newest_plan
 from pisigma.lifetime.cell.status import CellFacts, next_step
-from pisigma.lifetime.cell.step import Step
+from pisigma.lifetime.cell.step import COMPUTED, Step
 from pisigma.measurement.dates import date_in_name
 
 BEFORE_FIT = ("plan", "import")
@@ -51,9 +51,8 @@ class CellStatus:
     def last_error(self) -> Check | None:
         """The last check that found an RMS error of the model in use or, if there is none, of the newest model."""
         model = self.facts.in_use or (self.facts.models[-1] if self.facts.models else None)
-        known = [
-            one for one in self.facts.checks if model and one.model == model.name and one.rms_mm is not None
-        ]
+        checks = [] if model is None else self.facts.errors_of(model.name, *COMPUTED)
+        known = [one for one in checks if one.rms_mm is not None]
         return known[-1] if known else None
 
     def to_json(self) -> dict[str, Any]:

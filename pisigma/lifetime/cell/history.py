@@ -12,6 +12,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 
 from pisigma.files.errors import MeasurementError, ModelError, OutputError, Place, check_choice
+from pisigma.files.model_files import DESCRIPTION
 from pisigma.lifetime.cell.database import Database, Table
 from pisigma.lifetime.cell.events import Event, check_event
 from pisigma.lifetime.cell.exports import ControllerEntry, ExportEntry
@@ -336,7 +337,16 @@ class History:
         return event
 
     def _take_over(self, database: sqlite3.Connection) -> Sequence[Path]:
-        """Add the monitored sessions that versions before 2 stored in a file next to each model of the cell."""
+        """Add what earlier versions stored elsewhere.
+
+        Versions before 2 stored monitored sessions in a file next to each model of the cell; only the description of a
+        model states whether it has a posterior.
+        """
+        names = database.execute(f"SELECT name FROM {TABLES[ModelEntry].name}").fetchall()
+        without = [one for one in names if _lacks_posterior(self.path.parent / "models" / one[0])]
+        database.executemany(
+            f"UPDATE {TABLES[ModelEntry].name} SET has_posterior = 0 WHERE name = ?", without
+        )
         known = database.execute("SELECT name FROM sqlite_master WHERE name = 'sessions'").fetchall()
         rows = database.execute(_SESSIONS_OF_MODEL).fetchall() if known else []
         database.execute("DROP TABLE IF EXISTS sessions")
@@ -354,3 +364,11 @@ class History:
         table = TABLES[MonitoredSession].name
         database.executemany(f"INSERT OR REPLACE INTO {table} VALUES ({marks})", rows)
         return moved
+
+
+def _lacks_posterior(model: Path) -> bool:
+    """Return whether the description of a model states no posterior; False if it is missing."""
+    try:
+        return b"\nuncertainty:\n" not in (model / DESCRIPTION).read_bytes()
+    except OSError:
+        return False

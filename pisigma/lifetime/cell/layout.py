@@ -66,6 +66,15 @@ def model_folder(path: str | os.PathLike[str]) -> Path:
     return Path(path) / MODELS / entry.name
 
 
+def cell_of_model(folder: str | os.PathLike[str]) -> Path | None:
+    """Return the cell of a model folder, as the folder was named; None if the folder is outside of a cell."""
+    model = Path(os.path.realpath(folder))
+    if model.parent.name != MODELS or not is_cell(model.parent.parent):
+        return None
+    named = Path(folder).parent.parent
+    return named if os.path.realpath(named) == os.fspath(model.parent.parent) else model.parent.parent
+
+
 def history_of_model(folder: str | os.PathLike[str]) -> History:
     """Return the history with the monitored sessions of a model: that of its cell, else a file next to its folder.
 
@@ -74,10 +83,9 @@ def history_of_model(folder: str | os.PathLike[str]) -> History:
     Args:
         folder: folder of the model.
     """
-    model = Path(os.path.realpath(folder))
-    cell = model.parent.parent
-    if model.parent.name == MODELS and is_cell(cell):
+    if (cell := cell_of_model(folder)) is not None:
         return History(cell / HISTORY)
+    model = Path(os.path.realpath(folder))
     return History(model.parent / f"{model.name}{MODEL_HISTORY}")
 
 

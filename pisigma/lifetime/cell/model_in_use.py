@@ -5,6 +5,7 @@ import threading
 import time
 import weakref
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 from pisigma.files.errors import PisigmaError
@@ -45,7 +46,7 @@ class ModelInUse:
         """
         self.cell, self._command, self._load, self.problem = cell, command, load, ""
         self._lock, self._is_followed = threading.Lock(), False
-        self._seen = self._state()
+        self._seen: tuple[int, int, int] | None = None  # the first look reads the history again
         self.folder = model_folder(cell)
         self.findings = self._find()
         self.findings.accepted(cell)
@@ -59,12 +60,12 @@ class ModelInUse:
         """
         with self._lock:
             state = self._state()
-            if state == self._seen and not always:
+            if state is not None and state == self._seen and not always:
                 return
             is_settled = state is None or time.time_ns() - state[1] > SETTLED * 1e9
-            self._seen = state if is_settled else None
             try:
                 self.findings = self._find()
+                self._seen = state if is_settled else None  # without findings, the next look tries again
                 folder = model_folder(self.cell)
                 if always or folder != self.folder:
                     self._load(folder)
@@ -78,8 +79,9 @@ class ModelInUse:
         Args:
             report: function that is called with every new sentence of `warnings`.
         """
-        self._is_followed = True
-        threading.Thread(target=_follow, args=(weakref.ref(self), report), daemon=True).start()
+        self._is_followed, followed = True, weakref.ref(self)
+        _start_following(followed, report)
+        os.register_at_fork(after_in_child=lambda: _start_following(followed, report))
 
     def stop(self) -> None:
         """Stop looking for changes."""
@@ -104,6 +106,13 @@ class ModelInUse:
         return found.st_ino, found.st_mtime_ns, found.st_size
 
 
+def _start_following(followed: "weakref.ref[ModelInUse]", report: Callable[[str], None]) -> None:
+    """Start the thread, also in a process that was forked: it has none, and perhaps a lock that nobody releases."""
+    if (model := followed()) is not None and model._is_followed:
+        model._lock = threading.Lock()
+        threading.Thread(target=_follow, args=(followed, report), daemon=True).start()
+
+
 def _follow(followed: "weakref.ref[ModelInUse]", report: Callable[[str], None]) -> None:
     """Check for changes until the object is stopped or deleted."""
     reported: tuple[str, ...] = ()
@@ -115,6 +124,7 @@ def _follow(followed: "weakref.ref[ModelInUse]", report: Callable[[str], None]) 
         model.check()
         for sentence in model.warnings:
             if sentence not in reported:
-                report(sentence)
+                with suppress(OSError, ValueError):  # nobody reads the reports any more
+                    report(sentence)
         reported = model.warnings
         del model

@@ -5,7 +5,7 @@ import shlex
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
-from pisigma.lifetime.cell.controller import Controller
+from pisigma.lifetime.cell.controller import Controller, valid_sessions
 from pisigma.lifetime.cell.events import ARM_EVENTS, Event
 from pisigma.lifetime.cell.history import Check, ModelEntry, SessionEntry
 from pisigma.lifetime.cell.layout import SESSIONS
@@ -26,6 +26,7 @@ ATTENTION = (
     "verification_failed",
     "moved",
     "other_joint_zeros",
+    "fitted_to_set_aside",
     "outside_limit",
     "limit_below_scatter",
 )
@@ -107,22 +108,13 @@ class CellFacts:
         checks = [one for one in self.checks if one.model == model and one.command in commands]
         return [one for one in checks if one.session not in aside]
 
+    def errors_of(self, model: str, *commands: str) -> list[Check]:
+        """Return those of `checks_of` whose rows are trusted, so that their errors are those of the model."""
+        return [one for one in self.checks_of(model, *commands) if one.verdict not in NOT_TRUSTED]
+
     def new_sessions(self, model: ModelEntry) -> list[SessionEntry]:
         """Return the valid sessions that a model was not fitted to, measured on its newest day or later."""
         return [one for one in self.valid_sessions if one.name not in model.made_of and one.day >= model.day]
-
-
-def valid_sessions(
-    sessions: tuple[SessionEntry, ...], events: tuple[Event, ...], controller: Controller
-) -> tuple[SessionEntry, ...]:
-    """Return the sessions that describe the present arm.
-
-    They are not set aside, and were measured since the last event that changed the arm, with the joint zeros that are
-    active on the controller now.
-    """
-    since = max((one.day for one in events if one.kind in ARM_EVENTS), default="")
-    present = [one for one in sessions if not one.set_aside and one.day >= since]
-    return tuple(one for one in present if controller.is_present(one))
 
 
 def next_step(facts: CellFacts) -> Step:
@@ -178,9 +170,8 @@ def _file_to_take_in(facts: CellFacts) -> Step | None:
     command = facts.import_command(f"{facts.folder}/{SESSIONS}/{name}")
     refusals = [one for one in facts.checks if one.command == "import" and f"{one.session}.csv" == name]
     if refusals and refusals[-1].verdict == FOREIGN:
-        return Step(
-            "file_refused", f"{SESSIONS}/{name} is not a measurement file, but may be imported", command
-        )
+        why = f"{SESSIONS}/{name} is not a measurement file, but may be imported"
+        return Step("file_refused", why, command)
     if refusals:
         why = f"{refusals[-1].summary.rstrip('.')}; correct the file, or set it aside"
         return Step("file_refused", why, facts.command("session", name[:-4], "--set-aside", "refused"))
@@ -211,11 +202,8 @@ def _calibrate(facts: CellFacts, state: State, reason: str) -> Step:
     calibrations = [one for one in facts.checks if one.command == "calibrate"]
     newest = max(one.taken_in for one in facts.valid_sessions)
     if calibrations and calibrations[-1].verdict == "not_trusted" and calibrations[-1].checked >= newest:
-        return Step(
-            "not_trusted",
-            f"the calibration must not be trusted: {calibrations[-1].summary}",
-            facts.import_command(),
-        )
+        why = f"the calibration must not be trusted: {calibrations[-1].summary}"
+        return Step("not_trusted", why, facts.import_command())
     return Step(state, reason, facts.command("calibrate"))
 
 
@@ -320,9 +308,21 @@ def _better_model(facts: CellFacts) -> Step | None:
     )
 
 
+def _fitted_to_set_aside(facts: CellFacts) -> Step | None:
+    model, newest = facts.in_use, facts.newest_model
+    assert model is not None
+    if not (wrong := [one.name for one in facts.sessions if one.set_aside and one.name in model.made_of]):
+        return None
+    why = f"model '{model.name}' was fitted to session '{wrong[-1]}', which was set aside"
+    if newest is None or newest.made <= model.made:
+        return _calibrate(facts, "fitted_to_set_aside", why)
+    why = f"{why}; measure {VERIFICATION_POSES} poses, import them, and verify model '{newest.name}'"
+    return Step("fitted_to_set_aside", why, facts.command("plan"))
+
+
 def _p95(facts: CellFacts, model: ModelEntry) -> float | None:
     """Return the last known 95 % quantile of the position errors of a model [mm]; None if it is unknown."""
-    found = [one.p95_mm for one in facts.checks_of(model.name, "verify") if one.p95_mm is not None]
+    found = [one.p95_mm for one in facts.errors_of(model.name, "verify") if one.p95_mm is not None]
     return found[-1] if found else model.p95_mm
 
 
@@ -358,7 +358,7 @@ def _outside_limit(facts: CellFacts) -> Step | None:
 def _verification_due(facts: CellFacts) -> Step | None:
     model = facts.in_use
     assert model is not None
-    newest = max(one.day for one in facts.sessions)
+    newest = max(one.day for one in facts.valid_sessions)
     age = (datetime.date.fromisoformat(facts.today) - datetime.date.fromisoformat(newest)).days
     if age <= MAX_DAYS_UNVERIFIED:
         return None
@@ -372,7 +372,7 @@ def _verification_due(facts: CellFacts) -> Step | None:
 
 def _up_to_date(facts: CellFacts) -> Step:
     assert facts.in_use is not None
-    newest = datetime.date.fromisoformat(max(one.day for one in facts.sessions))
+    newest = datetime.date.fromisoformat(max(one.day for one in facts.valid_sessions))
     due = newest + datetime.timedelta(days=MAX_DAYS_UNVERIFIED)
     return Step(
         "up_to_date",
@@ -391,6 +391,7 @@ RULES: tuple[Callable[[CellFacts], Step | None], ...] = (
     _session_not_judged,
     _last_verdict,
     _better_model,
+    _fitted_to_set_aside,
     _outside_limit,
     _verification_due,
     _up_to_date,

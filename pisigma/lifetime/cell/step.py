@@ -25,6 +25,7 @@ State = Literal[
     "outside_limit",
     "limit_below_scatter",
     "better_model",
+    "fitted_to_set_aside",
     "verification_due",
     "up_to_date",
 ]

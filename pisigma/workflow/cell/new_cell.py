@@ -111,7 +111,8 @@ class NewCell:
         )
         shutil.copytree(model, folder / MODELS / name)
         day = min((made.date().isoformat(), *(one for one, _ in self.sessions if is_date(one))))
-        findings = load_model(model).metrics.get("diagnostics", ())
+        loaded = load_model(model)
+        findings = loaded.metrics.get("diagnostics", ())
         doubt = next((one["sentence"] for one in findings if one["severity"] == "implausible"), "")
         remark = doubt or "in use before the cell was created"
         entry = ModelEntry(
@@ -121,6 +122,7 @@ class NewCell:
             "",
             day,
             remark=remark,
+            has_posterior=loaded.uncertainty is not None,
         )
         History(folder / HISTORY).add(entry, *([] if doubt else [Use(name, now(), remark)]))
 

@@ -10,6 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from jaxtyping import Bool
+from torch import Tensor
 
 from pisigma.files.errors import AcceptanceError, MeasurementError, PisigmaError, Place, check_choice
 from pisigma.lifetime.cell.controller import Controller
@@ -97,11 +99,11 @@ class Sessions:
             The entry of the session.
 
         Raises:
-            MeasurementError: the rows cannot be read, or the cell already contains all of them.
+            MeasurementError: the rows cannot be read, or the cell already contains some of them.
             AcceptanceError: the rows must not be trusted.
         """
         rows = read_rows(file, self.robot, self.cameras)
-        if day and rows.date is not None and all(rows.date) and day != _day_of(rows):
+        if day and any(rows.date or ()) and day != _day_of(rows):
             raise MeasurementError(
                 expected=f"the first day of the rows, {_day_of(rows)}",
                 value=day,
@@ -126,7 +128,7 @@ class Sessions:
         if not self.history.add_session(entry, *models):  # another process was faster
             if inside is None:
                 path.unlink()
-            raise _known(rows)
+            _check_new(rows, torch.ones(rows.rows, dtype=torch.bool))
         return entry
 
     def add_next_file(self) -> bool:
@@ -158,8 +160,7 @@ class Sessions:
         for one in known:
             values = RowValues.from_rows(self.rows_of([one]).as_fields(), self.robot)
             again |= copies_of_known(rows.as_fields(), self.robot, values)
-        if bool(again.all()):
-            raise _known(rows)
+        _check_new(rows, again)
         model, fitted, controller = self.history.in_use, False, Controller.from_history(self.history)
         at = controller.active(day, now())
         found = controller.findings("import", model, self.history.sessions(), at).accepted(self.folder.parent)
@@ -170,7 +171,10 @@ class Sessions:
             stated = RecalibrationSettings(seen.moved or None)
             loaded = load_model(self.folder.parent / MODELS / model.name)
             verdict = check_rows(seen.rows, loaded, stated.fitted, may_move(stated))
-            fitted = bool(known_rows(loaded, seen.rows).all())
+            training = known_rows(loaded, seen.rows)
+            fitted = bool(training.all())
+            if not fitted:
+                _check_new(rows, training)
         if verdict.implausible and not accept_implausible:
             raise AcceptanceError(
                 f"the rows must not be trusted: {verdict.implausible[0].sentence.rstrip('.')}",
@@ -250,14 +254,15 @@ class Sessions:
         return found
 
     def choose(self, model: ModelEntry, name: str | None) -> SessionEntry:
-        """Return a session by its name; None: the newest to which a model was not fitted.
+        """Return a session that is new to a model (see `new_to`) by its name; None: the newest.
 
         Raises:
-            MeasurementError: there is no session with this name.
+            MeasurementError: there is no such session with this name.
         """
+        new = self.new_to(model)
         if name is None:
-            return self.new_to(model)[-1]
-        sessions = {one.name: one for one in self.valid_sessions()}
+            return new[-1]
+        sessions = {one.name: one for one in new}
         check_choice(MeasurementError, "session", name, tuple(sessions), Place(self.folder))
         return sessions[name]
 
@@ -344,15 +349,24 @@ def newest_day(events: Sequence[Event], kind: str, day: str) -> str:
     return max((one.day for one in events if one.kind == kind and one.day <= day), default="")
 
 
-def _known(rows: Measurements) -> MeasurementError:
-    """Return the refusal of rows that the cell already contains."""
-    return MeasurementError(
-        "the cell already contains every row", at=Place(rows.source), remedy="import new rows"
+def _check_new(rows: Measurements, known: Bool[Tensor, " rows"]) -> None:
+    """Refuse rows that the cell contains: a model would be verified with rows that it was fitted to.
+
+    Raises:
+        MeasurementError: some rows are known.
+    """
+    if not bool(known.any()):
+        return
+    count = "every row" if bool(known.all()) else f"{int(known.sum())} of {rows.rows} rows"
+    raise MeasurementError(
+        f"the cell already contains {count}",
+        at=Place(rows.source),
+        remedy="import new rows" if bool(known.all()) else "import a file with the other rows only",
     )
 
 
 def _day_of(rows: Measurements) -> str:
     """Return the first day of rows: from the column `date`, else from the name of their file, else today."""
-    if rows.date is not None and all(rows.date):
-        return min(rows.date)
+    if dates := [one for one in rows.date or () if one]:
+        return min(dates)
     return date_in_name(Path(rows.source).name) or datetime.date.today().isoformat()

@@ -268,6 +268,14 @@ def test_a_cell_of_schema_1_keeps_every_entry_and_the_monitored_sessions_of_its_
     assert history.database.upgrade() == SCHEMA_VERSION
 
 
+@pytest.mark.parametrize("has_posterior", [True, False])
+def test_an_upgrade_finds_out_which_models_have_a_posterior(older, has_posterior):
+    description = older / "models" / "2026-11-26" / "model.yaml"
+    if not has_posterior:
+        description.write_text(description.read_text().replace("\nuncertainty:\n", "\nothers:\n"))
+    assert [one.has_posterior for one in History(older / HISTORY).models()] == [has_posterior]
+
+
 def test_the_history_of_a_model_outside_of_a_cell_is_upgraded_too(older, tmp_path):
     path = tmp_path / "mine.history.sqlite"
     (older / "models" / "2026-11-26.history.sqlite").rename(path)

@@ -1,13 +1,15 @@
 """The model in use of a cell is followed: a change is taken over, and a model that cannot be loaded is reported."""
 
+import os
 import time
 
 import pytest
 from testing.cell_models import FIRST, SECOND, cell_of_two_models, put_into_use
 from testing.refusals import refused
 
-from pisigma.files.errors import ModelError
+from pisigma.files.errors import ModelError, OutputError
 from pisigma.lifetime.cell import model_in_use
+from pisigma.lifetime.cell.history import History
 from pisigma.lifetime.cell.model_in_use import ModelInUse
 
 
@@ -73,6 +75,59 @@ def test_a_model_that_cannot_be_loaded_leaves_the_one_before(cell, loads):
     in_use.check(always=True)
     assert (names, in_use.problem) == ([FIRST, SECOND], "")
     in_use.stop()
+
+
+def test_changes_are_followed_though_nobody_reads_the_reports(cell, loads):
+    _, in_use, problems = loads
+    problems[SECOND] = ModelError("damaged", option=SECOND)
+    reports = []
+
+    def report(sentence):
+        reports.append(sentence)
+        raise BrokenPipeError
+
+    in_use.follow(report)
+    put_into_use(cell, SECOND)
+    until(lambda: reports)
+    problems.clear()
+    put_into_use(cell, SECOND)
+    put_into_use(cell, FIRST)
+    put_into_use(cell, SECOND)
+    until(lambda: in_use.folder.name == SECOND)
+    in_use.stop()
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_a_forked_process_follows_changes_too(cell, loads):
+    _, in_use, _ = loads
+    in_use.follow()
+    child = os.fork()
+    if not child:
+        end = time.monotonic() + 10
+        while in_use.folder.name != SECOND and time.monotonic() < end:
+            time.sleep(0.01)
+        os._exit(in_use.folder.name != SECOND)
+    put_into_use(cell, SECOND)
+    assert os.waitpid(child, 0)[1] == 0
+    in_use.stop()
+
+
+def test_findings_that_cannot_be_read_are_read_again(cell, loads, monkeypatch):
+    names, in_use, _ = loads
+    time.sleep(2 * model_in_use.SETTLED)
+    in_use.check()
+    put_into_use(cell, SECOND)
+    time.sleep(2 * model_in_use.SETTLED)
+    with monkeypatch.context() as patched:
+        patched.setattr(History, "controller", locked)
+        in_use.check()
+    assert (names, bool(in_use.problem)) == ([FIRST], True)
+    in_use.check()
+    assert (names, in_use.problem) == ([FIRST, SECOND], "")
+
+
+def locked(history):
+    raise OutputError("the history cannot be used: database is locked")
 
 
 def test_a_cell_without_a_model_in_use_is_refused_at_first_and_reported_later(cell, loads):

@@ -5,17 +5,12 @@ from typing import get_args
 
 import pytest
 
-from pisigma.lifetime.cell.controller import Controller
+from pisigma.lifetime.cell.controller import Controller, valid_sessions
 from pisigma.lifetime.cell.events import ARM_EVENTS, Event
 from pisigma.lifetime.cell.exports import ControllerEntry, ExportEntry
+from pisigma.lifetime.cell.facts import CellStatus
 from pisigma.lifetime.cell.history import Check, ModelEntry, SessionEntry
-from pisigma.lifetime.cell.status import (
-    MAX_DAYS_UNVERIFIED,
-    CellFacts,
-    next_step,
-    plans_check,
-    valid_sessions,
-)
+from pisigma.lifetime.cell.status import MAX_DAYS_UNVERIFIED, NOT_TRUSTED, CellFacts, next_step, plans_check
 from pisigma.lifetime.cell.step import State
 
 
@@ -102,6 +97,10 @@ CASES = {
             checks=(*VERIFIED.checks, check("monitor", "a", "2026-03-10", "unchanged")),
         ),
         "verify",
+    ),
+    "fitted_to_set_aside": (
+        replace(VERIFIED, sessions=(replace(FIRST, set_aside="loose reflector"), SECOND)),
+        "calibrate",
     ),
     "outside_limit": (replace(VERIFIED, limit_mm=0.05), "plan"),
     "limit_below_scatter": (replace(VERIFIED, limit_mm=0.05, in_use=replace(MODEL, scatter_mm=0.018)), ""),
@@ -211,6 +210,37 @@ def test_verification_is_due_after_a_quarter(days, state):
 
     today = datetime.date(2026, 2, 10) + datetime.timedelta(days=MAX_DAYS_UNVERIFIED + days)
     assert next_step(replace(VERIFIED, today=today.isoformat())).state == state
+
+
+def test_a_session_that_was_set_aside_does_not_postpone_the_verification():
+    aside = replace(session("2026-08-31", rows=10), set_aside="loose reflector")
+    due, _ = CASES["verification_due"]
+    assert next_step(replace(due, sessions=(*due.sessions, aside))) == next_step(due)
+
+
+@pytest.mark.parametrize("verdict", ["not_better", *NOT_TRUSTED])
+@pytest.mark.parametrize("set_aside", ["", "loose reflector"])
+def test_errors_are_those_of_trusted_rows(verdict, set_aside):
+    wrong = replace(check("verify", "a", "2026-02-10", verdict, p95=9.0), rms_mm=5.0)
+    later = replace(check("monitor", "a", "2026-03-10", "unchanged"), rms_mm=0.05)
+    before = replace(check("calibrate", "a"), rms_mm=0.06)
+    sessions = (FIRST, replace(SECOND, set_aside=set_aside), THIRD)
+    facts = replace(MONITORED, sessions=sessions, checks=(before, wrong, later))
+    counts = not set_aside and verdict == "not_better"
+    assert next_step(facts).state == ("outside_limit" if counts else "up_to_date")
+    judged = replace(facts, checks=(before, wrong))
+    assert CellStatus(judged, next_step(judged)).last_error == (wrong if counts else before)
+
+
+def test_a_model_fitted_to_a_session_that_was_set_aside_is_replaced():
+    facts, _ = CASES["fitted_to_set_aside"]
+    assert next_step(replace(facts, in_use=replace(MODEL, sessions=""))).state == "up_to_date"
+    newer = model("b", "2026-02-10", day="2026-02-10")
+    step = next_step(replace(facts, models=(MODEL, newer)))
+    assert (step.state, step.command) == ("fitted_to_set_aside", "pisigma plan cell")
+    again = replace(facts, models=(MODEL, newer), sessions=(*facts.sessions, THIRD), today="2026-03-11")
+    judged = (*facts.checks, check("monitor", "a", "2026-03-10", "unchanged"))
+    assert next_step(replace(again, checks=judged)).command == "pisigma verify cell --model b"
 
 
 def test_a_session_that_cannot_be_trusted_is_not_recalibrated_with():

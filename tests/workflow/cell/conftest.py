@@ -1,5 +1,6 @@
 """A cell that was calibrated and verified, with files that were exported from its model."""
 
+import shutil
 from dataclasses import replace
 
 import pytest
@@ -26,3 +27,16 @@ def used(tmp_path_factory):
             export_from_cell(cell, form, ExportRequest(cell.folder, folder / name))
     cell.history.add(*(replace(one, exported=f"{day(25)}T08:00:00+00:00") for one in cell.history.exports()))
     return cell
+
+
+@pytest.fixture
+def cell(used, tmp_path):
+    """A copy of the cell; its exports are next to the original."""
+    shutil.copytree(used.folder, tmp_path / "cell")
+    return Cell.open(tmp_path / "cell")
+
+
+@pytest.fixture(scope="module")
+def quick_pictures(blank_pictures):
+    with no_type_checker():
+        yield

@@ -1,12 +1,10 @@
 """Exports that are active on the controller: every command of a cell follows the table of rules."""
 
 import json
-import shutil
 import struct
 
 import pytest
 from testing.cell_rows import ROBOT, day, measured
-from testing.models import no_type_checker
 from testing.refusals import refused
 
 import pisigma
@@ -18,25 +16,13 @@ from pisigma.deployment.serve.models import ServedModels
 from pisigma.files.errors import MeasurementError, ModelError
 from pisigma.lifetime.cell import controller
 from pisigma.lifetime.cell.controller import RULES, checked_in_use, checked_model_folder
-from pisigma.workflow.cell.cell import Cell
 from pisigma.workflow.cell.exports import export_from_cell, set_controller
+
+pytestmark = pytest.mark.usefixtures("quick_pictures")
 
 REACHABLE = "x_mm,y_mm,z_mm,roll_deg,pitch_deg,yaw_deg\n700,200,500,0,0,180\n"
 ZERO = 0.08
 """Change of the zero of the third joint [deg]."""
-
-
-@pytest.fixture(scope="module", autouse=True)
-def quick_pictures(blank_pictures):
-    with no_type_checker():
-        yield
-
-
-@pytest.fixture
-def cell(used, tmp_path):
-    """A copy of the cell; its exports are next to the original."""
-    shutil.copytree(used.folder, tmp_path / "cell")
-    return Cell.open(tmp_path / "cell")
 
 
 def exported(cell, tmp_path, form, **options):

@@ -1,14 +1,12 @@
 """Files that were put into the folder of sessions by hand: every command that reads rows adds them or names them."""
 
-import shutil
-
 import pytest
 from testing.cell_rows import ROBOT, day, measured
-from testing.models import no_type_checker
 from testing.refusals import refused
 
 from pisigma.files.errors import AcceptanceError, MeasurementError, PisigmaError
-from pisigma.workflow.cell.cell import Cell
+
+pytestmark = pytest.mark.usefixtures("quick_pictures")
 
 COMMANDS = {
     "calibrate": lambda cell: cell.calibrate(model="geometric", folds=0),
@@ -17,18 +15,6 @@ COMMANDS = {
     "recalibrate": lambda cell: cell.recalibrate(),
     "evaluate": lambda cell: cell.evaluate(),
 }
-
-
-@pytest.fixture(scope="module", autouse=True)
-def quick_pictures(blank_pictures):
-    with no_type_checker():
-        yield
-
-
-@pytest.fixture
-def cell(used, tmp_path):
-    shutil.copytree(used.folder, tmp_path / "cell")
-    return Cell.open(tmp_path / "cell")
 
 
 @pytest.mark.parametrize(
