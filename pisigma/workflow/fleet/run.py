@@ -118,7 +118,10 @@ def run_fleet(
             progress(f"{number} of {len(cells)} cells")
     after = [one.facts for one in FleetStatus.read(folder).cells]
     for facts in after:
-        parameters |= _parameters(facts, parameters.keys())
+        try:
+            parameters |= _parameters(facts, parameters.keys())
+        except PisigmaError as problem:  # one cell must not stop the others
+            reasons.setdefault(Path(facts.folder).name, str(problem))
     write_results(path, after, parameters)
     return FleetRun(
         cells=len(cells),

@@ -1,6 +1,7 @@
 """Advancing all cells of a folder: results, resuming, and cells that need attention."""
 
 import resource
+import shutil
 import sys
 
 import pytest
@@ -88,6 +89,16 @@ def test_a_later_call_continues(plant):
     rows_later(31, 5).write_csv(plant / "r2" / "sessions" / "2026-10-01.csv", model_before().robot)
     last = run_fleet(plant, ONE_JOB)
     assert (last.unchanged, last.done, last.refused) == (2, 3, ())
+
+
+def test_a_model_folder_that_is_gone_is_named_and_does_not_stop_the_others(plant):
+    first = run_fleet(plant, ONE_JOB)
+    first.results.unlink()
+    (model,) = (plant / "r0" / "models").iterdir()
+    shutil.rmtree(model)
+    last = run_fleet(plant, ONE_JOB)
+    assert [cell for cell, _ in last.refused] == ["r0", "r2"]
+    assert table_of(last)[1][1]["parameters"]
 
 
 def test_a_folder_without_cells_is_refused(tmp_path):
