@@ -1,10 +1,13 @@
 """Layout of the folder of a cell: its file, plans, sessions, models, exports and reports."""
 
+import datetime
 import os
+import re
 from pathlib import Path
 
 from pisigma.files.errors import ModelError, Place, PlanningError
 from pisigma.lifetime.cell.history import HISTORY, MODEL_HISTORY, History
+from pisigma.measurement.dates import date_in_name
 
 CELL_FILE = "cell.yaml"
 PLANS, SESSIONS, MODELS = "plans", "sessions", "models"
@@ -24,10 +27,20 @@ def newest_plan(path: str | os.PathLike[str]) -> Path:
     """
     if not is_cell(path):
         return Path(path)
-    plans = sorted((Path(path) / PLANS).glob("*.csv"), key=lambda one: one.stat().st_mtime)
+    plans = sorted((Path(path) / PLANS).glob("*.csv"), key=_made)
     if not plans:
         raise PlanningError("the cell has no plan", at=Place(path), remedy=f"run `pisigma plan {path}`")
     return plans[-1]
+
+
+def _made(plan: Path) -> tuple[str, list[tuple[int, str]]]:
+    """Return a sort key of plans: the day in the name, else that of the last change, and the numbers in the name.
+
+    Plans of one day are numbered; the times of files do not survive every copy of a cell.
+    """
+    changed = datetime.date.fromtimestamp(plan.stat().st_mtime).isoformat()
+    parts = re.findall(r"(\d+)|(\D+)", plan.stem)
+    return date_in_name(plan.stem) or changed, [(int(number or 0), text) for number, text in parts]
 
 
 def previous_and_current_model(path: str | os.PathLike[str]) -> tuple[Path, Path]:

@@ -8,7 +8,7 @@ from testing.refusals import refused
 
 from pisigma.files.errors import MeasurementError, OutputError, PlanningError
 from pisigma.lifetime.cell.history import HISTORY
-from pisigma.lifetime.cell.layout import CELL_FILE
+from pisigma.lifetime.cell.layout import CELL_FILE, newest_plan
 from pisigma.workflow.cell.archive import pack, unpack
 from pisigma.workflow.cell.cell import Cell
 
@@ -33,6 +33,16 @@ def test_an_unpacked_cell_has_the_same_files(cell, tmp_path):
     assert count == len(files(cell.folder))
     assert other.history.events() == cell.history.events()
     assert other.status().step.state == cell.status().step.state
+
+
+@pytest.mark.parametrize("count", [2, 3, 4])
+def test_the_newest_plan_is_the_same_in_a_copy(count, cell, tmp_path):
+    plans = ["2026-10-30-11", "2026-11-01", "2026-11-01-2", "2026-11-01-10"][:count]
+    for name in plans:
+        (cell.folder / "plans" / f"{name}.csv").write_text("q1_deg\n")
+    pack(cell, tmp_path / "welder7.zip")
+    for folder in (cell.folder, unpack(tmp_path / "welder7.zip", tmp_path / "there").folder):
+        assert newest_plan(folder).stem == plans[-1]
 
 
 def test_a_cell_is_packed_without_the_changes_that_another_process_is_making(cell, tmp_path):
