@@ -30,13 +30,20 @@ from pisigma.workflow.cell.new_files import output_path
 from pisigma.workflow.import_rows import ImportProposal, import_rows, propose_import
 from pisigma.workflow.load import load, stated_pose
 from pisigma.workflow.measure import MeasuringSession
-from pisigma.workflow.result_texts import plan_text, session_text, verification_text
+from pisigma.workflow.result_texts import (
+    monitoring_text,
+    plan_text,
+    recalibration_text,
+    session_text,
+    verification_text,
+)
 from pisigma.workflow.settings.importing import ImportSettings
 
 Form = Mapping[str, str]
 WIDTH = 200
 """Width of tables before models are divided among several [characters]."""
 EXPORT_OPTIONS = ("geometry", "targets", "branch", "config")
+NEEDS_ACTION = "the robot needs attention, for the reasons below."
 NOT_STORED = "no model was stored, because the result must not be trusted, for the reasons below."
 
 
@@ -54,7 +61,7 @@ def calibrate(cell: Cell, form: Form, progress: Progress) -> Outcome:
     also = [] if entry is None else [sentences("the cell", [f"Model '{entry.name}': {entry.remark}."])]
     assert isinstance(found, Calibration)  # there is no prior
     text = calibration_text(found.summary, folder, found.seconds, also)
-    return Outcome(text, NOT_STORED if entry is None else "")
+    return Outcome(_in_cell(text, cell), NOT_STORED if entry is None else "")
 
 
 def verify(cell: Cell, form: Form, progress: Progress) -> Outcome:
@@ -64,26 +71,27 @@ def verify(cell: Cell, form: Form, progress: Progress) -> Outcome:
     in_use = cell.history.in_use
     used = [f"Model '{entry.name}' is in use."] if in_use is not None and in_use.name == entry.name else []
     text = replace(verification_text(found, WIDTH), closing=tuple(used))
-    return Outcome(text, "" if found.accepted else found.sentence)
+    return Outcome(_in_cell(text, cell), "" if found.accepted else found.sentence)
 
 
 def monitor(cell: Cell, form: Form, progress: Progress) -> Outcome:
     """Compare every new session with the model in use."""
     found = cell.monitor(progress, **changed_settings("monitor", form))
-    check = next(one for one in reversed(cell.history.checks()) if one.command == "monitor")
-    verdict = Verdict(check.summary, check.verdict.replace("_", " "), cell.status().step.reason)
-    text = ResultText(verdict, tuple(found.warnings), (sentences("what has changed", found.sentences),))
-    return Outcome(text)
+    return Outcome(_in_cell(monitoring_text(found), cell), NEEDS_ACTION if found.needs_action else "")
 
 
 def recalibrate(cell: Cell, form: Form, progress: Progress) -> Outcome:
     """Recalibrate the model in use with the newest session."""
     accept = form.get("accept_implausible") == "true"
     found, entry = cell.recalibrate(None, progress, accept, **changed_settings("recalibrate", form))
-    name = "no model was stored" if entry is None else f"model '{entry.name}' was stored"
-    verdict = Verdict(found.summary.verdict, name, uncapitalised(cell.status().step.reason))
-    warnings = (*found.warnings, *(one.sentence for one in found.summary.outliers))
-    return Outcome(ResultText(verdict, warnings), "" if entry is not None else NOT_STORED)
+    folder = None if entry is None else cell.model_folder(entry.name)
+    return Outcome(_in_cell(recalibration_text(found, folder), cell), "" if entry is not None else NOT_STORED)
+
+
+def _in_cell(text: ResultText, cell: Cell) -> ResultText:
+    """Return a result with the next step of the cell, as its commands state it, instead of that of the result."""
+    step = uncapitalised(cell.status().step.reason)
+    return replace(text, verdict=replace(text.verdict, next_step=step))
 
 
 def proposal_of(files: list[Path], cell: Cell, form: Form) -> ImportProposal | None:

@@ -5,13 +5,19 @@ from pathlib import Path
 
 from pisigma.planning.session.state import AccuracyPoint, SessionState
 from pisigma.reporting.comparison_tables import comparison_blocks, model_rms
+from pisigma.reporting.derived_cards import candidate_names, candidate_table
+from pisigma.reporting.lifetime_tables import chart_table, session_table
 from pisigma.reporting.result_text import ResultText, sentences, table_block
 from pisigma.reporting.verdict import Verdict, counted, rounded, uncapitalised
+from pisigma.workflow.monitor import Monitoring
 from pisigma.workflow.plan import Plan
+from pisigma.workflow.recalibrate import Recalibration
 from pisigma.workflow.verify import Verification
 
 MAX_POINTS = 8
 """Rows of the table of expected errors."""
+MAX_SESSIONS = 6
+"""Sessions that are shown at once, the last ones."""
 
 NEXT_STEPS = {
     "better": "use the model, and verify again after a change of tool, base or arm.",
@@ -153,3 +159,95 @@ def accuracy_text(point: AccuracyPoint) -> str:
 
 def _errors(name: str, rms: float, p95: float) -> str:
     return "" if rms != rms else f"{name} {rounded(rms * 1e3)} and {rounded(p95 * 1e3)} mm"
+
+
+def monitoring_text(monitoring: Monitoring, closing: Sequence[str] = ()) -> ResultText:
+    """Lay out a monitoring: the verdict, a line for every session, and what the sessions say together.
+
+    Args:
+        monitoring: the monitoring.
+        closing: what was written where.
+    """
+    sessions, name = monitoring.sessions, monitoring.model.name
+    said = [f"{one.date}: {one.session.sentence}" for one in sessions if one.session.verdict != "unchanged"]
+    unobservable = dict.fromkeys(line for one in sessions for line in one.session.unobservable)
+    charts = table_block(f"charts of {len(monitoring.records)} sessions", *chart_table(monitoring.charts))
+    advice = next((line for line in monitoring.sentences if "`pisigma " in line), "")
+    together = [one for one in monitoring.sentences if one != advice]
+    details = (
+        table_block(f"sessions of {name}", *session_table(sessions)),
+        sentences("what has changed in all sessions", said, "  "),
+    )
+    return ResultText(
+        _monitoring_verdict(monitoring, advice),
+        tuple(monitoring.warnings),
+        (
+            sentences("what the sessions say together", together),
+            sentences("what has changed", [*said[-MAX_SESSIONS:], *unobservable], "  "),
+            table_block(f"last sessions of {name}", *session_table(sessions[-MAX_SESSIONS:])),
+            *([charts] if len(monitoring.records) > 1 else []),
+        ),
+        details if len(sessions) > MAX_SESSIONS else (),
+        tuple(closing),
+    )
+
+
+def _monitoring_verdict(monitoring: Monitoring, advice: str) -> Verdict:
+    """Judge a robot by its sessions; `advice` says how to recalibrate it where that pays."""
+    sessions, untrusted = monitoring.sessions, len(monitoring.untrusted)
+    changed = [one for one in sessions if one.session.verdict != "unchanged"]
+    last = f"{sessions[-1].date}, {rounded(sessions[-1].session.rms * 1e3, 0)} mm RMS" if sessions else "none"
+    alarms = [chart.what for chart in monitoring.charts if chart.alarm is not None]
+    doubts = [f"changed in {len(changed)} of {counted(len(sessions), 'session')}"] if changed else []
+    doubts += [f"outside the limits of its chart: {', '.join(alarms)}"] if alarms else []
+    doubts += [f"{counted(untrusted, 'session')} left out"] if untrusted else []
+    trust = f"yes: unchanged in {counted(len(sessions), 'session')}."
+    return Verdict(
+        f"last session {last} under the model, base and tool fitted where they were moved.",
+        f"{'no' if monitoring.needs_action else 'with caution'}: {'; '.join(doubts)}." if doubts else trust,
+        uncapitalised(advice)
+        or ("see what has changed below." if doubts else "measure the next session with the same poses."),
+    )
+
+
+def recalibration_text(recalibration: Recalibration, folder: Path | None) -> ResultText:
+    """Lay out a recalibration: the verdict, what has moved, and the models that were candidates.
+
+    Args:
+        recalibration: the recalibration.
+        folder: folder of the model; None if it was not written.
+    """
+    summary = recalibration.summary
+    warnings = (*(one.sentence for one in summary.diagnostics[1:]), *summary.warnings)
+    written = f"Model written to {folder} in {recalibration.seconds:.1f} s; its README.md has all figures."
+    return ResultText(
+        _recalibration_verdict(recalibration, folder),
+        (*warnings, *(one.sentence for one in summary.outliers)),
+        (
+            sentences("which model is kept", [summary.verdict]),
+            table_block(f"errors of {summary.left_out} held-out rows", *candidate_table(summary)),
+        ),
+        closing=() if folder is None else (written,),
+    )
+
+
+def _recalibration_verdict(recalibration: Recalibration, folder: Path | None) -> Verdict:
+    """Judge a recalibration."""
+    summary, names = recalibration.summary, candidate_names(recalibration.summary)
+    errors = {name: one.rms_mm for name, one in summary.cross_validation.items() if one.rms_mm is not None}
+    texts = {name: f"{names[name]} {rounded(error, summary.left_out)} mm" for name, error in errors.items()}
+    first = texts.pop(summary.kept, "not known: too few rows")
+    others = f"; {', '.join(texts.values())}" if texts else ""
+    count = len(summary.warnings) + len(summary.outliers)
+    cautions = f"with caution ({counted(count, 'warning')})" if count else "yes"
+    return Verdict(
+        f"{first} RMS, held out in cross-validation of {summary.left_out} new rows{others}.",
+        f"no: {summary.diagnostics[0].sentence}"
+        if summary.diagnostics
+        else f"{cautions}: {uncapitalised(summary.changed)}",
+        f"verify with other poses: `pisigma verify {folder} ROWS.csv`."
+        if folder is not None
+        else "run it with --out DIR instead of --dry-run to write this model."
+        if recalibration.trusted
+        else "correct what is named above and recalibrate again; no model was written.",
+    )

@@ -4,6 +4,7 @@ import html
 import json
 import re
 import shlex
+import shutil
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -14,9 +15,11 @@ from testing.cell_rows import ROBOT, day, measured
 from testing.models import no_type_checker
 from testing.pages import visitor
 from testing.report import HOSTILE
+from typer.testing import CliRunner
 
 pytest.importorskip("viser", reason="the extra view is not installed")
 
+from pisigma.cli.main import app
 from pisigma.lifetime.cell.layout import CELL_FILE
 from pisigma.workbench.job import BusyError, Jobs, Outcome
 from pisigma.workbench.tabs import TABS
@@ -283,3 +286,24 @@ def test_no_step_starts_once_the_server_ends():
     jobs.close()
     with pytest.raises(BusyError):
         jobs.start("plan", "Ada", "", lambda progress: Outcome())
+
+
+def test_results_are_those_of_the_commands(tmp_path):
+    """The page on a cell and the commands on a copy of it: the same figures, and attention at the same time."""
+    with no_type_checker():
+        made = Cell.create(tmp_path / "page", "ur10", limit_mm=0.5)
+        made.take_in(measured(40, 0), day=day(20))
+        made.calibrate(folds=0)
+        made.take_in(measured(15, 1, zero=0.2), day=day(10))
+        shutil.copytree(made.folder, tmp_path / "commands")
+        with Workbench(made.folder, port=0) as bench:
+            browser = visitor(bench.url)
+            for step in ("verify", "monitor", "recalibrate"):
+                found = ended(browser, bench, step)
+                result = CliRunner().invoke(app, [step, str(tmp_path / "commands")])
+                printed = " ".join(result.output.split()).replace("/commands", "/page")
+                assert found.text is not None, (step, found.refusal)
+                verdict = found.text.verdict
+                for text in (verdict.accuracy, verdict.trust, *found.text.warnings):
+                    assert " ".join(text.split()) in printed, step
+                assert bool(found.refusal) == (result.exit_code != 0), (step, found.refusal)

@@ -10,10 +10,8 @@ from pisigma.cli.cell import cell_at, next_lines, refuse_with_cell, report_overr
 from pisigma.cli.endings import NOT_ACCEPTED
 from pisigma.cli.output import print_json
 from pisigma.cli.progress import progress_of
-from pisigma.cli.screen import print_screen
+from pisigma.cli.screen import print_result
 from pisigma.cli.settings_options import StatedSettings, takes_settings
-from pisigma.reporting.result_text import sentences, table_block
-from pisigma.reporting.verdict import Verdict, counted, rounded, uncapitalised
 from pisigma.workflow.settings.monitoring import MonitorSettings
 
 if TYPE_CHECKING:
@@ -28,9 +26,6 @@ Sessions = Annotated[
         help="Measurements (CSV), one file per session of five poses or more; not needed for a cell.",
     ),
 ]
-MAX_SESSIONS = 6
-"""Sessions that are printed without `--verbose`, the last ones."""
-
 Page = Annotated[Path | None, typer.Option(help="HTML page to write, with charts of all sessions.")]
 
 
@@ -94,55 +89,11 @@ def _print(
     verbose: bool,
     status: "CellStatus | None" = None,
 ) -> None:
-    """Print the verdict, a line for every session, and what the sessions say together; `status`: of a cell."""
-    from pisigma.reporting.lifetime_tables import chart_table, session_table
+    """Print the result; `status`: of a cell."""
+    from pisigma.workflow.result_texts import monitoring_text
 
     if as_json:
         print_json(monitoring.to_json() | ({} if status is None else {"next": status.step.to_json()}))
         return
-    sessions = monitoring.sessions
-    said = [f"{one.date}: {one.session.sentence}" for one in sessions if one.session.verdict != "unchanged"]
-    unobservable = dict.fromkeys(line for one in sessions for line in one.session.unobservable)
-    charts = table_block(f"charts of {len(monitoring.records)} sessions", *chart_table(monitoring.charts))
-    advice = next((line for line in monitoring.sentences if "`pisigma " in line), "")
-    print_screen(
-        _verdict(monitoring, advice),
-        monitoring.warnings,
-        [
-            sentences(
-                "what the sessions say together", (one for one in monitoring.sentences if one != advice)
-            ),
-            sentences("what has changed", [*said[-MAX_SESSIONS:], *unobservable], "  "),
-            table_block(
-                f"last sessions of {monitoring.model.name}", *session_table(sessions[-MAX_SESSIONS:])
-            ),
-            *([charts] if len(monitoring.records) > 1 else []),
-        ],
-        [
-            table_block(f"sessions of {monitoring.model.name}", *session_table(sessions)),
-            sentences("what has changed in all sessions", said, "  "),
-        ]
-        if len(sessions) > MAX_SESSIONS
-        else [],
-        [] if page is None else [f"Page written to {page}."],
-        verbose,
-        [] if status is None else next_lines(status),
-    )
-
-
-def _verdict(monitoring: "Monitoring", advice: str) -> Verdict:
-    """Judge a robot by its sessions; `advice` says how to recalibrate it where that pays."""
-    sessions, untrusted = monitoring.sessions, len(monitoring.untrusted)
-    changed = [one for one in sessions if one.session.verdict != "unchanged"]
-    last = f"{sessions[-1].date}, {rounded(sessions[-1].session.rms * 1e3, 0)} mm RMS" if sessions else "none"
-    alarms = [chart.what for chart in monitoring.charts if chart.alarm is not None]
-    doubts = [f"changed in {len(changed)} of {counted(len(sessions), 'session')}"] if changed else []
-    doubts += [f"outside the limits of its chart: {', '.join(alarms)}"] if alarms else []
-    doubts += [f"{counted(untrusted, 'session')} left out"] if untrusted else []
-    trust = f"yes: unchanged in {counted(len(sessions), 'session')}."
-    return Verdict(
-        f"last session {last} under the model, base and tool fitted where they were moved.",
-        f"{'no' if monitoring.needs_action else 'with caution'}: {'; '.join(doubts)}." if doubts else trust,
-        uncapitalised(advice)
-        or ("see what has changed below." if doubts else "measure the next session with the same poses."),
-    )
+    text = monitoring_text(monitoring, [] if page is None else [f"Page written to {page}."])
+    print_result(text, verbose, [] if status is None else next_lines(status))

@@ -10,11 +10,9 @@ from pisigma.cli.arguments import AcceptImplausible, AsJson, ModelOrCell, Overwr
 from pisigma.cli.cell import cell_at, next_lines, refuse_with_cell, report_overrides
 from pisigma.cli.output import command_line, print_json, saved_model_folder
 from pisigma.cli.progress import progress_of
-from pisigma.cli.screen import print_screen
+from pisigma.cli.screen import print_result
 from pisigma.cli.settings_options import StatedSettings, takes_settings
 from pisigma.files.errors import AcceptanceError
-from pisigma.reporting.result_text import sentences, table_block
-from pisigma.reporting.verdict import Verdict, counted, rounded, uncapitalised
 from pisigma.workflow.settings.recalibration import RecalibrationSettings
 
 if TYPE_CHECKING:
@@ -143,8 +141,8 @@ def _print(
     verbose: bool,
     cell: "Cell | None" = None,
 ) -> None:
-    """Print the verdict, what has moved, the models that were candidates, and the next step of a cell."""
-    from pisigma.reporting.derived_cards import candidate_table
+    """Print the result, and the next step of a cell."""
+    from pisigma.workflow.result_texts import recalibration_text
 
     if as_json:
         then = {} if cell is None else {"next": cell.status().step.to_json()}
@@ -153,42 +151,4 @@ def _print(
     lines: list[str] = []
     if cell is not None and (in_use := cell.history.in_use) is not None:
         lines = [f"Model '{in_use.name}' is in use.", *next_lines(cell.status())]
-    summary = recalibration.summary
-    warnings = [*(one.sentence for one in summary.diagnostics[1:]), *summary.warnings]
-    print_screen(
-        _verdict(recalibration, folder),
-        [*warnings, *(one.sentence for one in summary.outliers)],
-        [
-            sentences("which model is kept", [summary.verdict]),
-            table_block(f"errors of {summary.left_out} held-out rows", *candidate_table(summary)),
-        ],
-        closing=[]
-        if folder is None
-        else [f"Model written to {folder} in {recalibration.seconds:.1f} s; its README.md has all figures."],
-        verbose=verbose,
-        next_step=lines,
-    )
-
-
-def _verdict(recalibration: "Recalibration", folder: Path | None) -> Verdict:
-    """Judge a recalibration."""
-    from pisigma.reporting.derived_cards import candidate_names
-
-    summary, names = recalibration.summary, candidate_names(recalibration.summary)
-    errors = {name: one.rms_mm for name, one in summary.cross_validation.items() if one.rms_mm is not None}
-    texts = {name: f"{names[name]} {rounded(error, summary.left_out)} mm" for name, error in errors.items()}
-    first = texts.pop(summary.kept, "not known: too few rows")
-    others = f"; {', '.join(texts.values())}" if texts else ""
-    count = len(summary.warnings) + len(summary.outliers)
-    cautions = f"with caution ({counted(count, 'warning')})" if count else "yes"
-    return Verdict(
-        f"{first} RMS, held out in cross-validation of {summary.left_out} new rows{others}.",
-        f"no: {summary.diagnostics[0].sentence}"
-        if summary.diagnostics
-        else f"{cautions}: {uncapitalised(summary.changed)}",
-        f"verify with other poses: `pisigma verify {folder} ROWS.csv`."
-        if folder is not None
-        else "run it with --out DIR instead of --dry-run to write this model."
-        if recalibration.trusted
-        else "correct what is named above and recalibrate again; no model was written.",
-    )
+    print_result(recalibration_text(recalibration, folder), verbose, lines)
