@@ -17,7 +17,13 @@ import typer
 
 from pisigma.cli.help import HelpAll
 from pisigma.cli.output import print_json
-from pisigma.files.errors import AcceptanceError, PisigmaError, make_printable, missing_extra
+from pisigma.files.errors import (
+    AcceptanceError,
+    PisigmaError,
+    fault_of_machine,
+    make_printable,
+    missing_extra,
+)
 from pisigma.files.plugins import load_files, load_installed
 
 REFUSED = 2
@@ -94,15 +100,13 @@ def exit_with_problem(problem: BaseException, as_json: bool = False) -> None:
         exit_with_error(str(missing))
     if isinstance(problem, KeyboardInterrupt):
         exit_with_error("interrupted; nothing was left half written.", _INTERRUPTED)
-    if isinstance(problem, OSError) and problem.filename is not None:
-        exit_with_error(f"{problem.filename}: cannot be used ({problem.strerror}); check the path.")
+    if fault := fault_of_machine(problem):
+        exit_with_error(fault)
     if isinstance(problem, OSError) and problem.errno in (errno.EPIPE, errno.ENOSPC, errno.EIO, errno.EFBIG):
         _print_no_more()
         if problem.errno == errno.EPIPE:
             raise typer.Exit(_NO_READER)
         exit_with_error(f"the standard output cannot be written ({problem.strerror}); print to another file.")
-    if isinstance(problem, MemoryError):
-        exit_with_error("there is not enough memory; give fewer or smaller inputs.")
     if os.environ.get(TRACEBACK):
         raise problem
     exit_with_error(_defect(problem), DEFECT)

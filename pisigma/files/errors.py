@@ -265,6 +265,15 @@ _PACKAGES = {"cv2": "opencv-python-headless"}
 """Packages whose module has another name, by that name."""
 
 
+def fault_of_machine(problem: BaseException) -> str:
+    """Say which file cannot be used, or that memory ran out; "" for every other problem."""
+    if isinstance(problem, OSError) and problem.filename is not None:
+        return f"{problem.filename}: cannot be used ({problem.strerror}); check the path."
+    if isinstance(problem, MemoryError):
+        return "there is not enough memory; give fewer or smaller inputs."
+    return ""
+
+
 def missing_extra(problem: ImportError) -> MissingExtraError | None:
     """Return an error that names the extra with the package that could not be imported; None if no extra has it."""
     module = (problem.name or "").split(".")[0]

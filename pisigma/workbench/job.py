@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-from pisigma.files.errors import missing_extra
+from pisigma.files.errors import fault_of_machine, missing_extra
 from pisigma.files.progress import Progress, TimeLeft
 from pisigma.reporting.result_text import ResultText
 
@@ -138,9 +138,11 @@ class Jobs:
         except ImportError as problem:
             found = Outcome(refusal=str(missing_extra(problem) or problem))
         except Exception as problem:
-            traceback.print_exc(file=sys.stderr)
+            if not (fault := fault_of_machine(problem)):
+                traceback.print_exc(file=sys.stderr)
             found = Outcome(
-                refusal=f"a defect of pisigma ended the step ({type(problem).__name__}: {problem}). Nothing was left "
+                refusal=fault
+                or f"a defect of pisigma ended the step ({type(problem).__name__}: {problem}). Nothing was left "
                 "half written. Please report it with the last lines of the terminal."
             )
         with self._lock:

@@ -15,7 +15,7 @@ import numpy as np
 from aiohttp import web
 from aiohttp.typedefs import Handler
 
-from pisigma.files.errors import PisigmaError, Place, PlanningError
+from pisigma.files.errors import PisigmaError, Place, PlanningError, fault_of_machine
 from pisigma.files.progress import Progress
 from pisigma.lifetime.cell.facts import CellStatus
 from pisigma.lifetime.cell.layout import CELL_FILE
@@ -51,6 +51,10 @@ def answers(function: Callable[["Workbench", web.Request], Awaitable[web.StreamR
                 "field": problem.option or str(problem.column or ""),
             }
             return web.json_response(fields, status=422)
+        except (OSError, MemoryError) as problem:
+            if not (fault := fault_of_machine(problem)):
+                raise
+            return web.json_response({"error": self._uploads.without_folder(fault), "field": ""}, status=422)
         except BusyError:
             job = self.jobs.running
             who = "somebody" if job is None else f"{job.person}: {job.step}"

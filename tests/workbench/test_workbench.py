@@ -20,6 +20,7 @@ from typer.testing import CliRunner
 pytest.importorskip("viser", reason="the extra view is not installed")
 
 from pisigma.cli.main import app
+from pisigma.files.errors import fault_of_machine
 from pisigma.lifetime.cell.layout import CELL_FILE
 from pisigma.workbench.job import BusyError, Jobs, Outcome
 from pisigma.workbench.tabs import TABS
@@ -279,6 +280,20 @@ def test_a_defect_ends_the_step_only(browser_with_link, bench, monkeypatch, caps
     assert "ZeroDivisionError" in ended(browser_with_link, bench, "verify").refusal
     assert "Traceback" in capsys.readouterr().err
     assert browser_with_link.ask("/tab/verify").status == 200
+
+
+@pytest.mark.parametrize("problem", [OSError(28, "No space left on device", "rows.csv"), MemoryError()])
+def test_a_machine_that_cannot_is_not_a_defect(browser_with_link, bench, monkeypatch, capsys, problem):
+    def full(*_):
+        raise problem
+
+    monkeypatch.setitem(STEPS, "plan", full)
+    monkeypatch.setattr(bench._uploads, "add", full)
+    expected = fault_of_machine(problem)
+    assert expected
+    assert ended(browser_with_link, bench, "plan").refusal == expected
+    assert json.loads(browser_with_link.ask("/upload?name=a", "POST", b"1").body)["error"] == expected
+    assert "Traceback" not in capsys.readouterr().err
 
 
 def test_no_step_starts_once_the_server_ends():
