@@ -155,7 +155,7 @@ def _incomplete(folder: Path, sessions: Sequence[SessionEntry], checks: Sequence
     made = planned[-1]
     if any(one.checked > made and one.command not in BEFORE_FIT for one in checks):
         return ""
-    measured = sum(one.rows for one in sessions if one.taken_in > made and not one.set_aside)
+    measured = sum(one.poses or one.rows for one in sessions if one.taken_in > made and not one.set_aside)
     with newest_plan(folder).open(encoding="utf-8") as file:
         poses = sum(bool(line.strip()) for line in file) - 1
     if not 0 < measured < MIN_MEASURED_SHARE * poses:

@@ -21,9 +21,10 @@ HISTORY = "history.sqlite"
 """Name of the history of a cell."""
 MODEL_HISTORY = ".history.sqlite"
 """Suffix of the history of a model outside of a cell, after the name of its folder."""
-SCHEMA_VERSION = 4
+SCHEMA_VERSION = 5
 """Version of the schema. Version 1 had no monitored sessions: each model had a file for them, without a version.
-Version 2 had no exports, and changes of the model in use could not be undone. Version 3 had no scatter of models."""
+Version 2 had no exports, and changes of the model in use could not be undone. Version 3 had no scatter of models,
+and version 4 no poses of sessions."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +42,7 @@ class SessionEntry:
         judged_by: what the rows were checked against: "robot" (the nominal robot), or the name of a model.
         remark: warnings of the check.
         set_aside: why the session is not used; empty if it is used.
+        poses: number of different joint values of the rows; 0 if it is unknown.
     """
 
     name: str
@@ -53,6 +55,7 @@ class SessionEntry:
     judged_by: str = "robot"
     remark: str = ""
     set_aside: str = ""
+    poses: int = 0
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,7 @@ from pisigma.measurement.copies import RowValues, copies_of_known
 from pisigma.measurement.csv.reading import is_measurement_file
 from pisigma.measurement.dataset import Measurements, join
 from pisigma.measurement.dates import EXPECTED_DATE, date_in_name, is_date
+from pisigma.measurement.groups import groups_of_equal_joints
 from pisigma.model.folder.model_folder import load_model
 from pisigma.model.training_rows import known_rows
 from pisigma.robot.description import Robot
@@ -192,6 +193,7 @@ class Sessions:
             temperature_c=temperature,
             judged_by="robot" if model is None else model.name,
             remark=" ".join((*found, *(one.sentence for one in verdict.diagnostics))),
+            poses=int(groups_of_equal_joints(rows.q).max()) + 1,
         )
         return entry, model if fitted else None
 

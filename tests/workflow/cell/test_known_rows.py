@@ -65,3 +65,12 @@ def test_the_cell_is_recalibrated_and_not_the_folder_of_its_model(cell):
     advice = [line for line in found.sentences if "pisigma recalibrate" in line]
     assert len(advice) == 1
     assert f"`pisigma recalibrate {cell.folder}`" in advice[0]
+
+
+@pytest.mark.parametrize(("poses", "state"), [(2, "session_incomplete"), (10, "session_not_judged")])
+def test_poses_that_were_measured_several_times_count_once(poses, state, cell):
+    cell.plan()
+    one, again = measured(poses, 9), torch.linspace(1e-5, 5e-5, 5)
+    entry = cell.take_in(join([replace(one, position=one.position + shift) for shift in again]), day=day(1))
+    assert (entry.rows, entry.poses) == (5 * poses, poses)
+    assert cell.status().step.state == state
