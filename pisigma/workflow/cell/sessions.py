@@ -355,9 +355,9 @@ def _check_new(rows: Measurements, known: Bool[Tensor, " rows"]) -> None:
     """Refuse rows that the cell contains: a model would be verified with rows that it was fitted to.
 
     Raises:
-        MeasurementError: some rows are known.
+        MeasurementError: some rows are known, or there are no rows.
     """
-    if not bool(known.any()):
+    if known.numel() and not bool(known.any()):
         return
     count = "every row" if bool(known.all()) else f"{int(known.sum())} of {rows.rows} rows"
     raise MeasurementError(

@@ -32,6 +32,11 @@ def test_a_file_that_grew_is_refused_until_the_known_rows_are_removed(known, cel
     assert cell.take_in(tmp_path / "new.csv").rows == NEW.rows
 
 
+def test_no_rows_are_refused(cell):
+    with refused(MeasurementError):
+        cell.take_in(NEW.select(torch.arange(0)))
+
+
 def test_rows_of_a_model_from_outside_of_the_cell_are_refused_with_others(used, tmp_path):
     of_model(used.model_folder(), NewCell("")).write(tmp_path / "other")
     other, fitted = Cell.open(tmp_path / "other"), measured(60, 1)
