@@ -318,9 +318,7 @@ class Cell:
             MeasurementError: there is no session with this name, or none to which the model was not fitted.
         """
         parent, chosen, seen = self._new_rows("recalibrate", None, session)
-        settings = replace(self.file.settings_of_step("recalibrate", **changed), cameras=None)
-        if seen.moved and settings.moved is None:
-            settings = replace(settings, moved=seen.moved)
+        settings = seen.settings_to_recalibrate(self.file.settings_of_step("recalibrate", **changed))
         result = recalibrate(self.model_folder(parent.name), seen.rows, settings, progress)
         result = with_warnings(result, self.on_controller("recalibrate", parent))
         if not (result.trusted or accept_implausible):

@@ -134,7 +134,7 @@ def check_of(
         return replace(check, recalibrate=True)
     if session.rows < MIN_ROWS:
         return check
-    tried = recalibrate(found.model, seen.rows, replace(settings, cameras=None, moved=seen.moved or None))
+    tried = recalibrate(found.model, seen.rows, seen.settings_to_recalibrate(settings))
     if not (tried.trusted and tried.gate.updates):
         return check
     return replace(check, recalibrate=True, summary=f"{judged.sentence} {tried.gate.sentence}")

@@ -53,6 +53,11 @@ class ModelRows:
         fit_frame, fit_tool = settings.fit_frame or self.fit_frame, settings.fit_tool or self.fit_tool
         return replace(settings, cameras=None, fit_frame=fit_frame, fit_tool=fit_tool)
 
+    def settings_to_recalibrate(self, settings: RecalibrationSettings) -> RecalibrationSettings:
+        """Return settings with what was moved, unless they state it; cameras are removed, as rows are read."""
+        moved = (self.moved or None) if settings.moved is None else settings.moved
+        return replace(settings, cameras=None, moved=moved)
+
     @property
     def fit_frame(self) -> bool:
         """Whether the instrument was set up again."""
