@@ -19,6 +19,7 @@ from pisigma.files.errors import (
     AcceptanceError,
     IdentificationError,
     MeasurementError,
+    SettingError,
     UnknownRobotError,
 )
 from pisigma.measurement.dataset import Measurements
@@ -324,8 +325,8 @@ def test_options_at_fault(refuses, data, tmp_path, arguments, error, value):
 def test_parameters_and_priors_at_fault(refuses, data, tmp_path):
     command = ("calibrate", "kiro4", data, "--out", tmp_path / "arm", "--model", "geometric")
     assert "'a_9'" in refuses(*command, "--set", "free=a_9", error=IdentificationError)
-    option = {"error": IdentificationError, "option": "prior_mm and prior_mrad"}
-    assert "nan mm" in refuses(*command, "--set", "prior_mm=nan", **option)
+    for value in ("nan", "inf"):
+        refuses(*command, "--set", f"prior_mm={value}", error=SettingError, option="prior_mm")
     assert not (tmp_path / "arm").exists()
 
 
