@@ -258,6 +258,7 @@ EXTRAS = {
     "pyarrow": "fleet",
     "ray": "ray",
     "pyzmq": "serve",
+    "asyncua": "opcua",
     "opencv-python-headless": "camera",
 }
 """The extra that installs each optional package."""

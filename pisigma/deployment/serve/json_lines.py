@@ -12,7 +12,7 @@ import numpy as np
 from pydantic_core import from_json
 
 from pisigma.deployment.serve.metrics import Metrics
-from pisigma.deployment.serve.models import ServedModel, ServedModels, solution_row
+from pisigma.deployment.serve.models import ModelStatus, ServedModel, ServedModels, solution_row
 from pisigma.deployment.serve.protocol import STATUS_NAMES, AbstractProtocol, BrokenStreamError, Reply
 from pisigma.deployment.serve.request_values import (
     pose_entries,
@@ -42,7 +42,7 @@ _KEYS = {
     "ask": {"id", "model"},
 }
 """Further keys that a request of each task may have."""
-_QUESTIONS = ("health", "models", "reload")
+_QUESTIONS = ("health", "models", "reload", "status", "urdf")
 
 _PLAIN = {"id", "model", "pose", *_NEAR, "brief"}
 """Keys of requests for poses in the default axes."""
@@ -180,6 +180,13 @@ class JsonLines(AbstractProtocol):
         if asked == "models":
             records = [_model_record(self._models[index]) for index in range(len(self._models))]
             return (lambda: ("models", {"models": records})), False
+        if asked in ("status", "urdf"):
+            model = self._models.find_model(request.get("model"))
+            if asked == "urdf":
+                return (
+                    lambda: ("urdf", {"model": model.name, "sha256": model.sha256, "urdf": model.urdf})
+                ), True
+            return (lambda: ("status", asdict(ModelStatus.of(model)))), True
         return (lambda: ("reload", {"problems": self._models.reload(), "models": len(self._models)})), True
 
     def _carry_out(self, request: dict[str, Any], job: _Job, names: dict[str, str], begun: int) -> bytes:

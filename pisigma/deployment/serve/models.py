@@ -1,19 +1,24 @@
 """Models of a server, which can be reloaded without dropping a request."""
 
 import contextlib
+import datetime
 import math
 import struct
 import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
+from pisigma.deployment.export.export_format import ExportRequest
+from pisigma.deployment.export.registry import export_format
 from pisigma.files.errors import ModelError, PisigmaError, Place, RequestError, nearest_choice
 from pisigma.files.model_files import is_model, model_hash
+from pisigma.lifetime.cell.facts import status_of
+from pisigma.lifetime.cell.layout import is_cell
 from pisigma.lifetime.cell.model_in_use import ModelInUse
 from pisigma.model.inverse.compiled_ik import CompiledIK
 from pisigma.model.inverse.corrected_ik import CorrectedIK, load
@@ -86,6 +91,20 @@ class ServedModel:
         return controller.ik.compiled is not None and not controller.coupling.passive
 
     @cached_property
+    def urdf(self) -> str:
+        """URDF of the calibrated robot, as `pisigma export --format urdf` writes it.
+
+        Raises:
+            PisigmaError: a URDF cannot describe the model.
+        """
+        if model_hash(self.folder) != self.sha256:
+            raise ModelError(
+                "the folder was changed since it was loaded", at=Place(self.folder), remedy="reload it"
+            )
+        request = ExportRequest(self.folder, self.folder / f"{self.name}.urdf")
+        return str(export_format("urdf").write(request).content)
+
+    @cached_property
     def _near(self) -> struct.Struct:
         """Byte layout of joint values."""
         return struct.Struct(f"<{len(self.ik.joints)}d")
@@ -115,6 +134,48 @@ class ServedModel:
             )
         T = np.frombuffer(T_base_tool, "<f8").reshape(4, 4)
         return solution_row(self.ik(T, near=None if none else np.array(values), throw=False))
+
+
+@dataclass(frozen=True)
+class ModelStatus:
+    """What an operator has to know about a served model.
+
+    Attributes:
+        model: name of the model.
+        sha256: SHA-256 of its `model.yaml`.
+        day: day of the newest rows that it was fitted to (ISO 8601); empty if no cell states it.
+        age_days: days since then; None if unknown.
+        state: state of the cell, as printed by `pisigma status`; "not_in_cell" for a model outside of a cell,
+            "not_in_use" if the cell uses another model, "unreadable" if the state cannot be determined.
+        reason: why it is in this state, as a sentence.
+    """
+
+    model: str
+    sha256: str
+    day: str = ""
+    age_days: int | None = None
+    state: str = "not_in_cell"
+    reason: str = ""
+
+    @staticmethod
+    def of(model: ServedModel) -> "ModelStatus":
+        """Return the status of a model today, from the history of the cell that contains it."""
+        cell = model.folder.absolute().parent.parent
+        named = ModelStatus(model.name, model.sha256)
+        if not is_cell(cell):
+            return named
+        try:
+            status = status_of(cell)
+        except (PisigmaError, OSError) as problem:
+            return replace(named, state="unreadable", reason=str(problem))
+        days = [one.day for one in status.facts.models if one.name == model.name and one.day]
+        if days:
+            age = datetime.date.fromisoformat(status.facts.today) - datetime.date.fromisoformat(days[-1])
+            named = replace(named, day=days[-1], age_days=age.days)
+        in_use = status.facts.in_use
+        if in_use is None or in_use.name != model.name:
+            return replace(named, state="not_in_use", reason="the cell uses another model, or none")
+        return replace(named, state=status.step.state, reason=status.step.reason)
 
 
 def solution_row(solution: Solution) -> list[float]:

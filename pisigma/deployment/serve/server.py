@@ -3,7 +3,6 @@
 import contextlib
 import functools
 import gc
-import ipaddress
 import selectors
 import socket
 import sys
@@ -17,9 +16,10 @@ from pisigma.deployment.serve.connection import Connection
 from pisigma.deployment.serve.json_lines import JsonLines
 from pisigma.deployment.serve.metrics import Metrics
 from pisigma.deployment.serve.models import ServedModels
+from pisigma.deployment.serve.opcua import OpcUa
 from pisigma.deployment.serve.polling import Polling
 from pisigma.deployment.serve.protocol import AbstractProtocol
-from pisigma.deployment.serve.settings import ServeSettings
+from pisigma.deployment.serve.settings import ServeSettings, is_local
 from pisigma.deployment.serve.zeromq import ZeroMq
 from pisigma.files.errors import OutputError
 
@@ -35,6 +35,7 @@ class Server:
         json_port: port for lines of JSON.
         binary_port: port for binary frames.
         zmq: server over ZeroMQ, or None.
+        opcua: server over OPC UA, or None.
         metrics: counts and durations of answers.
     """
 
@@ -43,7 +44,7 @@ class Server:
 
         Raises:
             OutputError: the host is not an address of this machine, a port is in use, or a required token is missing.
-            ImportError: pyzmq is required and not installed.
+            ImportError: pyzmq or asyncua is required and not installed.
         """
         check_host(settings)
         self.metrics = Metrics()
@@ -56,6 +57,7 @@ class Server:
             self.json_port = self._listen(settings.json_port, JsonLines(models, self.metrics))
             self.binary_port = self._listen(settings.binary_port, BinaryFrames(models, self.metrics))
             self.zmq = None if settings.zmq_port is None else self._zmq(settings.zmq_port)
+            self.opcua = OpcUa(models, self.metrics, settings) if settings.opcua else None
         except (OutputError, ImportError):
             self._listen_no_more()
             self._selector.close()
@@ -72,7 +74,8 @@ class Server:
     def ports(self) -> dict[str, int]:
         """Ports of the server by protocol."""
         ports = {"json_port": self.json_port, "binary_port": self.binary_port}
-        return ports if self.zmq is None else ports | {"zmq_port": self.zmq.port}
+        others = {"zmq_port": self.zmq, "opcua_port": self.opcua}
+        return ports | {name: other.port for name, other in others.items() if other is not None}
 
     def run(self) -> None:
         """Answer until `stop` is called, then finish the pending requests."""
@@ -201,9 +204,10 @@ class Server:
         self._listen_no_more()
         for connection in self._connections:
             connection.read_remaining()
-        if self.zmq is not None:
-            self.zmq.stop()
-        while self._stops < 2 and (self._connections or (self.zmq is not None and self.zmq.is_running)):
+        others = [other for other in (self.zmq, self.opcua) if other is not None]
+        for other in others:
+            other.stop()
+        while self._stops < 2 and (self._connections or any(other.is_running for other in others)):
             more = [connection.answer_remaining() for connection in self._connections]
             self._step(0.0 if any(more) else 0.05)
             self._sweep(time.monotonic())  # closes clients that do not receive their answers
@@ -221,18 +225,7 @@ def check_host(settings: ServeSettings) -> None:
     Raises:
         OutputError: the host is not an address, or other machines can reach it and there is no token.
     """
-    try:
-        addresses = {
-            str(entry[4][0]) for entry in socket.getaddrinfo(settings.host, 0, type=socket.SOCK_STREAM)
-        }
-    except OSError as problem:
-        raise OutputError(
-            f"'{settings.host}' is not an address of this machine ({problem.strerror})",
-            option="--host",
-            value=settings.host,
-            remedy="give 127.0.0.1, or 0.0.0.0 for all addresses",
-        ) from None
-    if settings.token is None and not all(ipaddress.ip_address(one).is_loopback for one in addresses):
+    if settings.token is None and not is_local(settings.host):
         raise OutputError(
             f"other machines can reach '{settings.host}', so clients must send a token",
             option="--token-file",

@@ -1,5 +1,7 @@
 """Settings of a server."""
 
+import ipaddress
+import socket
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -19,6 +21,24 @@ def token_in(file: Path) -> str:
     return read_input(file, OutputError).decode(errors="replace").strip()
 
 
+def is_local(host: str) -> bool:
+    """Return whether only programs on this machine can reach an address.
+
+    Raises:
+        OutputError: it is not an address of this machine.
+    """
+    try:
+        found = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)
+    except OSError as problem:
+        raise OutputError(
+            f"'{host}' is not an address of this machine ({problem.strerror})",
+            option="--host",
+            value=host,
+            remedy="give 127.0.0.1, or 0.0.0.0 for all addresses",
+        ) from None
+    return all(ipaddress.ip_address(str(entry[4][0])).is_loopback for entry in found)
+
+
 @dataclass(frozen=True)
 class ServeSettings:
     """Settings of a server.
@@ -28,6 +48,10 @@ class ServeSettings:
         json_port: port for lines of JSON (0: any free port).
         binary_port: port for binary frames (0: any free port).
         zmq_port: port for ZeroMQ (0: any free port). Needs the extra serve. None: no ZeroMQ.
+        opcua: whether to serve over OPC UA as well. Needs the extra opcua.
+        opcua_port: port for OPC UA (0: any free port).
+        opcua_certificates: folder of the certificate for OPC UA, which is made if it is missing, and of the
+            certificates of clients in its folder `trusted`. Needed if other machines can reach the server.
         token: token that every client has to send first; on a command line, a file that contains it.
         client_timeout: see `CLIENT_TIMEOUT`.
         polling: time to busy-poll for the next request [s] (0: sleep at once). The server polls only if requests
@@ -38,6 +62,9 @@ class ServeSettings:
     json_port: Annotated[int, Option("--port", min=0, max=LAST_PORT)] = 0
     binary_port: Annotated[int, Option(min=0, max=LAST_PORT)] = 0
     zmq_port: Annotated[int | None, Option(min=0, max=LAST_PORT)] = None
+    opcua: bool = False
+    opcua_port: Annotated[int, Option(min=0, max=LAST_PORT)] = 4840
+    opcua_certificates: Path | None = None
     token: Annotated[str | None, Option("--token-file", kind=Path, read=token_in)] = None
     client_timeout: Annotated[float, HIDDEN] = CLIENT_TIMEOUT
     polling: Annotated[float, Option("--poll-ms", unit="ms", min=0, max=100, is_key=True)] = POLL_DURATION
