@@ -2,6 +2,7 @@
 
 import functools
 import json
+import math
 import os
 import re
 from collections.abc import Iterable, Mapping
@@ -158,10 +159,11 @@ for _letter, _resolvers in _PlainLoader.yaml_implicit_resolvers.items():
         _QuotingDumper.add_implicit_resolver(_tag, _regexp, [_letter])
 
 
-def yaml_text(content: dict[str, Any]) -> str:
+def yaml_text(content: Any, in_one_line: bool = False) -> str:
     """Format plain values as YAML text that any YAML 1.1 or 1.2 reader restores unchanged."""
-    text: str = yaml.dump(content, Dumper=_QuotingDumper, sort_keys=False, allow_unicode=True)
-    return text
+    style: dict[str, Any] = {"default_flow_style": True, "width": math.inf} if in_one_line else {}
+    text: str = yaml.dump(content, Dumper=_QuotingDumper, sort_keys=False, allow_unicode=True, **style)
+    return text.removesuffix("\n").removesuffix("\n...") if in_one_line else text
 
 
 def plain_content(text: str, error: type[PisigmaError], source: str) -> Any:

@@ -40,13 +40,23 @@ class CellScene:
         self._server, self._lock = server, threading.Lock()
         self._state: SessionState | None = None
         self._scene: SessionScene | None = None
+        self._turn = 0
+        self._before: dict[str, str] | None = None
         server.gui.configure_theme(show_logo=False, show_share_button=False)
         self._slider = server.gui.add_slider("errors magnified by", *MAGNIFICATIONS, initial_value=0)
         self._slider.on_update(self._magnify)
         server.scene.configure_default_lights(cast_shadow=False)
 
-    def show_cell(self, cell: Cell) -> None:
-        """Show the robot, its surroundings, and the poses of the newest plan."""
+    def show_cell(self, cell: Cell, is_movable: bool = False) -> int:
+        """Show the robot, its surroundings, and the poses of the newest plan.
+
+        Args:
+            cell: the cell.
+            is_movable: whether boxes and tracker can be dragged.
+
+        Returns:
+            The number of calls so far.
+        """
         planned: MeasuringSession | None = None
         if any((cell.folder / PLANS).glob("*.csv")):
             try:
@@ -54,7 +64,7 @@ class CellScene:
             except PisigmaError:
                 planned = None  # the tabs say what is wrong with it
         arm = ArmInSurroundings.from_robot(cell.robot, cell.file.document.surroundings)
-        if planned is not None:
+        if planned is not None and not is_movable:
             arm = planned.plan.arm
         camera = None if planned is None else planned.plan.settings.camera
         with self._lock, self._server.atomic():
@@ -63,13 +73,35 @@ class CellScene:
             view.position, view.look_at = first_view(arm)
             view.fov = FIELD
             sight = None if camera is None else sight_of(camera)
-            self._scene = SessionScene(self._server.scene, arm, _body(cell, arm), sight)
+            self._scene = SessionScene(self._server.scene, arm, _body(cell, arm), sight, is_movable)
             self._reach, self._state = arm.robot.reach, None
+            self._turn += 1
+            self._before = self._places() if is_movable else None
             if planned is None:
                 self._scene.show_pose("/tried", np.zeros(arm.robot.dof))
             else:
                 self._scene.show_robot(planned.state)
         self._server.flush()
+        return self._turn
+
+    def dragged(self) -> dict[str, Any]:
+        """Return the keys of `cell.yaml` that people changed by dragging, since which call of `show_cell`."""
+        with self._lock:
+            before = self._before
+            moved = {} if before is None else {k: v for k, v in self._places().items() if v != before[k]}
+            return {"turn": 0 if before is None else self._turn, "values": moved}
+
+    def _places(self) -> dict[str, str]:
+        """Return the positions of all objects that can be dragged [mm], and the yaw angles of boxes [deg]."""
+        places: dict[str, str] = {}
+        for name, node in ({} if self._scene is None else self._scene.handles).items():
+            key, at = f"surroundings.{name}", [f"{1e3 * one:.1f}" for one in node.position]
+            if name == "tracker":
+                places |= {f"{key}.{axis}_mm": one for axis, one in zip("xyz", at, strict=True)}
+            else:
+                places[f"{key}.center_mm"] = ", ".join(at)
+                places[f"{key}.yaw_deg"] = f"{np.rad2deg(2 * np.arctan2(node.wxyz[3], node.wxyz[0])):.2f}"
+        return places
 
     def show_state(self, state: SessionState) -> None:
         """Show the rows of a session with their errors."""
@@ -106,6 +138,6 @@ def _body(cell: Cell, arm: ArmInSurroundings) -> AbstractBody:
     """Return the meshes of a URDF file, or capsules if it has none."""
     document = cell.file.document
     try:
-        return MeshBody(arm.robot, cell.file.robot, document.base, document.tip)
+        return MeshBody(arm.robot, cell.file.robot, document.base, document.tip, cell.folder)
     except RobotError:
         return CapsuleBody(arm.capsules)

@@ -1,14 +1,21 @@
-"""Forms made from the settings of steps."""
+"""Forms made from the settings of steps, and from those of `cell.yaml`."""
 
+import hashlib
 import itertools
 import shlex
-from collections.abc import Mapping
-from dataclasses import dataclass
+import types
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, get_args, get_origin
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
-from pisigma.files.setting import Setting, flat_settings
-from pisigma.workflow.cell.cell_file import CAMERA_KEYS, STEPS, CellFile
+from pisigma.files.errors import PlanningError
+from pisigma.files.setting import Setting, attributes_of, flat_settings
+from pisigma.files.yaml_edit import with_value
+from pisigma.files.yaml_file import Section, plain_content
+from pisigma.robot.row import MAX_MAGNITUDE
+from pisigma.workflow.cell.cell_file import CAMERA_KEYS, STATED_ABOVE, STEPS, CellDocument, CellFile
 
 FIRST = {
     "plan": ("count", "check"),
@@ -18,6 +25,8 @@ FIRST = {
     "recalibrate": (),
 }
 """Settings that are shown at once; the others are behind "all settings"."""
+NEW_CELL = {"sensor": "--sensor", "limit_mm": "--limit-mm"}
+"""Settings of a new cell, with their options."""
 LEFT_OUT = ("map", "no_history")
 """Settings of a form of their own, or that a cell does not have."""
 
@@ -27,41 +36,125 @@ class Field:
     """A field of a form.
 
     Attributes:
-        key: key of the setting in `cell.yaml`.
-        option: option of the command, or its start if a value follows without a space.
-        help: what it does, with unit and bounds.
-        kind: "number", "flag", "choice" or "text".
+        key: name of the field: the key of a setting in its section of `cell.yaml`, or in the whole file, with dots.
+        help: what it does, with unit.
+        kind: "number", "flag", "choice", "list" or "text".
         choices: choices of a "choice".
+        bounds: smallest and largest value that is accepted, such as ">= 0"; "" if there are none.
         default: value without an entry: that of `cell.yaml`, else the default; "" if there is none.
+        value: value that the form shows as entered.
+        option: option of the command, or its start if a value follows without a space; "" without a command.
         first: whether it is shown at once.
     """
 
     key: str
-    option: str
     help: str
     kind: str
-    choices: tuple[str, ...]
-    default: str
-    first: bool
+    choices: tuple[str, ...] = ()
+    bounds: str = ""
+    default: str = ""
+    value: str = ""
+    option: str = ""
+    first: bool = True
+
+    @property
+    def label(self) -> str:
+        """Name of the field for people."""
+        return self.key.rpartition(".")[2].replace("_", " ")
+
+    @property
+    def group(self) -> str:
+        """Section of `cell.yaml` with the field."""
+        return self.key.rpartition(".")[0]
 
 
 def form_of(step: str, file: CellFile) -> list[Field]:
     """Return the fields of a step; files and cameras are not among them, as a page must not name paths."""
-    stated = file.stated_values(step)
-    return [
-        Field(
-            one.key,
-            f"--set {one.key}="
-            if one.option.is_key or one.default is False
-            else one.name,  # no option switches off
-            one.help,
-            _kind(one),
-            tuple(map(str, get_args(one.kind))) if get_origin(one.kind) is Literal else (),
-            _text(stated.get(one.key, one.default)),
-            one.key in FIRST[step],
-        )
-        for one in _settings(step)
-    ]
+    stated, fields = file.stated_values(step), []
+    for one in _settings(step):
+        key, option = one.key, one.name
+        if one.option.is_key or one.default is False:  # no option switches off
+            option = f"--set {key}="
+        default = _text(stated.get(key, one.default))
+        fields.append(replace(_field(one), default=default, option=option, first=key in FIRST.get(step, ())))
+    return fields
+
+
+def form_of_cell(file: CellFile) -> dict[str, list[Field]]:
+    """Return the fields of `cell.yaml` by its sections, with the values that the file states; "" is the cell itself."""
+    text = file.path.read_text(encoding="utf-8")
+    stated = plain_content(text, PlanningError, str(file.path))
+    fields: dict[str, list[Field]] = {"": []}
+    for one in _section(CellDocument, stated, ""):
+        fields.setdefault(one.key.rpartition(".")[0] and one.key.partition(".")[0], []).append(one)
+    for step in STEPS:
+        values = stated.get(step) or {}
+        fields[step] = [
+            replace(_field(one), key=f"{step}.{one.key}", value=_text(values.get(one.key)))
+            for one in _settings(step)
+            if one.key not in STATED_ABOVE.get(step, ())
+        ]
+    return fields
+
+
+def form_of_new_cell() -> list[Field]:
+    """Return the fields of a new cell besides its robot."""
+    fields = {one.key: one for one in _section(CellDocument, {}, "")}
+    return [replace(fields[key], option=option) for key, option in NEW_CELL.items()]
+
+
+def changed_cell(file: CellFile, form: Mapping[str, str]) -> str:
+    """Return the text of `cell.yaml` with the values of a form; fields that the form does not have are kept.
+
+    Raises:
+        PisigmaError: the file is written in a way in which a value cannot be changed alone.
+    """
+    text = file.path.read_text(encoding="utf-8")
+    fields = itertools.chain.from_iterable(form_of_cell(file).values())
+    entered = [(one, form.get(one.key, one.value).strip()) for one in fields]
+    changed = [(one, value) for one, value in entered if value != one.value]
+    removed = [(one, value) for one, value in changed if not value]
+    stated = [(one, value) for one, value in changed if value]
+    for one, value in [*stated, *reversed(removed)]:  # a removed item changes the numbers of later ones
+        keys = [int(part) if part.isdigit() else part for part in one.key.split(".")]
+        text = with_value(text, keys, _value(one.kind, value), str(file.path))
+    return text
+
+
+def digest_of(text: str) -> str:
+    """Return the SHA-256 of a text, by which a change since it was shown is noticed."""
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _section(section: type[Section], stated: Any, prefix: str) -> Iterator[Field]:
+    """Yield the fields of a section of `cell.yaml` and of the sections in it; lists of sections get an empty one."""
+    meanings = {key: text for one in reversed(section.__mro__) for key, text in attributes_of(one).items()}
+    for name, info in section.model_fields.items():
+        key, kind, bounds = f"{prefix}{info.alias or name}", info.annotation, list(info.metadata)
+        value = stated.get(name) if isinstance(stated, dict) else None
+        while get_origin(kind) in (Annotated, Union, types.UnionType):
+            bounds += get_args(kind)[1:] if get_origin(kind) is Annotated else ()
+            kind = next(one for one in get_args(kind) if one is not type(None))
+        item = get_args(kind)[0] if get_origin(kind) is tuple else None
+        if isinstance(kind, type) and issubclass(kind, Section):
+            yield from _section(kind, value, f"{key}.")
+        elif isinstance(item, type) and issubclass(item, Section):
+            for number, one in enumerate([*(value or ()), {}]):
+                yield from _section(item, one, f"{key}.{number}.")
+        elif get_origin(kind) is not dict:
+            limits = " and ".join(filter(None, map(_bound, bounds)))
+            default = "" if info.is_required() else _text(info.default) or "not stated"
+            meaning = meanings.get(name, "").partition("; None")[0]
+            help_ = f"{meaning[:1].upper()}{meaning[1:]}"
+            yield Field(key, help_, *_kind(kind), limits, default, _text(value))
+
+
+def _bound(constraint: Any) -> str:
+    """Return a bound of a pydantic field as text; "" for other constraints."""
+    for sign, name in ((">", "gt"), (">=", "ge"), ("<", "lt"), ("<=", "le")):
+        if (bound := getattr(constraint, name, None)) is not None and abs(bound) < MAX_MAGNITUDE:
+            return f"{sign} {bound:g}"
+    return " and ".join(filter(None, map(_bound, getattr(constraint, "metadata", ()))))
 
 
 def changed_settings(step: str, form: Mapping[str, str]) -> dict[str, Any]:
@@ -92,15 +185,38 @@ def _settings(step: str) -> list[Setting]:
     ]
 
 
-def _kind(setting: Setting) -> str:
-    if setting.kind is bool:
-        return "flag"
-    if setting.kind in (int, float):
-        return "number"
-    return "choice" if get_origin(setting.kind) is Literal else "text"
+def _field(setting: Setting) -> Field:
+    """Return the field of a setting, with its default."""
+    least, most = setting.option.min, setting.option.max
+    bounds = [f"{sign} {bound:g}" for sign, bound in ((">=", least), ("<=", most)) if bound is not None]
+    kind, choices = _kind(setting.kind)
+    return Field(setting.key, setting.help, kind, choices, " and ".join(bounds), _text(setting.default))
+
+
+def _kind(kind: Any) -> tuple[str, tuple[str, ...]]:
+    """Return kind and choices of a field."""
+    if get_origin(kind) is Literal:
+        return "choice", tuple(map(str, get_args(kind)))
+    if get_origin(kind) in (tuple, list):
+        return "list", ()
+    return {bool: "flag", int: "number", float: "number"}.get(kind, "text"), ()
 
 
 def _text(value: object) -> str:
     if isinstance(value, bool):
-        return "yes" if value else "no"
+        return "true" if value else "false"
+    if isinstance(value, list | tuple):
+        return ", ".join(map(_text, value))
     return "" if value is None else f"{value:.12g}" if isinstance(value, float) else str(value)
+
+
+def _value(kind: str, text: str) -> Any:
+    """Return what a person entered as a plain value; a text that is not of the kind is refused by its setting."""
+    if kind == "list":
+        return [_value("number", one.strip()) for one in text.split(",") if one.strip()] or None
+    if kind == "flag":
+        return {"true": True, "false": False}.get(text, text or None)
+    if kind == "number":
+        with suppress(ValueError):
+            return float(text) if set(text) & set(".eE") else int(text)
+    return text or None

@@ -5,7 +5,7 @@ import sys
 import threading
 import traceback
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from pisigma.files.errors import fault_of_machine, missing_extra
@@ -28,20 +28,26 @@ class Outcome:
     Attributes:
         text: the result for people; None if the step was refused.
         refusal: why the input was refused, or the result is not accepted.
-        command: command line that does the same.
+        field: field of the form that is at fault; "" if none is.
+        subject: what it is about, such as a session; "" if that is clear from its step.
         curve: expected accuracy against the number of poses; () without one.
-        person: who started it.
-        ended: time of day at which it ended.
         stopped: whether a person stopped it.
+        step: name of the step.
+        command: command line that does the same.
+        person: who started it.
+        ended: day and time at which it ended.
     """
 
     text: ResultText | None = None
     refusal: str = ""
-    command: str = ""
+    field: str = ""
+    subject: str = ""
     curve: tuple[Any, ...] = ()
+    stopped: bool = False
+    step: str = ""
+    command: str = ""
     person: str = ""
     ended: str = ""
-    stopped: bool = False
 
 
 Work = Callable[[Progress], Outcome]
@@ -146,12 +152,12 @@ class Jobs:
                 "half written. Please report it with the last lines of the terminal."
             )
         with self._lock:
-            self.outcomes[job.step] = Outcome(
-                found.text, found.refusal, job.command, found.curve, job.person, _clock(), found.stopped
+            self.outcomes[job.step] = replace(
+                found, step=job.step, command=job.command, person=job.person, ended=_clock()
             )
             self.running = None
             self.version, self.ended = self.version + 1, self.ended + 1
 
 
 def _clock() -> str:
-    return datetime.datetime.now().strftime("%H:%M")
+    return datetime.datetime.now().strftime("%Y-%m-%d %H:%M")

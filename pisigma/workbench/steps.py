@@ -8,7 +8,15 @@ from typing import Any
 from pisigma.deployment.export.export_format import ExportRequest
 from pisigma.deployment.export.registry import export_format
 from pisigma.deployment.export.targets import POSE_COLUMNS
-from pisigma.files.errors import MeasurementError, OutputError, Place, PoseError, check_choice
+from pisigma.files.errors import (
+    MeasurementError,
+    OutputError,
+    Place,
+    PlanningError,
+    PoseError,
+    RobotError,
+    check_choice,
+)
 from pisigma.files.progress import Progress
 from pisigma.lifetime.cell.layout import EXPORTS, newest_plan
 from pisigma.measurement.csv.reading import is_measurement_file
@@ -21,10 +29,12 @@ from pisigma.reporting.calibration_text import calibration_text
 from pisigma.reporting.result_text import ResultText, sentences
 from pisigma.reporting.solution_text import FAILURES, solution_text, statuses_of
 from pisigma.reporting.verdict import Verdict, counted, uncapitalised
-from pisigma.workbench.forms import changed_settings
+from pisigma.robot.robot_file import catalogue
+from pisigma.workbench.forms import changed_cell, changed_settings, digest_of
 from pisigma.workbench.job import Outcome
 from pisigma.workflow.calibrate import Calibration
 from pisigma.workflow.cell.cell import Cell
+from pisigma.workflow.cell.cell_file import CellFile
 from pisigma.workflow.cell.exports import export_from_cell
 from pisigma.workflow.cell.new_files import output_path
 from pisigma.workflow.import_rows import ImportProposal, import_rows, propose_import
@@ -45,6 +55,45 @@ WIDTH = 200
 EXPORT_OPTIONS = ("geometry", "targets", "branch", "config")
 NEEDS_ACTION = "the robot needs attention, for the reasons below."
 NOT_STORED = "no model was stored, because the result must not be trusted, for the reasons below."
+
+
+def create(folder: Path, form: Form, files: list[Path]) -> Cell:
+    """Create the cell of a robot of the catalogue, or of an uploaded file."""
+    robot = str(files[0]) if files else form.get("robot", "")
+    if not files:
+        check_choice(RobotError, "robot", robot, catalogue())  # a page must not name paths
+    limit = number_of(form, "limit_mm") if form.get("limit_mm") else None
+    return Cell.create(
+        folder, robot, form.get("sensor") or "tracker", limit, form.get("base"), form.get("tip")
+    )
+
+
+def write_cell(cell: Cell, form: Form, texts: dict[str, str]) -> None:
+    """Write `cell.yaml`, if it is valid and is still the file that the person saw.
+
+    Args:
+        cell: the cell.
+        form: "seen", the digest of the file that the person saw, with its new "text" or the values of its form; or
+            "undo", the digest of the file whose last change is undone.
+        texts: the text before every change, by the digest of the text after it.
+
+    Raises:
+        PlanningError: the file has been changed meanwhile, or is not valid.
+    """
+    before = cell.file.path.read_text(encoding="utf-8")
+    digest, undo, entered = digest_of(before), form.get("undo"), form.get("text")
+    if digest not in (form.get("seen"), undo) or (undo and undo not in texts):
+        raise PlanningError(
+            "the file has been changed since it was shown here",
+            at=Place(cell.file.path),
+            remedy="copy what you entered, discard your changes, and repeat them",
+        )
+    text = texts[undo] if undo else changed_cell(cell.file, form) if entered is None else entered
+    CellFile.write(cell.folder, text)
+    if undo:
+        del texts[undo]
+    elif text != before:
+        texts[digest_of(text)] = before
 
 
 def plan(cell: Cell, form: Form, progress: Progress) -> Outcome:
@@ -154,7 +203,7 @@ def check_rows(cell: Cell, form: Form, progress: Progress) -> tuple[Outcome, Ses
     state = session.state
     alarms = sentences("alarms", [one.sentence for one in state.alarms])
     text = session_text(state)
-    return Outcome(replace(text, blocks=(alarms, *text.blocks))), state
+    return Outcome(replace(text, blocks=(alarms, *text.blocks)), subject=f"Session {name}"), state
 
 
 def export(cell: Cell, form: Form, files: Mapping[str, Path]) -> Outcome:

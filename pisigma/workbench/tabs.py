@@ -1,8 +1,7 @@
 """What the tabs of a page show, read from the cell."""
 
-import hashlib
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_args
@@ -16,7 +15,8 @@ from pisigma.lifetime.cell.facts import CellStatus
 from pisigma.lifetime.cell.layout import CELL_FILE, EXPORTS, MODELS, PLANS
 from pisigma.planning.plan_file import yaml_of
 from pisigma.reporting.result_text import merge_alike_warnings
-from pisigma.workbench.forms import form_of, form_of_command
+from pisigma.robot.robot_file import catalogue
+from pisigma.workbench.forms import digest_of, form_of, form_of_cell, form_of_command, form_of_new_cell
 from pisigma.workbench.job import Jobs
 from pisigma.workflow.cell.cell import Cell
 from pisigma.workflow.import_rows import ImportProposal
@@ -71,15 +71,31 @@ class Tabs:
             {"together": merge_alike_warnings, "tab_of": lambda step: TAB_OF.get(step, step)},
         )
 
-    def page(self, cell: Cell) -> str:
-        """Render the frame of the page, without the content of a tab."""
+    def page(self, folder: Path, cell: Cell | None) -> str:
+        """Render the frame of the page, without the content of a tab; without a cell there is only one tab."""
+        robot, tabs = ("", {"status": "New cell"}) if cell is None else (cell.robot.name, TABS)
         template = self._environment.get_template("page.html.j2")
-        return template.render(
-            tabs=TABS, name=cell.folder.resolve().name, robot=cell.robot.name, folder=str(cell.folder)
+        return template.render(tabs=tabs, name=folder.resolve().name, robot=robot, folder=str(folder))
+
+    def new_cell(self, folder: Path) -> str:
+        """Render the form that creates the cell."""
+        return self._environment.get_template("new.html.j2").render(
+            path=folder.absolute(),
+            folder=shlex.quote(str(folder)),
+            robots=catalogue(),
+            settings=form_of_new_cell(),
+            outcomes=self._jobs.outcomes,
         )
 
-    def tab(self, name: str, cell: Cell, status: CellStatus) -> str:
-        """Render the content of a tab."""
+    def tab(self, name: str, cell: Cell, status: CellStatus, texts: Mapping[str, str]) -> str:
+        """Render the content of a tab.
+
+        Args:
+            name: name of the tab.
+            cell: the cell.
+            status: its status.
+            texts: the text of `cell.yaml` before a change of the page, by the digest of the text after it.
+        """
         context: dict[str, Any] = {
             "facts": status.facts,
             "step": status.step,
@@ -88,7 +104,9 @@ class Tabs:
             "forms": lambda step: form_of(step, cell.file),
             "words": form_of_command(status.step.command) if status.step.command else None,
         }
-        return self._environment.get_template(f"{name}.html.j2").render(context | _more(name, cell, status))
+        return self._environment.get_template(f"{name}.html.j2").render(
+            context | _more(name, cell, status, texts)
+        )
 
     def proposal(self, proposal: ImportProposal | None, files: Sequence[Path], numbers: str) -> str:
         """Render the proposed meaning of the columns of uploaded files.
@@ -110,14 +128,15 @@ class Tabs:
         return template.render(tables=tables, files=names, words=shlex.join(names), numbers=numbers)
 
 
-def _more(name: str, cell: Cell, status: CellStatus) -> dict[str, Any]:
+def _more(name: str, cell: Cell, status: CellStatus, texts: Mapping[str, str]) -> dict[str, Any]:
     """Return what only one tab shows."""
     match name:
         case "status":
             return {"timeline": timeline(status), "kinds": get_args(EventKind)}
         case "cell":
             text = (cell.folder / CELL_FILE).read_text(encoding="utf-8")
-            return {"text": text, "seen": digest_of(text)}
+            seen = digest_of(text)
+            return {"text": text, "seen": seen, "settings": form_of_cell(cell.file), "undo": seen in texts}
         case "plan":
             plans = sorted((cell.folder / PLANS).glob("*.csv"), reverse=True)
             return {"plans": [(one.name, yaml_of(one).name) for one in plans]}
@@ -130,11 +149,6 @@ def _more(name: str, cell: Cell, status: CellStatus) -> dict[str, Any]:
                 "columns": POSE_COLUMNS,
             }
     return {}
-
-
-def digest_of(text: str) -> str:
-    """Return the SHA-256 of a text, by which a change since it was shown is noticed."""
-    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def timeline(status: CellStatus) -> list[TimelineEntry]:

@@ -4,6 +4,7 @@ import asyncio
 import functools
 import json
 import math
+import os
 import threading
 import time
 from collections.abc import Awaitable, Callable, Mapping
@@ -15,25 +16,29 @@ import numpy as np
 from aiohttp import web
 from aiohttp.typedefs import Handler
 
-from pisigma.files.errors import PisigmaError, Place, PlanningError, fault_of_machine
+from pisigma.files.errors import (
+    PisigmaError,
+    fault_of_machine,
+)
 from pisigma.files.progress import Progress
 from pisigma.lifetime.cell.facts import CellStatus
-from pisigma.lifetime.cell.layout import CELL_FILE
+from pisigma.robot.urdf_file import read_urdf
 from pisigma.workbench import steps
 from pisigma.workbench.cell_scene import CellScene
 from pisigma.workbench.job import BusyError, Jobs, Outcome
 from pisigma.workbench.server.front_server import FrontServer
 from pisigma.workbench.server.viser_server import ViserBackend
-from pisigma.workbench.tabs import TABS, Tabs, digest_of, download_of
+from pisigma.workbench.tabs import TABS, Tabs, download_of
 from pisigma.workbench.uploads import Uploads
 from pisigma.workflow.cell.cell import Cell
-from pisigma.workflow.cell.cell_file import CellFile
 from pisigma.workflow.cell.exports import NONE, set_controller
 
 Form = Mapping[str, str]
 STATUS_AGE = 5.0
 """Age after which the status is read again [s], because commands may change the cell as well."""
 STATIC = {"workbench.js": "text/javascript", "workbench.css": "text/css"}
+NO_CELL = {"state": "no_cell", "reason": "the folder has no cell yet", "command": "pisigma new"}
+"""Next step of a folder without a cell."""
 MAX_PERSON, MAX_COMMAND = 60, 2000
 """Longest name of a person, and longest command line that is shown."""
 
@@ -78,24 +83,26 @@ class Workbench:
         """Start serving.
 
         Args:
-            folder: folder of the cell.
+            folder: folder of the cell; if it does not exist or is empty, the page creates the cell.
             host: address to listen on; at 127.0.0.1 only this machine can open the page.
             port: port to listen on; if it is taken, the next free one.
 
         Raises:
             ImportError: viser or aiohttp is not installed.
             OutputError: the host is not an address of this machine.
-            PlanningError: the folder is not a cell.
+            PlanningError: the folder is not a cell, and not empty.
         """
-        cell = Cell.open(folder)
-        self.folder, self._status = folder, (cell.status(), time.monotonic())
-        self._reading = threading.Lock()
+        self.folder, self._has_cell = folder, False
+        cell = self._cell()
+        self._status = None if cell is None else cell.status(), time.monotonic()
+        self._reading, self._texts = threading.Lock(), dict[str, str]()
         self.jobs, self._uploads = Jobs(), Uploads()
         self._tabs = Tabs(self.jobs)
         self._behind = ViserBackend("pisigma")
         try:
             self._scene = CellScene(self._behind.server)
-            self._scene.show_cell(cell)
+            if cell is not None:
+                self._scene.show_cell(cell)
             self._front = FrontServer(self._pages(), host, port, self._behind.close_sockets)
         except BaseException:
             self._behind.close()
@@ -125,30 +132,41 @@ class Workbench:
             ("POST", "/propose"): self._propose,
             ("POST", "/step/{name}"): self._step,
             ("POST", "/stop"): self._stop,
+            ("POST", "/drag"): self._drag,
             **self._behind.pages("/scene"),
         }
 
-    def status(self) -> CellStatus:
-        """Return the status of the cell, which is read again after some seconds and after every step."""
+    def status(self) -> CellStatus | None:
+        """Return the status of the cell, which is read again after some seconds and after every step.
+
+        It is None until there is a cell.
+        """
         with self._reading:
             found, when = self._status
             if time.monotonic() - when > STATUS_AGE:
-                before, found = found, Cell.open(self.folder).status()
+                cell, before = self._cell(), found
+                found = None if cell is None else cell.status()
                 self._status = found, time.monotonic()
                 self.jobs.version += found != before
             return found
 
     @answers
     async def _page(self, request: web.Request) -> web.StreamResponse:
-        text = await asyncio.to_thread(lambda: self._tabs.page(Cell.open(self.folder)))
+        text = await asyncio.to_thread(lambda: self._tabs.page(self.folder, self._cell()))
         return web.Response(text=text, content_type="text/html")
 
     @answers
     async def _tab(self, request: web.Request) -> web.StreamResponse:
         name = request.match_info["name"]
+
+        def tab() -> str:
+            if (cell := self._cell()) is None or (status := self.status()) is None:
+                return self._tabs.new_cell(self.folder)
+            return self._tabs.tab(name, cell, status, self._texts)
+
         if name not in TABS:
             raise web.HTTPNotFound
-        text = await asyncio.to_thread(lambda: self._tabs.tab(name, Cell.open(self.folder), self.status()))
+        text = await asyncio.to_thread(tab)
         return web.Response(text=text, content_type="text/html")
 
     @answers
@@ -165,7 +183,8 @@ class Workbench:
             "version": self.jobs.version,
             "ended": self.jobs.ended,
             "running": running,
-            "next": status.step.to_json(),
+            "next": NO_CELL if status is None else status.step.to_json(),
+            "dragged": self._scene.dragged(),
         }
         return web.json_response(said)
 
@@ -189,7 +208,16 @@ class Workbench:
     async def _upload(self, request: web.Request) -> web.StreamResponse:
         content = await request.read()
         number = await asyncio.to_thread(self._uploads.add, request.query.get("name", ""), content)
-        return web.json_response({"file": number})
+        (path,) = self._uploads.paths([number])
+        is_urdf = "links" in request.query and path.suffix.lower() in (".urdf", ".xacro")
+        links = await asyncio.to_thread(lambda: [*read_urdf(path)[0].link_map]) if is_urdf else []
+        return web.json_response({"file": number, "links": links})
+
+    @answers
+    async def _drag(self, request: web.Request) -> web.StreamResponse:
+        is_on = "on" in await _form(request)
+        turn = await asyncio.to_thread(lambda: self._scene.show_cell(Cell.open(self.folder), is_on))
+        return web.json_response({"turn": turn})
 
     @answers
     async def _propose(self, request: web.Request) -> web.StreamResponse:
@@ -210,20 +238,39 @@ class Workbench:
     @answers
     async def _step(self, request: web.Request) -> web.StreamResponse:
         name, form = request.match_info["name"], await _form(request)
-        if (work := STEPS.get(name)) is None:
+        if name not in (*STEPS, "new"):
             raise web.HTTPNotFound
 
         def run(progress: Progress) -> Outcome:
             try:
-                return work(self, Cell.open(self.folder), form, progress)
+                if name == "new":
+                    return self._create(form)
+                return STEPS[name](self, Cell.open(self.folder), form, progress)
             except PisigmaError as problem:
-                return Outcome(refusal=self._uploads.without_folder(str(problem)))
+                field = problem.option or str(problem.column or "")
+                return Outcome(refusal=self._uploads.without_folder(str(problem)), field=field)
             finally:
                 with self._reading:  # a reading that began before the end of the step is out of date
                     self._status = self._status[0], -math.inf
 
         self.jobs.start(name, _person(request), form.pop("command", "")[:MAX_COMMAND], run)
         return web.json_response({"started": name})
+
+    def _cell(self) -> Cell | None:
+        """Return the cell; None if the folder does not exist or is empty, and had no cell so far."""
+        is_free = not os.path.lexists(self.folder) or (
+            self.folder.is_dir() and not any(self.folder.iterdir())
+        )
+        if is_free and not self._has_cell:
+            return None
+        self._has_cell = True
+        return Cell.open(self.folder)
+
+    def _create(self, form: Form) -> Outcome:
+        """Create the cell, and show it."""
+        files = self._uploads.paths([form["file"]] if "file" in form else [])
+        self._scene.show_cell(steps.create(self.folder, form, files))
+        return Outcome()
 
     # What steps need besides the cell: uploaded files, the scene, and files to download.
 
@@ -263,15 +310,8 @@ class Workbench:
         return found
 
     def write_cell(self, cell: Cell, form: Form, progress: Progress) -> Outcome:
-        """Write `cell.yaml`, if it is valid and is still the file that the person saw."""
-        path = cell.folder / CELL_FILE
-        if form.get("seen") != digest_of(path.read_text(encoding="utf-8")):
-            raise PlanningError(
-                "the file has been changed since it was shown here",
-                at=Place(path),
-                remedy="copy your text, open the tab again, and repeat your changes there",
-            )
-        CellFile.write(cell.folder, form.get("text", ""))
+        """Write `cell.yaml`, and show the cell."""
+        steps.write_cell(cell, form, self._texts)
         self._scene.show_cell(Cell.open(cell.folder))
         return Outcome()
 

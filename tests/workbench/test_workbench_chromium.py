@@ -1,4 +1,4 @@
-"""A cell in headless Chromium: from a plan to a corrected pose by clicks and keys, with the bits of the commands."""
+"""A cell in headless Chromium: from an empty folder to a corrected pose by clicks and keys, as by the commands."""
 
 import math
 from pathlib import Path
@@ -21,7 +21,7 @@ from pisigma.workbench.workbench import Workbench
 from pisigma.workflow.cell.cell import Cell
 from pisigma.workflow.load import load
 
-SETTINGS = {"plan:": "plan:\n  candidates: 100", "calibrate:": "calibrate:\n  model: geometric\n  folds: 0"}
+SETTINGS = (("plan", "candidates", "100"), ("calibrate", "model", "geometric"), ("calibrate", "folds", "0"))
 
 
 @pytest.fixture(scope="module")
@@ -33,27 +33,53 @@ def simulated(shared_data) -> Path:
     return folder
 
 
-@pytest.fixture
-def cells(simulated, tmp_path, blank_pictures) -> tuple[Cell, Cell]:
-    """Two equal cells: one for the page, one for the functions of the commands."""
-    made = []
-    for name in ("page", "commands"):
-        cell = Cell.create(tmp_path / name, simulated / "kr10.urdf")
-        text = cell.file.path.read_text()
-        for before, after in SETTINGS.items():
-            text = text.replace(f"\n{before}", f"\n{after}")
-        cell.file.path.write_text(text)
-        made.append(Cell.open(cell.folder))
-    return made[0], made[1]
+def created(page, folder: Path, robot: Path) -> Cell:
+    """Create the cell of an empty folder by its form."""
+    page.set_input_files("[data-links]", robot)
+    page.select_option("[name=tip]", label="tool0")
+    page.press("form[data-step=new] button[type=submit]", "Enter")
+    page.wait_for_selector("#tab-cell")
+    return Cell.open(folder)
+
+
+def set_in_form(page, cell: Cell) -> None:
+    """Change settings by the form of `cell.yaml`; the first value is not valid."""
+    show(page, "cell")
+    comments = [line for line in cell.file.path.read_text().splitlines() if "#" in line]
+    for section in ("plan", "calibrate"):
+        page.click(f"summary >> text=/^{section}$/")
+    for value, is_refused in (("many", True), ("100", False)):
+        page.fill("[name='plan.candidates']", value)
+        press(page, "cell")
+        assert bool(page.query_selector("[name='plan.candidates'][aria-invalid]")) is is_refused
+        assert bool(page.query_selector("label:has([name='plan.candidates']) .fault")) is is_refused
+    show(page, "plan")
+    show(page, "cell")
+    do(page, "cell", **{f"{section}.{key}": value for section, key, value in SETTINGS})
+    lines = cell.file.path.read_text().splitlines()
+    assert [line for line in lines if "#" in line] == comments
+
+
+def set_in_text(cell: Cell) -> None:
+    """Change the same settings in the text."""
+    text = cell.file.path.read_text()
+    for _, key, value in SETTINGS:
+        text = text.replace(f"\n  # {key}:", f"\n  {key}: {value}\n  # {key}:", 1)
+    cell.file.path.write_text(text)
+
+
+def press(page, step) -> None:
+    """Press the button of a form with a key, and wait for the end."""
+    before = int(page.get_attribute("body", "data-ended"))
+    page.press(f"form[data-step={step}] button[type=submit]", "Enter")
+    page.wait_for_selector(f"body[data-ended='{before + 1}']")
 
 
 def do(page, step, **fields):
     """Fill a form, press its button with a key and wait for the end; return what the page says."""
     for name, value in fields.items():
-        page.fill(f"form[data-step={step}] [name={name}]", value)
-    before = int(page.get_attribute("body", "data-ended"))
-    page.press(f"form[data-step={step}] button[type=submit]", "Enter")
-    page.wait_for_selector(f"body[data-ended='{before + 1}']")
+        page.fill(f"form[data-step={step}] [name='{name}']", value)
+    press(page, step)
     assert page.query_selector(".refusal") is None, page.inner_text(".refusal")
     return page.inner_text("#content")
 
@@ -71,11 +97,17 @@ def rows_of(path: Path, target: Path, count: int) -> Path:
     return target
 
 
-def test_from_a_plan_to_a_corrected_pose(browser, cells, simulated, tmp_path):
-    page_cell, command_cell = cells
+def test_from_an_empty_folder_to_a_corrected_pose(browser, simulated, tmp_path, blank_pictures):
+    folder, robot = tmp_path / "page", simulated / "kr10.urdf"
     first = rows_of(simulated / "kr10.csv", tmp_path / "2026-11-01.csv", 60)
     second = rows_of(simulated / "kr10_check.csv", tmp_path / "2026-11-02.csv", 20)
-    with no_type_checker(), Workbench(page_cell.folder, port=0) as bench, opened(browser, bench.url) as page:
+    with no_type_checker(), Workbench(folder, port=0) as bench, opened(browser, bench.url) as page:
+        page_cell = created(page, folder, robot)
+        command_cell = Cell.create(tmp_path / "commands", robot, tip="tool0")
+        assert page_cell.file.path.read_bytes() == command_cell.file.path.read_bytes()
+        set_in_form(page, page_cell)
+        set_in_text(command_cell)
+        assert page_cell.file.path.read_bytes() == command_cell.file.path.read_bytes()
         show(page, "plan")
         assert "pisigma plan" in do(page, "plan", count="12", check="2")
         assert "60 rows were added" in upload(page, first)
@@ -84,6 +116,7 @@ def test_from_a_plan_to_a_corrected_pose(browser, cells, simulated, tmp_path):
         upload(page, second)
         show(page, "verify")
         assert "is in use" in do(page, "verify")
+        page_cell, command_cell = Cell.open(folder), Cell.open(command_cell.folder)
         command_cell.plan(count=12, check=2)
         for rows in (first, second):
             command_cell.take_in(rows)

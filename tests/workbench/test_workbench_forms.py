@@ -80,6 +80,7 @@ def test_a_text_is_kept_until_it_is_saved_and_no_other_is_replaced(browser, benc
     with opened(browser, bench.url) as first, opened(browser, bench.url) as second:
         for page in (first, second):
             show(page, "cell")
+            page.click("summary >> text=Edit as text")
         first.fill("[name=text]", "limit_mm: 'wrong")
         press(first, bench)
         assert first.query_selector(".refusal") is not None
@@ -101,5 +102,5 @@ def test_a_text_is_kept_until_it_is_saved_and_no_other_is_replaced(browser, benc
 def press(page, bench):
     """Save the text, and wait for the end of the step."""
     before = bench.jobs.ended
-    page.press("form[data-step=cell] button[type=submit]", "Enter")
+    page.press("form[data-name=text] button[type=submit]", "Enter")
     page.wait_for_selector(f"body[data-ended='{before + 1}']")

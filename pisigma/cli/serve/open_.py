@@ -38,7 +38,7 @@ def open_(
     no_browser: Annotated[bool, typer.Option("--no-browser", help="Print the link only.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Open a cell as a page in the browser, until Ctrl-C.
+    """Open a cell as a page in the browser, until Ctrl-C; in an empty or new folder, the page creates the cell.
 
     Prints the link to the page as its first line. Only somebody who has this link can open the page.
     """

@@ -126,7 +126,13 @@ class ToolSection(FrameSection):
 
 
 class TrackerSection(Section):
-    """Approximate position of the tracker in the robot's base frame."""
+    """Approximate position of the tracker in the robot's base frame.
+
+    Attributes:
+        x_mm: position along x [mm].
+        y_mm: position along y [mm].
+        z_mm: position along z [mm].
+    """
 
     x_mm: Bounded
     y_mm: Bounded

@@ -1,6 +1,6 @@
 // The page of a cell: tabs, forms that start steps, progress. Everything shown is made by the server; nothing is computed here.
 const content = document.getElementById("content"), person = document.getElementById("person");
-let tab = location.hash.slice(1), version = -1, running = null;
+let tab = location.hash.slice(1), wanted = tab, version = -1, ended = 0, running = null;
 
 person.value = localStorage.getItem("person") || "";
 person.addEventListener("change", () => localStorage.setItem("person", person.value));
@@ -19,12 +19,41 @@ async function ask(path, body, type = "application/json") {
 
 const steps = (path, form) => ask(`${path}?person=${encodeURIComponent(person.value)}`, JSON.stringify(form));
 
-async function show(name, keep = false) {
-  const kept = keep ? [...content.querySelectorAll("form")].filter(isEdited).map(form => [form.dataset.step, values(form)]) : [];
-  const opened = keep ? [...content.querySelectorAll("details")].map(one => one.open) : [];
-  const proposal = keep && content.querySelector("#proposal")?.firstElementChild;
-  const top = content.scrollTop;
-  content.innerHTML = await (await ask(`tab/${name}`)).text();
+const kept = {};  // the forms of every tab as people left them, and what else a tab had open
+const started = new Map();  // steps that were started here, with the number of steps that had ended by then
+let proposal = null, dragging = 0;
+
+function keep(parts, forms) {  // a form that the server sends unchanged stays as it is; else what was typed is copied
+  for (const form of parts.querySelectorAll("form")) {
+    const key = `${form.dataset.step} ${form.dataset.name || form.dataset.command}`, before = forms[key], served = form.outerHTML;
+    if (before?.served === served) form.replaceWith(before.form);
+    else {
+      if (before) copy(before.form, form);
+      forms[key] = { form, served };
+    }
+  }
+}
+
+async function show(name) {
+  wanted = name;
+  const text = await (await ask(`tab/${name}`)).text(), parts = document.createElement("div");
+  if (wanted !== name) return;  // another tab was chosen meanwhile
+  const top = name === tab ? content.scrollTop : 0, focus = document.activeElement;
+  parts.innerHTML = text;
+  if (kept[tab]) kept[tab].open = [...content.querySelectorAll("details[open] > summary")].map(one => one.textContent);
+  const left = kept[name] ||= { forms: {}, open: [] };
+  for (const one of parts.querySelectorAll(".outcome")) if (started.get(one.dataset.step) < ended) {
+    started.delete(one.dataset.step);
+    if (one.classList.contains("refused")) continue;
+    for (const [key, { form }] of Object.entries(left.forms)) if (form.dataset.step === one.dataset.step && form.dataset.once !== undefined) delete left.forms[key];
+    if (one.dataset.step === "import") proposal = null;
+  }
+  keep(parts, left.forms);
+  if (proposal) parts.querySelector("#proposal")?.append(proposal);
+  content.replaceChildren(...parts.childNodes);
+  content.querySelectorAll("details > summary").forEach(one => { if (left.open.includes(one.textContent)) one.parentElement.open = true; });
+  if (name === tab && content.contains(focus)) focus.focus({ preventScroll: true });
+  content.scrollTop = top;
   tab = name;
   for (const button of document.querySelectorAll("[role=tab]")) {
     const chosen = button.dataset.tab === name;
@@ -33,29 +62,38 @@ async function show(name, keep = false) {
   }
   history.replaceState(null, "", "#" + name);
   content.setAttribute("aria-labelledby", "tab-" + name);
-  for (const [step, fields] of kept) fill(content.querySelector(`form[data-step="${step}"]`), fields);
-  [...content.querySelectorAll("details")].forEach((one, number) => { if (opened[number]) one.open = true; });
-  if (proposal && running) content.querySelector("#proposal").append(proposal);
-  if (keep) content.scrollTop = top;
+  content.querySelectorAll("small.fault").forEach(one => one.remove());
+  content.querySelectorAll("[aria-invalid]").forEach(one => one.removeAttribute("aria-invalid"));
+  content.querySelectorAll(".outcome[data-field]").forEach(mark);
   content.querySelectorAll("form").forEach(say);
   lock();
 }
 
-// A text is kept while a person changes it, with the digest of the file that it was made from, until it has been saved.
-const isEdited = form => form.elements.text?.value !== form.elements.text?.defaultValue || !form.elements.text;
+function isEdited(one) {
+  if (one.type === "checkbox") return one.checked !== one.defaultChecked;
+  if (one.options) return one.selectedIndex !== Math.max(0, [...one.options].findIndex(choice => choice.defaultSelected));
+  return one.type !== "hidden" && !one.hidden && one.value !== one.defaultValue;
+}
 
-function fill(form, fields) {
-  if (!form || form.dataset.fixed !== undefined || (fields.text !== undefined && fields.text === form.elements.text.defaultValue)) return;
-  for (const one of form.elements) if (one.name in fields && one.type !== "hidden") {
-    if (one.type === "checkbox") one.checked = true; else one.value = fields[one.name];
+// What was typed stays, with the digest of the file that it was made from, until it has been saved.
+function copy(before, form) {
+  let isNew = false;
+  for (const one of before.elements) {
+    const other = form.elements[one.name];
+    if (form.dataset.fixed !== undefined || !other?.form || !isEdited(one)) continue;
+    if (one.type === "file") other.files = one.files;
+    else if (one.type === "checkbox") other.checked = one.checked;
+    else if (!one.options || [...other.options].some(choice => choice.value === one.value)) other.value = one.value;
+    isNew ||= isEdited(other);
   }
+  if (isNew && form.elements.seen) form.elements.seen.value = before.elements.seen.value;
 }
 
 function values(form) {
   const found = {};
   for (const one of form.elements) {
     if (!one.name || one.type === "file" || (one.type === "checkbox" && !one.checked)) continue;
-    if (one.value !== "") found[one.name] = one.value;
+    if (one.value !== "" || form.dataset.all !== undefined) found[one.name] = one.value;
   }
   return found;
 }
@@ -68,12 +106,13 @@ function say(form) {  // the command line that does the same
   let line = form.dataset.command.trim();
   for (const one of form.elements) {
     const option = one.dataset.option;
-    if (one.dataset.word !== undefined && one.value) line += ` ${quoted(one.value)}`;
+    const value = one.type === "file" ? one.files[0]?.name || "" : one.value;
+    if (one.dataset.word !== undefined && value) line += ` ${quoted(value)}`;
     else if (!option || one.value === "" || (one.type === "checkbox" && !one.checked)) continue;
     else if (/[=/]$/.test(option)) line += ` ${option}${quoted(one.value)}`;
     else if (one.dataset.kind === "flag") line += one.value === "true" ? ` ${option}` : ` --no-${option.slice(2)}`;
     else if (one.dataset.kind === "switch") line += ` ${option}`;
-    else line += ` ${option} ${quoted(one.type === "file" ? one.files[0].name : one.value)}`;
+    else line += ` ${option} ${quoted(value)}`;
   }
   if (form.elements.export?.value === "") line += " --export none";
   if (form.dataset.rows !== undefined) line += ` --rows ${quoted(`${document.body.dataset.folder}/sessions/${form.elements.session.value}.csv`)}`;
@@ -86,16 +125,41 @@ function say(form) {  // the command line that does the same
 }
 
 function fault(form, problem) {
-  const shown = form.querySelector(".fault");
+  const shown = form.querySelector("p.fault");
   shown.textContent = problem ? problem.message : "";
   shown.hidden = !problem;
-  const name = problem?.field?.replace(/^--/, "").replaceAll("-", "_").split(".").pop();
-  if (name && form.elements[name]?.focus) form.elements[name].focus();
+  if (problem?.field) point(form, problem.field)?.focus();
 }
 
-async function upload(file) {
-  const answer = await ask(`upload?name=${encodeURIComponent(file.name)}`, file, "application/octet-stream");
-  return (await answer.json()).file;
+function point(form, name) {  // show which field is at fault
+  const field = form.elements[name] || form.elements[name.replace(/^(--set )?(--)?/, "").replaceAll("-", "_")];
+  if (!field?.closest) return null;
+  for (let one = field.closest("details"); one; one = one.parentElement.closest("details")) one.open = true;
+  field.setAttribute("aria-invalid", true);
+  return field;
+}
+
+function mark(outcome) {  // put the reason of a refusal next to its field
+  for (const form of content.querySelectorAll(`form[data-step="${outcome.dataset.step}"]`)) {
+    const field = point(form, outcome.dataset.field), text = outcome.querySelector(".refusal")?.textContent;
+    if (!field || !text || field.parentElement.querySelector(".fault")) continue;
+    field.after(Object.assign(document.createElement("small"), { className: "fault", textContent: text }));
+  }
+}
+
+async function upload(file, more = "") {
+  const answer = await ask(`upload?name=${encodeURIComponent(file.name)}${more}`, file, "application/octet-stream");
+  return await answer.json();
+}
+
+async function offer(input) {  // the links of a robot file
+  fault(input.form, null);
+  try {
+    const links = input.files.length ? (await upload(input.files[0], "&links")).links : [];
+    for (const name of ["tip", "base"]) input.form.elements[name].replaceChildren(input.form.elements[name].options[0], ...links.map(link => new Option(link, link)));
+    input.form.elements.robot.value = "";
+  } catch (problem) { fault(input.form, problem); }
+  say(input.form);
 }
 
 async function start(form) {
@@ -103,8 +167,9 @@ async function start(form) {
   try {
     const fields = { ...values(form), command: form.querySelector(".command code")?.textContent || "" };
     if (form.dataset.go !== undefined) return show(form.dataset.tabOf);
-    for (const one of form.querySelectorAll("[data-upload]")) if (one.files.length) fields[one.dataset.upload] = await upload(one.files[0]);
+    for (const one of form.querySelectorAll("[data-upload]")) if (one.files.length) fields[one.dataset.upload] = (await upload(one.files[0])).file;
     await steps(`step/${form.dataset.step}`, fields);
+    started.set(form.dataset.step, ended);
     if (form.dataset.tabOf && form.dataset.tabOf !== tab) await show(form.dataset.tabOf);
     await poll();
   } catch (problem) { fault(form, problem); }
@@ -117,12 +182,13 @@ async function propose(form) {
     let fields = form ? values(form) : {};
     if (!form) {
       const numbers = [];
-      for (const file of document.getElementById("files").files) numbers.push(await upload(file));
+      for (const file of document.getElementById("files").files) numbers.push((await upload(file)).file);
       if (!numbers.length) return;
       fields = { files: numbers.join(",") };
     }
     where.innerHTML = await (await ask("propose", JSON.stringify(fields))).text();
-    if (form) fill(where.querySelector("form"), fields);
+    if (form) copy(form, where.querySelector("form"));
+    proposal = where.firstElementChild;
     where.querySelectorAll("form").forEach(say);
     lock();
   } catch (problem) { shown.textContent = problem.message; shown.hidden = false; }
@@ -136,17 +202,21 @@ async function poll() {
   try {
     const state = await (await ask("state")).json();
     document.getElementById("next").textContent = state.next.command ? `Next: ${state.next.reason}.` : `Nothing to do: ${state.next.reason}.`;
+    if (document.body.dataset.state === "no_cell" && state.next.state !== "no_cell") return location.reload();
     document.body.dataset.state = state.next.state;
     running = state.running;
     document.getElementById("running").hidden = !running;
     document.body.dataset.running = running ? running.step : "";
     if (running) document.getElementById("what").textContent = `${running.person} started ${running.step} at ${running.started}: ${running.stopped_by ? `being stopped by ${running.stopped_by}` : running.what || "starting"}`;
     document.getElementById("stop").disabled = Boolean(running?.stopped_by);
-    if (state.version !== version) { const first = version < 0; version = state.version; if (!first) await show(tab, true); }
+    ended = state.ended;
+    if (state.version !== version) { const first = version < 0; version = state.version; if (!first) await show(wanted); }
     lock();
-    document.body.dataset.ended = state.ended;
+    if (state.dragged.turn !== dragging) dragging = 0;
+    for (const [name, value] of Object.entries(dragging ? state.dragged.values : {})) for (const one of content.querySelectorAll(`[name="${name}"]`)) one.value = value;
+    document.body.dataset.ended = ended;
   } catch (problem) { document.getElementById("next").textContent = `The server does not answer (${problem.message}).`; }
-  polling = setTimeout(poll, running ? 300 : 2000);
+  polling = setTimeout(poll, running || dragging ? 300 : 2000);
 }
 
 function csv(table) {
@@ -175,16 +245,19 @@ document.querySelector("nav").addEventListener("keydown", event => {
   const step = { ArrowRight: 1, ArrowLeft: -1 }[event.key], all = [...document.querySelectorAll("[role=tab]")];
   if (step) { const one = all[(all.findIndex(one => one.dataset.tab === tab) + step + all.length) % all.length]; one.focus(); show(one.dataset.tab); }
 });
-document.getElementById("stop").addEventListener("click", () => steps("stop", { ended: document.body.dataset.ended }).then(poll));
+document.getElementById("stop").addEventListener("click", () => steps("stop", { ended: String(ended) }).then(poll));
 content.addEventListener("submit", event => { event.preventDefault(); start(event.target); });
 content.addEventListener("input", event => { if (event.target.form) say(event.target.form); });
-content.addEventListener("change", event => { if (event.target.id === "files") propose(); else if (event.target.form) say(event.target.form); });
+content.addEventListener("change", event => { if (event.target.id === "files") propose(); else if (event.target.dataset.links !== undefined) offer(event.target); else if (event.target.form) say(event.target.form); });
 content.addEventListener("click", event => {
   const one = event.target;
   if (one.dataset.copy !== undefined) navigator.clipboard?.writeText(one.parentElement.querySelector("code").textContent);
   if (one.dataset.csv !== undefined) save("table.csv", csv(one.parentElement.querySelector("table")), "text/csv");
   if (one.dataset.png !== undefined) png(one.closest("figure"));
   if (one.dataset.again !== undefined) propose(one.form);
+  if (one.dataset.clear !== undefined) { for (const field of one.closest("fieldset").elements) field.value = ""; }
+  if (one.dataset.discard !== undefined) { kept[tab].forms = {}; show(tab); if (dragging) steps("drag", {}); }
+  if (one.dataset.drag !== undefined) steps("drag", { on: "true" }).then(async answer => { dragging = (await answer.json()).turn; poll(); }, problem => fault(one.form, problem));
 });
 await show(document.getElementById("tab-" + tab) ? tab : "status");
 await poll();

@@ -76,7 +76,12 @@ class MeshBody(AbstractBody):
     """Meshes of the links of a URDF file, each moved with its joint."""
 
     def __init__(
-        self, robot: Robot, path: str | os.PathLike[str], base: str | None = None, tip: str | None = None
+        self,
+        robot: Robot,
+        path: str | os.PathLike[str],
+        base: str | None = None,
+        tip: str | None = None,
+        inside: Path | None = None,
     ):
         """Read the meshes.
 
@@ -85,6 +90,7 @@ class MeshBody(AbstractBody):
             path: URDF file.
             base: link that poses are given in, as in `Robot.load`.
             tip: link that is the tool, as in `Robot.load`.
+            inside: folder that contains all meshes that may be read; None for any folder.
 
         Raises:
             RobotError: the file cannot be used, belongs to another robot or has no visual, or a mesh is missing or has
@@ -102,7 +108,9 @@ class MeshBody(AbstractBody):
         self._urdf, _ = read_urdf(path)
         self.links: dict[str, Surface] = {}
         for element in parse_xml(path).iterchildren("{*}link"):
-            if visuals := [_surface(visual, Path(path)) for visual in element.iterchildren("{*}visual")]:
+            if visuals := [
+                _surface(visual, Path(path), inside) for visual in element.iterchildren("{*}visual")
+            ]:
                 self.links[element.get("name")] = join_surfaces(visuals)
         if not self.links:
             raise RobotError("no link has a <visual>", at=Place(path))
@@ -161,7 +169,7 @@ def _motion(joint: Any, value: float) -> Frame:
     return T
 
 
-def _surface(visual: Any, path: Path) -> Surface:
+def _surface(visual: Any, path: Path, inside: Path | None) -> Surface:
     """Return the surface of a <visual> in the frame of its link.
 
     Raises:
@@ -174,7 +182,7 @@ def _surface(visual: Any, path: Path) -> Surface:
             for geometry in visual.iterchildren("{*}geometry")
             for child in geometry.iterchildren("{*}*")
         )
-        mesh = _mesh(shape, path)
+        mesh = _mesh(shape, path, inside)
         xyz, rpy = ([0.0] * 3 if origin is None else _numbers(origin, key, "0 0 0") for key in ("xyz", "rpy"))
         T = frame_of([*xyz, *rpy[::-1]])
     except RobotError:
@@ -187,7 +195,7 @@ def _surface(visual: Any, path: Path) -> Surface:
     return Surface(mesh.vertices, mesh.faces).transformed(T[:3, :3], T[:3, 3])
 
 
-def _mesh(shape: Any, path: Path) -> "trimesh.Trimesh":
+def _mesh(shape: Any, path: Path, inside: Path | None) -> "trimesh.Trimesh":
     import trimesh
     from lxml import etree
 
@@ -201,7 +209,7 @@ def _mesh(shape: Any, path: Path) -> "trimesh.Trimesh":
         case "sphere":
             mesh = trimesh.creation.icosphere(radius=_numbers(shape, "radius")[0])
         case _:
-            file = _mesh_file(shape.get("filename", ""), path)
+            file = _mesh_file(shape.get("filename", ""), path, inside)
             mesh = trimesh.load_mesh(io.BytesIO(read_input(file, RobotError)), file.suffix[1:].lower())
             mesh.apply_transform(np.diag((*_numbers(shape, "scale", "1 1 1"), 1.0)))
     return mesh
@@ -211,7 +219,7 @@ def _numbers(element: Any, key: str, default: str = "") -> list[float]:
     return [float(word) for word in element.get(key, default).split()]
 
 
-def _mesh_file(name: str, path: Path) -> Path:
+def _mesh_file(name: str, path: Path, inside: Path | None) -> Path:
     """Find the file of a mesh; `package://name/...` is searched for in the parent folders of the URDF file.
 
     Raises:
@@ -220,12 +228,13 @@ def _mesh_file(name: str, path: Path) -> Path:
     kind, _, rest = name.rpartition("://")
     folders = path.resolve().parents
     if kind == "package":
-        package, _, inside = rest.partition("/")
+        package, _, below = rest.partition("/")
         choices = [folder / rest for folder in folders]
-        choices += [folder / inside for folder in folders if folder.name == package]
+        choices += [folder / below for folder in folders if folder.name == package]
     else:
         choices = [folders[0] / rest]
     for choice in choices:
-        if choice.is_file():
+        is_allowed = inside is None or choice.resolve().is_relative_to(inside.resolve())
+        if is_allowed and choice.is_file():
             return choice
     raise RobotError(f"there is no mesh file '{name}'", value=name, at=Place(path))

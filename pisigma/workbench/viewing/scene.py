@@ -1,6 +1,6 @@
 """Three-dimensional scene of the robot, its surroundings and the rows so far, in the robot's base frame [m]."""
 
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import torch
@@ -42,12 +42,17 @@ SHEET, PRINT = (245, 245, 245), (20, 20, 20)
 """Colours of a board's sheet and corners."""
 CORNER_DOT = 0.25
 """Diameter of a corner's dot, as a share of the distance of two corners."""
-FLOOR, TRACKER_HEAD, CONE, BEAM = 5.0, 0.05, 0.2, 0.003
-"""Shares of the robot's reach: edge of the floor, radius of the tracker, length of the cone, width of the beam."""
+FLOOR, TRACKER_HEAD, CONE, BEAM, HANDLE = 5.0, 0.05, 0.2, 0.003, 0.3
+"""Shares of the robot's reach: edge of the floor, radius of the tracker, length of the cone, width of the beam, size of
+the arrows by which objects are dragged."""
 
 
 class SessionScene:
-    """Scene of the robot and the rows; every call replaces what was drawn before."""
+    """Scene of the robot and the rows; every call replaces what was drawn before.
+
+    Attributes:
+        handles: nodes of boxes and tracker by their keys in the surroundings.
+    """
 
     def __init__(
         self,
@@ -55,6 +60,7 @@ class SessionScene:
         arm: ArmInSurroundings,
         body: AbstractBody,
         sight: BoardSight | None = None,
+        is_movable: bool = False,
     ) -> None:
         """Draw the surroundings.
 
@@ -63,6 +69,7 @@ class SessionScene:
             arm: the robot in its surroundings.
             body: appearance of the robot.
             sight: camera and board; None without a camera.
+            is_movable: whether boxes and tracker can be dragged.
         """
         self._sight = sight
         self._scene, self._arm, self._robot, self._body = scene, arm, arm.robot, body
@@ -71,7 +78,7 @@ class SessionScene:
         scene.set_up_direction("+z")
         axes = AXES * arm.robot.reach
         scene.add_frame("/base", axes_length=axes, axes_radius=axes / 20)
-        draw_surroundings(scene, arm.surroundings, arm.robot.reach)
+        self.handles = draw_surroundings(scene, arm.surroundings, arm.robot.reach, is_movable)
 
     def show_robot(self, state: SessionState) -> None:
         """Draw the robot at the last row and as a ghost at the next pose."""
@@ -207,34 +214,50 @@ def draw_board(scene: "viser.SceneApi", name: str, board: Board) -> None:
     scene.add_point_cloud(f"{name}/corners", board.corners, PRINT, point_size=size, precision="float32")
 
 
-def draw_surroundings(scene: "viser.SceneApi", surroundings: Surroundings, reach: float) -> None:
-    """Draw floor, boxes and tracker.
+def draw_surroundings(
+    scene: "viser.SceneApi", surroundings: Surroundings, reach: float, is_movable: bool = False
+) -> dict[str, "viser.SceneNodeHandle"]:
+    """Draw floor, boxes and tracker; return the nodes of boxes and tracker by their keys in the surroundings.
 
     Args:
         scene: scene to draw in, in the robot's base frame.
         surroundings: surroundings to draw; without a floor the grid is at the height of the robot's base.
         reach: reach of the robot [m].
+        is_movable: whether boxes (with their yaw) and tracker can be dragged.
     """
-    edge = FLOOR * reach
+    edge, fixed = FLOOR * reach, (0.0, 0.0)
     height = 0.0 if surroundings.floor_mm is None else surroundings.floor_mm / 1e3
-    scene.add_grid("/floor", edge, edge, cell_size=0.25, section_size=1.0, position=(0.0, 0.0, height))
-    for number, box in enumerate(surroundings.boxes):
-        name, center, edges = f"/boxes/{number}", box.center.numpy(), 2 * box.half_size.numpy()
-        half = np.deg2rad(box.yaw_deg) / 2
-        turned = (np.cos(half), 0.0, 0.0, np.sin(half))
-        scene.add_box(name, FORBIDDEN, edges, opacity=0.35, position=center, wxyz=turned, cast_shadow=False)
-        top = center + np.array([0.0, 0.0, edges[2] / 2])
-        scene.add_label(f"{name}_label", box.name, position=top, anchor="bottom-center")
-    if surroundings.tracker is not None:
-        head, size, up = (
-            surroundings.tracker.position.numpy(),
-            TRACKER_HEAD * reach,
-            np.array([0.0, 0.0, 1.0]),
+
+    def node(name: str, position: Any, yaw: float | None = None) -> Any:
+        half = (yaw or 0.0) / 2
+        at: dict[str, Any] = {"position": position, "wxyz": (np.cos(half), 0.0, 0.0, np.sin(half))}
+        if not is_movable:
+            return scene.add_frame(name, show_axes=False, **at)
+        limits = (fixed, fixed, (-7.0, 7.0))
+        return scene.add_transform_controls(
+            name,
+            HANDLE * reach,
+            disable_rotations=yaw is None,
+            rotation_limits=limits,
+            depth_test=False,
+            **at,
         )
-        scene.add_icosphere("/tracker", size, TRACKER, position=head)
+
+    scene.add_grid("/floor", edge, edge, cell_size=0.25, section_size=1.0, position=(0.0, 0.0, height))
+    handles = {}
+    for number, box in enumerate(surroundings.boxes):
+        name, edges = f"/boxes/{number}", 2 * box.half_size.numpy()
+        handles[f"boxes.{number}"] = node(name, box.center.numpy(), np.deg2rad(box.yaw_deg))
+        scene.add_box(f"{name}/box", FORBIDDEN, edges, opacity=0.35, cast_shadow=False)
+        scene.add_label(f"{name}/label", box.name, position=(0, 0, edges[2] / 2), anchor="bottom-center")
+    if surroundings.tracker is not None:
+        head, size = surroundings.tracker.position.numpy(), TRACKER_HEAD * reach
+        handles["tracker"] = node("/tracker", head)
+        scene.add_icosphere("/tracker/head", size, TRACKER)
         if (stand := float(head[2] - height)) > 0:
-            scene.add_cylinder("/tracker/stand", size / 3, stand, TRACKER, position=-stand / 2 * up)
-        scene.add_label("/tracker/label", "tracker", position=1.2 * size * up, anchor="bottom-center")
+            scene.add_cylinder("/tracker/stand", size / 3, stand, TRACKER, position=(0, 0, -stand / 2))
+        scene.add_label("/tracker/label", "tracker", position=(0, 0, 1.2 * size), anchor="bottom-center")
+    return handles
 
 
 def draw_sight(
