@@ -233,6 +233,17 @@ def nominal_poses_of_rows(model: CalibratedModel, measurements: Measurements) ->
     return _seen(T, model.robot, model.bases, model.tools, measurements)
 
 
+def geometric_poses(
+    model: CalibratedModel, q: Float64[Tensor, "*batch rows dof"], measurements: Measurements
+) -> Float64[Tensor, "*batch rows 4 4"]:
+    """Predict the poses of rows at other joint values q [rad or m] by the identified geometry alone.
+
+    For errors see `poses_of_rows`.
+    """
+    T = forward_kinematics(model.calibrated or model.robot, q)
+    return _seen(T, model.robot, model.bases, model.tools, measurements)
+
+
 def bases_of_rows(model: CalibratedModel, measurements: Measurements) -> Float64[Tensor, "#rows 4 4"]:
     """Return the pose of the robot's base in the frame of every row; for errors see `poses_of_rows`."""
     bases = _of_rows(model.bases, measurements.frame, "frame", measurements)
@@ -284,8 +295,12 @@ def known_names(
 
 
 def _seen(
-    T: Float64[Tensor, "rows 4 4"], robot: Robot, bases: Frames, tools: Frames, measurements: Measurements
-) -> Float64[Tensor, "rows 4 4"]:
+    T: Float64[Tensor, "*batch rows 4 4"],
+    robot: Robot,
+    bases: Frames,
+    tools: Frames,
+    measurements: Measurements,
+) -> Float64[Tensor, "*batch rows 4 4"]:
     """Convert poses T_base_tool to poses of the rows' targets in the rows' frames."""
     before = _of_rows(bases, measurements.frame, "frame", measurements)
     behind = _of_rows(tools, measurements.target, "target", measurements)

@@ -1,5 +1,6 @@
 """Fit base and tool transforms to measured poses, in closed form or by Levenberg-Marquardt."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -55,6 +56,19 @@ class MeasuredPoses:
         """Select the rows of a mask or an index."""
         return MeasuredPoses(self.position[rows], self.rotation[rows], self.has_rotation[rows], self.lever)
 
+    @staticmethod
+    def stack(several: Sequence["MeasuredPoses"]) -> "MeasuredPoses":
+        """Stack measured poses that have rotations in the same rows."""
+        return replace(
+            several[0],
+            position=torch.stack([one.position for one in several]),
+            rotation=torch.stack([one.rotation for one in several]),
+        )
+
+    def select_batches(self, index: Tensor) -> "MeasuredPoses":
+        """Select members of the batch by a mask or an index."""
+        return replace(self, position=self.position[index], rotation=self.rotation[index])
+
     def scale_positions(self, factor: float) -> "MeasuredPoses":
         """Multiply the positions by a factor."""
         return replace(self, position=self.position * factor)
@@ -85,14 +99,14 @@ def best_base(
 ) -> Float64[Tensor, "*batch 4 4"]:
     """Find the transform X that minimises the distance of `X T` to measured poses (weighted orthogonal Procrustes)."""
     # The best shift makes the mean positions equal, so only the rotation remains to be found.
-    middle, wanted = T[..., :3, 3].mean(-2, keepdim=True), measured.position.mean(0)
+    middle, wanted = T[..., :3, 3].mean(-2, keepdim=True), measured.position.mean(-2, keepdim=True)
     M = (measured.position - wanted).mT @ (T[..., :3, 3] - middle)
     if bool(measured.has_rotation.any()):
         weight = measured.has_rotation.to(T)[:, None, None]
         # As in `squared_errors`, every column of a rotation counts as a point of weight lever² / 2.
         M = M + measured.lever**2 / 2 * (weight * measured.rotation @ T[..., :3, :3].mT).sum(-3)
     R = nearest_rotation(M)
-    return transform(R, wanted - (R @ middle.mT)[..., 0])
+    return transform(R, (wanted - middle @ R.mT)[..., 0, :])
 
 
 def best_tool(

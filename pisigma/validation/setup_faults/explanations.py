@@ -21,6 +21,7 @@ from pisigma.model.calibrated_model import (
     poses_of_rows,
 )
 from pisigma.robot.frame_fits import (
+    AFFINE_UNKNOWNS,
     LEVER_SHARE,
     MeasuredPoses,
     affine_error,
@@ -30,7 +31,7 @@ from pisigma.robot.frame_fits import (
 )
 from pisigma.robot.se3 import rotation_vector
 from pisigma.validation.setup_faults.cause import Cause, length_text
-from pisigma.validation.setup_faults.hypothesis import COLLAPSED, Hypothesis, PredictingArm
+from pisigma.validation.setup_faults.hypothesis import COLLAPSED, Hypothesis, PredictingArm, error_with_fitted
 from pisigma.validation.setup_faults.joint_faults import NEAR_BEST, NOTICED, joint_causes, likely_maps
 
 if TYPE_CHECKING:
@@ -94,22 +95,26 @@ def fault_hypotheses(
     arm: PredictingArm, some: Measurements, here: Hypothesis, most: float
 ) -> Iterator[Hypothesis]:
     """Yield all hypotheses that may explain the errors to `most` [m]; the first is that nothing is wrong."""
-    yield from frame_hypotheses(arm, some, here, most)
+    return frame_hypotheses(arm, some, list(_faults_in_frames(arm, some, here)), most)
+
+
+def _faults_in_frames(arm: PredictingArm, some: Measurements, here: Hypothesis) -> Iterator[Hypothesis]:
+    """Yield the hypotheses of `fault_hypotheses` with frame and tool as they are."""
+    yield here
     for measured, cause in measured_pose_faults(here.measured, here.T[:, :3, 3], "corner" in some.kinds):
-        yield from frame_hypotheses(arm, some, replace(here, measured=measured, causes=(cause,)), most)
+        yield replace(here, measured=measured, causes=(cause,))
     if arm.model is not None:
         for T, cause in _other_corrections(arm.model, some):
-            yield from frame_hypotheses(arm, some, here.with_cause(cause, T, fitted=0), most)
+            yield here.with_cause(cause, T, fitted=0)
     if not here.error > SMALL_SHARE * arm.robot.reach:
         return
     for measured, cause in _likely_conventions(arm, here):
-        yield from frame_hypotheses(arm, some, replace(here, measured=measured, causes=(cause,)), most)
+        yield replace(here, measured=measured, causes=(cause,))
     maps = likely_maps(arm, some, here.measured)
     for number, q in enumerate(maps.apply(some.q)):
         T = arm.poses(replace(some, q=q))
         if bool(torch.isfinite(T).all()):
-            causes = joint_causes(maps, number, arm.robot)
-            yield from frame_hypotheses(arm, some, Hypothesis(q, T, here.measured, causes, 1), most)
+            yield Hypothesis(q, T, here.measured, joint_causes(maps, number, arm.robot), 1)
 
 
 def _likely_conventions(arm: PredictingArm, here: Hypothesis) -> Iterator[tuple[MeasuredPoses, Cause]]:
@@ -120,7 +125,8 @@ def _likely_conventions(arm: PredictingArm, here: Hypothesis) -> Iterator[tuple[
     eye = torch.eye(3).to(here.T)
     tried = list(other_conventions(here.measured.rotation))
     R = torch.where(turned[:, None, None], torch.stack([rotation for rotation, _, _ in tried]), eye)
-    for errors in arm.errors_in_frames(here.T, replace(here.measured, rotation=R)):
+    for mode in arm.modes:
+        errors = error_with_fitted(mode, here.T, replace(here.measured, rotation=R))
         limit = max(NEAR_BEST**2 * float(errors.min()), NOTICED**2)
         for number in errors.argsort()[:MAX_CONVENTIONS].tolist():
             if float(errors[number]) <= limit:
@@ -149,32 +155,55 @@ def _other_corrections(
 
 
 def frame_hypotheses(
-    arm: PredictingArm, some: Measurements, here: Hypothesis, most: float = math.inf
+    arm: PredictingArm, some: Measurements, tried: Sequence[Hypothesis], most: float = math.inf
 ) -> Iterator[Hypothesis]:
-    """Yield a hypothesis as it is, and with another frame, another tool, and both; without a model, both are fitted.
+    """Yield hypotheses as they are, and with another frame, another tool, and both; without a model, both are fitted.
 
     Both are fitted only if an affine fit, which is a lower bound of the errors, leaves at most `most` [m].
+
+    Args:
+        arm: the predicting arm.
+        some: the rows; without a model, they may be others for every hypothesis and are not used.
+        tried: the hypotheses.
+        most: largest error that an explanation may leave [m].
     """
-    rows, per_tool = len(here.T), 6 if bool(here.measured.has_rotation.any()) else 3
-    bound = float(affine_error(here.T, here.measured)) * (1 - 13 / rows) if rows > 13 else 0.0
-    alone = True
-    if arm.model is not None:
-        yield here
-        frames, targets = numbers_of_names(some.frame), numbers_of_names(some.target)
-        count, tools = int(frames.max()) + 1, int(targets.max()) + 1
-        X, Y = _per_group(best_base, frames, here), _per_group(best_tool, targets, here)
-        yield here.with_cause(_moved("frame", X, bases_of_rows(arm.model, some)), X @ here.T, 6 * count)
-        yield here.with_cause(_moved("tool", Y), here.T @ Y, per_tool * tools)
-        alone = count == tools == 1
-    if not alone or bound > most**2:
-        return
-    base, tool = best_base_and_tool(here.T, here.measured)
-    T = base @ here.T @ tool
     if arm.model is None:
-        yield replace(here, T=T)
-    else:
-        moved = _moved("frame", base[None], bases_of_rows(arm.model, some))
-        yield here.with_cause(moved, base @ here.T, 6).with_cause(_moved("tool", tool[None]), T, per_tool)
+        for here, base, tool in _with_frames_fitted(tried, most):
+            yield replace(here, T=base @ here.T @ tool)
+        return
+    frames, targets, bases = (
+        numbers_of_names(some.frame),
+        numbers_of_names(some.target),
+        bases_of_rows(arm.model, some),
+    )
+    count, tools = int(frames.max()) + 1, int(targets.max()) + 1
+    for here in tried:
+        yield here
+        X, Y = _per_group(best_base, frames, here), _per_group(best_tool, targets, here)
+        yield here.with_cause(_moved("frame", X, bases), X @ here.T, 6 * count)
+        yield here.with_cause(_moved("tool", Y), here.T @ Y, here.values_of_tool * tools)
+    for here, base, tool in _with_frames_fitted(tried, most) if count == tools == 1 else ():
+        moved = here.with_cause(_moved("frame", base[None], bases), base @ here.T, 6)
+        yield moved.with_cause(_moved("tool", tool[None]), moved.T @ tool, here.values_of_tool)
+
+
+def _with_frames_fitted(
+    tried: Sequence[Hypothesis], most: float
+) -> Iterator[tuple[Hypothesis, Float64[Tensor, "4 4"], Float64[Tensor, "4 4"]]]:
+    """Fit base and tool under all hypotheses at once that they may explain to `most` [m]."""
+    groups: dict[tuple[bool, ...], list[Hypothesis]] = {}
+    for here in tried:
+        groups.setdefault(tuple(here.measured.has_rotation.tolist()), []).append(here)
+    for rows, group in groups.items():
+        T, measured = (
+            torch.stack([here.T for here in group]),
+            MeasuredPoses.stack([h.measured for h in group]),
+        )
+        if len(rows) > AFFINE_UNKNOWNS:
+            likely = ~(affine_error(T, measured) * (1 - AFFINE_UNKNOWNS / len(rows)) > most**2)
+            group = list(itertools.compress(group, likely.tolist()))
+            T, measured = T[likely], measured.select_batches(likely)
+        yield from zip(group, *best_base_and_tool(T, measured), strict=True)
 
 
 def _per_group(

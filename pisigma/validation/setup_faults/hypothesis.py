@@ -1,7 +1,9 @@
 """Hypotheses of setup faults, the arm that predicts poses under them, and the joint values under them."""
 
-from collections.abc import Iterator, Set
+from collections.abc import Iterator, Sequence, Set
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Literal
 
 import numpy as np
 import torch
@@ -9,7 +11,7 @@ from jaxtyping import Float64, Int64
 from torch import Tensor
 
 from pisigma.measurement.dataset import Measurements
-from pisigma.model.calibrated_model import CalibratedModel, poses_of_rows
+from pisigma.model.calibrated_model import CalibratedModel, geometric_poses, poses_of_rows
 from pisigma.robot.description import Robot
 from pisigma.robot.frame_fits import (
     LEVER_SHARE,
@@ -30,6 +32,8 @@ COLLAPSED = 0.25
 MIN_FREEDOM = 6
 """Degrees of freedom that a fit must leave."""
 _MAX_POSES = 2**17
+FittedFrames = Literal["none", "base", "base and tool"]
+"""Frames that are fitted to the rows under a hypothesis."""
 SHIFTS = (1, -1, 2, -2)
 """Rows by which joint values may be shifted relative to the measurements."""
 MARGIN = max(SHIFTS)
@@ -66,8 +70,17 @@ class PredictingArm:
             return poses_of_rows(self.model, rows)
         return forward_kinematics(self.robot, rows.q)
 
+    @property
+    def modes(self) -> tuple[FittedFrames, ...]:
+        """Frames that are fitted to compare hypotheses; without a model, base and tool always are."""
+        return ("base and tool",) if self.model is None else ("none", "base", "base and tool")
+
     def screened_errors(
-        self, rows: Measurements, q: Float64[Tensor, "maps rows dof"], measured: MeasuredPoses
+        self,
+        rows: Measurements,
+        q: Float64[Tensor, "maps rows dof"],
+        measured: MeasuredPoses,
+        modes: Sequence[FittedFrames],
     ) -> Float64[Tensor, "modes maps"]:
         """Compute mean squared errors [m²] under hypotheses of the joint values, with the geometry alone.
 
@@ -75,37 +88,35 @@ class PredictingArm:
             rows: rows of one frame and target.
             q: hypothetical joint values [rad or m].
             measured: measured poses.
+            modes: frames that are fitted.
 
         Returns:
-            See `errors_in_frames`.
+            See `error_with_fitted`.
         """
-        chunks = torch.split(q, max(1, _MAX_POSES // rows.rows))
-        return torch.cat([self._screened(rows, chunk, measured) for chunk in chunks], 1)
-
-    def errors_in_frames(
-        self, T: Float64[Tensor, "*#batch rows 4 4"], measured: MeasuredPoses
-    ) -> Float64[Tensor, "modes *#batch"]:
-        """Compute the mean squared errors [m²] of predicted poses.
-
-        Returns:
-            Errors with the frame as it is, with the frame fitted, and a lower bound of those with base and tool
-            fitted; only the last one without a model.
-        """
-        bound = affine_error(T, measured)
-        if self.model is None:
-            return bound[None]
-        fitted = best_base(T, measured)[..., None, :, :] @ T
+        chunks = [
+            forward_kinematics(self.robot, some)
+            if self.model is None
+            else geometric_poses(self.model, some, rows)
+            for some in q.split(max(1, _MAX_POSES // rows.rows))
+        ]
         return torch.stack(
-            [measured.squared_errors(T).mean(-1), measured.squared_errors(fitted).mean(-1), bound]
+            [torch.cat([error_with_fitted(mode, T, measured) for T in chunks]) for mode in modes]
         )
 
-    def _screened(self, rows: Measurements, q: Tensor, measured: MeasuredPoses) -> Tensor:
-        if self.model is None:
-            return self.errors_in_frames(forward_kinematics(self.robot, q), measured)
-        count = len(q)
-        repeated = Measurements(q=q.flatten(0, 1), frame=rows.frame * count, target=rows.target * count)
-        T = poses_of_rows(replace(self.model, hybrid=None, network=None), repeated)
-        return self.errors_in_frames(T.reshape(*q.shape[:2], 4, 4), measured)
+
+def error_with_fitted(
+    mode: FittedFrames, T: Float64[Tensor, "*#batch rows 4 4"], measured: MeasuredPoses
+) -> Float64[Tensor, "*#batch"]:
+    """Compute the mean squared error [m²] of predicted poses, as they are or with the base fitted to them.
+
+    With base and tool fitted, it is the lower bound of `affine_error`.
+    """
+    if mode == "base and tool":
+        return affine_error(T, measured)
+    if mode == "base":
+        T = best_base(T, measured)[..., None, :, :] @ T
+    error: Tensor = measured.squared_errors(T).mean(-1)
+    return error
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,6 +144,11 @@ class Hypothesis:
         return sum(cause.size for cause in self.causes) - (1 if {"frame", "tool"} <= kinds else 0)
 
     @property
+    def values_of_tool(self) -> int:
+        """Number of parameters of a tool: 6 with orientations, else 3."""
+        return 6 if bool(self.measured.has_rotation.any()) else 3
+
+    @cached_property
     def error(self) -> float:
         """RMS error [m], corrected for the degrees of freedom."""
         spare = self.measured.values - self.fitted

@@ -3,7 +3,7 @@
 import itertools
 import math
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,7 +16,7 @@ from pisigma.robot.description import Robot
 from pisigma.robot.frame_fits import MeasuredPoses
 from pisigma.robot.se3 import wrap_to_pi
 from pisigma.validation.setup_faults.cause import Cause, joints_text
-from pisigma.validation.setup_faults.hypothesis import PredictingArm
+from pisigma.validation.setup_faults.hypothesis import FittedFrames, PredictingArm
 
 QUARTER = math.pi / 2
 GRADIANS = 0.9
@@ -249,8 +249,10 @@ def likely_maps(arm: PredictingArm, measurements: Measurements, measured: Measur
     rows, robot = _screened_rows(measurements), arm.robot
     some, few = measurements.select(rows), measured.select(rows)
 
-    def errors_of(maps: JointMaps) -> Float64[Tensor, "modes maps"]:
-        return arm.screened_errors(some, maps.apply(some.q), few)
+    def errors_of(
+        maps: JointMaps, modes: Sequence[FittedFrames] = arm.modes
+    ) -> Float64[Tensor, "modes maps"]:
+        return arm.screened_errors(some, maps.apply(some.q), few, modes)
 
     kinds = (
         other_units(robot),
@@ -262,11 +264,12 @@ def likely_maps(arm: PredictingArm, measurements: Measurements, measured: Measur
     tried = [(maps, errors_of(maps)) for maps in kinds]
     unchanged = errors_of(JointMaps.unchanged(1, robot.dof))[:, 0].tolist()
     likely: list[JointMaps] = []
-    for mode in range(len(unchanged)):
-        zeros = _best_zeros(robot, lambda maps, mode=mode: errors_of(maps)[mode])  # type: ignore[misc]
-        candidates = [(maps, errors[mode]) for maps, errors in (*tried, (zeros, errors_of(zeros)))]
+    for number, mode in enumerate(arm.modes):
+        zeros = _best_zeros(robot, lambda maps, mode=mode: errors_of(maps, [mode])[0])  # type: ignore[misc]
+        candidates = [(maps, errors[number]) for maps, errors in tried]
+        candidates.append((zeros, errors_of(zeros, [mode])[0]))
         least = min(float(errors.min()) for _, errors in candidates if len(errors))
-        limit = min(PROMISING**2 * unchanged[mode], max(NEAR_BEST**2 * least, NOTICED**2))
+        limit = min(PROMISING**2 * unchanged[number], max(NEAR_BEST**2 * least, NOTICED**2))
         for maps, errors in candidates:
             best = errors.argsort()[:MAX_KEPT]
             likely.append(maps.select(best[errors[best] <= limit]))

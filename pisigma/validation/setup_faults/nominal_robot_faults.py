@@ -84,7 +84,7 @@ def find_nominal_robot_faults(robot: Robot, measurements: Measurements) -> tuple
     some, arm = rows.select(chosen), PredictingArm(robot)
     measured = MeasuredPoses.from_tensors(some.position, some.rotation, LEVER_SHARE * robot.reach)
     raw = Hypothesis(some.q, arm.poses(some), measured)
-    here, usual = next(frame_hypotheses(arm, some, raw)), usual_error(robot, some.q)
+    here, usual = next(frame_hypotheses(arm, some, [raw])), usual_error(robot, some.q)
     if len(set(measurements.target)) > 1:
         named = _named_otherwise(robot, measurements, usual)
         if named or not here.error > usual:
@@ -94,13 +94,13 @@ def find_nominal_robot_faults(robot: Robot, measurements: Measurements) -> tuple
     most = largest_explained(here, robot.reach)
     tried = [
         *fault_hypotheses(arm, some, raw, most),
-        *_with_joints(arm, shifted_rows(robot, rows, chosen, measured), most),
+        *_with_joints(arm, some, shifted_rows(robot, rows, chosen, measured), most),
     ]
     faults = choose_simplest(tried, most)
     if not faults and not are_unrelated(robot, rows):
         freed = ((q, measured, cause) for q, cause in estimate_joint_values(robot, some, measured))
         faults = choose_simplest(
-            _with_joints(arm, freed, most, values=1) + _labelled(some, raw.T, measured), most
+            _with_joints(arm, some, freed, most, values=1) + _labelled(some, raw.T, measured), most
         )
     if faults:
         faults = _better_than_zeros(faults, _error_with_zeros(robot, some, measured), usual)
@@ -135,7 +135,7 @@ def _error_with_zeros(robot: Robot, rows: Measurements, measured: MeasuredPoses)
     if np.abs(moved[:, 0]).max() > MAX_ZERO or np.abs(moved[:, 1]).max() > MAX_SLIDE:
         return math.inf
     arm = PredictingArm(robot.with_geometry(dh=fitted.dh))
-    here = next(frame_hypotheses(arm, rows, Hypothesis(rows.q, arm.poses(rows), measured)))
+    here = next(frame_hypotheses(arm, rows, [Hypothesis(rows.q, arm.poses(rows), measured)]))
     return replace(here, fitted=here.fitted + robot.dof).error
 
 
@@ -170,6 +170,7 @@ def _labelled(
 
 def _with_joints(
     arm: PredictingArm,
+    some: Measurements,
     tried: Iterable[tuple[Float64[Tensor, "rows dof"], MeasuredPoses, Cause]],
     most: float,
     values: int = 0,
@@ -178,18 +179,16 @@ def _with_joints(
 
     Args:
         arm: the predicting arm.
+        some: the rows.
         tried: joint values, measured poses and cause of each hypothesis.
         most: largest error that an explanation may leave [m].
         values: number of unknowns per row.
     """
-    return [
-        other
+    hypotheses = [
+        Hypothesis(q, arm.poses(Measurements(q=q)), measured, (cause,), values * len(q))
         for q, measured, cause in tried
-        for rows in [Measurements(q=q)]
-        for other in frame_hypotheses(
-            arm, rows, Hypothesis(q, arm.poses(rows), measured, (cause,), values * len(q)), most
-        )
     ]
+    return list(frame_hypotheses(arm, some, hypotheses, most))
 
 
 def are_unrelated(robot: Robot, measurements: Measurements) -> bool:

@@ -82,7 +82,9 @@ def find_setup_faults(
     arm = PredictingArm(model.robot, model)
     most = largest_explained(here, model.robot.reach)
     tried = (
-        frame_hypotheses(arm, known, here, most) if frames_only else fault_hypotheses(arm, known, here, most)
+        frame_hypotheses(arm, known, [here], most)
+        if frames_only
+        else fault_hypotheses(arm, known, here, most)
     )
     free = {CAUSES[kind] for kind in fitted}
     faults = tuple(
@@ -102,7 +104,7 @@ def _nominal_error(nominal: CalibratedModel | None, some: Measurements, other: H
         return float("nan")
     T = poses_of_rows(nominal, replace(some, q=other.q))
     tried = frame_hypotheses(
-        PredictingArm(nominal.robot, nominal), some, Hypothesis(other.q, T, other.measured)
+        PredictingArm(nominal.robot, nominal), some, [Hypothesis(other.q, T, other.measured)]
     )
     wanted = kinds & {"frame", "tool"}
     return next(one.rms()[0] for one in tried if {cause.kind for cause in one.causes} == wanted)
