@@ -32,7 +32,7 @@ STATISTICS = ("mean", "rms", "p95")
 """Statistics with a confidence interval; the maximum has none, because no resample exceeds the measured one."""
 QUANTILE = 0.95
 """Quantile of the statistic "p95"."""
-_BATCH = 2**22
+_BATCH = 2**16
 """Indices that are drawn at a time."""
 
 
@@ -65,31 +65,38 @@ def confidence_intervals(
     if groups < 2:
         unknown = np.full((len(STATISTICS), len(errors), 2), np.nan)
         return Intervals(unknown, unknown)
-    order = np.argsort(group, kind="stable")
-    sizes, errors = np.bincount(group), errors[:, order]
 
-    def of_resample(sampled: Int64[np.ndarray, " groups"]) -> np.ndarray:
-        times = np.bincount(sampled.astype(np.int64), minlength=groups)
-        values = statistics(np.repeat(errors, np.repeat(times, sizes), axis=1))
+    def of_resamples(sampled: Int64[np.ndarray, "*resamples groups"], axis: int) -> np.ndarray:
+        drawn = sampled.reshape(-1, groups) + groups * np.arange(sampled.size // groups)[:, None]
+        times = np.bincount(drawn.ravel(), minlength=drawn.size).reshape(sampled.shape)
+        values = np.stack([statistics(of_model, times[..., group]) for of_model in errors], 1)
         return np.stack([values, values - values[:, :1]])
 
     result = stats.bootstrap(
         (np.arange(groups),),
-        of_resample,
-        vectorized=False,
+        of_resamples,
+        vectorized=True,
         method="percentile",
         n_resamples=bootstrap.resamples,
         confidence_level=bootstrap.confidence,
-        batch=max(1, _BATCH // groups),
+        batch=max(1, _BATCH // errors.shape[1]),
         rng=np.random.default_rng(bootstrap.seed),
     )
     return Intervals(*np.stack([result.confidence_interval.low, result.confidence_interval.high], -1))
 
 
-def statistics(errors: Float64[np.ndarray, "models rows"]) -> Float64[np.ndarray, "statistics models"]:
-    """Compute mean, RMS and 95 % quantile of every model's errors, in the order of `STATISTICS`."""
-    quantile = np.quantile(errors, QUANTILE, axis=1)
-    return np.stack([errors.mean(1), np.sqrt((errors**2).mean(1)), quantile])
+def statistics(
+    errors: Float64[np.ndarray, " rows"], times: Int64[np.ndarray, "*resamples rows"]
+) -> Float64[np.ndarray, "statistics *resamples"]:
+    """Compute mean, RMS and 95 % quantile of errors of which each occurs some times, in the order of `STATISTICS`."""
+    order = np.argsort(errors)
+    errors, times = errors[order], times[..., order]
+    last = times.cumsum(-1)
+    count = last[..., -1]
+    place = QUANTILE * (count - 1)
+    lower, upper = (errors[(last <= end[..., None]).sum(-1)] for end in (np.floor(place), np.ceil(place)))
+    quantile = lower + (place - np.floor(place)) * (upper - lower)
+    return np.stack([times @ errors / count, np.sqrt(times @ errors**2 / count), quantile])
 
 
 @dataclass(frozen=True)
@@ -360,7 +367,7 @@ def _differences(
     sizes: Float64[np.ndarray, "models rows"], group: Int64[np.ndarray, " rows"], intervals: Intervals
 ) -> list[Difference]:
     """Compare every model with the first one, including itself."""
-    values = statistics(sizes)
+    values = np.stack([statistics(of_model, np.ones_like(group)) for of_model in sizes], 1)
     means = np.stack([np.bincount(group, row) for row in sizes]) / np.bincount(group)
     return [
         Difference(

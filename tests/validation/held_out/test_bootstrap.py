@@ -21,13 +21,20 @@ def grouped(seed: int, groups: int, models: int = 2) -> tuple[np.ndarray, np.nda
     return errors, rng.permutation(group)
 
 
-def test_statistics_are_numpys():
+def by_numpy(errors: np.ndarray) -> np.ndarray:
+    """Mean, RMS and 95 % quantile of every model's errors."""
+    mean, rms = errors.mean(1), np.sqrt((errors**2).mean(1))
+    values = {"mean": mean, "rms": rms, "p95": np.quantile(errors, 0.95, axis=1)}
+    return np.stack([values[name] for name in STATISTICS])
+
+
+def test_statistics_of_repeated_errors_are_numpys():
     errors, _ = grouped(0, 8)
-    found = dict(zip(STATISTICS, statistics(errors), strict=True))
-    for model, values in enumerate(errors):
-        assert_close(found["mean"][model], values.mean(), rtol=1e-12)
-        assert_close(found["rms"][model], np.sqrt((values**2).mean()), rtol=1e-12)
-        assert_close(found["p95"][model], np.quantile(values, 0.95), rtol=1e-12)
+    for times in (np.ones(ROWS, dtype=np.int64), np.arange(ROWS)[::-1] % 4):
+        for of_model in errors:
+            expected = by_numpy(np.repeat(of_model, times)[None])[:, 0]
+            assert_close(statistics(of_model, times), expected, rtol=1e-12)
+            assert_close(statistics(of_model, np.stack([times, times]))[:, 1], expected, rtol=1e-12)
 
 
 @pytest.mark.parametrize("groups", [2, 9, ROWS])
@@ -37,7 +44,7 @@ def test_intervals_are_those_of_resamples_drawn_by_hand(groups: int):
     rng, resamples = np.random.default_rng(5), []
     for drawn in rng.integers(0, groups, (800, groups)):
         rows = np.concatenate([np.flatnonzero(group == index) for index in drawn])
-        resamples.append(statistics(errors[:, rows]))
+        resamples.append(by_numpy(errors[:, rows]))
     values = np.stack(resamples, -1)
     found = confidence_intervals(Bootstrap(resamples=800, seed=5, confidence=0.9), errors, group)
     spread = values.std(-1).max()
