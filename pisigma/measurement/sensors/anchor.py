@@ -152,8 +152,8 @@ def stated_position(measurements: Measurements, row: int) -> Float64[Tensor, " 3
 
 
 def anchor_from_distances(
-    points: Float64[Tensor, "rows 3"], distance: Float64[Tensor, " rows"]
-) -> Float64[Tensor, " 4"]:
+    points: Float64[Tensor, "*batch rows 3"], distance: Float64[Tensor, "*batch rows"]
+) -> Float64[Tensor, "*batch 4"]:
     """Estimate an anchor and its zero offset from distances to points (multilateration).
 
     `(d - zero)² = |p - a|²` is linear in a, zero and `|a|² - zero²`; the solution is refined by least squares of
@@ -166,39 +166,47 @@ def anchor_from_distances(
     Returns:
         x, y, z, zero [m].
     """
-    centre, middle = points.mean(0), distance.mean()  # centred, for the condition of the linear system
-    p, d = points - centre, distance - middle
-    A = torch.cat([-2 * p, 2 * d[:, None], torch.ones_like(d)[:, None]], -1)
-    solution = torch.linalg.pinv(A, rtol=1e-4) @ (d.square() - p.square().sum(-1))
+    centre, middle = (
+        points.mean(-2),
+        distance.mean(-1, keepdim=True),
+    )  # for the condition of the linear system
+    p, d = points - centre[..., None, :], distance - middle
+    A = torch.cat([-2 * p, 2 * d[..., None], torch.ones_like(d)[..., None]], -1)
+    squares = p.square().sum(-1)
+    solution = torch.linalg.pinv(A, rtol=1e-4) @ (d.square() - squares)[..., None]
     # the linear system may not determine the zero offset, so a zero offset of 0 is a second start
-    without_zero = torch.linalg.pinv(A[:, [0, 1, 2, 4]], rtol=1e-6) @ (distance.square() - p.square().sum(-1))
-    starts = solution[:4], torch.cat([without_zero[:3], -middle[None]])
-    best, _ = min((_refined(p, d, start) for start in starts), key=lambda end: end[1])
-    return best + torch.cat([centre, middle[None]])
+    without_zero = (
+        torch.linalg.pinv(A[..., [0, 1, 2, 4]], rtol=1e-6) @ (distance.square() - squares)[..., None]
+    )
+    starts = torch.stack([solution[..., :4, 0], torch.cat([without_zero[..., :3, 0], -middle], -1)])
+    ends, errors = _refined(p, d, starts)
+    best = ends.take_along_dim(errors.argmin(0)[None, ..., None], 0)[0]
+    return best + torch.cat([centre, middle], -1)
 
 
-def _refined(p: Tensor, d: Tensor, unknown: Tensor) -> tuple[Tensor, float]:
-    """Return anchor and zero offset after damped least-squares steps, and the RMS residual [m]."""
+def _refined(p: Tensor, d: Tensor, unknown: Tensor) -> tuple[Tensor, Tensor]:
+    """Return anchors and zero offsets after damped least-squares steps, and the sums of squared residuals [m²]."""
 
     def linearised(unknown: Tensor) -> tuple[Tensor, Tensor]:
-        vector = p - unknown[:3]
+        vector = p - unknown[..., None, :3]
         length = vector.norm(dim=-1).clamp(min=1e-9)
-        J = torch.cat([-vector / length[:, None], torch.ones_like(length)[:, None]], -1)
-        return d - length - unknown[3], J
+        J = torch.cat([-vector / length[..., None], torch.ones_like(length)[..., None]], -1)
+        return d - length - unknown[..., 3:], J
 
     residual, J = linearised(unknown)
-    damping = 1e-6
+    damping = torch.full_like(unknown[..., :1], 1e-6)
     for _ in range(ITERATIONS):
         normal = J.mT @ J
-        trial = unknown + torch.linalg.solve(
-            normal + damping * torch.diag(normal.diagonal()), J.mT @ residual
-        )
+        damped = normal + torch.diag_embed(damping * normal.diagonal(dim1=-2, dim2=-1))
+        trial = unknown + torch.linalg.solve(damped, J.mT @ residual[..., None])[..., 0]
         trial_residual, trial_J = linearised(trial)
-        if float(trial_residual.square().sum()) <= float(residual.square().sum()):
-            unknown, residual, J, damping = trial, trial_residual, trial_J, damping / 10
-        else:
-            damping *= 100
-    return unknown, float(residual.square().mean().sqrt())
+        better = (trial_residual.square().sum(-1) <= residual.square().sum(-1))[..., None]
+        unknown, residual = torch.where(better, trial, unknown), torch.where(better, trial_residual, residual)
+        J, damping = (
+            torch.where(better[..., None], trial_J, J),
+            torch.where(better, damping / 10, damping * 100),
+        )
+    return unknown, residual.square().sum(-1)
 
 
 def _check_wire(

@@ -97,7 +97,7 @@ class PredictingArm:
             forward_kinematics(self.robot, some)
             if self.model is None
             else geometric_poses(self.model, some, rows)
-            for some in q.split(max(1, _MAX_POSES // rows.rows))
+            for some in torch.split(q, max(1, _MAX_POSES // rows.rows))
         ]
         return torch.stack(
             [torch.cat([error_with_fitted(mode, T, measured) for T in chunks]) for mode in modes]

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float64, Int64
+from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
 from pisigma.calibration.geometric.initial_guess.base_and_tool_closed_form import base_by_points
@@ -57,82 +57,107 @@ class _Distances:
     R: Float64[Tensor, "rows 3 3"]
     p: Float64[Tensor, "rows 3"]
     anchor: Int64[Tensor, " rows"]
-    measured: Float64[Tensor, " rows"]
+    measured: Float64[Tensor, "*batch rows"]
 
     @property
     def unknowns(self) -> int:
         """Number of unknowns: the tool, and every anchor with its zero offset."""
         return 3 + 4 * (int(self.anchor.max()) + 1)
 
-    def start(self, tool: Float64[Tensor, " 3"]) -> Float64[Tensor, " unknowns"]:
+    def points(self, tool: Float64[Tensor, "*batch 3"]) -> Float64[Tensor, "*batch rows 3"]:
+        """Compute the positions of a tool, or their differences in pairs [m]."""
+        return (self.R @ tool[..., None, :, None])[..., 0] + self.p
+
+    def start(self, tool: Float64[Tensor, "*batch 3"]) -> Float64[Tensor, "*batch unknowns"]:
         """Return a tool and the anchors fitted with it."""
-        points = (self.R @ tool) + self.p
+        points = self.points(tool)
         anchors = [
-            anchor_from_distances(points[self.anchor == k], self.measured[self.anchor == k])
+            anchor_from_distances(points[..., self.anchor == k, :], self.measured[..., self.anchor == k])
             for k in range((self.unknowns - 3) // 4)
         ]
-        return torch.cat([tool, *anchors])
+        return torch.cat([tool, *anchors], -1)
 
     def linearised(
-        self, unknown: Float64[Tensor, " unknowns"]
-    ) -> tuple[Float64[Tensor, " rows"], Float64[Tensor, "rows unknowns"]]:
+        self, unknown: Float64[Tensor, "*batch unknowns"]
+    ) -> tuple[Float64[Tensor, "*batch rows"], Float64[Tensor, "*batch rows unknowns"]]:
         """Return measured minus predicted distances [m] and the derivative of the predicted ones."""
         wires = (self.anchor >= 0).nonzero()[:, 0]
-        away, zero = (self.R @ unknown[:3]) + self.p, torch.zeros_like(self.measured)
-        anchors = unknown[3:].view(-1, 4)[self.anchor[wires]]
-        away[wires] -= anchors[:, :3]
-        zero[wires] = anchors[:, 3]
+        away, zero = self.points(unknown[..., :3]), torch.zeros_like(self.measured)
+        anchors = unknown[..., 3:].reshape(*unknown.shape[:-1], -1, 4)[..., self.anchor[wires], :]
+        away[..., wires, :] -= anchors[..., :3]
+        zero[..., wires] = anchors[..., 3]
         length = away.norm(dim=-1).clamp(min=1e-9)
-        direction = away / length[:, None]
-        J = torch.zeros(len(length), len(unknown), dtype=torch.float64)
-        J[:, :3] = (direction[:, None] @ self.R)[:, 0]
+        direction = away / length[..., None]
+        J = torch.zeros(*length.shape, unknown.shape[-1], dtype=torch.float64)
+        J[..., :3] = (direction[..., None, :] @ self.R)[..., 0, :]
         columns = 3 + 4 * self.anchor[wires, None] + torch.arange(4)
-        J[wires[:, None], columns] = torch.cat([-direction[wires], torch.ones(len(wires), 1).double()], -1)
+        by_anchor = torch.cat([-direction, torch.ones_like(length)[..., None]], -1)
+        J[..., wires[:, None], columns] = by_anchor[..., wires, :]
         return self.measured - length - zero, J
 
     def fitted(
-        self, nominal_tool: Float64[Tensor, " 3"], held: bool, reach: float
-    ) -> tuple[Float64[Tensor, " 3"], Float64[Tensor, " rows"]]:
-        """Fit the tool to the distances, starting near the nominal one, then far off; return it and residuals [m]."""
-        best = self._refined(nominal_tool, nominal_tool, held)
-        ways = torch.cat([torch.eye(3), -torch.eye(3)]).double() * FAR_START * reach
-        for way in () if held else ways:
-            if not self.is_doubtful(*best):
-                break
-            other = self._refined(nominal_tool + way, nominal_tool, held)
-            best = min(best, other, key=lambda fit: float(fit[1].abs().median()))
-        return best
+        self,
+        factors: Float64[Tensor, " units"],
+        nominal_tool: Float64[Tensor, " 3"],
+        held: bool,
+        reach: float,
+    ) -> tuple[Float64[Tensor, "units 3"], Float64[Tensor, "units rows"]]:
+        """Fit the tool to the distances times each factor, starting near the nominal one, then far off.
 
-    def is_doubtful(self, tool: Float64[Tensor, " 3"], residual: Float64[Tensor, " rows"]) -> bool:
+        Returns:
+            For every factor, the tool and the residuals [m].
+        """
+        in_units = replace(self, measured=factors[:, None] * self.measured)
+        tool, residual = in_units._refined(nominal_tool.expand(len(factors), 3), nominal_tool, held)
+        doubtful = self.is_doubtful(tool, residual).nonzero()[:, 0]
+        if held or not len(doubtful):
+            return tool, residual
+        ways = torch.cat([torch.eye(3), -torch.eye(3)]).double() * FAR_START * reach
+        several = replace(self, measured=in_units.measured[doubtful, None].expand(-1, len(ways), -1))
+        far = several._refined((nominal_tool + ways).expand(len(doubtful), -1, -1), nominal_tool, held)
+        for unit, tools, residuals in zip(doubtful.tolist(), *far, strict=True):
+            for other in zip(tools, residuals, strict=True):
+                best = tool[unit], residual[unit]
+                if bool(self.is_doubtful(*best)):
+                    tool[unit], residual[unit] = min(
+                        best, other, key=lambda fit: float(fit[1].abs().median())
+                    )
+        return tool, residual
+
+    def is_doubtful(
+        self, tool: Float64[Tensor, "*batch 3"], residual: Float64[Tensor, "*batch rows"]
+    ) -> Bool[Tensor, "*batch"]:
         """Say whether the median error is large relative to the motion of the tool."""
-        points = self.R @ tool + self.p
-        motion = (points - points.mean(0)).norm(dim=-1).median()
-        return float(residual.abs().median()) > DOUBTFUL * float(motion)
+        points = self.points(tool)
+        motion = (points - points.mean(-2, keepdim=True)).norm(dim=-1).median(-1).values
+        doubtful: Tensor = residual.abs().median(-1).values > DOUBTFUL * motion
+        return doubtful
 
     def _refined(
-        self, start: Float64[Tensor, " 3"], nominal_tool: Float64[Tensor, " 3"], held: bool
-    ) -> tuple[Float64[Tensor, " 3"], Float64[Tensor, " rows"]]:
-        """Refine the tool by robust Levenberg-Marquardt steps; return it and the residuals [m]."""
+        self, start: Float64[Tensor, "*batch 3"], nominal_tool: Float64[Tensor, " 3"], held: bool
+    ) -> tuple[Float64[Tensor, "*batch 3"], Float64[Tensor, "*batch rows"]]:
+        """Refine tools by robust Levenberg-Marquardt steps, all at once; return them and the residuals [m]."""
         unknown = self.start(start)
-        pull = torch.zeros_like(unknown)
-        pull[:3] = (HELD if held else WEAK) ** 2 * len(self.measured)
-        damping = 1e-3
+        pull, nominal = torch.zeros(2, unknown.shape[-1]).double()
+        pull[:3], nominal[:3] = (HELD if held else WEAK) ** 2 * self.measured.shape[-1], nominal_tool
+        damping = torch.full_like(unknown[..., :1], 1e-3)
+        residual, J = self.linearised(unknown)
         for _ in range(MAX_ITERATIONS):
-            residual, J = self.linearised(unknown)
-            limit = OUTLYING * residual.abs().median().clamp(min=1e-9)
-            weight = (limit / residual.abs()).clamp(max=1.0)  # Huber's
-            off = torch.cat([unknown[:3] - nominal_tool, torch.zeros_like(unknown[3:])])
-            normal = (J.mT * weight) @ J + torch.diag(pull)
-            gradient = (J.mT * weight) @ residual - pull * off
-            scale = normal.diagonal().clamp(min=1e-12)
-            step = torch.linalg.solve(normal + damping * torch.diag(scale), gradient)
-            if _cost(self.linearised(unknown + step)[0], limit) < _cost(residual, limit):
-                unknown, damping = unknown + step, max(damping / 10, 1e-9)
-            else:
-                damping *= 10
+            limit = OUTLYING * residual.abs().median(-1, keepdim=True).values.clamp(min=1e-9)
+            weighted = J.mT * (limit / residual.abs()).clamp(max=1.0)[..., None, :]  # Huber's
+            normal = weighted @ J + torch.diag(pull)
+            gradient = weighted @ residual[..., None] - (pull * (unknown - nominal))[..., None]
+            scale = normal.diagonal(dim1=-2, dim2=-1).clamp(min=1e-12)
+            step = torch.linalg.solve(normal + torch.diag_embed(damping * scale), gradient)[..., 0]
+            trial_residual, trial_J = self.linearised(unknown + step)
+            better = (_cost(trial_residual, limit) < _cost(residual, limit))[..., None]
+            unknown = torch.where(better, unknown + step, unknown)
+            residual = torch.where(better, trial_residual, residual)
+            J = torch.where(better[..., None], trial_J, J)
+            damping = torch.where(better, (damping / 10).clamp(min=1e-9), damping * 10)
             if float(step.abs().max()) < CONVERGENCE_TOLERANCE:
                 break
-        return unknown[:3], self.linearised(unknown)[0]
+        return unknown[..., :3], residual
 
 
 def tools_from_distances(
@@ -163,7 +188,7 @@ def tools_from_distances(
             continue
         held = name in tools or not free_tool
         position = torch.from_numpy(tools.get(name, nominal_tool)[:3].copy())
-        tool, residual = distances.fitted(position, held, reach)
+        tool, residual = (one[0] for one in distances.fitted(torch.ones(1).double(), position, held, reach))
         _refuse_other_units(space.robot, distances, (tool, residual), (position, held), measurements.source)
         off = int((residual.abs() > MAX_NOMINAL_ERROR * reach).sum())
         if off > MAX_WRONG_SHARE * len(residual):
@@ -231,15 +256,8 @@ def _refuse_other_units(
     if not distances.is_doubtful(*fit):
         return
     typical = float(fit[1].abs().median())
-    misses = [
-        float(
-            replace(distances, measured=distances.measured * factor)
-            .fitted(*start, robot.reach)[1]
-            .abs()
-            .median()
-        )
-        for factor, _, _ in MISNAMED_UNITS
-    ]
+    factors = torch.tensor([factor for factor, _, _ in MISNAMED_UNITS]).double()
+    misses = distances.fitted(factors, *start, robot.reach)[1].abs().median(-1).values.tolist()
     miss, (factor, are, named) = min(
         zip(misses, MISNAMED_UNITS, strict=True), key=lambda one: one[0] / one[1][0]
     )
@@ -275,7 +293,7 @@ def _distances_of(measurements: Measurements, T: Tensor, target: str) -> _Distan
     )
 
 
-def _cost(residual: Tensor, limit: Tensor) -> float:
+def _cost(residual: Tensor, limit: Tensor) -> Tensor:
     """Compute Huber's cost: quadratic up to a limit, then linear."""
     size = residual.abs()
-    return float(torch.where(size <= limit, size.square(), 2 * limit * size - limit.square()).sum())
+    return torch.where(size <= limit, size.square(), 2 * limit * size - limit.square()).sum(-1)
