@@ -48,6 +48,31 @@ def near_of(joint_state, joints):
     return [stated[name] for name in joints] if all(name in stated for name in joints) else None
 
 
+def solution(stamped, near, arm, solve):
+    """Ask for the joint values of a geometry_msgs/PoseStamped.
+
+    Args:
+        stamped: desired pose of the tool in the base frame.
+        near: joint values to stay near to, in the order of the model; None for none.
+        arm: The arm.
+        solve: Function that asks the server, such as `FrameClient.solve`; an OSError becomes COMMUNICATION_FAILURE.
+
+    Returns:
+        Name of an error code of moveit_msgs/MoveItErrorCodes, and the joint values, which are empty unless it is SUCCESS.
+    """
+    if stamped.header.frame_id.lstrip("/") != arm.base_frame:
+        return "FRAME_TRANSFORM_FAILURE", []
+    try:
+        status, q, _ = solve(matrix_of(stamped.pose), near, arm.model)
+    except OSError:
+        return "COMMUNICATION_FAILURE", []
+    if len(q) == len(arm.joints) and (
+        status == REACHED or (status == OUTSIDE_DOMAIN and arm.accept_outside_domain)
+    ):
+        return "SUCCESS", list(q)
+    return ("INVALID_GOAL_CONSTRAINTS" if status == INVALID_POSE else "NO_IK_SOLUTION"), []
+
+
 def answer(request, response, arm, solve):
     """Fill the response of a GetPositionIK service, and return it.
 
@@ -57,25 +82,13 @@ def answer(request, response, arm, solve):
         response: Response that gets `solution.joint_state` and `error_code`; only an error code if the pose is not
             reached.
         arm: The arm.
-        solve: Function that asks the server, such as `FrameClient.solve`; an OSError becomes COMMUNICATION_FAILURE.
+        solve: See `solution`.
     """
     wanted, code = request.ik_request, response.error_code
-    frame = wanted.pose_stamped.header.frame_id
-    if frame.lstrip("/") != arm.base_frame:
-        code.val = code.FRAME_TRANSFORM_FAILURE
-        return response
     near = near_of(wanted.robot_state.joint_state, arm.joints)
-    try:
-        status, q, _ = solve(matrix_of(wanted.pose_stamped.pose), near, arm.model)
-    except OSError:
-        code.val = code.COMMUNICATION_FAILURE
-        return response
-    if status == REACHED or (status == OUTSIDE_DOMAIN and arm.accept_outside_domain):
+    name, q = solution(wanted.pose_stamped, near, arm, solve)
+    code.val = getattr(code, name)
+    if q:
         response.solution.joint_state.name = list(arm.joints)
-        response.solution.joint_state.position = list(q)
-        code.val = code.SUCCESS
-    elif status == INVALID_POSE:
-        code.val = code.INVALID_GOAL_CONSTRAINTS
-    else:
-        code.val = code.NO_IK_SOLUTION
+        response.solution.joint_state.position = q
     return response

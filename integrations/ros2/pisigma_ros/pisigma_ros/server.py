@@ -1,0 +1,84 @@
+"""The connections of the nodes to `pisigma serve`: binary frames for poses, and lines of JSON in a background thread."""
+
+import threading
+from xml.etree import ElementTree
+
+from pisigma_ros.pisigma_client import FrameClient, JsonClient
+
+SLOW = 60.0
+"""[s] Longest wait for the first URDF of a model, which the server has to make."""
+CALIBRATED_FRAME = "calibrated_frame"
+"""Link of a calibrated URDF that is the frame of the model's poses, if it is not the root."""
+
+
+class Server:
+    """Corrected joint values of a server, and what it says about a model.
+
+    Attributes:
+        problem: Why the server did not answer last; empty if it did.
+        status: Name, SHA-256, age and state of the model, as the server states them.
+        joints: Names of the joints of the model.
+        urdf: URDF of the calibrated robot; empty if a URDF cannot describe it.
+    """
+
+    def __init__(self, host, port, json_port, token=None, model=0, timeout=0.5):
+        """Connect, and ask for the model and its URDF; an OSError or RuntimeError says that this is not possible."""
+        self._address, self._json_address = (port, host, token, timeout), (json_port, host, token, SLOW)
+        self._model, self._lines = model, None
+        self._frames = FrameClient(*self._address)
+        self.problem, self.status, self.joints, self.urdf = "", {}, [], ""
+        self._ask()
+        self._ending = threading.Event()
+
+    def solve(self, *arguments):
+        """See `FrameClient.solve`; after a failure, the next request opens a new connection."""
+        if self._frames is None:
+            self._frames = FrameClient(*self._address)
+        try:
+            return self._frames.solve(*arguments)
+        except OSError:
+            self._frames.close()
+            self._frames = None
+            raise
+
+    def follow(self, period):
+        """Ask for the model every `period` seconds in a background thread."""
+        threading.Thread(target=self._follow, args=(period,), daemon=True).start()
+
+    def close(self):
+        """End the connections and the thread."""
+        self._ending.set()
+        for client in (self._frames, self._lines):
+            if client is not None:
+                client.close()
+
+    @property
+    def pose_frame(self):
+        """Name of the link of the URDF in which poses are stated."""
+        root = ElementTree.fromstring(self.urdf)
+        links = [link.get("name") for link in root.iterfind("link")]
+        children = {child.get("link") for child in root.iterfind("joint/child")}
+        roots = [link for link in links if link not in children]
+        return CALIBRATED_FRAME if CALIBRATED_FRAME in links else roots[0]
+
+    def _follow(self, period):
+        while not self._ending.wait(period):
+            try:
+                self._ask()
+                self.problem = ""
+            except (OSError, RuntimeError, ValueError) as problem:
+                if self._lines is not None:
+                    self._lines.close()
+                self._lines, self.problem = None, str(problem)
+
+    def _ask(self):
+        if self._lines is None:
+            self._lines = JsonClient(*self._json_address)
+        status = self._lines.ask(ask="status", model=self._model)
+        if status["sha256"] != self.status.get("sha256"):
+            self.joints = self._lines.ask(ask="models")["models"][self._model]["joints"]
+            try:
+                self.urdf = self._lines.ask(ask="urdf", model=self._model)["urdf"]
+            except RuntimeError:
+                self.urdf = ""
+        self.status = {key: value for key, value in status.items() if key != "id"}

@@ -1,0 +1,107 @@
+"""Drives the ROS 2 node from a process of its own, in the environment of the ROS wheels.
+
+It reads one request per line of JSON, `[name, arguments]`, calls the method of `Driver` with this name, and prints what it
+returns as a line of JSON.
+"""
+
+import json
+import sys
+import time
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseStamped
+from lifecycle_msgs.srv import ChangeState, GetState
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from sensor_msgs.msg import JointState
+from std_msgs.msg import String
+
+LONGEST = 20.0
+"""[s] Longest wait for anything; only for what must not come is it waited shorter."""
+
+
+class Driver(Node):
+    """A user of the node."""
+
+    def __init__(self):
+        super().__init__("driver")
+        self.joints, self.diagnostics, self.urdf = [], [], []
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self.create_subscription(JointState, "/corrected_ik/corrected_joints", self.joints.append, 100)
+        self.create_subscription(DiagnosticArray, "/diagnostics", self.diagnostics.append, 10)
+        self.create_subscription(String, "/robot_description", self.urdf.append, latched)
+        self.poses = self.create_publisher(PoseStamped, "/corrected_ik/desired_pose", 100)
+        self.states = self.create_publisher(JointState, "/joint_states", 10)
+        self.change = self.create_client(ChangeState, "/corrected_ik/change_state")
+        self.get = self.create_client(GetState, "/corrected_ik/get_state")
+
+    def until(self, found, longest=LONGEST):
+        end = time.monotonic() + longest
+        while not found() and time.monotonic() < end:
+            rclpy.spin_once(self, timeout_sec=0.05)
+        return found()
+
+    def connect(self):
+        """Wait until the node is there in both directions, and return its URDF."""
+        self.until(lambda: self.poses.get_subscription_count() and self.states.get_subscription_count())
+        self.until(lambda: self.count_publishers("/corrected_ik/corrected_joints"))
+        self.until(lambda: self.urdf)
+        return self.urdf[-1].data if self.urdf else None
+
+    def pose(self, frame, values, stamp, longest=LONGEST):
+        """Return the answer to x, y, z and a quaternion: stamp, frame, names and positions."""
+        message = PoseStamped()
+        message.header.frame_id, message.header.stamp.sec = frame, stamp
+        for part, names, numbers in (("position", "xyz", values[:3]), ("orientation", "xyzw", values[3:])):
+            for name, number in zip(names, numbers, strict=True):
+                setattr(getattr(message.pose, part), name, number)
+        self.joints.clear()
+        self.poses.publish(message)
+        self.until(lambda: self.joints, longest)
+        return [
+            [one.header.stamp.sec, one.header.frame_id, list(one.name), list(one.position)]
+            for one in self.joints
+        ]
+
+    def near(self, names, positions):
+        """Publish joint_states for a moment."""
+        for _ in range(5):
+            self.states.publish(JointState(name=names, position=positions))
+            self.until(lambda: False, 0.02)
+
+    def report(self, requests):
+        """Return level, hardware and values of the first diagnostics after a number of requests."""
+        self.diagnostics.clear()
+
+        def last():
+            found = [one.status[0] for one in self.diagnostics]
+            return [one for one in found if {"requests": str(requests)}.items() <= _values(one).items()]
+
+        status = self.until(last)[0]
+        return [status.level[0], status.hardware_id, _values(status)]
+
+    def transition(self, name):
+        """Ask for a transition, and return the state afterwards."""
+        request = ChangeState.Request()
+        request.transition.label = name
+        self._call(self.change, request)
+        return self._call(self.get, GetState.Request()).current_state.label
+
+    def _call(self, client, request):
+        client.wait_for_service(LONGEST)
+        future = client.call_async(request)
+        rclpy.spin_until_future_complete(self, future, timeout_sec=LONGEST)
+        return future.result()
+
+
+def _values(status):
+    return {one.key: one.value for one in status.values}
+
+
+if __name__ == "__main__":
+    rclpy.init()
+    driver = Driver()
+    for line in sys.stdin:
+        method, arguments = json.loads(line)
+        print(json.dumps(getattr(driver, method)(*arguments)), flush=True)
