@@ -1,10 +1,9 @@
 """Round trips of the ROS 2 node over DDS on one machine, with requests to an empty node in between.
 
 Run `python benchmarks/ros_node.py models/my_ur10 --ros ROS_ENVIRONMENT`, a virtual environment with the wheels of
-`integrations/ros2/requirements.txt`. Three processes run in it: the node of `pisigma_ros`, an empty node that answers the
-same messages with stored joint values, and a client that asks them in turn, with poses of the model's training rows.
-Printed are how many answers were lost or wrong compared with Python, the medians
-of both nodes, and their ratio.
+`integrations/ros2/requirements.txt`. Three processes run in it: the node of `pisigma_ros`, an empty node that answers
+the same messages with stored joint values, and a client that asks them in turn, with poses of the model's training
+rows. Printed are how many answers were lost or wrong compared with Python, the medians of both nodes, and their ratio.
 """
 
 import argparse

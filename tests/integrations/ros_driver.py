@@ -1,7 +1,7 @@
 """Drives the ROS 2 node from a process of its own, in the environment of the ROS wheels.
 
-It reads one request per line of JSON, `[name, arguments]`, calls the method of `Driver` with this name, and prints what it
-returns as a line of JSON.
+It reads lines of JSON, `[name, arguments]`, calls the method of `Driver` with this name, and prints what it returns
+as a line of JSON.
 """
 
 import json

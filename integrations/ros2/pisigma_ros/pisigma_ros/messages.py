@@ -58,7 +58,7 @@ def solution(stamped, near, arm, solve):
         solve: Function that asks the server, such as `FrameClient.solve`; an OSError becomes COMMUNICATION_FAILURE.
 
     Returns:
-        Name of an error code of moveit_msgs/MoveItErrorCodes, and the joint values, which are empty unless it is SUCCESS.
+        Name of an error code of moveit_msgs/MoveItErrorCodes, and the joint values; none unless it is SUCCESS.
     """
     if stamped.header.frame_id.lstrip("/") != arm.base_frame:
         return "FRAME_TRANSFORM_FAILURE", []

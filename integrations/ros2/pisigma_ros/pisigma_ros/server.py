@@ -1,4 +1,4 @@
-"""The connections of the nodes to `pisigma serve`: binary frames for poses, and lines of JSON in a background thread."""
+"""Connections to `pisigma serve`: binary frames for poses, and lines of JSON in a background thread."""
 
 import threading
 from xml.etree import ElementTree
