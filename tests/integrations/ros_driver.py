@@ -16,6 +16,7 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
+from std_srvs.srv import Trigger
 
 LONGEST = 20.0
 """[s] Longest wait for anything; only for what must not come is it waited shorter."""
@@ -32,6 +33,7 @@ class Driver(Node):
         self.create_subscription(DiagnosticArray, "/diagnostics", self.diagnostics.append, 10)
         self.create_subscription(String, "/robot_description", self.urdf.append, latched)
         self.poses = self.create_publisher(PoseStamped, "/corrected_ik/desired_pose", 100)
+        self.tracker = self.create_publisher(PoseStamped, "/tracker", 10)
         self.states = self.create_publisher(JointState, "/joint_states", 10)
         self.change = self.create_client(ChangeState, "/corrected_ik/change_state")
         self.get = self.create_client(GetState, "/corrected_ik/get_state")
@@ -69,6 +71,25 @@ class Driver(Node):
         for _ in range(5):
             self.states.publish(JointState(name=names, position=positions))
             self.until(lambda: False, 0.02)
+
+    def trigger(self, name):
+        """Call a service of the recorder, and return whether it succeeded and its message."""
+        done = self._call(self.create_client(Trigger, f"/record_session/{name}"), Trigger.Request())
+        return [done.success, done.message]
+
+    def measure(self, names, positions, reading):
+        """Publish joint_states and a pose of the tracker until a row was recorded."""
+        message = PoseStamped()
+        message.pose.position.x, message.pose.position.y, message.pose.position.z = reading
+        self.until(lambda: self.tracker.get_subscription_count() and self.states.get_subscription_count())
+        end, done = time.monotonic() + LONGEST, [False, ""]
+        while not done[0] and time.monotonic() < end:
+            for _ in range(10):
+                self.states.publish(JointState(name=names, position=positions))
+                self.tracker.publish(message)
+                self.until(lambda: False, 0.01)
+            done = self.trigger("take")
+        return done
 
     def report(self, requests):
         """Return level, hardware and values of the first diagnostics after a number of requests."""

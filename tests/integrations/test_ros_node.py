@@ -62,6 +62,26 @@ def driver(repository):
         yield ask
 
 
+def test_a_session_is_recorded_into_a_cell(repository, tmp_path):
+    cell = pisigma.Cell.create(tmp_path / "cell", "ur10")
+    joints = [f"joint_{number}" for number in range(1, 7)]
+    words = ["-p", f"cell:={cell.folder}", "-p", f"joints:=[{', '.join(joints)}]", "-p", "window:=0.3"]
+    recorder = started(repository, "-m", "pisigma_ros.recorder", "--ros-args", *words)
+    rows = [([0.1 * number + row for number in range(6)], [0.5, 0.1 * row, 0.7]) for row in range(2)]
+    with recorder, driver(repository) as ask:
+        assert ask("trigger", "finish")[0] is False
+        assert ask("trigger", "take")[0] is False
+        for q, reading in rows:
+            assert ask("measure", joints[::-1], q[::-1], reading)[0] is True
+        done, file = ask("trigger", "finish")
+    data = pisigma.Measurements.read_csv(file)
+    assert done
+    assert Path(file).parent == cell.folder / "sessions"
+    assert_close(data.q, [q for q, _ in rows], atol=1e-12)
+    assert_close(data.position, [reading for _, reading in rows], atol=1e-12)
+    assert cell.status().step.state == "not_taken_in"
+
+
 def test_poses_are_answered_with_corrected_joints(repository):
     model = repository / "models" / "kiro4"
     ik = pisigma.load(model)

@@ -83,9 +83,8 @@ class Recorder(Node):
         ] + ["x_m", "y_m", "z_m"]
         if self._value("orientation"):
             self._columns += ["qx", "qy", "qz", "qw"]
-        name = datetime.datetime.now().strftime("%Y-%m-%d-%H%M%S")
-        self._file = cell / "sessions" / f"{name}.csv"
-        self._rows, self._last = 0, None
+        self._folder = cell / "sessions"
+        self._file, self._rows, self._last = None, 0, None
         self._arm, self._tracker = Samples(self._value("window")), Samples(self._value("window"))
         overriding = {"qos_overriding_options": QoSOverridingOptions.with_default_policies()}
         quick = qos_profile_sensor_data
@@ -139,15 +138,12 @@ class Recorder(Node):
             self._write(q, reading)
             self.get_logger().info(f"Row {self._rows} recorded")
 
-    @property
-    def _unfinished(self):
-        """The file while rows are added, which is not a measurement file of the cell yet."""
-        return self._file.with_suffix(".csv.unfinished")
-
     def _write(self, q, reading):
         """Add a row to the unfinished file, so that no row is lost if the machine fails."""
-        self._file.parent.mkdir(exist_ok=True)
-        with self._unfinished.open("a" if self._rows else "w", newline="", encoding="utf-8") as file:
+        if self._file is None:
+            self._folder.mkdir(exist_ok=True)
+            self._file = self._folder / f"{datetime.datetime.now():%Y-%m-%d-%H%M%S}.csv.unfinished"
+        with self._file.open("a" if self._rows else "x", newline="", encoding="utf-8") as file:
             table = csv.writer(file, lineterminator="\n")
             if not self._rows:
                 table.writerow(self._columns)
@@ -160,10 +156,10 @@ class Recorder(Node):
         if not self._rows:
             response.message = "no row was recorded"
             return response
-        os.replace(self._unfinished, self._file)
-        response.success, response.message = True, str(self._file)
-        name = datetime.datetime.now().strftime("%Y-%m-%d-%H%M%S")
-        self._file, self._rows, self._last = self._file.with_name(f"{name}.csv"), 0, None
+        finished = self._file.with_suffix("")
+        os.replace(self._file, finished)
+        response.success, response.message = True, str(finished)
+        self._file, self._rows, self._last = None, 0, None
         return response
 
 
