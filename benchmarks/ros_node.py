@@ -173,8 +173,8 @@ def main() -> None:
         }
         arguments = [word for name, value in parameters.items() for word in ("-p", f"{name}:={value}")]
         node = [python, "-m", "pisigma_ros.node", "--ros-args", *arguments]
-        processes.append(subprocess.Popen(node, env=environment))
-        processes.append(subprocess.Popen([python, __file__, "empty"], env=environment))
+        processes.append(subprocess.Popen(node, env=environment, text=True))
+        processes.append(subprocess.Popen([python, __file__, "empty"], env=environment, text=True))
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / "work.json"
             file.write_text(json.dumps(work_of(options.model, options.requests)))
