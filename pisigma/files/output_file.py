@@ -1,5 +1,6 @@
 """Write a file completely or not at all, and never over an input or a part of a model."""
 
+import errno
 import os
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -101,9 +102,10 @@ def writing_whole(path: Path) -> Iterator[TextIO]:
 
 def write_failure(path: str | os.PathLike[str], problem: OSError) -> OutputError:
     """Return the error of an output that the operating system does not let us write."""
+    is_full = problem.errno in (errno.ENOSPC, errno.EDQUOT)
     return OutputError(
         f"the output cannot be written: {problem.strerror}",
         value=problem.strerror,
         at=Place(path),
-        remedy="choose another --out",
+        remedy="free space on its disk" if is_full else "make its folder writable or choose another --out",
     )

@@ -1,6 +1,7 @@
 """Cards and pages from templates: layout and wording are in the folder `templates`."""
 
 import functools
+import re
 from pathlib import Path
 
 import jinja2
@@ -39,6 +40,11 @@ def write_card(folder: Path, template: str, **content: object) -> None:
     (folder / CARD).write_text(render(template, **content) + "\n", encoding="utf-8")
 
 
+def file_name(text: str) -> str:
+    """Replace the characters that file names cannot have."""
+    return re.sub(r"[^\w.-]", "_", text) or "figure"
+
+
 @functools.cache
 def _environment() -> jinja2.Environment:
     return template_environment(
@@ -46,6 +52,7 @@ def _environment() -> jinja2.Environment:
         {
             "figure": figure_text,
             "digits": "{:.4g}".format,
+            "file_name": file_name,
             "pose_table": pose_table,
             "joint_table": joint_table,
             "distance_table": lambda distances: markdown_table(*distance_table(distances)),

@@ -2,7 +2,6 @@
 
 import io
 import os
-import re
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -24,7 +23,9 @@ from pisigma.files.errors import OutputError, Place
 from pisigma.files.output_file import write_whole
 from pisigma.reporting.calibration_figures import STYLES, show_correlations
 from pisigma.reporting.page.content import ReportContent
+from pisigma.reporting.page.drawn_values import csv_of
 from pisigma.reporting.page.wording import LAYER_LABELS, curve_text, dependence_text
+from pisigma.reporting.rendering import file_name
 from pisigma.validation.held_out.validation_figures import LearningPoint
 from pisigma.validation.report.corrections import CorrectionCurve, Correlations
 from pisigma.validation.report.dependence import Dependence, bin_errors
@@ -43,6 +44,7 @@ _STYLE: dict[Any, Any] = {
     "svg.hashsalt": "pisigma",
     "svg.fonttype": "none",
     "font.size": 10.0,
+    "axes.facecolor": "none",  # pages invert their charts in the dark
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.grid": True,
@@ -52,6 +54,7 @@ _STYLE: dict[Any, Any] = {
     "legend.frameon": False,
     "legend.fontsize": 9.0,
 }
+_SVG_METADATA: dict[str, Any] = {"Date": None, "Creator": None}
 MAX_MAP_DOTS = 1_500
 """Dots of the flat map with the largest errors; of the others every fourth is drawn, at most as many."""
 _COLORS = {"nominal": BEFORE, "geometric": OTHER, "hybrid": AFTER}
@@ -78,7 +81,7 @@ class Drawing:
         stream = io.BytesIO()
         with drawing_style():
             FigureCanvasSVG(self.figure)
-            self.figure.savefig(stream, format="svg", dpi=PIXELS, metadata={"Date": None, "Creator": None})
+            self.figure.savefig(stream, format="svg", dpi=PIXELS, facecolor="none", metadata=_SVG_METADATA)
         return stream.getvalue().decode()
 
     def png(self) -> bytes:
@@ -88,6 +91,10 @@ class Drawing:
             FigureCanvasAgg(self.figure)
             self.figure.savefig(stream, format="png", dpi=160, metadata={"Software": None})
         return stream.getvalue()
+
+    def csv(self) -> str:
+        """Write the values that are drawn as CSV."""
+        return csv_of(self.figure)
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,7 +152,7 @@ def check_figures(folder: Path, inputs: Iterable[Input] = ()) -> None:
 
 
 def write_figures(drawings: Sequence[Drawing], folder: Path) -> list[Path]:
-    """Write every figure as PNG and SVG.
+    """Write every figure as PNG and SVG, and what is drawn in it as CSV.
 
     Args:
         drawings: drawings to write; characters that file names cannot have are replaced.
@@ -158,11 +165,10 @@ def write_figures(drawings: Sequence[Drawing], folder: Path) -> list[Path]:
     try:
         folder.mkdir(exist_ok=True)
         for drawing in drawings:
-            stem = folder / (re.sub(r"[^\w.-]", "_", drawing.key) or "figure")
-            svg, png = Path(f"{stem}.svg"), Path(f"{stem}.png")
-            write_whole(svg, drawing.svg())
-            write_whole(png, drawing.png())
-            written += [png, svg]
+            stem = folder / file_name(drawing.key)
+            for suffix, content in (("png", drawing.png()), ("svg", drawing.svg()), ("csv", drawing.csv())):
+                written.append(Path(f"{stem}.{suffix}"))
+                write_whole(written[-1], content)
     except OSError as problem:
         raise OutputError(
             f"cannot be written to: {problem.strerror}",

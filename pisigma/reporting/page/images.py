@@ -3,15 +3,13 @@
 from collections.abc import Sequence
 
 import numpy as np
-from markupsafe import Markup
 from matplotlib.figure import Figure
 from PIL import Image
 
 from pisigma.measurement.camera.detection.detected_boards import BoardImage, DetectedBoards, rms_of
 from pisigma.measurement.camera.detection.detector import read_image
 from pisigma.reporting.page.figures import AFTER, BEFORE, Drawing, drawing_style
-from pisigma.reporting.page.page import data_url, read_resource
-from pisigma.reporting.rendering import render
+from pisigma.reporting.page.page import html_page
 from pisigma.reporting.result_text import Table
 
 WIDTH = 4.8
@@ -40,7 +38,7 @@ def images_page(
     """
     sentences, warnings = texts
     scale = arrow_scale(detection)
-    return render(
+    return html_page(
         "images.html.j2",
         title=title,
         sentences=sentences,
@@ -48,8 +46,6 @@ def images_page(
         tables=tables,
         scale=f"{scale:g}",
         pictures=[draw_image(one, detection, scale) for one in detection.images if one.is_read],
-        image=data_url,
-        style=Markup(read_resource("style.css")),  # ours
     )
 
 

@@ -4,7 +4,6 @@ import datetime
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
 
@@ -19,8 +18,7 @@ from pisigma.reporting.comparison_tables import comparison_tables
 from pisigma.reporting.fleet_tables import ERRORS_NOTE, cell_table, state_table
 from pisigma.reporting.lifetime_tables import chart_table, difference_table, session_table
 from pisigma.reporting.page.figures import AFTER, BEFORE, OTHER, Drawing, draw_map, drawing_style, make_panel
-from pisigma.reporting.page.page import data_url, read_resource
-from pisigma.reporting.rendering import render
+from pisigma.reporting.page.page import html_page
 from pisigma.reporting.tables import pose_rows
 from pisigma.validation.held_out.model_comparison import ModelComparison
 from pisigma.validation.report.error_map import Layer
@@ -46,7 +44,7 @@ def monitoring_page(
         warnings: warnings, one sentence each.
     """
     days = [datetime.date.fromisoformat(one.date) for one in records]
-    return render(
+    return html_page(
         "monitoring.html.j2",
         model=model,
         records=records,
@@ -59,8 +57,6 @@ def monitoring_page(
         charts=chart_table(charts),
         rate=f"{FALSE_ALARMS_PER_YEAR:g}",
         per_year=SESSIONS_PER_YEAR,
-        image=data_url,
-        style=Markup(read_resource("style.css")),  # ours
     )
 
 
@@ -122,7 +118,7 @@ def fleet_page(status: FleetStatus) -> str:
     """
     place = {one.name: number for number, (one, _) in enumerate(status.by_error)}
     cells = sorted(status.cells, key=lambda one: (*urgency(one), place.get(one.name, len(place))))
-    return render(
+    return html_page(
         "fleet.html.j2",
         name=status.folder.resolve().name,
         status=status,
@@ -131,7 +127,6 @@ def fleet_page(status: FleetStatus) -> str:
         cells=cells,
         table=cell_table(cells),
         note=ERRORS_NOTE,
-        style=Markup(read_resource("style.css")),  # ours
     )
 
 
@@ -153,7 +148,7 @@ def comparison_page(
     """
     first, second = models
     sentences, warnings = texts
-    return render(
+    return html_page(
         "comparison.html.j2",
         names=(first, second),
         models=models,
@@ -166,8 +161,6 @@ def comparison_page(
         rows=() if rows is None else comparison_tables(rows, "the rows", PAGE_WIDTH),
         sentences=sentences,
         warnings=warnings,
-        image=data_url,
-        style=Markup(read_resource("style.css")),  # ours
     )
 
 

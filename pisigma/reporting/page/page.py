@@ -35,6 +35,8 @@ from pisigma.validation.report.error_map import ErrorMap
 
 _ESCAPED = {ord(mark): f"\\u{ord(mark):04x}" for mark in "<>&\u2028\u2029"}
 _PACKAGE = "pisigma.reporting.page"
+RESOURCES = {"style": "style.css", "common_script": "copies.js"}
+"""Files of this folder that every page contains, by their names in templates."""
 
 
 def render_page(content: ReportContent, figures: ReportFigures, acceptance: Acceptance | None = None) -> str:
@@ -45,7 +47,7 @@ def render_page(content: ReportContent, figures: ReportFigures, acceptance: Acce
         figures: its figures.
         acceptance: statements by which the robot of a cell is accepted; None without a cell.
     """
-    return render(
+    return html_page(
         "page.html.j2",
         c=content,
         a=acceptance,
@@ -57,12 +59,21 @@ def render_page(content: ReportContent, figures: ReportFigures, acceptance: Acce
         names_text=names_text,
         map_text=map_text(content.map),
         parameter_table=parameter_table,
-        image=data_url,
         png=lambda png: _address("png", png),
         map_data=script_json(map_data(content.map, content.model.robot)),
-        style=Markup(read_resource("style.css")),  # ours
         script=Markup(read_resource("viewer.js")),
     )
+
+
+def html_page(template: str, **content: object) -> str:
+    """Render a page with the style, the script and the images of all pages; texts are escaped.
+
+    Args:
+        template: file of the folder `templates` that extends `base.html.j2`.
+        content: values by the names in the template.
+    """
+    ours = {name: Markup(read_resource(file)) for name, file in RESOURCES.items()}
+    return render(template, image=data_url, **ours, **content)
 
 
 def _acceptance(acceptance: Acceptance) -> dict[str, Any]:

@@ -300,6 +300,15 @@
     if (event.ctrlKey || event.metaKey || event.altKey || !keys[event.key]) return;
     event.preventDefault(); keys[event.key]();
   });
+  byId("viewer").csv = () => {
+    const names = ["row", "frame", "target", ...data.joints.map((joint) => `${joint.name} [${joint.unit}]`), "x [mm]", "y [mm]", "z [mm]", ...layers.map((layer) => `${layer.label} [${layer.unit}]`)];
+    const number = (v) => (Number.isFinite(v) ? String(Number(v.toPrecision(6))) : "");
+    const rows = Array.from(row, (one, i) => [
+      number(one), data.frames[frame[i]] ?? "", data.targets[target[i]] ?? "", ...data.joints.map((_, j) => number(q[dof * i + j])),
+      ...[0, 1, 2].map((a) => number(place[3 * i + a])), ...layers.map((layer) => number(layer.values[i])),
+    ]);
+    return [names, ...rows];
+  };
   new ResizeObserver(fit).observe(canvas);
   window.matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
   if (layers.length) show(state.layer);

@@ -85,12 +85,12 @@ def hostile_page(tmp_path_factory):
 def test_hostile_names_are_text(hostile_page):
     content, text = hostile_page
     found = Page(text)
-    assert found.elements.count("script") == 2
+    assert found.elements.count("script") == 3
     assert "b" not in found.elements
-    assert text.count("</script>") == 2
+    assert text.count("</script>") == 3
     assert "onerror=alert(2)>" not in text
     assert any(HOSTILE in word for word in found.words)
-    data = json.loads(found.scripts[0])
+    data = json.loads(found.scripts[1])
     assert HOSTILE in data["frames"]
     assert "</table><b>floor" in data["frames"]
     assert len(content.frames.names) == 2
@@ -114,7 +114,7 @@ def test_json_cannot_end_its_element():
 
 def test_the_map_holds_what_the_content_says(hostile_page):
     content, text = hostile_page
-    data = json.loads(Page(text).scripts[0])
+    data = json.loads(Page(text).scripts[1])
     unpack = lambda packed: np.frombuffer(base64.b64decode(packed), "<f4")  # noqa: E731
     assert_close(unpack(data["place"]).reshape(-1, 3), content.map.place, rtol=1e-6, atol=1e-3)
     for stored, layer in zip(data["layers"], content.map.layers, strict=True):
@@ -166,13 +166,13 @@ def test_of_very_many_rows_the_worst_are_shown(tmp_path, monkeypatch):
     assert content.map.rows == 1_000
 
 
-def test_figures_are_written_as_png_and_svg(tmp_path):
+def test_figures_are_written_as_png_svg_and_csv(tmp_path):
     arm, model = geometric_under_test()
     drawings = draw_figures(report_content(model, tmp_path, measured(arm, 60, seed=9))).all[:3]
     written = write_figures(drawings, tmp_path / "figures")
-    assert len(written) == 2 * len(drawings)
-    assert all(path.stat().st_size > 1000 for path in written)
-    assert {path.suffix for path in written} == {".png", ".svg"}
+    assert len(written) == 3 * len(drawings)
+    assert all(path.stat().st_size > 500 for path in written)
+    assert {path.suffix for path in written} == {".png", ".svg", ".csv"}
     (tmp_path / "file").write_text("")
     with refused(OutputError, option="--figures", file="file"):
         check_figures(tmp_path / "file")
