@@ -31,7 +31,11 @@ def acceptance_sentences(acceptance: Acceptance) -> tuple[str, ...]:
     if acceptance.limit_mm is not None:
         lines.append(f"The limit is {acceptance.limit_mm:g} mm.")
     if measured is not None and measured.fitted:
-        lines.append(f"The {' and the '.join(measured.fitted)} was fitted to these rows, as it was changed.")
+        several = len(measured.fitted) > 1
+        lines.append(
+            f"The {' and the '.join(measured.fitted)} {'were' if several else 'was'} fitted to these rows, as "
+            f"{'they were' if several else 'it was'} changed."
+        )
     if measured is not None and measured.doubt:
         lines.append(measured.doubt)
     if acceptance.contradicted:

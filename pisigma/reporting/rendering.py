@@ -5,9 +5,11 @@ import re
 from pathlib import Path
 
 import jinja2
+from markupsafe import Markup, escape
 
 from pisigma.files.model_files import CARD
 from pisigma.files.templates import template_environment
+from pisigma.reporting.result_text import Table
 from pisigma.reporting.tables import (
     distance_table,
     figure_text,
@@ -40,6 +42,20 @@ def write_card(folder: Path, template: str, **content: object) -> None:
     (folder / CARD).write_text(render(template, **content) + "\n", encoding="utf-8")
 
 
+def code(line: str) -> Markup:
+    """Escape a sentence for a page, and show its commands, which are in backquotes, as code."""
+    return Markup(re.sub("`([^`]+)`", r"<code>\1</code>", str(escape(line))))
+
+
+def text_columns(table: Table) -> tuple[bool, ...]:
+    """Return which columns of a table contain texts, which are left-aligned, rather than numbers."""
+    stated = [[Markup(cell).striptags() for cell in cells if cell] for cells in zip(*table.rows, strict=True)]
+    texts = ([one for one in cells if re.search(r"[^\W\d_]{2}", one)] for cells in stated)
+    return tuple(2 * len(text) > len(cells) for text, cells in zip(texts, stated, strict=True)) or (
+        True,
+    ) * len(table.columns)
+
+
 def file_name(text: str) -> str:
     """Replace the characters that file names cannot have."""
     return re.sub(r"[^\w.-]", "_", text) or "figure"
@@ -52,7 +68,8 @@ def _environment() -> jinja2.Environment:
         {
             "figure": figure_text,
             "digits": "{:.4g}".format,
-            "file_name": file_name,
+            "code": code,
+            "text_columns": text_columns,
             "pose_table": pose_table,
             "joint_table": joint_table,
             "distance_table": lambda distances: markdown_table(*distance_table(distances)),

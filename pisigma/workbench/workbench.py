@@ -36,7 +36,12 @@ from pisigma.workflow.cell.exports import NONE, set_controller
 Form = Mapping[str, str]
 STATUS_AGE = 5.0
 """Age after which the status is read again [s], because commands may change the cell as well."""
-STATIC = {"workbench.js": "text/javascript", "workbench.css": "text/css"}
+STATIC = {
+    "workbench.js": ("text/javascript", "pisigma.workbench", "static"),
+    "workbench.css": ("text/css", "pisigma.workbench", "static"),
+    "copies.js": ("text/javascript", "pisigma.reporting", "page"),
+}
+"""Type, package and folder of the files of the page."""
 NO_CELL = {"state": "no_cell", "reason": "the folder has no cell yet", "command": "pisigma new"}
 """Next step of a folder without a cell."""
 MAX_PERSON, MAX_COMMAND = 60, 2000
@@ -192,8 +197,9 @@ class Workbench:
         name = request.match_info["name"]
         if name not in STATIC:
             raise web.HTTPNotFound
-        text = resources.files("pisigma.workbench").joinpath("static", name).read_text(encoding="utf-8")
-        return web.Response(text=text, content_type=STATIC[name])
+        kind, package, folder = STATIC[name]
+        text = resources.files(package).joinpath(folder, name).read_text(encoding="utf-8")
+        return web.Response(text=text, content_type=kind)
 
     @answers
     async def _download(self, request: web.Request) -> web.StreamResponse:

@@ -15,6 +15,7 @@ from pisigma.files.errors import MeasurementError, ModelError, Place
 from pisigma.files.model_files import model_hash
 from pisigma.files.output_file import check_page, write_whole
 from pisigma.files.progress import Progress
+from pisigma.lifetime.cell.history import HISTORY, History
 from pisigma.lifetime.cell.layout import cell_of_model, history_of_model
 from pisigma.lifetime.monitoring.charts import FALSE_ALARMS_PER_YEAR, SESSIONS_PER_YEAR, Chart
 from pisigma.lifetime.monitoring.history import (
@@ -198,8 +199,29 @@ class Monitoring:
         from pisigma.reporting.page.lifetime import monitoring_page  # matplotlib takes a second
 
         check_page(Path(page))
-        lines = (self.sentences, self.warnings)
-        write_whole(Path(page), monitoring_page(self.model, self.records, self.charts, *lines))
+        content = monitoring_page(
+            self.model,
+            self.records,
+            self.charts,
+            self.sentences,
+            self.warnings,
+            [
+                (one.date, one.file, " ".join(said.sentence for said in one.diagnostics))
+                for one in self.untrusted
+            ],
+            self._marks(),
+            None if self.forecast is None else self.forecast.limit_mm,
+        )
+        write_whole(Path(page), content)
+
+    def _marks(self) -> dict[str, list[tuple[datetime.date, str]]]:
+        """Return the days of events of the cell for all charts, and of jumps for that of their joint."""
+        events = () if self.cell is None else History(self.cell / HISTORY).events()
+        marks: dict[str, list[tuple[datetime.date, str]]] = {}
+        marks[""] = [(datetime.date.fromisoformat(one.day), one.kind) for one in events]
+        for one in self.jumps:
+            marks.setdefault(one.what, []).append((datetime.date.fromisoformat(one.after), "jump"))
+        return marks
 
 
 def monitor(

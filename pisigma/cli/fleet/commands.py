@@ -111,7 +111,7 @@ def show_fleet(
     if page is not None:
         from pisigma.reporting.page.lifetime import fleet_page
 
-        write_whole(page, fleet_page(seen))
+        write_whole(page, fleet_page(seen, page.parent))
     if as_json:
         print_json(seen.to_json())
     else:

@@ -119,7 +119,7 @@ class Session:
         """The verdict as a clause with a full stop."""
         if self.verdict == "unclear":
             named = (
-                f"{what} ({share:.0%})"
+                f"{what} ({format_probability(share)})"
                 for what, share in self.candidates[:3]
                 if share >= MIN_NAMED_PROBABILITY
             )

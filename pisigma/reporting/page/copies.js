@@ -1,4 +1,4 @@
-// Copy, CSV and PNG of tables and figures, by buttons with data-copy, data-csv and data-png. Every page has this script.
+// Buttons to copy and download every figure and every element of class "data", which has a table. Every page has this script.
 "use strict";
 (() => {
   const quoted = (text) => (/[",\n]/.test(text) ? `"${text.replaceAll('"', '""')}"` : text);
@@ -48,12 +48,28 @@
   document.addEventListener("click", async (event) => {
     const button = event.target.closest("button[data-copy], button[data-csv], button[data-png]");
     if (!button) return;
-    const box = button.closest(".command, figure, .data"), name = box.dataset.name || "table";
+    const box = button.closest(".command, figure, .data"), name = (box.dataset.name || "table").replaceAll(/[^\p{L}\p{N}.-]+/gu, "_");
     try {
       if (button.dataset.csv !== undefined) save(`${name}.csv`, new Blob([csv(box)], { type: "text/csv" }));
       else if (button.dataset.png !== undefined) save(`${name}.png`, await png(box));
       else { await copy(box); answer(button, "Copied"); }
     } catch { answer(button, "Not possible here"); }
   });
+  const equip = () => {
+    for (const box of document.querySelectorAll("figure, .data")) {
+      if (box.querySelector(".copies")) continue;
+      const kinds = box.querySelector("canvas, svg, img") ? ["Copy", "CSV", "PNG"] : ["Copy", "CSV"];
+      const bar = Object.assign(document.createElement("span"), { className: "copies" });
+      bar.append(...kinds.map((kind) => {
+        const button = Object.assign(document.createElement("button"), { type: "button", textContent: kind });
+        button.dataset[kind.toLowerCase()] = "";
+        button.setAttribute("aria-label", `${kind}: ${box.dataset.name || "table"}`);
+        return button;
+      }));
+      (box.querySelector("figcaption") ?? box).append(" ", bar);
+    }
+  };
+  equip();
+  new MutationObserver(equip).observe(document.body, { childList: true, subtree: true });
   addEventListener("beforeprint", () => document.querySelectorAll("details").forEach((one) => { one.open = true; }));
 })();

@@ -51,7 +51,7 @@ def _points_of(axes: Axes) -> Iterator[Point]:
     names = axes.get_xlabel() or "x", axes.get_ylabel() or "y"
     panel = axes.get_title(loc="left") or axes.get_title()
     for line in axes.lines:
-        across = line.get_xdata(orig=True)
+        across: Any = line.get_xdata(orig=True)
         if line.get_transform() == axes.transData and len(across):
             yield from _series(panel, line.get_label(), zip(names, (across, line.get_ydata()), strict=True))
     for steps in (one for one in axes.patches if isinstance(one, StepPatch)):

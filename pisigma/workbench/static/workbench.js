@@ -219,27 +219,6 @@ async function poll() {
   polling = setTimeout(poll, running || dragging ? 300 : 2000);
 }
 
-function csv(table) {
-  const cell = one => { const text = one.innerText.trim(); return /[",\n]/.test(text) ? `"${text.replaceAll('"', '""')}"` : text; };
-  return [...table.rows].map(row => [...row.cells].map(cell).join(",")).join("\n") + "\n";
-}
-
-function save(name, content, type) {
-  const link = document.createElement("a");
-  link.href = typeof content === "string" && content.startsWith("data:") ? content : `data:${type};charset=utf-8,${encodeURIComponent(content)}`;
-  link.download = name;
-  link.click();
-}
-
-function png(figure) {  // the chart with its present colours
-  const svg = figure.querySelector("svg"), copy = svg.cloneNode(true), originals = svg.querySelectorAll("*");
-  copy.querySelectorAll("*").forEach((one, number) => { for (const name of ["fill", "stroke", "stroke-width", "stroke-dasharray", "font-size", "font-family"]) one.style.setProperty(name, getComputedStyle(originals[number]).getPropertyValue(name)); });
-  copy.setAttribute("width", 1200); copy.setAttribute("height", 600);
-  const picture = new Image(), canvas = Object.assign(document.createElement("canvas"), { width: 1200, height: 600 });
-  picture.onload = () => { const pen = canvas.getContext("2d"); pen.fillStyle = getComputedStyle(document.body).backgroundColor; pen.fillRect(0, 0, 1200, 600); pen.drawImage(picture, 0, 0); save("accuracy.png", canvas.toDataURL("image/png")); };
-  picture.src = "data:image/svg+xml;charset=utf-8," + encodeURIComponent(new XMLSerializer().serializeToString(copy));
-}
-
 document.querySelector("nav").addEventListener("click", event => { if (event.target.dataset.tab) show(event.target.dataset.tab); });
 document.querySelector("nav").addEventListener("keydown", event => {
   const step = { ArrowRight: 1, ArrowLeft: -1 }[event.key], all = [...document.querySelectorAll("[role=tab]")];
@@ -251,9 +230,6 @@ content.addEventListener("input", event => { if (event.target.form) say(event.ta
 content.addEventListener("change", event => { if (event.target.id === "files") propose(); else if (event.target.dataset.links !== undefined) offer(event.target); else if (event.target.form) say(event.target.form); });
 content.addEventListener("click", event => {
   const one = event.target;
-  if (one.dataset.copy !== undefined) navigator.clipboard?.writeText(one.parentElement.querySelector("code").textContent);
-  if (one.dataset.csv !== undefined) save("table.csv", csv(one.parentElement.querySelector("table")), "text/csv");
-  if (one.dataset.png !== undefined) png(one.closest("figure"));
   if (one.dataset.again !== undefined) propose(one.form);
   if (one.dataset.clear !== undefined) { for (const field of one.closest("fieldset").elements) field.value = ""; }
   if (one.dataset.discard !== undefined) { kept[tab].forms = {}; show(tab); if (dragging) steps("drag", {}); }

@@ -51,7 +51,7 @@ def test_status_prints_and_writes_a_page(plant, run):
     assert shown.exit_code == 3, shown.output
     assert_screen(shown.stdout, "1 file_refused", "cell2: ", "not_verified")
     text = page.read_text(encoding="utf-8")
-    assert '<tr data-state="file_refused">' in text
+    assert '<span class="badge bad">file refused</span>' in text
     assert "<b>" not in text
     assert 'src="http' not in text
     of_folder = run("status", folder / "cells", "--json")
