@@ -126,18 +126,15 @@ class GravityTorques(AbstractFeature):
     def _frames(self, q: Float[Tensor, "poses dof"]) -> tuple[Tensor, Tensor, Tensor]:
         """Return axis and origin of every joint, and origin and axes of its row's frame; the pose index is last."""
         geometry = Geometry(self.robot.dh.tolist(), [0.0] * 6, [0.0] * 6)
-
-        def vector(values: tuple[float | Tensor, ...]) -> Tensor:
-            return torch.stack([value * torch.ones_like(q[:, 0]) for value in values])
-
-        found = []
         columns = q.t().contiguous().unbind(0)
+        values: list[float | Tensor] = []
         for row, step in zip(self.robot.rows, iterate_rows(self.robot, geometry, columns), strict=True):
             if row.type != "fixed":
-                carried = torch.stack([vector(part) for part in (step.after[3], *step.after[:3])])
-                found.append((vector(step.before[2]), vector(step.before[3]), carried))
-        z, p, carried = (torch.stack(part) for part in zip(*found, strict=True))
-        return z, p, carried
+                for part in (*step.before[2:], step.after[3], *step.after[:3]):
+                    values += part
+        whole = [value if isinstance(value, Tensor) else q.new_full(q.shape[:1], value) for value in values]
+        frames = torch.stack(whole).view(self.robot.dof, 6, 3, len(q))
+        return frames[:, 0], frames[:, 1], frames[:, 2:]
 
     def pack(self, weight: Float64[np.ndarray, "dof columns"]) -> Float64[np.ndarray, " values"]:
         """Return the direction of gravity, and the scaled weights of every joint and moved row."""

@@ -1,5 +1,6 @@
 """Residuals of a calibration in the order of the file, with their derivatives."""
 
+import contextlib
 import hashlib
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -213,5 +214,13 @@ def inverse_of(normal: Float64[np.ndarray, "unknowns unknowns"]) -> Float64[np.n
     """Invert a normal matrix with column scaling; undetermined directions get variance 0."""
     scale = 1 / np.sqrt(np.maximum(normal.diagonal(), 1e-300))
     scales = scale * scale[:, None]
-    inverse: np.ndarray = np.linalg.pinv(normal * scales, rcond=UNDETERMINED, hermitian=True) * scales
+    scaled = normal * scales
+    with contextlib.suppress(np.linalg.LinAlgError):
+        root = np.linalg.cholesky(scaled)
+        inverse: np.ndarray = np.linalg.inv(root)
+        inverse = inverse.T @ inverse
+        # The sums of rows bound the largest eigenvalues of both, so that every direction is determined.
+        if np.abs(scaled).sum(0).max() * np.abs(inverse).sum(0).max() * UNDETERMINED < 1:
+            return inverse * scales
+    inverse = np.linalg.pinv(scaled, rcond=UNDETERMINED, hermitian=True) * scales
     return inverse
