@@ -95,7 +95,7 @@ class CellScene:
         """Return the positions of all objects that can be dragged [mm], and the yaw angles of boxes [deg]."""
         places: dict[str, str] = {}
         for name, node in ({} if self._scene is None else self._scene.handles).items():
-            key, at = f"surroundings.{name}", [f"{1e3 * one:.1f}" for one in node.position]
+            key, at = f"surroundings.{name}", [f"{1e3 * one:.1f}".removesuffix(".0") for one in node.position]
             if name == "tracker":
                 places |= {f"{key}.{axis}_mm": one for axis, one in zip("xyz", at, strict=True)}
             else:

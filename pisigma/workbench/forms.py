@@ -143,7 +143,7 @@ def _section(section: type[Section], stated: Any, prefix: str) -> Iterator[Field
                 yield from _section(item, one, f"{key}.{number}.")
         elif get_origin(kind) is not dict:
             limits = " and ".join(filter(None, map(_bound, bounds)))
-            default = "" if info.is_required() else _text(info.default) or "not stated"
+            default = "required" if info.is_required() else _text(info.default) or "not stated"
             meaning = meanings.get(name, "").partition("; None")[0]
             help_ = f"{meaning[:1].upper()}{meaning[1:]}"
             yield Field(key, help_, *_kind(kind), limits, default, _text(value))

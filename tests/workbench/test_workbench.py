@@ -10,6 +10,7 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from urllib.parse import quote
 
+import numpy as np
 import pytest
 from testing.cell_rows import ROBOT, day, measured
 from testing.models import no_type_checker
@@ -20,7 +21,7 @@ from typer.testing import CliRunner
 pytest.importorskip("viser", reason="the extra view is not installed")
 
 from pisigma.cli.main import app
-from pisigma.files.errors import fault_of_machine
+from pisigma.files.errors import PlanningError, fault_of_machine
 from pisigma.lifetime.cell.layout import CELL_FILE
 from pisigma.workbench.job import BusyError, Jobs, Outcome
 from pisigma.workbench.tabs import TABS
@@ -153,6 +154,66 @@ def test_a_setting_can_be_changed(browser_with_link, bench, cell):
         assert "changed since" in ended(browser_with_link, bench, "cell", text=before, seen=stale).refusal
     assert Cell.open(cell.folder).file.document.limit_mm == 0.4
     assert ended(browser_with_link, bench, "cell", text=before, seen=seen(browser_with_link)).refusal == ""
+
+
+def test_what_was_dragged_is_written_and_can_be_undone(browser_with_link, bench, cell):
+    text = cell.file.path.read_text()
+    box = {"name": HOSTILE, "center_mm": "700, 0, 50.5", "size_mm": "100, 200, 101"}
+    fields = {f"surroundings.boxes.0.{key}": value for key, value in box.items()}
+    fields["surroundings.tracker.z_mm"] = "900"
+    assert state(browser_with_link)["dragged"] == {"turn": 0, "values": {}}
+    digest = seen(browser_with_link)
+    refused = ended(browser_with_link, bench, "cell", seen=digest, **fields)
+    assert refused.field == "surroundings.tracker.x_mm"
+    fields |= {"surroundings.tracker.x_mm": "3000", "surroundings.tracker.y_mm": "-10"}
+    assert ended(browser_with_link, bench, "cell", seen=digest, **fields).refusal == ""
+    turn = json.loads(browser_with_link.ask("/drag", "POST", '{"on": "true"}').body)["turn"]
+    handles = bench._scene._scene.handles
+    handles["boxes.0"].wxyz = (np.cos(np.pi / 8), 0, 0, np.sin(np.pi / 8))
+    handles["tracker"].position = (3, -0.01, 0.8)
+    found = state(browser_with_link)["dragged"]
+    values = {"surroundings.boxes.0.yaw_deg": "45.00", "surroundings.tracker.z_mm": "800"}
+    assert found == {"turn": turn, "values": values}
+    assert ended(browser_with_link, bench, "cell", seen=seen(browser_with_link), **values).refusal == ""
+    written = Cell.open(cell.folder).file.document.surroundings
+    assert (written.boxes[0].center_mm, written.boxes[0].yaw_deg) == ((700, 0, 50.5), 45)
+    assert (written.boxes[0].name, written.tracker.z_mm) == (HOSTILE, 800)
+    assert HOSTILE not in browser_with_link.ask("/tab/cell").body.decode()
+    for _ in range(2):
+        last = seen(browser_with_link)
+        assert ended(browser_with_link, bench, "cell", undo=last).refusal == ""
+    assert ended(browser_with_link, bench, "cell", undo=last).refusal
+    assert cell.file.path.read_text() == text
+
+
+def test_an_empty_folder_becomes_a_cell_once(tmp_path):
+    folder = tmp_path / "new"
+    with no_type_checker(), Workbench(folder, port=0) as new:
+        first, second = visitor(new.url), visitor(new.url)
+        assert state(first)["next"]["state"] == "no_cell"
+        assert ended(first, new, "plan").refusal
+        for form in (
+            {},
+            {"robot": "/etc/passwd"},
+            {"robot": str(folder)},
+            {"robot": "ur5", "limit_mm": HOSTILE},
+            {"robot": "ur5", "limit_mm": "-1"},
+            {"robot": "ur5", "sensor": HOSTILE},
+            {"file": "7"},
+            {"file": upload(first, "a.urdf", b"<robot/>")},
+        ):
+            assert ended(first, new, "new", **form).refusal, form
+            assert first.ask("/tab/status").status == 200
+        assert first.ask("/upload?name=a.urdf&links", "POST", HOSTILE.encode()).status == 422
+        assert not folder.exists()
+        assert list(tmp_path.iterdir()) == []
+        assert ended(first, new, "new", robot="ur5", limit_mm="0.3").refusal == ""
+        assert ended(second, new, "new", robot="ur10").refusal
+        assert state(second)["next"] == Cell.open(folder).status().step.to_json()
+        assert Cell.open(folder).robot.name == "ur5"
+        assert "data-step" in second.ask("/tab/plan").body.decode()
+    with pytest.raises(PlanningError):
+        Workbench(tmp_path, port=0)
 
 
 def test_a_cell_file_that_breaks_during_a_step_is_named_as_the_fault(

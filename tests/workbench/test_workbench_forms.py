@@ -75,6 +75,8 @@ def test_every_command_that_a_form_shows_can_be_read(browser, bench, tmp_path, c
 
 
 def test_a_text_is_kept_until_it_is_saved_and_no_other_is_replaced(browser, bench, cell):
+    from playwright.sync_api import expect
+
     text = cell.file.path.read_text()
     changed = text.replace("limit_mm: 0.5", "limit_mm: 0.25")
     with opened(browser, bench.url) as first, opened(browser, bench.url) as second:
@@ -87,6 +89,10 @@ def test_a_text_is_kept_until_it_is_saved_and_no_other_is_replaced(browser, benc
         assert first.input_value("[name=text]") == "limit_mm: 'wrong"
         second.fill("[name=text]", f"{text}\n# of the second\n")
         first.fill("[name=text]", changed)
+        second.fill("[name=limit_mm]", "0.75")
+        show(second, "plan")
+        second.fill("[name=count]", "17")
+        show(second, "cell")
         press(first, bench)
         assert first.query_selector(".refusal") is None
         assert first.input_value("[name=text]") == changed
@@ -94,6 +100,12 @@ def test_a_text_is_kept_until_it_is_saved_and_no_other_is_replaced(browser, benc
         assert "changed since" in second.inner_text(".refusal")
         assert second.input_value("[name=text]").endswith("# of the second\n")
         assert cell.file.path.read_text() == changed
+        assert second.input_value("[name=limit_mm]") == "0.75"
+        second.press("form[data-name=text] [data-discard]", "Enter")
+        expect(second.locator("[name=limit_mm]")).to_have_value("0.25")
+        assert second.input_value("[name=text]") == changed
+        show(second, "plan")
+        assert second.input_value("[name=count]") == "17"
         press(first, bench)
         assert first.query_selector(".refusal") is None
     assert CellFile.read(cell.folder).document.limit_mm == 0.25

@@ -20,12 +20,14 @@ async function ask(path, body, type = "application/json") {
 const steps = (path, form) => ask(`${path}?person=${encodeURIComponent(person.value)}`, JSON.stringify(form));
 
 const kept = {};  // the forms of every tab as people left them, and what else a tab had open
-const started = new Map();  // steps that were started here, with the number of steps that had ended by then
+const started = {};  // the form by which a step was started here, and the number of steps that had ended by then
 let proposal = null, dragging = 0;
+
+const keyOf = form => `${form.dataset.step} ${form.dataset.name || form.dataset.command}`;
 
 function keep(parts, forms) {  // a form that the server sends unchanged stays as it is; else what was typed is copied
   for (const form of parts.querySelectorAll("form")) {
-    const key = `${form.dataset.step} ${form.dataset.name || form.dataset.command}`, before = forms[key], served = form.outerHTML;
+    const key = keyOf(form), before = forms[key], served = form.outerHTML;
     if (before?.served === served) form.replaceWith(before.form);
     else {
       if (before) copy(before.form, form);
@@ -34,25 +36,31 @@ function keep(parts, forms) {  // a form that the server sends unchanged stays a
   }
 }
 
+const nameOf = details => details.dataset.name || details.querySelector("summary").textContent;
+
 async function show(name) {
   wanted = name;
   const text = await (await ask(`tab/${name}`)).text(), parts = document.createElement("div");
   if (wanted !== name) return;  // another tab was chosen meanwhile
   const top = name === tab ? content.scrollTop : 0, focus = document.activeElement;
+  const place = focus.form && name === tab ? [keyOf(focus.form), focus.name] : [];
   parts.innerHTML = text;
-  if (kept[tab]) kept[tab].open = [...content.querySelectorAll("details[open] > summary")].map(one => one.textContent);
+  if (kept[tab]) kept[tab].open = [...content.querySelectorAll("details[open]")].map(nameOf);
   const left = kept[name] ||= { forms: {}, open: [] };
-  for (const one of parts.querySelectorAll(".outcome")) if (started.get(one.dataset.step) < ended) {
-    started.delete(one.dataset.step);
-    if (one.classList.contains("refused")) continue;
-    for (const [key, { form }] of Object.entries(left.forms)) if (form.dataset.step === one.dataset.step && form.dataset.once !== undefined) delete left.forms[key];
+  let refused = "";
+  for (const one of parts.querySelectorAll(".outcome")) if (started[one.dataset.step]?.ended < ended) {
+    const { form } = started[one.dataset.step];
+    delete started[one.dataset.step];
+    if (one.classList.contains("refused")) { refused = one.dataset.step; continue; }
+    if (form.dataset.once !== undefined) delete left.forms[keyOf(form)];
     if (one.dataset.step === "import") proposal = null;
   }
   keep(parts, left.forms);
   if (proposal) parts.querySelector("#proposal")?.append(proposal);
   content.replaceChildren(...parts.childNodes);
-  content.querySelectorAll("details > summary").forEach(one => { if (left.open.includes(one.textContent)) one.parentElement.open = true; });
-  if (name === tab && content.contains(focus)) focus.focus({ preventScroll: true });
+  content.querySelectorAll("details").forEach(one => { one.open ||= left.open.includes(nameOf(one)); });
+  const [form, field] = [left.forms[place[0]]?.form, place[1]];  // the form may be a new one
+  if (form) (form.elements[field] || form.querySelector("[type=submit]")).focus({ preventScroll: true });
   content.scrollTop = top;
   tab = name;
   for (const button of document.querySelectorAll("[role=tab]")) {
@@ -64,7 +72,7 @@ async function show(name) {
   content.setAttribute("aria-labelledby", "tab-" + name);
   content.querySelectorAll("small.fault").forEach(one => one.remove());
   content.querySelectorAll("[aria-invalid]").forEach(one => one.removeAttribute("aria-invalid"));
-  content.querySelectorAll(".outcome[data-field]").forEach(mark);
+  content.querySelectorAll(".outcome[data-field]").forEach(one => mark(one, one.dataset.step === refused));
   content.querySelectorAll("form").forEach(say);
   lock();
 }
@@ -139,10 +147,11 @@ function point(form, name) {  // show which field is at fault
   return field;
 }
 
-function mark(outcome) {  // put the reason of a refusal next to its field
+function mark(outcome, isNew) {  // put the reason of a refusal next to its field
   for (const form of content.querySelectorAll(`form[data-step="${outcome.dataset.step}"]`)) {
     const field = point(form, outcome.dataset.field), text = outcome.querySelector(".refusal")?.textContent;
     if (!field || !text || field.parentElement.querySelector(".fault")) continue;
+    if (isNew) field.focus();
     field.after(Object.assign(document.createElement("small"), { className: "fault", textContent: text }));
   }
 }
@@ -169,7 +178,7 @@ async function start(form) {
     if (form.dataset.go !== undefined) return show(form.dataset.tabOf);
     for (const one of form.querySelectorAll("[data-upload]")) if (one.files.length) fields[one.dataset.upload] = (await upload(one.files[0])).file;
     await steps(`step/${form.dataset.step}`, fields);
-    started.set(form.dataset.step, ended);
+    started[form.dataset.step] = { form, ended };
     if (form.dataset.tabOf && form.dataset.tabOf !== tab) await show(form.dataset.tabOf);
     await poll();
   } catch (problem) { fault(form, problem); }
