@@ -8,6 +8,7 @@ cells with the manifest of a checkout of an earlier version (`--before FOLDER`),
 import argparse
 import json
 import os
+import resource
 import shutil
 import signal
 import subprocess
@@ -87,15 +88,15 @@ def results(out: str) -> list[dict[str, object]]:
     return rows
 
 
-def seconds_of(words: list[str], checkout: Path) -> float:
-    """Return the seconds of a command of a checkout."""
+def seconds_of(words: list[str], checkout: Path) -> tuple[float, float]:
+    """Return the seconds of a command of a checkout, and the CPU seconds, which hardly depend on other processes."""
     environment = os.environ | {"PYTHONPATH": os.fspath(checkout)}
-    started = time.monotonic()
+    started, used = time.monotonic(), sum(resource.getrusage(resource.RUSAGE_CHILDREN)[:2])
     done = subprocess.run(
         [sys.executable, "-m", "pisigma", *words], env=environment, capture_output=True, check=False
     )
     assert done.returncode in (0, 3), done.stderr.decode()
-    return time.monotonic() - started
+    return time.monotonic() - started, sum(resource.getrusage(resource.RUSAGE_CHILDREN)[:2]) - used
 
 
 def before(robots: int, earlier: Path, repeats: int) -> None:
@@ -111,12 +112,10 @@ def before(robots: int, earlier: Path, repeats: int) -> None:
             ("status --json", ["fleet", "status", old, "--json"], ["fleet", "status", new, "--json"]),
         ):
             jobs = ["--jobs", "2"] if "run" in name else []
-            seconds = [
-                seconds_of([*of_manifest, *jobs], earlier),
-                seconds_of([*of_cells, *jobs], here),
-            ]
-            ratios.setdefault(name, []).append(seconds[1] / seconds[0])
-            print(f"{name}: manifest {seconds[0]:.1f} s, cells {seconds[1]:.1f} s", flush=True)
+            of_old, of_new = seconds_of([*of_manifest, *jobs], earlier), seconds_of([*of_cells, *jobs], here)
+            for clock, old_seconds, new_seconds in zip(("", " (CPU)"), of_old, of_new, strict=True):
+                ratios.setdefault(f"{name}{clock}", []).append(new_seconds / old_seconds)
+                print(f"{name}{clock}: manifest {old_seconds:.1f} s, cells {new_seconds:.1f} s", flush=True)
     for name, found in ratios.items():
         print(f"{robots} robots, {name}: cells take {np.median(found):.2f} times as long, of {sorted(found)}")
 

@@ -14,7 +14,7 @@ from pisigma.cli.output import print_json, print_line, print_lines, print_table,
 from pisigma.cli.settings_options import Group, StatedSettings
 
 if TYPE_CHECKING:
-    from pisigma.lifetime.cell.facts import CellStatus
+    from pisigma.lifetime.cell.status import CellStatus
     from pisigma.workflow.cell.cell import Cell
 
 CellFolder = Annotated[Path, typer.Argument(metavar="CELL", help="Folder of a cell.")]

@@ -2,8 +2,8 @@
 
 from collections.abc import Iterable
 
-from pisigma.lifetime.cell.facts import CellStatus
-from pisigma.lifetime.cell.status import ATTENTION
+from pisigma.lifetime.cell.status import CellStatus
+from pisigma.lifetime.cell.step import ATTENTION
 from pisigma.lifetime.fleet.status import UNREADABLE, FleetStatus
 from pisigma.reporting.result_text import Table
 from pisigma.reporting.verdict import Verdict, counted, rounded

@@ -11,8 +11,8 @@ from pisigma.deployment.export.targets import POSE_COLUMNS
 from pisigma.files.errors import ModelError, check_choice
 from pisigma.files.templates import template_environment
 from pisigma.lifetime.cell.events import EventKind
-from pisigma.lifetime.cell.facts import CellStatus
 from pisigma.lifetime.cell.layout import CELL_FILE, EXPORTS, MODELS, PLANS
+from pisigma.lifetime.cell.status import CellStatus
 from pisigma.planning.plan_file import yaml_of
 from pisigma.reporting.result_text import merge_alike_warnings
 from pisigma.robot.robot_file import catalogue

@@ -21,7 +21,7 @@ from pisigma.files.errors import (
     fault_of_machine,
 )
 from pisigma.files.progress import Progress
-from pisigma.lifetime.cell.facts import CellStatus
+from pisigma.lifetime.cell.status import CellStatus
 from pisigma.robot.urdf_file import read_urdf
 from pisigma.workbench import steps
 from pisigma.workbench.cell_scene import CellScene

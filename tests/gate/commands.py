@@ -10,7 +10,7 @@ from testing.measured_plans import measured_plan
 from testing.models import no_type_checker
 
 from pisigma.files.errors import AcceptanceError, PisigmaError
-from pisigma.lifetime.cell.status import ATTENTION
+from pisigma.lifetime.cell.step import ATTENTION
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.folder.model_folder import save_model
 from pisigma.planning.plan_settings import PlanSettings

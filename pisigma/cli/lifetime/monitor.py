@@ -15,7 +15,7 @@ from pisigma.cli.settings_options import StatedSettings, takes_settings
 from pisigma.workflow.settings.monitoring import MonitorSettings
 
 if TYPE_CHECKING:
-    from pisigma.lifetime.cell.facts import CellStatus
+    from pisigma.lifetime.cell.status import CellStatus
     from pisigma.workflow.cell.cell import Cell
     from pisigma.workflow.monitor import Monitoring
 

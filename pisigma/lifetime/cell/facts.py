@@ -3,8 +3,9 @@
 import datetime
 import hashlib
 import os
+import shlex
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,11 +13,10 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from pisigma.files.errors import PlanningError
 from pisigma.files.yaml_file import read_yaml
-from pisigma.lifetime.cell.controller import Controller, records
+from pisigma.lifetime.cell.controller import Controller, valid_sessions
+from pisigma.lifetime.cell.events import Event
 from pisigma.lifetime.cell.history import HISTORY, Check, History, ModelEntry, SessionEntry
 from pisigma.lifetime.cell.layout import CELL_FILE, PLANS, SESSIONS, newest_plan
-from pisigma.lifetime.cell.status import CellFacts, next_step
-from pisigma.lifetime.cell.step import COMPUTED, Step
 from pisigma.measurement.dates import date_in_name
 
 BEFORE_FIT = ("plan", "import")
@@ -25,63 +25,88 @@ MIN_MEASURED_SHARE = 0.9
 """Smallest share of the poses of a plan after which it counts as measured; some poses may be out of sight."""
 
 
+NOT_TRUSTED = ("implausible", "setup_fault", "not_trusted")
+"""Verdicts of `verify`, `monitor` and `recalibrate` after which nothing is concluded from a session."""
+
+
 @dataclass(frozen=True)
-class CellStatus:
-    """Status of a cell.
+class CellFacts:
+    """Facts about a cell from which the rules derive its next step.
 
     Attributes:
-        facts: facts from which the next step was derived.
-        step: the next step.
+        folder: folder of the cell, as the user named it.
+        plans: names of the plans.
+        sessions: all sessions in the order of their days.
+        edited: names of sessions whose files were changed or removed after they were added.
+        events: all events in the order of their days.
+        models: all models in the order in which they were made.
+        checks: all checks in the order in which they were made.
+        in_use: the model in use; None if there is none.
+        limit_mm: limit of the 95 % quantile of the position errors [mm]; None if there is none.
+        today: day (ISO 8601).
+        not_taken_in: names of the files in `sessions/` that are not in the history yet, by their dates.
+        not_read: names of the files in `sessions/` that are not measurement files and were not imported.
+        plans_nothing: why no poses can be planned; "" if they can.
+        incomplete: how many poses of the newest plan have been measured, if they are too few; else "".
+        controller: what was active on the controller when.
     """
 
-    facts: CellFacts
-    step: Step
+    folder: str
+    plans: tuple[str, ...]
+    sessions: tuple[SessionEntry, ...]
+    edited: tuple[str, ...]
+    events: tuple[Event, ...]
+    models: tuple[ModelEntry, ...]
+    checks: tuple[Check, ...]
+    in_use: ModelEntry | None
+    limit_mm: float | None
+    today: str
+    not_taken_in: tuple[str, ...] = ()
+    not_read: tuple[str, ...] = ()
+    plans_nothing: str = ""
+    incomplete: str = ""
+    controller: Controller = field(default_factory=Controller)
 
     @property
-    def name(self) -> str:
-        """Name of the folder of the cell."""
-        return Path(self.facts.folder).name
+    def valid_sessions(self) -> tuple[SessionEntry, ...]:
+        """Sessions that describe the present arm; see `valid_sessions`."""
+        return valid_sessions(self.sessions, self.events, self.controller)
 
     @property
-    def is_due(self) -> bool:
-        """Whether there are steps that need neither new rows nor a decision of a person."""
-        return self.step.verb is not None or self.step.state in ("not_taken_in", "file_refused")
+    def newest_model(self) -> ModelEntry | None:
+        """The newest model that was fitted to valid sessions only; None if there is none."""
+        valid = {one.name for one in self.valid_sessions}
+        made = [one for one in self.models if one.made_of and valid.issuperset(one.made_of)]
+        return made[-1] if made else None
 
     @property
-    def last_error(self) -> Check | None:
-        """The last check that found an RMS error of the model in use or, if there is none, of the newest model."""
-        model = self.facts.in_use or (self.facts.models[-1] if self.facts.models else None)
-        checks = [] if model is None else self.facts.errors_of(model.name, *COMPUTED)
-        known = [one for one in checks if one.rms_mm is not None]
-        return known[-1] if known else None
+    def unmeasured_plan(self) -> str:
+        """What the newest plan contains, if no session was added after it was made; else ""."""
+        planned = [one for one in self.checks if one.command == "plan"]
+        newest = max((one.taken_in for one in self.sessions), default="")
+        return planned[-1].summary if planned and planned[-1].checked > newest else ""
 
-    def to_json(self) -> dict[str, Any]:
-        """Return the status as plain values; `next.command` and `next.reason` are the next step."""
-        facts, model = self.facts, self.facts.in_use
-        return {
-            "cell": facts.folder,
-            "model": None if model is None else model.name,
-            "made_of": [] if model is None else list(model.made_of),
-            "p95_mm": None if model is None else model.p95_mm,
-            "limit_mm": facts.limit_mm,
-            "controller": records(facts.controller.active()),
-            "plans": list(facts.plans),
-            "sessions": [
-                {
-                    "name": one.name,
-                    "day": one.day,
-                    "rows": one.rows,
-                    "set_aside": one.set_aside or None,
-                    "controller": records(facts.controller.during(one)),
-                }
-                for one in facts.sessions
-            ],
-            "events": [one.to_json() for one in facts.events],
-            "models": [{"name": one.name, "remark": one.remark} for one in facts.models],
-            "not_taken_in": list(facts.not_taken_in),
-            "not_read": list(facts.not_read),
-            "next": self.step.to_json(),
-        }
+    def command(self, verb: str, *words: str) -> str:
+        """Return a command line for this cell."""
+        return shlex.join(["pisigma", verb, self.folder, *words])
+
+    def import_command(self, rows: str = "ROWS.csv") -> str:
+        """Return the command that adds rows to the cell."""
+        return shlex.join(["pisigma", "import", rows, "--cell", self.folder])
+
+    def checks_of(self, model: str, *commands: str) -> list[Check]:
+        """Return the checks of a model by some commands, newest last, without those of sessions that were set aside."""
+        aside = {one.name for one in self.sessions if one.set_aside}
+        checks = [one for one in self.checks if one.model == model and one.command in commands]
+        return [one for one in checks if one.session not in aside]
+
+    def errors_of(self, model: str, *commands: str) -> list[Check]:
+        """Return those of `checks_of` whose rows are trusted, so that their errors are those of the model."""
+        return [one for one in self.checks_of(model, *commands) if one.verdict not in NOT_TRUSTED]
+
+    def new_sessions(self, model: ModelEntry) -> list[SessionEntry]:
+        """Return the valid sessions that a model was not fitted to, measured on its newest day or later."""
+        return [one for one in self.valid_sessions if one.name not in model.made_of and one.day >= model.day]
 
 
 class _Stated(BaseModel):
@@ -104,8 +129,8 @@ class _Stated(BaseModel):
         return f"{CELL_FILE} does not state where the board is (surroundings, view)"
 
 
-def status_of(folder: Path) -> CellStatus:
-    """Return the status of a cell and its next step.
+def facts_of(folder: Path) -> CellFacts:
+    """Read the facts about a cell.
 
     Args:
         folder: folder of the cell.
@@ -114,12 +139,6 @@ def status_of(folder: Path) -> CellStatus:
         PlanningError: `cell.yaml` cannot be read.
         OutputError: the history cannot be read.
     """
-    facts = facts_of(folder)
-    return CellStatus(facts, next_step(facts))
-
-
-def facts_of(folder: Path) -> CellFacts:
-    """Read the facts about a cell; see `status_of`."""
     history = History(folder / HISTORY)
     with history.database.snapshot():
         return _facts(folder, history)

@@ -1,15 +1,17 @@
 """Next step of a cell: rules that derive a state, a reason and a command from its sessions, events and models."""
 
 import datetime
-import shlex
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
-from pisigma.lifetime.cell.controller import Controller, valid_sessions
-from pisigma.lifetime.cell.events import ARM_EVENTS, Event
-from pisigma.lifetime.cell.history import Check, ModelEntry, SessionEntry
+from pisigma.lifetime.cell.controller import records
+from pisigma.lifetime.cell.events import ARM_EVENTS
+from pisigma.lifetime.cell.facts import NOT_TRUSTED, CellFacts, facts_of
+from pisigma.lifetime.cell.history import Check, ModelEntry
 from pisigma.lifetime.cell.layout import SESSIONS
-from pisigma.lifetime.cell.step import State, Step
+from pisigma.lifetime.cell.step import COMPUTED, State, Step
 
 MAX_DAYS_UNVERIFIED = 92
 """[days] Time without a session after which the model in use has to be verified again: a quarter of a year."""
@@ -18,103 +20,80 @@ VERIFICATION_POSES = 10
 P95_PER_SCATTER = 2.7955
 """95 % quantile of the length of three independent normal errors, per standard deviation (chi distribution)."""
 
-ATTENTION = (
-    "edited_session",
-    "file_refused",
-    "not_trusted",
-    "session_not_trusted",
-    "verification_failed",
-    "moved",
-    "other_joint_zeros",
-    "fitted_to_set_aside",
-    "outside_limit",
-    "limit_below_scatter",
-)
-"""States in which a limit is missed, or rows or a model must not be trusted."""
 FOREIGN = "foreign"
 """Verdict on a file in `sessions/` that is not a measurement file."""
-NOT_TRUSTED = ("implausible", "setup_fault", "not_trusted")
-"""Verdicts of `verify`, `monitor` and `recalibrate` after which nothing is concluded from a session."""
 
 
 @dataclass(frozen=True)
-class CellFacts:
-    """Facts about a cell from which the rules derive its next step.
+class CellStatus:
+    """Status of a cell.
 
     Attributes:
-        folder: folder of the cell, as the user named it.
-        plans: names of the plans.
-        sessions: all sessions in the order of their days.
-        edited: names of sessions whose files were changed or removed after they were added.
-        events: all events in the order of their days.
-        models: all models in the order in which they were made.
-        checks: all checks in the order in which they were made.
-        in_use: the model in use; None if there is none.
-        limit_mm: limit of the 95 % quantile of the position errors [mm]; None if there is none.
-        today: day (ISO 8601).
-        not_taken_in: names of the files in `sessions/` that are not in the history yet, by their dates.
-        not_read: names of the files in `sessions/` that are not measurement files and were not imported.
-        plans_nothing: why no poses can be planned; "" if they can.
-        incomplete: how many poses of the newest plan have been measured, if they are too few; else "".
-        controller: what was active on the controller when.
+        facts: facts from which the next step was derived.
+        step: the next step.
     """
 
-    folder: str
-    plans: tuple[str, ...]
-    sessions: tuple[SessionEntry, ...]
-    edited: tuple[str, ...]
-    events: tuple[Event, ...]
-    models: tuple[ModelEntry, ...]
-    checks: tuple[Check, ...]
-    in_use: ModelEntry | None
-    limit_mm: float | None
-    today: str
-    not_taken_in: tuple[str, ...] = ()
-    not_read: tuple[str, ...] = ()
-    plans_nothing: str = ""
-    incomplete: str = ""
-    controller: Controller = field(default_factory=Controller)
+    facts: CellFacts
+    step: Step
 
     @property
-    def valid_sessions(self) -> tuple[SessionEntry, ...]:
-        """Sessions that describe the present arm; see `valid_sessions`."""
-        return valid_sessions(self.sessions, self.events, self.controller)
+    def name(self) -> str:
+        """Name of the folder of the cell."""
+        return Path(self.facts.folder).name
 
     @property
-    def newest_model(self) -> ModelEntry | None:
-        """The newest model that was fitted to valid sessions only; None if there is none."""
-        valid = {one.name for one in self.valid_sessions}
-        made = [one for one in self.models if one.made_of and valid.issuperset(one.made_of)]
-        return made[-1] if made else None
+    def is_due(self) -> bool:
+        """Whether there are steps that need neither new rows nor a decision of a person."""
+        return self.step.verb is not None or self.step.state in ("not_taken_in", "file_refused")
 
     @property
-    def unmeasured_plan(self) -> str:
-        """What the newest plan contains, if no session was added after it was made; else ""."""
-        planned = [one for one in self.checks if one.command == "plan"]
-        newest = max((one.taken_in for one in self.sessions), default="")
-        return planned[-1].summary if planned and planned[-1].checked > newest else ""
+    def last_error(self) -> Check | None:
+        """The last check that found an RMS error of the model in use or, if there is none, of the newest model."""
+        model = self.facts.in_use or (self.facts.models[-1] if self.facts.models else None)
+        checks = [] if model is None else self.facts.errors_of(model.name, *COMPUTED)
+        known = [one for one in checks if one.rms_mm is not None]
+        return known[-1] if known else None
 
-    def command(self, verb: str, *words: str) -> str:
-        """Return a command line for this cell."""
-        return shlex.join(["pisigma", verb, self.folder, *words])
+    def to_json(self) -> dict[str, Any]:
+        """Return the status as plain values; `next.command` and `next.reason` are the next step."""
+        facts, model = self.facts, self.facts.in_use
+        return {
+            "cell": facts.folder,
+            "model": None if model is None else model.name,
+            "made_of": [] if model is None else list(model.made_of),
+            "p95_mm": None if model is None else model.p95_mm,
+            "limit_mm": facts.limit_mm,
+            "controller": records(facts.controller.active()),
+            "plans": list(facts.plans),
+            "sessions": [
+                {
+                    "name": one.name,
+                    "day": one.day,
+                    "rows": one.rows,
+                    "set_aside": one.set_aside or None,
+                    "controller": records(facts.controller.during(one)),
+                }
+                for one in facts.sessions
+            ],
+            "events": [one.to_json() for one in facts.events],
+            "models": [{"name": one.name, "remark": one.remark} for one in facts.models],
+            "not_taken_in": list(facts.not_taken_in),
+            "not_read": list(facts.not_read),
+            "next": self.step.to_json(),
+        }
 
-    def import_command(self, rows: str = "ROWS.csv") -> str:
-        """Return the command that adds rows to the cell."""
-        return shlex.join(["pisigma", "import", rows, "--cell", self.folder])
 
-    def checks_of(self, model: str, *commands: str) -> list[Check]:
-        """Return the checks of a model by some commands, newest last, without those of sessions that were set aside."""
-        aside = {one.name for one in self.sessions if one.set_aside}
-        checks = [one for one in self.checks if one.model == model and one.command in commands]
-        return [one for one in checks if one.session not in aside]
+def status_of(folder: Path) -> CellStatus:
+    """Return the status of a cell and its next step.
 
-    def errors_of(self, model: str, *commands: str) -> list[Check]:
-        """Return those of `checks_of` whose rows are trusted, so that their errors are those of the model."""
-        return [one for one in self.checks_of(model, *commands) if one.verdict not in NOT_TRUSTED]
+    Args:
+        folder: folder of the cell.
 
-    def new_sessions(self, model: ModelEntry) -> list[SessionEntry]:
-        """Return the valid sessions that a model was not fitted to, measured on its newest day or later."""
-        return [one for one in self.valid_sessions if one.name not in model.made_of and one.day >= model.day]
+    Raises:
+        PisigmaError: see `facts_of`.
+    """
+    facts = facts_of(folder)
+    return CellStatus(facts, next_step(facts))
 
 
 def next_step(facts: CellFacts) -> Step:

@@ -30,6 +30,20 @@ State = Literal[
     "up_to_date",
 ]
 
+ATTENTION: tuple[State, ...] = (
+    "edited_session",
+    "file_refused",
+    "not_trusted",
+    "session_not_trusted",
+    "verification_failed",
+    "moved",
+    "other_joint_zeros",
+    "fitted_to_set_aside",
+    "outside_limit",
+    "limit_below_scatter",
+)
+"""States in which a limit is missed, or rows or a model must not be trusted."""
+
 
 @dataclass(frozen=True)
 class Step:

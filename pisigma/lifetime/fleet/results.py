@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from pisigma.files.output_file import write_whole
-from pisigma.lifetime.cell.status import CellFacts
+from pisigma.lifetime.cell.facts import CellFacts
 
 RESULTS = "results.parquet"
 """Name of the table in the folder of the cells."""

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from pisigma.files.errors import PisigmaError
-from pisigma.lifetime.cell.facts import CellStatus, status_of
 from pisigma.lifetime.cell.history import Check
 from pisigma.lifetime.cell.layout import cells_in
-from pisigma.lifetime.cell.status import ATTENTION
+from pisigma.lifetime.cell.status import CellStatus, status_of
+from pisigma.lifetime.cell.step import ATTENTION
 
 UNREADABLE = "unreadable"
 """State of a cell whose file or history cannot be read."""

@@ -5,8 +5,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from pisigma.files.progress import Progress
-from pisigma.lifetime.cell.facts import CellStatus, facts_of, status_of
-from pisigma.lifetime.cell.status import next_step
+from pisigma.lifetime.cell.facts import facts_of
+from pisigma.lifetime.cell.status import CellStatus, next_step, status_of
 from pisigma.workflow.cell.cell import Cell
 
 

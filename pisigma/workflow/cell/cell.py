@@ -16,9 +16,9 @@ from pisigma.files.errors import ModelError, Place
 from pisigma.files.model_files import is_model
 from pisigma.files.progress import Progress
 from pisigma.lifetime.cell.controller import findings
-from pisigma.lifetime.cell.facts import CellStatus, status_of
 from pisigma.lifetime.cell.history import HISTORY, Check, Entry, History, ModelEntry, SessionEntry, Use, now
 from pisigma.lifetime.cell.layout import MODELS, PLANS
+from pisigma.lifetime.cell.status import CellStatus, status_of
 from pisigma.measurement.camera.camera_files import CameraFiles
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel

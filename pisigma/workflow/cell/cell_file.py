@@ -15,8 +15,9 @@ from pisigma.files.scratch import FILE, scratch_beside
 from pisigma.files.setting import attributes_of, build_settings, by_key, flat_settings
 from pisigma.files.setting_values import checked_values
 from pisigma.files.yaml_file import Section, place_of_key, read_yaml, yaml_text
+from pisigma.lifetime.cell.facts import CellFacts
 from pisigma.lifetime.cell.layout import CELL_FILE
-from pisigma.lifetime.cell.status import VERIFICATION_POSES, CellFacts, plans_check
+from pisigma.lifetime.cell.status import VERIFICATION_POSES, plans_check
 from pisigma.planning.plan_settings import PlanSettings
 from pisigma.planning.surroundings.surroundings import Surroundings
 from pisigma.robot.description import Robot

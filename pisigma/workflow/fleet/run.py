@@ -14,9 +14,10 @@ from pisigma.files.engines.engine import AbstractEngine
 from pisigma.files.engines.processes import ProcessEngine
 from pisigma.files.errors import PisigmaError
 from pisigma.files.progress import Progress
-from pisigma.lifetime.cell.facts import status_of
+from pisigma.lifetime.cell.facts import CellFacts
 from pisigma.lifetime.cell.layout import MODELS, cells_in
-from pisigma.lifetime.cell.status import ATTENTION, CellFacts
+from pisigma.lifetime.cell.status import status_of
+from pisigma.lifetime.cell.step import ATTENTION
 from pisigma.lifetime.fleet.results import (
     RESULTS,
     ParameterValue,

@@ -9,8 +9,9 @@ from testing.refusals import refused
 from pisigma.files.errors import MeasurementError, ModelError
 from pisigma.lifetime.cell.controller import RULES, Controller, Situation, record_controller
 from pisigma.lifetime.cell.exports import Contents, ControllerEntry, ExportEntry
+from pisigma.lifetime.cell.facts import CellFacts
 from pisigma.lifetime.cell.history import HISTORY, History, ModelEntry, SessionEntry
-from pisigma.lifetime.cell.status import CellFacts, next_step
+from pisigma.lifetime.cell.status import next_step
 
 DH = ExportEntry("dh.csv", "dh", "dh", "kinematics", "a", "2026-01-12T08:00:00+00:00")
 OFFSETS = ExportEntry("offsets.csv", "offsets", "offsets", "joint_zeros", "a", "2026-01-12T08:00:00+00:00")

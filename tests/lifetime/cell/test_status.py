@@ -8,9 +8,9 @@ import pytest
 from pisigma.lifetime.cell.controller import Controller, valid_sessions
 from pisigma.lifetime.cell.events import ARM_EVENTS, Event
 from pisigma.lifetime.cell.exports import ControllerEntry, ExportEntry
-from pisigma.lifetime.cell.facts import CellStatus
+from pisigma.lifetime.cell.facts import NOT_TRUSTED, CellFacts
 from pisigma.lifetime.cell.history import Check, ModelEntry, SessionEntry
-from pisigma.lifetime.cell.status import MAX_DAYS_UNVERIFIED, NOT_TRUSTED, CellFacts, next_step, plans_check
+from pisigma.lifetime.cell.status import MAX_DAYS_UNVERIFIED, CellStatus, next_step, plans_check
 from pisigma.lifetime.cell.step import State
 
 
