@@ -41,6 +41,7 @@ MODEL_FILES = frozenset(
 _MAX_BYTES = {DESCRIPTION: 2**21, WEIGHTS: 2**28, HELD_OUT_CSV: 2**28}
 """Largest sizes of files for which it is not `MAX_BYTES`."""
 
+_WEIGHTS_HASH = re.compile(rb"^weights_sha256: ['\"]?([0-9a-f]{64})", re.MULTILINE)
 _SIGNED = re.compile(rb"(.*\n)compiled_sha256: (\S+)\nsha256: ([0-9a-f]{64})\n", re.DOTALL)
 
 
@@ -64,6 +65,17 @@ def model_hash(folder: str | os.PathLike[str]) -> str:
         ModelError: the file cannot be read.
     """
     return hashlib.sha256(read_model_file(Path(folder), DESCRIPTION)).hexdigest()
+
+
+def is_unchanged(folder: Path, sha256: str) -> bool:
+    """Return whether the description and the weights of a model are those of a `model_hash`."""
+    try:
+        description, weights = (read_model_file(folder, name) for name in (DESCRIPTION, WEIGHTS))
+    except ModelError:
+        return False
+    stated = _WEIGHTS_HASH.search(description)
+    same = stated is None or hashlib.sha256(weights).hexdigest().encode() == stated[1]
+    return same and hashlib.sha256(description).hexdigest() == sha256
 
 
 def check_model_hash(folder: str | os.PathLike[str], sha256: str) -> None:

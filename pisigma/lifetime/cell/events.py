@@ -13,6 +13,8 @@ EventKind = Literal[
 the arm was changed (see `ARM_EVENTS`). "firmware" and "accepted", by a person, are only recorded."""
 ARM_EVENTS: frozenset[EventKind] = frozenset(("mastering", "encoder", "collision", "maintenance"))
 """Events after which earlier sessions no longer describe the arm."""
+CHANGING_EVENTS: frozenset[EventKind] = ARM_EVENTS | {"instrument", "tool"}
+"""Events after which rows must not be fitted together with earlier ones as if nothing had changed."""
 
 
 @dataclass(frozen=True)

@@ -2,21 +2,24 @@
 
 import datetime
 import hashlib
+import json
 import os
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
 from pisigma.files.errors import PlanningError
+from pisigma.files.model_files import is_unchanged
 from pisigma.files.yaml_file import read_yaml
 from pisigma.lifetime.cell.controller import Controller, valid_sessions
-from pisigma.lifetime.cell.events import Event
+from pisigma.lifetime.cell.events import CHANGING_EVENTS, Event
 from pisigma.lifetime.cell.history import HISTORY, Check, History, ModelEntry, SessionEntry
-from pisigma.lifetime.cell.layout import CELL_FILE, PLANS, SESSIONS, newest_plan
+from pisigma.lifetime.cell.layout import CELL_FILE, MODELS, PLANS, SESSIONS, newest_plan
 from pisigma.measurement.dates import date_in_name
 
 BEFORE_FIT = ("plan", "import")
@@ -47,6 +50,8 @@ class CellFacts:
         not_taken_in: names of the files in `sessions/` that are not in the history yet, by their dates.
         not_read: names of the files in `sessions/` that are not measurement files and were not imported.
         plans_nothing: why no poses can be planned; "" if they can.
+        settings_sha256: SHA-256 of the present settings of a calibration; see `Check`.
+        changed_models: those of the model in use and the newest one that were changed or removed after they were made.
         incomplete: how many poses of the newest plan have been measured, if they are too few; else "".
         controller: what was active on the controller when.
     """
@@ -64,20 +69,43 @@ class CellFacts:
     not_taken_in: tuple[str, ...] = ()
     not_read: tuple[str, ...] = ()
     plans_nothing: str = ""
+    settings_sha256: str = ""
+    changed_models: tuple[str, ...] = ()
     incomplete: str = ""
     controller: Controller = field(default_factory=Controller)
 
-    @property
+    @cached_property
     def valid_sessions(self) -> tuple[SessionEntry, ...]:
         """Sessions that describe the present arm; see `valid_sessions`."""
         return valid_sessions(self.sessions, self.events, self.controller)
 
     @property
     def newest_model(self) -> ModelEntry | None:
-        """The newest model that was fitted to valid sessions only; None if there is none."""
+        """The newest unchanged model that was fitted to valid sessions only; None if there is none."""
         valid = {one.name for one in self.valid_sessions}
-        made = [one for one in self.models if one.made_of and valid.issuperset(one.made_of)]
+        made = [one for one in self.unchanged_models if one.made_of and valid.issuperset(one.made_of)]
         return made[-1] if made else None
+
+    @property
+    def unchanged_models(self) -> list[ModelEntry]:
+        """Models that were not changed or removed after they were made."""
+        return [one for one in self.models if one.name not in self.changed_models]
+
+    def later_event(self, model: ModelEntry) -> str:
+        """Return what was recorded only after a model had been fitted to rows before and after it; "" if nothing.
+
+        A recalibration finds what has moved since its parent, so the calibration that it goes back to counts.
+        """
+        models = {one.name: one for one in self.models}
+        while model.parent in models:
+            model = models[model.parent]
+        first = min((one.day for one in self.sessions if one.name in model.made_of), default=model.day)
+        changes: list[tuple[str, str, str]] = [
+            (one.day, one.recorded, one.kind) for one in self.events if one.kind in CHANGING_EVENTS
+        ]
+        changes += [(one.day, one.recorded, "controller") for one in self.controller.zero_changes]
+        late = [(kind, day) for day, at, kind in changes if at > model.made and first < day <= model.day]
+        return f"the event '{late[-1][0]}' of {late[-1][1]}" if late else ""
 
     @property
     def unmeasured_plan(self) -> str:
@@ -116,6 +144,19 @@ class _Stated(BaseModel):
     sensor: str = "tracker"
     limit_mm: Annotated[float, Field(gt=0)] | None = None
     surroundings: dict[str, Any] | None = None
+    robot: Any = None
+    base: Any = None
+    tip: Any = None
+    camera: Any = None
+    calibrate: Any = None
+
+    def settings_hash(self, folder: Path) -> str:
+        """Return the SHA-256 of the settings that a calibration depends on, and of the files that they name."""
+        camera = self.camera if isinstance(self.camera, dict) else {}
+        names = [str(self.robot), *map(str, (*camera.get("camera", ()), *camera.get("board", ())))]
+        stated = [self.robot, self.base, self.tip, self.camera, self.calibrate or None]
+        hashes = [sha256_of(folder / name) for name in names]
+        return hashlib.sha256(json.dumps([stated, hashes], sort_keys=True, default=str).encode()).hexdigest()
 
     def plans_nothing(self, model: ModelEntry | None) -> str:
         """Return why no poses can be planned; "" if they can.
@@ -127,6 +168,15 @@ class _Stated(BaseModel):
         if self.sensor != "camera" or (view and (model is not None or "frame" in view)):
             return ""
         return f"{CELL_FILE} does not state where the board is (surroundings, view)"
+
+
+def settings_hash(folder: Path) -> str:
+    """Return the SHA-256 of the settings of a calibration of a cell; see `Check`.
+
+    Raises:
+        PlanningError: `cell.yaml` cannot be read.
+    """
+    return read_yaml(folder / CELL_FILE, _Stated, PlanningError).settings_hash(folder)
 
 
 def facts_of(folder: Path) -> CellFacts:
@@ -147,13 +197,15 @@ def facts_of(folder: Path) -> CellFacts:
 def _facts(folder: Path, history: History) -> CellFacts:
     sessions, checks = history.sessions(), history.checks()
     stated, in_use = read_yaml(folder / CELL_FILE, _Stated, PlanningError), history.in_use
+    models = history.models()
+    checked = {one.name: one.sha256 for one in (*models[-1:], *([] if in_use is None else [in_use]))}
     return CellFacts(
         folder=os.fspath(folder),
         plans=tuple(sorted(path.stem for path in (folder / PLANS).glob("*.csv"))),
         sessions=sessions,
         edited=edited_sessions(folder / SESSIONS, sessions),
         events=history.events(),
-        models=history.models(),
+        models=models,
         checks=checks,
         in_use=in_use,
         limit_mm=stated.limit_mm,
@@ -161,6 +213,10 @@ def _facts(folder: Path, history: History) -> CellFacts:
         not_taken_in=not_taken_in(folder / SESSIONS, sessions),
         not_read=unimported_files(folder / SESSIONS, sessions),
         plans_nothing=stated.plans_nothing(in_use),
+        settings_sha256=stated.settings_hash(folder),
+        changed_models=tuple(
+            name for name, sha256 in checked.items() if not is_unchanged(folder / MODELS / name, sha256)
+        ),
         incomplete=_incomplete(folder, sessions, checks),
         controller=Controller.from_history(history),
     )

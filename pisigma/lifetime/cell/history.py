@@ -21,10 +21,10 @@ HISTORY = "history.sqlite"
 """Name of the history of a cell."""
 MODEL_HISTORY = ".history.sqlite"
 """Suffix of the history of a model outside of a cell, after the name of its folder."""
-SCHEMA_VERSION = 5
+SCHEMA_VERSION = 6
 """Version of the schema. Version 1 had no monitored sessions: each model had a file for them, without a version.
 Version 2 had no exports, and changes of the model in use could not be undone. Version 3 had no scatter of models,
-and version 4 no poses of sessions."""
+version 4 no poses of sessions, and version 5 no settings of checks."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class ModelEntry:
     Attributes:
         name: name of its folder in `models/`.
         sha256: SHA-256 of its `model.yaml`.
-        made: time at which it was calibrated or recalibrated (ISO 8601, UTC).
+        made: time at which its rows and events were read (ISO 8601, UTC).
         sessions: names of the sessions that it was fitted to, separated by commas.
         day: day of the newest of them (ISO 8601).
         frame_day: day of the instrument event with which the newest frame of the model begins; empty if the model has
@@ -114,6 +114,8 @@ class Check:
         checked: time of the check (ISO 8601, UTC).
         rms_mm: RMS position error [mm] of held-out rows or, without a validation, of the rows of a calibration; for
             `verify` and `monitor` of the session. None if it is unknown.
+        settings_sha256: SHA-256 of the settings in `cell.yaml` that a calibration depends on, and of the files that it
+            names; empty if it is unknown, and for all other commands.
     """
 
     command: str
@@ -125,6 +127,7 @@ class Check:
     recalibrate: bool
     checked: str
     rms_mm: float | None = None
+    settings_sha256: str = ""
 
 
 @dataclass(frozen=True)

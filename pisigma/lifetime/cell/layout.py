@@ -6,7 +6,8 @@ import re
 from pathlib import Path
 
 from pisigma.files.errors import ModelError, Place, PlanningError
-from pisigma.lifetime.cell.history import HISTORY, MODEL_HISTORY, History
+from pisigma.files.model_files import is_unchanged
+from pisigma.lifetime.cell.history import HISTORY, MODEL_HISTORY, History, ModelEntry
 from pisigma.measurement.dates import date_in_name
 
 CELL_FILE = "cell.yaml"
@@ -65,7 +66,7 @@ def model_folder(path: str | os.PathLike[str]) -> Path:
     """Return the folder of a cell's model in use; a path that is not a cell is returned unchanged.
 
     Raises:
-        ModelError: no model of the cell is in use.
+        ModelError: no model of the cell is in use, or it was changed or removed.
     """
     if not is_cell(path):
         return Path(path)
@@ -76,7 +77,23 @@ def model_folder(path: str | os.PathLike[str]) -> Path:
             at=Place(path),
             remedy=f"see `pisigma status {path}` for the next step",
         )
-    return Path(path) / MODELS / entry.name
+    return checked_model(Path(path), entry)
+
+
+def checked_model(cell: Path, model: ModelEntry) -> Path:
+    """Return the folder of a model of a cell.
+
+    Raises:
+        ModelError: the folder was changed or removed after the model was made.
+    """
+    folder = cell / MODELS / model.name
+    if is_unchanged(folder, model.sha256):
+        return folder
+    raise ModelError(
+        "the model was changed or removed after it was made",
+        at=Place(folder),
+        remedy=f"restore the folder, or see `pisigma status {cell}` for the next step",
+    )
 
 
 def cell_of_model(folder: str | os.PathLike[str]) -> Path | None:

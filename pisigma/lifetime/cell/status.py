@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from pisigma.lifetime.cell.controller import records
-from pisigma.lifetime.cell.events import ARM_EVENTS
+from pisigma.lifetime.cell.events import ARM_EVENTS, CHANGING_EVENTS
 from pisigma.lifetime.cell.facts import NOT_TRUSTED, CellFacts, facts_of
 from pisigma.lifetime.cell.history import Check, ModelEntry
 from pisigma.lifetime.cell.layout import SESSIONS
@@ -17,6 +17,10 @@ MAX_DAYS_UNVERIFIED = 92
 """[days] Time without a session after which the model in use has to be verified again: a quarter of a year."""
 VERIFICATION_POSES = 10
 """Number of poses of a session for verification or monitoring."""
+MEASURE_AND = f"measure {VERIFICATION_POSES} poses, import them, and"
+CAN_VERIFY = "is not in use; session '{}', to which it was not fitted, can verify it"
+JUDGING = ("verify", "monitor", "recalibrate")
+"""Commands that compare a session with a model."""
 P95_PER_SCATTER = 2.7955
 """95 % quantile of the length of three independent normal errors, per standard deviation (chi distribution)."""
 
@@ -97,7 +101,7 @@ def status_of(folder: Path) -> CellStatus:
 
 
 def next_step(facts: CellFacts) -> Step:
-    """Return the step of the first rule that applies, in the order of `RULES`; a plan is measured before the next."""
+    """Return the step of the first of `RULES` and `RULES_IN_USE` that applies; a plan is measured before the next."""
     step = due_step(facts)
     if facts.incomplete and step.verb in ("calibrate", "verify", "monitor"):
         why = f"{facts.incomplete}; measure and import the others, or continue with `{step.command}`"
@@ -114,7 +118,12 @@ def next_step(facts: CellFacts) -> Step:
 
 def due_step(facts: CellFacts) -> Step:
     """Return the step of the first rule that applies, as if every plan had been measured."""
-    return next(step for rule in RULES if (step := rule(facts)) is not None)
+    steps = (rule(facts) for rule in RULES)
+    if (step := next(filter(None, steps), None)) is None:
+        assert facts.in_use is not None  # else a rule of `RULES` applies
+        steps = (rule(facts, facts.in_use) for rule in RULES_IN_USE)
+        step = next(filter(None, steps), None) or _up_to_date(facts, facts.in_use)
+    return step
 
 
 def plans_check(facts: CellFacts) -> bool:
@@ -123,11 +132,20 @@ def plans_check(facts: CellFacts) -> bool:
 
 
 def _to_measure(facts: CellFacts, plan: str) -> Step:
-    return Step(
-        "not_measured",
-        f"{plan} has not been measured yet; ROWS.csv contains its rows with the measured columns added",
-        facts.import_command(),
-    )
+    why = f"{plan} has not been measured yet; ROWS.csv contains its rows with the measured columns added"
+    return Step("not_measured", why, facts.import_command())
+
+
+def _model_changed(facts: CellFacts) -> Step | None:
+    if facts.in_use is None or facts.in_use.name not in facts.changed_models:
+        return None
+    state: State = "model_changed"
+    why = f"the folder of model '{facts.in_use.name}', which is in use, was changed or removed; restore it"
+    if (newest := facts.newest_model) is not None:
+        return Step(state, f"{why}, or use model '{newest.name}'", facts.command("use", newest.name))
+    if facts.valid_sessions:
+        return _calibrate(facts, state, f"{why}, or calibrate again")
+    return Step(state, f"{why}, or measure new rows", facts.command("plan"))
 
 
 def _edited_session(facts: CellFacts) -> Step | None:
@@ -178,12 +196,25 @@ def _not_calibrated(facts: CellFacts) -> Step | None:
 
 def _calibrate(facts: CellFacts, state: State, reason: str) -> Step:
     """Return the step "calibrate"; more rows are measured instead if these must not be trusted."""
-    calibrations = [one for one in facts.checks if one.command == "calibrate"]
-    newest = max(one.taken_in for one in facts.valid_sessions)
-    if calibrations and calibrations[-1].verdict == "not_trusted" and calibrations[-1].checked >= newest:
-        why = f"the calibration must not be trusted: {calibrations[-1].summary}"
-        return Step("not_trusted", why, facts.import_command())
+    last = _last_calibration(facts)
+    newest = [one.taken_in for one in facts.valid_sessions]
+    newest += [one.recorded for one in facts.events if one.kind in CHANGING_EVENTS]
+    if last is not None and last.verdict == "not_trusted" and last.checked >= max(newest):
+        why = f"the calibration must not be trusted: {last.summary}"
+        return _settings_changed(facts) or Step("not_trusted", why, facts.import_command())
     return Step(state, reason, facts.command("calibrate"))
+
+
+def _last_calibration(facts: CellFacts) -> Check | None:
+    return next((one for one in reversed(facts.checks) if one.command == "calibrate"), None)
+
+
+def _settings_changed(facts: CellFacts, _: ModelEntry | None = None) -> Step | None:
+    last = _last_calibration(facts)
+    if last is None or last.settings_sha256 in ("", facts.settings_sha256):
+        return None
+    why = "the settings of the calibration in cell.yaml, or a file that they name, were changed after it"
+    return Step("settings_changed", why, facts.command("calibrate"))
 
 
 def _not_verified(facts: CellFacts) -> Step | None:
@@ -191,23 +222,27 @@ def _not_verified(facts: CellFacts) -> Step | None:
         return None
     model = facts.newest_model
     assert model is not None  # else an earlier rule applies
+    if changed := _settings_changed(facts):
+        return changed
+    if wrong := _wrongly_fitted(facts, model):
+        return _calibrate(facts, *wrong)
+    if new := _not_judged(facts, model, "verify", "recalibrate"):
+        why = f"model '{model.name}' {CAN_VERIFY.format(new[-1])}"
+        return Step("not_verified", why, facts.command("verify"))
     verdicts = facts.checks_of(model.name, "verify", "recalibrate")
-    judged = {one.session for one in verdicts}
-    new = [one for one in facts.new_sessions(model) if one.name not in judged]
-    if new:
-        return Step(
-            "not_verified",
-            f"model '{model.name}' is not in use; session '{new[-1].name}', to which it was not fitted, can verify it",
-            facts.command("verify"),
-        )
     if verdicts and (step := _after(facts, verdicts[-1], ("not_better", "undecided"))):
         return step
     return Step(
         "not_verified",
-        f"model '{model.name}' has not been verified with new rows; measure {VERIFICATION_POSES} poses, import them, "
-        f"and run `{facts.command('verify')}`",
+        f"model '{model.name}' has not been verified with new rows; {MEASURE_AND} run `{facts.command('verify')}`",
         facts.command("plan"),
     )
+
+
+def _not_judged(facts: CellFacts, model: ModelEntry, *commands: str) -> list[str]:
+    """Return the names of sessions that are new to a model, and that none of the commands has compared with it."""
+    judged = {one.session for one in facts.checks_of(model.name, *commands)}
+    return [one.name for one in facts.new_sessions(model) if one.name not in judged]
 
 
 def _after(facts: CellFacts, last: Check, failed: tuple[str, ...]) -> Step | None:
@@ -229,14 +264,12 @@ def _after(facts: CellFacts, last: Check, failed: tuple[str, ...]) -> Step | Non
     return None
 
 
-def _other_joint_zeros(facts: CellFacts) -> Step | None:
-    model = facts.in_use
+def _other_joint_zeros(facts: CellFacts, model: ModelEntry) -> Step | None:
     state: State = "other_joint_zeros"
-    assert model is not None
     if facts.controller.fits(model, facts.sessions):
         return None
     why = f"model '{model.name}' needs other joint zeros than those that are active on the controller"
-    if fitting := [one.name for one in facts.models if facts.controller.fits(one, facts.sessions)]:
+    if fitting := [one.name for one in facts.unchanged_models if facts.controller.fits(one, facts.sessions)]:
         return Step(state, f"{why}; model '{fitting[-1]}' needs these", facts.command("use", fitting[-1]))
     if not (new := facts.new_sessions(model)):
         return Step(state, why, facts.command("plan"))
@@ -246,57 +279,51 @@ def _other_joint_zeros(facts: CellFacts) -> Step | None:
     return Step(state, why, facts.command("recalibrate" if model.has_posterior else "calibrate"))
 
 
-def _session_not_judged(facts: CellFacts) -> Step | None:
-    model = facts.in_use
-    assert model is not None
-    judged = {one.session for one in facts.checks_of(model.name, "verify", "monitor", "recalibrate")}
-    new = [one for one in facts.new_sessions(model) if one.name not in judged]
-    if not new:
+def _session_not_judged(facts: CellFacts, model: ModelEntry) -> Step | None:
+    if not (new := _not_judged(facts, model, *JUDGING)):
         return None
     verb = "monitor" if model.has_posterior else "verify"
     if facts.limit_mm is not None and _p95(facts, model) is None:
         verb = "verify"
-    return Step(
-        "session_not_judged",
-        f"session '{new[-1].name}' has not been compared with model '{model.name}'",
-        facts.command(verb),
-    )
+    why = f"session '{new[-1]}' has not been compared with model '{model.name}'"
+    return Step("session_not_judged", why, facts.command(verb))
 
 
-def _last_verdict(facts: CellFacts) -> Step | None:
+def _last_verdict(facts: CellFacts, model: ModelEntry) -> Step | None:
     """Return the step that follows from the last session that was compared with the model in use."""
-    model = facts.in_use
-    assert model is not None
-    checks = facts.checks_of(model.name, "verify", "monitor", "recalibrate")
+    checks = facts.checks_of(model.name, *JUDGING)
     return _after(facts, checks[-1], ("not_better",)) if checks else None
 
 
-def _better_model(facts: CellFacts) -> Step | None:
-    newest, model = facts.newest_model, facts.in_use
-    assert model is not None
-    if newest is None or newest.name == model.name or newest.made <= model.made:
+def _better_model(facts: CellFacts, model: ModelEntry) -> Step | None:
+    newest = facts.newest_model
+    if newest is None or newest.made <= model.made or _wrongly_fitted(facts, newest):
         return None
-    judged = {one.session for one in facts.checks_of(newest.name, "verify")}
-    new = [one for one in facts.new_sessions(newest) if one.name not in judged]
-    if not new:
+    if not (new := _not_judged(facts, newest, "verify")):
         return None
-    return Step(
-        "better_model",
-        f"model '{newest.name}' is not in use; session '{new[-1].name}', to which it was not fitted, can verify it",
-        facts.command("verify", "--model", newest.name),
-    )
+    why = f"model '{newest.name}' {CAN_VERIFY.format(new[-1])}"
+    return Step("better_model", why, facts.command("verify", "--model", newest.name))
 
 
-def _fitted_to_set_aside(facts: CellFacts) -> Step | None:
-    model, newest = facts.in_use, facts.newest_model
-    assert model is not None
-    if not (wrong := [one.name for one in facts.sessions if one.set_aside and one.name in model.made_of]):
+def _replaced(facts: CellFacts, model: ModelEntry) -> Step | None:
+    newest = facts.newest_model
+    if (wrong := _wrongly_fitted(facts, model)) is None:
         return None
-    why = f"model '{model.name}' was fitted to session '{wrong[-1]}', which was set aside"
-    if newest is None or newest.made <= model.made:
-        return _calibrate(facts, "fitted_to_set_aside", why)
-    why = f"{why}; measure {VERIFICATION_POSES} poses, import them, and verify model '{newest.name}'"
-    return Step("fitted_to_set_aside", why, facts.command("plan"))
+    if newest is None or newest.made <= model.made or _wrongly_fitted(facts, newest):
+        return _calibrate(facts, *wrong)
+    return Step(wrong[0], f"{wrong[1]}; {MEASURE_AND} verify model '{newest.name}'", facts.command("plan"))
+
+
+def _wrongly_fitted(facts: CellFacts, model: ModelEntry) -> tuple[State, str] | None:
+    """Return the state and the reason if a model was fitted to rows that do not belong together; else None."""
+    aside = [one.name for one in facts.sessions if one.set_aside and one.name in model.made_of]
+    if aside:
+        why = f"model '{model.name}' was fitted to session '{aside[-1]}', which was set aside"
+        return "fitted_to_set_aside", why
+    if late := facts.later_event(model):
+        why = f"model '{model.name}' was fitted to rows before and after {late}, which was recorded later"
+        return "fitted_before_event", why
+    return None
 
 
 def _p95(facts: CellFacts, model: ModelEntry) -> float | None:
@@ -305,38 +332,29 @@ def _p95(facts: CellFacts, model: ModelEntry) -> float | None:
     return found[-1] if found else model.p95_mm
 
 
-def _outside_limit(facts: CellFacts) -> Step | None:
-    model, limit = facts.in_use, facts.limit_mm
-    assert model is not None
-    p95 = _p95(facts, model)
+def _outside_limit(facts: CellFacts, model: ModelEntry) -> Step | None:
+    limit, p95 = facts.limit_mm, _p95(facts, model)
     if limit is None or (p95 is not None and p95 <= limit):
         return None
     if p95 is None:
-        return Step(
-            "verification_due",
-            f"it is not known whether model '{model.name}' meets the limit of {limit:g} mm; measure "
-            f"{VERIFICATION_POSES} poses, import them, and run `{facts.command('verify')}`",
-            facts.command("plan"),
-        )
+        why = f"it is not known whether model '{model.name}' meets the limit of {limit:g} mm; {MEASURE_AND}"
+        return Step("verification_due", f"{why} run `{facts.command('verify')}`", facts.command("plan"))
+    missed = f"the 95 % quantile of the position errors is {p95:.3f} mm, above the limit of {limit:g} mm"
     scatter = P95_PER_SCATTER * (model.scatter_mm or 0.0)
     if scatter > limit:
         return Step(
             "limit_below_scatter",
-            f"the 95 % quantile of the position errors is {p95:.3f} mm, above the limit of {limit:g} mm; the scatter "
-            f"of the sensor and of the robot alone makes {scatter:.3f} mm, which more poses do not reduce; use a more "
-            "accurate sensor, or raise limit_mm",
+            f"{missed}; the scatter of the sensor and of the robot alone makes {scatter:.3f} mm, which more poses do "
+            "not reduce; use a more accurate sensor, or raise limit_mm",
         )
     return Step(
         "outside_limit",
-        f"the 95 % quantile of the position errors is {p95:.3f} mm, above the limit of {limit:g} mm; more poses reduce "
-        "it until the repeatability of the robot is reached",
+        f"{missed}; more poses reduce it until the repeatability of the robot is reached",
         facts.command("plan"),
     )
 
 
-def _verification_due(facts: CellFacts) -> Step | None:
-    model = facts.in_use
-    assert model is not None
+def _verification_due(facts: CellFacts, model: ModelEntry) -> Step | None:
     newest = max(one.day for one in facts.valid_sessions)
     age = (datetime.date.fromisoformat(facts.today) - datetime.date.fromisoformat(newest)).days
     if age <= MAX_DAYS_UNVERIFIED:
@@ -349,29 +367,30 @@ def _verification_due(facts: CellFacts) -> Step | None:
     )
 
 
-def _up_to_date(facts: CellFacts) -> Step:
-    assert facts.in_use is not None
+def _up_to_date(facts: CellFacts, model: ModelEntry) -> Step:
     newest = datetime.date.fromisoformat(max(one.day for one in facts.valid_sessions))
     due = newest + datetime.timedelta(days=MAX_DAYS_UNVERIFIED)
-    return Step(
-        "up_to_date",
-        f"model '{facts.in_use.name}' is in use (`{facts.command('serve')}`, `ik` or `export`); measure again by "
-        f"{due}",
-    )
+    why = f"model '{model.name}' is in use (`{facts.command('serve')}`, `ik` or `export`); measure again by {due}"
+    return Step("up_to_date", why)
 
 
 RULES: tuple[Callable[[CellFacts], Step | None], ...] = (
+    _model_changed,
     _edited_session,
     _file_to_take_in,
     _no_session,
     _not_calibrated,
     _not_verified,
+)
+"""Rules until a model is in use, in order."""
+RULES_IN_USE: tuple[Callable[[CellFacts, ModelEntry], Step | None], ...] = (
     _other_joint_zeros,
     _session_not_judged,
     _last_verdict,
+    _settings_changed,
     _better_model,
-    _fitted_to_set_aside,
+    _replaced,
     _outside_limit,
     _verification_due,
-    _up_to_date,
 )
+"""Rules for a model in use, in order; without a step, the cell is up to date."""

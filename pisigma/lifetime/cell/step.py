@@ -7,6 +7,7 @@ COMPUTED = ("calibrate", "verify", "monitor", "recalibrate")
 """Commands that need neither new rows nor a decision of a person."""
 
 State = Literal[
+    "model_changed",
     "edited_session",
     "not_taken_in",
     "file_refused",
@@ -14,6 +15,7 @@ State = Literal[
     "not_measured",
     "session_incomplete",
     "not_calibrated",
+    "settings_changed",
     "not_trusted",
     "not_verified",
     "verification_failed",
@@ -26,11 +28,13 @@ State = Literal[
     "limit_below_scatter",
     "better_model",
     "fitted_to_set_aside",
+    "fitted_before_event",
     "verification_due",
     "up_to_date",
 ]
 
 ATTENTION: tuple[State, ...] = (
+    "model_changed",
     "edited_session",
     "file_refused",
     "not_trusted",
@@ -39,6 +43,7 @@ ATTENTION: tuple[State, ...] = (
     "moved",
     "other_joint_zeros",
     "fitted_to_set_aside",
+    "fitted_before_event",
     "outside_limit",
     "limit_below_scatter",
 )

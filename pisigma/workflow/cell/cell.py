@@ -16,6 +16,7 @@ from pisigma.files.errors import ModelError, Place
 from pisigma.files.model_files import is_model
 from pisigma.files.progress import Progress
 from pisigma.lifetime.cell.controller import findings
+from pisigma.lifetime.cell.facts import settings_hash
 from pisigma.lifetime.cell.history import HISTORY, Check, Entry, History, ModelEntry, SessionEntry, Use, now
 from pisigma.lifetime.cell.layout import MODELS, PLANS
 from pisigma.lifetime.cell.status import CellStatus, status_of
@@ -203,22 +204,26 @@ class Cell:
         Raises:
             MeasurementError: there are no valid sessions.
         """
-        sessions, warnings = self.sessions.valid_sessions(), self.on_controller("calibrate", None)
+        sessions, started, events = self.sessions.valid_sessions(), now(), self.history.events()
+        warnings, stated = self.on_controller("calibrate", None), settings_hash(self.folder)
         settings: CalibrationSettings = self.file.settings_of_step("calibrate", **changed)
-        result = calibrate_rows(self.robot, self.sessions.rows_of(sessions), settings, prior, progress)
+        result = calibrate_rows(
+            self.robot, self.sessions.rows_of(sessions, events), settings, prior, progress
+        )
         result = with_warnings(result, warnings)
         doubt = "" if result.trusted else result.diagnostics[0].sentence
         if doubt and not accept_implausible:
-            self.history.add(Check("calibrate", "", "", "not_trusted", doubt, None, False, now()))
+            refused = ("calibrate", "", "", "not_trusted", doubt)
+            self.history.add(Check(*refused, None, False, started, settings_sha256=stated))
             return result, None
         remark, better = doubt or "not verified yet", False
         if not doubt and prior is None and (in_use := self.history.in_use) is not None:
             better, remark = is_better(self.sessions, in_use, sessions, settings, progress)
-        path = save_new(self.folder / MODELS, partial(result.save, accept_implausible=accept_implausible))
+        path = self._saved(result, accept_implausible)
         p95, rms = errors_of(result)
-        entry = entry_of(self.history, path, sessions, remark, result)
+        entry = entry_of(events, started, path, sessions, remark, result)
         verdict = "accepted_implausible" if doubt else "trusted"
-        check = Check("calibrate", entry.name, "", verdict, doubt, p95, False, now(), rms)
+        check = Check("calibrate", entry.name, "", verdict, doubt, p95, False, started, rms, stated)
         self.history.add(entry, check, *([Use(entry.name, now(), remark)] if better else []))
         return result, entry
 
@@ -317,6 +322,7 @@ class Cell:
             ModelError: there is no model.
             MeasurementError: there is no session with this name, or none to which the model was not fitted.
         """
+        started = now()
         parent, chosen, seen = self._new_rows("recalibrate", None, session)
         settings = seen.settings_to_recalibrate(self.file.settings_of_step("recalibrate", **changed))
         result = recalibrate(self.model_folder(parent.name), seen.rows, settings, progress)
@@ -326,9 +332,9 @@ class Cell:
             refused = ("recalibrate", parent.name, chosen.name, "not_trusted", doubt)
             self.history.add(Check(*refused, None, False, now()))
             return result, None
-        path = save_new(self.folder / MODELS, partial(result.save, accept_implausible=accept_implausible))
+        path = self._saved(result, accept_implausible)
         remark, (p95, rms) = result.summary.verdict, errors_of(result)
-        entry = entry_of(self.history, path, [chosen], remark, result, parent)
+        entry = entry_of((), started, path, [chosen], remark, result, parent)
         of = ("recalibrate", entry.name, chosen.name, result.summary.kept, remark)
         added: list[Entry] = [entry, Check(*of, p95, False, now(), rms)]
         if result.trusted:
@@ -364,6 +370,13 @@ class Cell:
     def on_controller(self, command: str, model: ModelEntry | None) -> tuple[str, ...]:
         """Return warnings because of what is active on the controller; raise a ModelError if a rule refuses it."""
         return findings(self.history, command, model).accepted(self.folder)
+
+    def _saved(self, result: Calibration | Recalibration, accept_implausible: bool) -> Path:
+        """Save a model under a name that no model of the cell has had; return its folder."""
+        names = [one.name for one in self.history.models()]
+        return save_new(
+            self.folder / MODELS, partial(result.save, accept_implausible=accept_implausible), names
+        )
 
     def _candidate(self, model: str | None) -> ModelEntry:
         """Return the named model, else the model in use, else the newest."""

@@ -5,12 +5,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
-from pisigma.files.errors import ModelError, Place
-from pisigma.files.model_files import model_hash
+from pisigma.files.model_files import is_unchanged, model_hash
 from pisigma.files.progress import Progress
 from pisigma.lifetime.cell.events import Event, EventKind
 from pisigma.lifetime.cell.history import Check, History, ModelEntry, SessionEntry, Use, now
-from pisigma.lifetime.cell.layout import MODELS
+from pisigma.lifetime.cell.layout import MODELS, checked_model
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import load_model
@@ -50,7 +49,9 @@ def is_better(
         settings: settings of the calibration.
         progress: called with the name of each step.
     """
-    newest, older = sessions[-1], list(sessions[:-1])
+    newest, older, folder = sessions[-1], list(sessions[:-1]), stored.folder.parent / MODELS / in_use.name
+    if not is_unchanged(folder, in_use.sha256):
+        return False, f"model '{in_use.name}', which is in use, was changed or removed"
     if newest.name in in_use.made_of or newest.rows < MIN_ROWS or not older:
         return False, f"there is no session of {MIN_ROWS} rows or more to compare it with '{in_use.name}'"
     progress("calibration without the newest session")
@@ -65,7 +66,7 @@ def is_better(
     )
     rows = stored.as_measured(newest)
     seen = [stored.rows_for(one, rows, newest.day) for one in (in_use, entry)]
-    old = load_model(stored.folder.parent / MODELS / in_use.name)
+    old = load_model(folder)
     judged = evaluate(
         [replace(old, name="in use"), replace(with_names_of(without.model, entry, in_use), name="new")],
         seen[0].rows,
@@ -195,7 +196,8 @@ def errors_of(result: Calibration | Recalibration) -> tuple[float | None, float 
 
 
 def entry_of(
-    history: History,
+    events: Sequence[Event],
+    made: str,
     path: Path,
     sessions: Sequence[SessionEntry],
     remark: str,
@@ -205,18 +207,19 @@ def entry_of(
     """Return the history entry of a new model.
 
     Args:
-        history: history of the cell.
+        events: events that were recorded when its rows were read; a recalibration keeps the names of its parent.
+        made: time at which they were read (ISO 8601, UTC).
         path: folder of the model.
         sessions: sessions to which it was fitted.
         remark: why it is or is not in use.
         result: calibration or recalibration that made it.
         parent: model that was recalibrated; None for a calibration.
     """
-    events, day = history.events(), max(one.day for one in sessions)
+    day = max(one.day for one in sessions)
     entry = ModelEntry(
         name=path.name,
         sha256=model_hash(path),
-        made=now(),
+        made=made,
         sessions=",".join(one.name for one in sessions),
         day=day,
         frame_day=newest_day(events, "instrument", day),
@@ -249,13 +252,10 @@ def put_into_use(history: History, model: str, reason: str, undo: bool = False) 
         undo: whether this undoes the last change.
 
     Raises:
-        ModelError: the folder of the model was changed.
+        ModelError: the folder of the model was changed or removed.
     """
-    folder = history.path.parent / MODELS / model
-    if model and model_hash(folder) != history.model(model).sha256:
-        raise ModelError(
-            "the model was changed after it was made", at=Place(folder), remedy="use another model"
-        )
+    if model:
+        checked_model(history.path.parent, history.model(model))
     history.add(Use(model, now(), reason, undo))
 
 

@@ -45,18 +45,19 @@ def output_path(cell: str | os.PathLike[str], part: str, suffix: str) -> Path:
     return free_path(folder, datetime.date.today().isoformat(), suffix)
 
 
-def save_new(folder: Path, save: Callable[[Path], object]) -> Path:
+def save_new(folder: Path, save: Callable[[Path], object], taken: Collection[str]) -> Path:
     """Save a model under a new name, the date of today, even if other processes save models in the same folder.
 
     Args:
         folder: folder of the models.
         save: function that writes the folder of the model, and refuses an existing one.
+        taken: further names that are taken, such as those of models whose folders were removed.
 
     Raises:
         OutputError: the model cannot be written.
     """
     while True:
-        path = free_path(folder, datetime.date.today().isoformat(), "")
+        path = free_path(folder, datetime.date.today().isoformat(), "", taken)
         try:
             save(path)
             return path

@@ -14,6 +14,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from pisigma.files.errors import AcceptanceError, MeasurementError, PisigmaError, Place, check_choice
+from pisigma.files.model_files import is_unchanged
 from pisigma.lifetime.cell.controller import Controller
 from pisigma.lifetime.cell.events import Event
 from pisigma.lifetime.cell.facts import facts_of, not_taken_in, sha256_of, unimported_files
@@ -170,12 +171,15 @@ class Sessions:
         model, fitted, controller = self.history.in_use, False, Controller.from_history(self.history)
         at = controller.active(day, now())
         found = controller.findings("import", model, self.history.sessions(), at).accepted(self.folder.parent)
-        if model is None or found:  # with other joint zeros, the model does not describe the arm
-            model, verdict = None, check_rows(rows, self.robot)
+        if model is None or found or not is_unchanged(self._folder_of(model), model.sha256):
+            model, verdict = (
+                None,
+                check_rows(rows, self.robot),
+            )  # other joint zeros: it does not describe the arm
         else:
             seen = self.rows_for(model, rows, day)
             stated = RecalibrationSettings(seen.moved or None)
-            loaded = load_model(self.folder.parent / MODELS / model.name)
+            loaded = load_model(self._folder_of(model))
             verdict = check_rows(seen.rows, loaded, stated.fitted, may_move(stated))
             training = known_rows(loaded, seen.rows)
             fitted = bool(training.all())
@@ -201,6 +205,9 @@ class Sessions:
             poses=int(groups_of_equal_joints(rows.q).max()) + 1,
         )
         return entry, model if fitted else None
+
+    def _folder_of(self, model: ModelEntry) -> Path:
+        return self.folder.parent / MODELS / model.name
 
     def set_aside(self, session: str, reason: str) -> None:
         """Exclude a session, or a file in the folder that has not been added, from all further steps; it is kept.
@@ -273,13 +280,19 @@ class Sessions:
         check_choice(MeasurementError, "session", name, tuple(sessions), Place(self.folder))
         return sessions[name]
 
-    def rows_of(self, sessions: Sequence[SessionEntry]) -> Measurements:
+    def rows_of(
+        self, sessions: Sequence[SessionEntry], events: Sequence[Event] | None = None
+    ) -> Measurements:
         """Return the rows of sessions; rows after an instrument or tool event have a new frame or target.
+
+        Args:
+            sessions: the sessions.
+            events: events that count; None: all that have been recorded.
 
         Raises:
             MeasurementError: a file was changed or removed after it was added.
         """
-        events, parts = self.history.events(), []
+        events, parts = self.history.events() if events is None else events, []
         for one in sessions:
             days = newest_day(events, "instrument", one.day), newest_day(events, "tool", one.day)
             parts.append(with_setup_names(self.as_measured(one), *days))

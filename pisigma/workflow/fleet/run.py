@@ -151,8 +151,9 @@ def _advance(folder: Path, prior: Path | None) -> tuple[str, dict[str, list[Para
 
 def _parameters(facts: CellFacts, known: Iterable[str] = ()) -> dict[str, list[ParameterValue]]:
     """Return the estimated parameters of the models of a cell, except known ones, by the SHA-256 of the models."""
-    new = [one for one in facts.models if one.sha256 not in known]
-    return {one.sha256: parameters_of(load_model(Path(facts.folder) / MODELS / one.name)) for one in new}
+    new = {one.sha256: Path(facts.folder) / MODELS / one.name for one in facts.models}
+    there = {sha256: folder for sha256, folder in new.items() if sha256 not in known and folder.is_dir()}
+    return {sha256: parameters_of(load_model(folder)) for sha256, folder in there.items()}
 
 
 def parameters_of(model: CalibratedModel) -> list[ParameterValue]:

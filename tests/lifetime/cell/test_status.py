@@ -30,10 +30,12 @@ def check(
 
 FIRST, SECOND = session("2026-01-10"), session("2026-02-10", rows=10)
 MODEL = model("a", "2026-01-10", p95_mm=0.1)
-EMPTY = CellFacts("cell", (), (), (), (), (), (), None, 0.3, "2026-02-11")
+EMPTY = CellFacts("cell", (), (), (), (), (), (), None, 0.3, "2026-02-11", settings_sha256="hash")
 PLANNED = replace(EMPTY, plans=("2026-01-09",))
 MEASURED = replace(PLANNED, sessions=(FIRST,))
-CALIBRATED = replace(MEASURED, models=(MODEL,), checks=(check("calibrate", "a"),))
+CALIBRATED = replace(
+    MEASURED, models=(MODEL,), checks=(replace(check("calibrate", "a"), settings_sha256="hash"),)
+)
 MEASURED_AGAIN = replace(CALIBRATED, sessions=(FIRST, SECOND))
 VERIFIED = replace(
     MEASURED_AGAIN, checks=(*CALIBRATED.checks, check("verify", "a", "2026-02-10")), in_use=MODEL
@@ -46,6 +48,10 @@ OFFSETS = Controller(
     (ControllerEntry("2026-02-20", "hash", "", "2026-02-20T08:00:00+00:00"),),
     (ExportEntry("offsets.csv", "hash", "offsets", "joint_zeros", "a", "2026-02-19T08:00:00+00:00"),),
 )
+
+MIXED = replace(NEWER, name="a")
+LATE = Event("2026-02-01", "instrument", "", "2026-02-11T08:00:00+00:00")
+"""An event that was recorded after a model had been fitted to sessions before and after it."""
 
 CASES = {
     "no_plan": (EMPTY, "plan"),
@@ -102,6 +108,9 @@ CASES = {
         replace(VERIFIED, sessions=(replace(FIRST, set_aside="loose reflector"), SECOND)),
         "calibrate",
     ),
+    "fitted_before_event": (replace(VERIFIED, in_use=MIXED, models=(MIXED,), events=(LATE,)), "calibrate"),
+    "model_changed": (replace(VERIFIED, changed_models=("a",)), "calibrate"),
+    "settings_changed": (replace(VERIFIED, settings_sha256="other"), "calibrate"),
     "outside_limit": (replace(VERIFIED, limit_mm=0.05), "plan"),
     "limit_below_scatter": (replace(VERIFIED, limit_mm=0.05, in_use=replace(MODEL, scatter_mm=0.018)), ""),
     "verification_due": (replace(VERIFIED, today="2026-09-01"), "plan"),
@@ -277,3 +286,51 @@ def test_a_model_that_fits_the_joint_zeros_is_used_and_else_one_is_made():
     )
     step = next_step(replace(facts, models=(fitting,), in_use=fitting, controller=without))
     assert (step.state, step.command.split()[1]) == ("other_joint_zeros", "plan")
+
+
+def test_a_model_that_was_changed_is_replaced_by_another_or_made_again():
+    facts, _ = CASES["model_changed"]
+    newer = replace(facts, models=(MODEL, NEWER))
+    assert next_step(newer).command == "pisigma use cell b"
+    assert next_step(replace(newer, changed_models=("a", "b"))).verb == "calibrate"
+    event = Event("2026-02-11", "collision", "", "2026-02-11T08:00:00+00:00")
+    assert next_step(replace(facts, events=(event,))).command == "pisigma plan cell"
+    not_in_use = replace(facts, in_use=None)
+    assert next_step(not_in_use).state == "not_calibrated"
+
+
+@pytest.mark.parametrize(
+    ("event", "state"),
+    [
+        (LATE, "fitted_before_event"),
+        (replace(LATE, kind="firmware"), "up_to_date"),
+        (replace(LATE, recorded="2026-02-02T08:00:00+00:00"), "up_to_date"),
+        (replace(LATE, day="2026-01-10"), "up_to_date"),
+        (replace(LATE, day="2026-02-11"), "up_to_date"),
+    ],
+)
+def test_an_event_that_was_recorded_after_a_calibration_of_rows_before_and_after_it(event, state):
+    facts = replace(CASES["fitted_before_event"][0], events=(event,))
+    assert next_step(facts).state == state
+    assert next_step(replace(facts, in_use=None)).state == (
+        "not_verified" if state == "up_to_date" else state
+    )
+    recalibrated = model("c", "2026-01-10,2026-02-10,2026-03-10", day="2026-03-10", parent="a")
+    assert (
+        next_step(replace(facts, models=(MIXED, recalibrated), in_use=recalibrated, limit_mm=None)).state
+        == state
+    )
+    again = replace(facts, models=(MIXED, replace(MIXED, name="b", made="2026-02-12T08:00:00+00:00")))
+    assert next_step(again).verb is None
+
+
+def test_changed_settings_or_events_let_a_calibration_that_failed_be_repeated():
+    failed = replace(check("calibrate", "", verdict="not_trusted"), settings_sha256="hash")
+    facts = replace(MEASURED, checks=(failed,))
+    assert next_step(facts).state == "not_trusted"
+    assert next_step(replace(facts, settings_sha256="other")).state == "settings_changed"
+    assert next_step(replace(facts, checks=(replace(failed, settings_sha256=""),))).state == "not_trusted"
+    event = replace(LATE, day="2026-01-10")
+    assert next_step(replace(facts, events=(event,))).state == "not_calibrated"
+    not_in_use = replace(CALIBRATED, settings_sha256="other")
+    assert next_step(not_in_use).state == "settings_changed"

@@ -146,17 +146,38 @@ def test_a_file_that_was_edited_is_named_and_not_used(year):
     assert cell.status().step.state != "edited_session"
 
 
-def test_a_changed_model_is_not_put_into_use(year):
+@pytest.mark.parametrize("file", ["model.yaml", "model.safetensors"])
+def test_a_changed_model_is_named_and_not_used(year, file):
     cell, *_ = year
-    entry = cell.history.models()[0]
-    path = cell.folder / "models" / entry.name / "model.yaml"
+    entry = cell.history.in_use
+    path = cell.folder / "models" / entry.name / file
     content = path.read_bytes()
     path.write_bytes(content + b"\n")
     try:
+        assert cell.status().step.state == "model_changed"
         with refused(ModelError):
             cell.use(entry.name, "")
+        with refused(ModelError):
+            pisigma.load(cell.folder)
     finally:
         path.write_bytes(content)
+
+
+def test_an_event_that_is_recorded_during_a_calibration_asks_for_another(tmp_path):
+    cell = Cell.create(tmp_path / "cell", "ur10")
+    cell.take_in(measured(14, 1), day="2026-01-10")
+    cell.take_in(measured(8, 2), day="2026-01-12")
+
+    def record(_):
+        if not cell.history.events():
+            cell.history.record("instrument", "2026-01-11")
+
+    _, entry = cell.calibrate(record, model="geometric", folds=2)
+    assert entry.frame_day == ""
+    assert cell.status().step.state == "fitted_before_event"
+    _, again = cell.calibrate(model="geometric", folds=0)
+    assert again.frame_day == "2026-01-11"
+    assert cell.status().step.state == "not_verified"
 
 
 def test_sessions_before_and_after_an_event_of_the_instrument_are_in_two_frames(tmp_path):

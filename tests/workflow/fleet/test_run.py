@@ -91,14 +91,19 @@ def test_a_later_call_continues(plant):
     assert (last.unchanged, last.done, last.refused) == (2, 3, ())
 
 
-def test_a_model_folder_that_is_gone_is_named_and_does_not_stop_the_others(plant):
+def test_a_cell_is_calibrated_again_if_its_model_is_gone_or_its_settings_were_edited(plant):
     first = run_fleet(plant, ONE_JOB)
     first.results.unlink()
     (model,) = (plant / "r0" / "models").iterdir()
     shutil.rmtree(model)
+    with (plant / "r1" / "cell.yaml").open("a", encoding="utf-8") as file:
+        file.write("  robust: false\n")
     last = run_fleet(plant, ONE_JOB)
-    assert [cell for cell, _ in last.refused] == ["r0", "r2"]
-    assert table_of(last)[1][1]["parameters"]
+    assert (last.unchanged, last.refused) == (0, first.refused)
+    checks, rows = table_of(last)
+    assert [cell for cell, command, _ in checks if command == "calibrate"] == ["r0", "r0", "r1", "r1"]
+    assert [bool(row["parameters"]) for row in rows[:4]] == [False, True, True, True]
+    assert run_fleet(plant, ONE_JOB).unchanged == 2
 
 
 def test_a_folder_without_cells_is_refused(tmp_path):
