@@ -17,9 +17,9 @@ from pisigma.deployment.export.export_format import ExportRequest
 from pisigma.deployment.export.registry import export_format
 from pisigma.files.errors import ModelError, PisigmaError, Place, RequestError, nearest_choice
 from pisigma.files.model_files import is_model, model_hash
-from pisigma.lifetime.cell.facts import status_of
 from pisigma.lifetime.cell.layout import is_cell
 from pisigma.lifetime.cell.model_in_use import ModelInUse
+from pisigma.lifetime.cell.status import status_of
 from pisigma.model.inverse.compiled_ik import CompiledIK
 from pisigma.model.inverse.corrected_ik import CorrectedIK, load
 from pisigma.model.inverse.solution import Solution
