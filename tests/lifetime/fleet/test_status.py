@@ -1,5 +1,6 @@
 """Status of a fleet: cells by their states, and the largest errors."""
 
+import hashlib
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +13,10 @@ from pisigma.lifetime.fleet.status import FleetStatus
 from pisigma.reporting.fleet_tables import cell_table, fleet_verdict, state_table
 
 SESSION = SessionEntry("2026-03-01", "hash", "2026-03-02T09:00:00+00:00", "2026-03-01", 30, "position")
-MODEL = ModelEntry("a", "hash", "2026-03-02T12:00:00+00:00", "2026-03-01", "2026-03-01")
+DESCRIPTION = b"format: 5\n"
+MODEL = ModelEntry(
+    "a", hashlib.sha256(DESCRIPTION).hexdigest(), "2026-03-02T12:00:00+00:00", "2026-03-01", "2026-03-01"
+)
 CHECK = Check("calibrate", "a", "", "trusted", "", None, False, "2026-03-02T12:00:00+00:00", 0.05)
 
 
@@ -23,14 +27,15 @@ def cell(folder, name, *entries, text="robot: ur10\n"):
     (path / "sessions" / "2026-03-01.csv").write_text("rows")
     if entries:
         History(path / HISTORY).add(*entries)
+        (path / "models" / "a").mkdir(parents=True)
+        (path / "models" / "a" / "model.yaml").write_bytes(DESCRIPTION)
+        (path / "models" / "a" / "model.safetensors").write_bytes(b"")
     return path
 
 
 @pytest.fixture
 def fleet(tmp_path):
     """One cell in each of six states."""
-    import hashlib
-
     session = replace(SESSION, sha256=hashlib.sha256(b"rows").hexdigest())
     cell(tmp_path, "new")
     cell(tmp_path, "measured", session, MODEL, replace(CHECK, rms_mm=0.2))
