@@ -13,9 +13,9 @@ from matplotlib.axes import Axes
 from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
 
 from pisigma.files.model_files import CARD
-from pisigma.lifetime.cell.facts import CellStatus
 from pisigma.lifetime.cell.layout import MODELS
-from pisigma.lifetime.cell.status import ATTENTION
+from pisigma.lifetime.cell.status import CellStatus
+from pisigma.lifetime.cell.step import ATTENTION
 from pisigma.lifetime.comparison.model_pair import Displacement
 from pisigma.lifetime.comparison.parameter_differences import ParameterDifferences
 from pisigma.lifetime.fleet.status import UNREADABLE, FleetStatus, urgency

@@ -221,6 +221,7 @@ def inverse_of(normal: Float64[np.ndarray, "unknowns unknowns"]) -> Float64[np.n
         inverse = inverse.T @ inverse
         # The sums of rows bound the largest eigenvalues of both, so that every direction is determined.
         if np.abs(scaled).sum(0).max() * np.abs(inverse).sum(0).max() * UNDETERMINED < 1:
-            return inverse * scales
+            inverse *= scales
+            return inverse
     inverse = np.linalg.pinv(scaled, rcond=UNDETERMINED, hermitian=True) * scales
     return inverse
