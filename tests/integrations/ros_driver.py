@@ -53,13 +53,8 @@ class Driver(Node):
 
     def pose(self, frame, values, stamp, longest=LONGEST):
         """Return the answer to x, y, z and a quaternion: stamp, frame, names and positions."""
-        message = PoseStamped()
-        message.header.frame_id, message.header.stamp.sec = frame, stamp
-        for part, names, numbers in (("position", "xyz", values[:3]), ("orientation", "xyzw", values[3:])):
-            for name, number in zip(names, numbers, strict=True):
-                setattr(getattr(message.pose, part), name, number)
         self.joints.clear()
-        self.poses.publish(message)
+        self.poses.publish(_stamped(frame, values, stamp))
         self.until(lambda: self.joints, longest)
         return [
             [one.header.stamp.sec, one.header.frame_id, list(one.name), list(one.position)]
@@ -71,6 +66,20 @@ class Driver(Node):
         for _ in range(5):
             self.states.publish(JointState(name=names, position=positions))
             self.until(lambda: False, 0.02)
+
+    def service(self, frame, values, names, positions, link=""):
+        """Return error code, names and positions of the service of MoveIt's type; None if it is not installed."""
+        try:
+            from moveit_msgs.srv import GetPositionIK
+        except ImportError:
+            return None
+        request = GetPositionIK.Request()
+        wanted = request.ik_request
+        wanted.pose_stamped, wanted.ik_link_name = _stamped(frame, values, 0), link
+        wanted.robot_state.joint_state = JointState(name=names, position=positions)
+        done = self._call(self.create_client(GetPositionIK, "/corrected_ik/compute_ik"), request)
+        state = done.solution.joint_state
+        return [done.error_code.val, list(state.name), list(state.position)]
 
     def trigger(self, name):
         """Call a service of the recorder, and return whether it succeeded and its message."""
@@ -114,6 +123,15 @@ class Driver(Node):
         future = client.call_async(request)
         rclpy.spin_until_future_complete(self, future, timeout_sec=LONGEST)
         return future.result()
+
+
+def _stamped(frame, values, stamp):
+    message = PoseStamped()
+    message.header.frame_id, message.header.stamp.sec = frame, stamp
+    for part, names, numbers in (("position", "xyz", values[:3]), ("orientation", "xyzw", values[3:])):
+        for name, number in zip(names, numbers, strict=True):
+            setattr(getattr(message.pose, part), name, number)
+    return message
 
 
 def _values(status):

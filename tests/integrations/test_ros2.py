@@ -16,6 +16,8 @@ JOINTS = tuple(f"joint_{number}" for number in range(1, 7))
 CODES = {
     "SUCCESS": 1,
     "INVALID_GOAL_CONSTRAINTS": -16,
+    "INVALID_LINK_NAME": -18,
+    "COLLISION_CHECKING_UNAVAILABLE": -22,
     "FRAME_TRANSFORM_FAILURE": -21,
     "COMMUNICATION_FAILURE": -25,
     "NO_IK_SOLUTION": -31,
@@ -41,7 +43,19 @@ def _request(T, near, frame="base_link"):
     )
     stated = Message(name=[*reversed(JOINTS), "gripper"], position=[*reversed(near), 0.1])
     stamped = Message(header=Message(frame_id=frame), pose=pose)
-    return Message(ik_request=Message(pose_stamped=stamped, robot_state=Message(joint_state=stated)))
+    constraints = Message(
+        **{f"{kind}_constraints": [] for kind in ("joint", "position", "orientation", "visibility")}
+    )
+    return Message(
+        ik_request=Message(
+            pose_stamped=stamped,
+            robot_state=Message(joint_state=stated),
+            ik_link_name="",
+            pose_stamped_vector=[],
+            avoid_collisions=False,
+            constraints=constraints,
+        )
+    )
 
 
 def _response():
@@ -79,6 +93,22 @@ def test_a_service_call_returns_corrected_joint_values(messages, repository):
         raise ConnectionError("closed")
 
     assert messages.answer(_request(T, near), _response(), arm, gone).error_code.val == -25
+
+
+def test_what_the_service_cannot_do_is_refused(messages):
+    arm = messages.Arm(JOINTS, "base_link", "tool0")
+    for field, value, wanted in (
+        ("ik_link_name", "flange", -18),
+        ("pose_stamped_vector", [None], -18),
+        ("avoid_collisions", True, -22),
+        ("constraints", None, -16),
+    ):
+        request = _request(np.eye(4), np.zeros(6))
+        if value is None:
+            request.ik_request.constraints.orientation_constraints.append("level")
+        else:
+            setattr(request.ik_request, field, value)
+        assert messages.answer(request, _response(), arm, None).error_code.val == wanted
 
 
 def test_joint_values_outside_the_domain_are_returned_if_accepted(messages):

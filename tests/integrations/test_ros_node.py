@@ -105,8 +105,13 @@ def test_poses_are_answered_with_corrected_joints(repository):
             (("world", pose), ("base_link", far), ("base_link", skew)), 3
         ):
             assert ask("pose", frame, values, number) == [[number, "base_link", JOINTS, []]]
-        level, hardware, values = ask("report", 5)
-        assert (level, hardware, values["SUCCESS"], values["model"]) == (0, "kiro4", "1", "kiro4")
+        by_service = ask("service", "base_link", pose, JOINTS, near.tolist(), "tool0")
+        if by_service is not None:  # tests/integrations/build_messages.py was run
+            assert by_service == [1, JOINTS, q]
+            assert ask("service", "base_link", pose, JOINTS, near.tolist(), "flange") == [-18, [], []]
+        level, hardware, values = ask("report", 5 + 2 * (by_service is not None))
+        assert (level, hardware, values["model"]) == (0, "kiro4", "kiro4")
+        assert values["SUCCESS"] == ("1" if by_service is None else "2")
         assert [values[name] for name in ("FRAME_TRANSFORM_FAILURE", "INVALID_GOAL_CONSTRAINTS")] == [
             "1",
             "1",
@@ -118,4 +123,4 @@ def test_poses_are_answered_with_corrected_joints(repository):
         server.stop()
         ask("near", JOINTS, near.tolist())
         assert ask("pose", "base_link", pose, 10) == [[10, "base_link", JOINTS, []]]
-        assert ask("report", 6)[0] == 2
+        assert ask("report", int(values["requests"]) + 1)[0] == 2

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 
 REACHED, OUTSIDE_JOINT_LIMITS, OUTSIDE_DOMAIN, INVALID_POSE = 0, 2, 3, 6
 """Statuses of the server, see its protocol."""
+CONSTRAINTS = ("joint", "position", "orientation", "visibility")
+"""Kinds of constraints of a moveit_msgs/Constraints."""
 
 
 @dataclass(frozen=True)
@@ -17,12 +19,14 @@ class Arm:
     Attributes:
         joints: Names of the joints in ROS, in the order of the model.
         base_frame: Name in ROS of the frame of the model's poses.
+        tip_link: Name in ROS of the link that the poses are of.
         model: Index of the model on the server.
         accept_outside_domain: Whether to accept joint values with an extrapolated correction.
     """
 
     joints: tuple[str, ...]
     base_frame: str
+    tip_link: str = ""
     model: int = 0
     accept_outside_domain: bool = False
 
@@ -73,6 +77,16 @@ def solution(stamped, near, arm, solve):
     return ("INVALID_GOAL_CONSTRAINTS" if status == INVALID_POSE else "NO_IK_SOLUTION"), []
 
 
+def _refusal(wanted, arm):
+    """Return the error code for what a moveit_msgs/PositionIKRequest asks for in addition to a pose; "" for nothing."""
+    if wanted.ik_link_name not in ("", arm.tip_link) or wanted.pose_stamped_vector:
+        return "INVALID_LINK_NAME"
+    if wanted.avoid_collisions:
+        return "COLLISION_CHECKING_UNAVAILABLE"
+    is_constrained = any(getattr(wanted.constraints, f"{kind}_constraints") for kind in CONSTRAINTS)
+    return "INVALID_GOAL_CONSTRAINTS" if is_constrained else ""
+
+
 def answer(request, response, arm, solve):
     """Fill the response of a GetPositionIK service, and return it.
 
@@ -86,7 +100,9 @@ def answer(request, response, arm, solve):
     """
     wanted, code = request.ik_request, response.error_code
     near = near_of(wanted.robot_state.joint_state, arm.joints)
-    name, q = solution(wanted.pose_stamped, near, arm, solve)
+    name, q = _refusal(wanted, arm), []
+    if not name:
+        name, q = solution(wanted.pose_stamped, near, arm, solve)
     code.val = getattr(code, name)
     if q:
         response.solution.joint_state.name = list(arm.joints)

@@ -36,6 +36,7 @@ PARAMETERS = {
     "model": (0, "Index of the model on the server."),
     "joints": ([""], "Names of the joints in ROS, in the order of the model; by default those of the model."),
     "base_frame": ("", "Frame of the poses; by default that of the calibrated robot_description."),
+    "tip_link": ("", "Link that the poses are of; by default the tool of the calibrated robot_description."),
     "accept_outside_domain": (False, "Whether to accept joint values with an extrapolated correction."),
     "joint_states_max_age": (
         1.0,
@@ -73,18 +74,25 @@ class CorrectedIk(LifecycleNode):
                 self._value("model"),
                 self._value("timeout"),
             )
-            base_frame = self._value("base_frame") or self._server.pose_frame
-        except (OSError, RuntimeError, LookupError, SyntaxError) as problem:
+        except (OSError, RuntimeError, LookupError, ValueError) as problem:
             self.get_logger().error(f"The server cannot be used: {problem}")
             return TransitionCallbackReturn.FAILURE
+        frames = [
+            self._value(name) or found
+            for name, found in zip(("base_frame", "tip_link"), self._server.links, strict=True)
+        ]
+        if not all(frames):
+            self.get_logger().error("A URDF cannot describe the model: set base_frame and tip_link")
+            self._server.close()
+            return TransitionCallbackReturn.FAILURE
         joints = tuple(filter(None, self._value("joints"))) or tuple(self._server.joints)
-        self._arm = Arm(joints, base_frame, self._value("model"))
+        self._arm = Arm(joints, *frames, self._value("model"))
         self._read()
         self._joint_states, self._counts, self._durations = None, Counter(), deque(maxlen=1024)
         self._shown = None
         self._create()
         self._server.follow(self._value("diagnostics_period"))
-        self.get_logger().info(f"Poses in the frame '{base_frame}', joints {', '.join(joints)}")
+        self.get_logger().info(f"Poses of '{frames[1]}' in '{frames[0]}', joints {', '.join(joints)}")
         return TransitionCallbackReturn.SUCCESS
 
     def _create(self):

@@ -7,8 +7,8 @@ from pisigma_ros.pisigma_client import FrameClient, JsonClient
 
 SLOW = 60.0
 """[s] Longest wait for the first URDF of a model, which the server has to make."""
-CALIBRATED_FRAME = "calibrated_frame"
-"""Link of a calibrated URDF that is the frame of the model's poses, if it is not the root."""
+FRAMES, TIPS = ("calibrated_frame", "base_link"), ("calibrated_tool", "tool0")
+"""Links of a calibrated URDF that are the frame of the model's poses and its tool; the first one that it has."""
 
 
 class Server:
@@ -53,13 +53,12 @@ class Server:
                 client.close()
 
     @property
-    def pose_frame(self):
-        """Name of the link of the URDF in which poses are stated."""
-        root = ElementTree.fromstring(self.urdf)
-        links = [link.get("name") for link in root.iterfind("link")]
-        children = {child.get("link") for child in root.iterfind("joint/child")}
-        roots = [link for link in links if link not in children]
-        return CALIBRATED_FRAME if CALIBRATED_FRAME in links else roots[0]
+    def links(self):
+        """Names of the links of the URDF that are the frame of the poses and the tool; "" without a URDF."""
+        links = {
+            link.get("name") for link in ElementTree.fromstring(self.urdf or "<robot/>").iterfind("link")
+        }
+        return tuple(next((name for name in names if name in links), "") for names in (FRAMES, TIPS))
 
     def _follow(self, period):
         while not self._ending.wait(period):
