@@ -59,8 +59,8 @@ NOT_STORED = "no model was stored, because the result must not be trusted, for t
 
 def create(folder: Path, form: Form, files: list[Path]) -> Cell:
     """Create the cell of a robot of the catalogue, or of an uploaded file."""
-    robot = str(files[0]) if files else form.get("robot", "")
-    if not files:
+    robot = form.get("robot") or "".join(map(str, files))
+    if form.get("robot") or not files:
         check_choice(RobotError, "robot", robot, catalogue())  # a page must not name paths
     limit = number_of(form, "limit_mm") if form.get("limit_mm") else None
     return Cell.create(

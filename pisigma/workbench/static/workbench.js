@@ -161,12 +161,14 @@ async function upload(file, more = "") {
   return await answer.json();
 }
 
-async function offer(input) {  // the links of a robot file
+async function offer(input) {  // the links of a robot file, which replaces a robot of the catalogue and the other way round
   fault(input.form, null);
+  const file = input.files?.[0], other = input.form.querySelector("[data-links]");
+  if (other !== input) { if (input.value) other.value = ""; else if (other.files.length) return; }
   try {
-    const links = input.files.length ? (await upload(input.files[0], "&links")).links : [];
+    const links = file ? (await upload(file, "&links")).links : [];
     for (const name of ["tip", "base"]) input.form.elements[name].replaceChildren(input.form.elements[name].options[0], ...links.map(link => new Option(link, link)));
-    input.form.elements.robot.value = "";
+    if (file) input.form.elements.robot.value = "";
   } catch (problem) { fault(input.form, problem); }
   say(input.form);
 }
@@ -236,7 +238,7 @@ document.querySelector("nav").addEventListener("keydown", event => {
 document.getElementById("stop").addEventListener("click", () => steps("stop", { ended: String(ended) }).then(poll));
 content.addEventListener("submit", event => { event.preventDefault(); start(event.target); });
 content.addEventListener("input", event => { if (event.target.form) say(event.target.form); });
-content.addEventListener("change", event => { if (event.target.id === "files") propose(); else if (event.target.dataset.links !== undefined) offer(event.target); else if (event.target.form) say(event.target.form); });
+content.addEventListener("change", event => { if (event.target.id === "files") propose(); else if (event.target.matches("[data-links], [data-step=new] [name=robot]")) offer(event.target); else if (event.target.form) say(event.target.form); });
 content.addEventListener("click", event => {
   const one = event.target;
   if (one.dataset.again !== undefined) propose(one.form);
