@@ -60,7 +60,9 @@ NOT_STORED = "no model was stored, because the result must not be trusted, for t
 def create(folder: Path, form: Form, files: list[Path]) -> Cell:
     """Create the cell of a robot of the catalogue, or of an uploaded file."""
     robot = form.get("robot") or "".join(map(str, files))
-    if form.get("robot") or not files:
+    if not robot:
+        raise RobotError(expected="a robot of the catalogue, or a file", option="robot")
+    if robot == form.get("robot"):
         check_choice(RobotError, "robot", robot, catalogue())  # a page must not name paths
     limit = number_of(form, "limit_mm") if form.get("limit_mm") else None
     return Cell.create(

@@ -171,7 +171,7 @@ def timeline(status: CellStatus) -> list[TimelineEntry]:
             "check",
             f"{one.command}{f' of {one.model}' if one.model else ''}: {one.verdict.replace('_', ' ')}"
             f"{f'; {one.summary}' if one.summary else ''}",
-            one.verdict not in ("trusted", "better", "unchanged", "recalibrated"),
+            one.verdict not in ("planned", "trusted", "better", "unchanged", "recalibrated"),
         )
         for one in facts.checks
     ]

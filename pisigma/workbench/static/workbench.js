@@ -20,6 +20,7 @@ async function ask(path, body, type = "application/json") {
 const steps = (path, form) => ask(`${path}?person=${encodeURIComponent(person.value)}`, JSON.stringify(form));
 
 const kept = {};  // the forms of every tab as people left them, and what else a tab had open
+const refusals = {};  // the last refusal of every step that was started here
 const started = {};  // the form by which a step was started here, and the number of steps that had ended by then
 let proposal = null, dragging = 0;
 
@@ -51,7 +52,7 @@ async function show(name) {
   for (const one of parts.querySelectorAll(".outcome")) if (started[one.dataset.step]?.ended < ended) {
     const { form } = started[one.dataset.step];
     delete started[one.dataset.step];
-    if (one.classList.contains("refused")) { refused = one.dataset.step; continue; }
+    if (one.classList.contains("refused")) { refused = refusals[one.dataset.step] = one.outerHTML; continue; }
     if (form.dataset.once !== undefined) delete left.forms[keyOf(form)];
     if (one.dataset.step === "import") proposal = null;
   }
@@ -72,7 +73,7 @@ async function show(name) {
   content.setAttribute("aria-labelledby", "tab-" + name);
   content.querySelectorAll("small.fault").forEach(one => one.remove());
   content.querySelectorAll("[aria-invalid]").forEach(one => one.removeAttribute("aria-invalid"));
-  content.querySelectorAll(".outcome[data-field]").forEach(one => mark(one, one.dataset.step === refused));
+  content.querySelectorAll(".outcome[data-field]").forEach(one => { if (refusals[one.dataset.step] === one.outerHTML) mark(one, refused === one.outerHTML); });
   content.querySelectorAll("form").forEach(say);
   lock();
 }

@@ -27,17 +27,15 @@ if TYPE_CHECKING:  # names in full, which type checkers at run time find without
     import viser
 
 
+Values = Float64[np.ndarray, " dof"]
+
+
 class AbstractBody(ABC):
     """Interface of the appearance of a robot, drawn at joint values in the base frame of poses."""
 
     @abstractmethod
     def draw(
-        self,
-        scene: "viser.SceneApi",
-        name: str,
-        q: Float64[np.ndarray, " dof"],
-        color: Color,
-        opacity: float | None,
+        self, scene: "viser.SceneApi", name: str, q: Values, color: Color, opacity: float | None
     ) -> None:
         """Draw the robot, replacing what was drawn under the name before.
 
@@ -57,12 +55,7 @@ class CapsuleBody(AbstractBody):
         self._capsules = capsules
 
     def draw(
-        self,
-        scene: "viser.SceneApi",
-        name: str,
-        q: Float64[np.ndarray, " dof"],
-        color: Color,
-        opacity: float | None,
+        self, scene: "viser.SceneApi", name: str, q: Values, color: Color, opacity: float | None
     ) -> None:
         """Draw one mesh of all capsules; see `AbstractBody.draw`."""
         segments, radii = self._capsules.segments(torch.from_numpy(q)).numpy(), self._capsules.radius.tolist()
@@ -117,12 +110,7 @@ class MeshBody(AbstractBody):
         self._drawn: dict[str, viser.MeshHandle] = {}
 
     def draw(
-        self,
-        scene: "viser.SceneApi",
-        name: str,
-        q: Float64[np.ndarray, " dof"],
-        color: Color,
-        opacity: float | None,
+        self, scene: "viser.SceneApi", name: str, q: Values, color: Color, opacity: float | None
     ) -> None:
         """Draw one mesh per link on the first call, and move the meshes afterwards; see `AbstractBody.draw`."""
         values = dict(zip(self._joints, q.tolist(), strict=True))
