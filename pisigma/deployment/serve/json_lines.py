@@ -317,7 +317,7 @@ def _model_record(model: ServedModel) -> dict[str, Any]:
         "sha256": model.sha256,
         "joints": model.ik.joints,
         "units": ["deg" if is_revolute else "mm" for is_revolute in model.ik.revolute],
-        "limits": per_unit.round(9).tolist(),
+        "limits": [[_or_none(bound) for bound in bounds] for bounds in per_unit.round(9).tolist()],
         "branches": model.ik.branches,
     }
 

@@ -111,12 +111,18 @@ class NumericArm:
         q: Float64[Tensor, "poses dof"],
         near: Float64[Tensor, "poses dof"] | None,
     ) -> Float64[Tensor, "poses dof"]:
-        """Move redundant joints, at constant poses, as near as possible to `near` or to the middle of their limits."""
+        """Move redundant joints, at constant poses, as near as possible to `near` or to the middle of their limits.
+
+        A joint without limits prefers its present value instead of a middle, with half a turn as its scale.
+        """
         limits, half = self._travel
         q, _ = wrap_into_limits(self.nominal, q)
         if near is None:
-            middle = limits.mean(-1).expand_as(q)
-            return approach_preferred(self.nominal, self._task, T, q, middle, half)
+            limited = torch.isfinite(half)
+            preferred = torch.where(limited, limits.mean(-1), q)
+            return approach_preferred(
+                self.nominal, self._task, T, q, preferred, torch.where(limited, half, torch.pi)
+            )
         q = nearest_turn(self.nominal, q, near, within_limits=True)
         return approach_preferred(self.nominal, self._task, T, q, near, torch.ones_like(half))
 
@@ -125,7 +131,8 @@ class NumericArm:
     ) -> Float64[Tensor, " poses"]:
         """Rate joint values: singularity measure times the smallest distance to a joint limit over half its range."""
         limits, half = self._travel
-        margin = torch.minimum(q - limits[:, 0], limits[:, 1] - q).div(half).clamp(max=1.0).amin(-1)
+        margins = torch.minimum(q - limits[:, 0], limits[:, 1] - q) / half
+        margin = torch.where(torch.isfinite(half), margins.clamp(max=1.0), 1.0).amin(-1)
         return margin * self.singularity_measure(T, q)
 
     def singularity_measure(

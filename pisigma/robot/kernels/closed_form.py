@@ -6,6 +6,8 @@ The formulas are plain functions in the files of `pisigma.robot.kinematics.close
 import math
 from typing import Any
 
+import numpy as np
+
 from pisigma.robot.kernels.forms import compiled_closed_forms, compiled_plain
 from pisigma.robot.kernels.rotations import wrap
 from pisigma.robot.kernels.rows import Array, Record, kernel
@@ -93,10 +95,11 @@ def nearest_turn(arms: Record, q: Array, near: Array, within_limits: bool) -> No
     for j in range(arms.dof):
         if not arms.revolute[j]:
             continue
-        turns = math.floor((near[j] - q[j]) / (2 * math.pi) + 0.5)
+        # numpy's floor and ceil stay floats, and so infinite where a joint has no limits
+        turns = np.floor((near[j] - q[j]) / (2 * math.pi) + 0.5)
         if within_limits:
-            lowest = math.ceil((arms.limits[j, 0] - LIMIT_TOLERANCE - q[j]) / (2 * math.pi))
-            highest = math.floor((arms.limits[j, 1] + LIMIT_TOLERANCE - q[j]) / (2 * math.pi))
+            lowest = np.ceil((arms.limits[j, 0] - LIMIT_TOLERANCE - q[j]) / (2 * math.pi))
+            highest = np.floor((arms.limits[j, 1] + LIMIT_TOLERANCE - q[j]) / (2 * math.pi))
             turns = max(min(turns, highest), lowest) if lowest <= highest else 0.0
         if turns != 0.0:
             q[j] += 2 * math.pi * turns

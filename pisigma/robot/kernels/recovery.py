@@ -266,6 +266,8 @@ def _margin(arms: Record, q: Array) -> float:
     least = 1.0
     for j in range(arms.dof):
         half = max((arms.limits[j, 1] - arms.limits[j, 0]) / 2, 1e-9)
+        if half == math.inf:
+            continue
         least = min(least, (q[j] - arms.limits[j, 0]) / half, (arms.limits[j, 1] - q[j]) / half)
     return least
 
@@ -274,7 +276,8 @@ def _margin(arms: Record, q: Array) -> float:
 def settle(description: Record, memory: Record, has_near: bool, q: Array) -> bool:
     """Move q to the pose, the elbow angle and, for redundant arms, preferred values; return whether it succeeds.
 
-    Preferred values are `memory.near` or the middle of the travel, with distances scaled by half the travel.
+    Preferred values are `memory.near` or the middle of the travel, with distances scaled by half the travel. Without
+    `memory.near`, a joint without limits prefers its present value, with half a turn as its scale.
     """
     arms = description.arms
     if not search(description, memory, memory.pose, q):
@@ -283,15 +286,16 @@ def settle(description: Record, memory: Record, has_near: bool, q: Array) -> boo
         return False
     if memory.rows < arms.dof:
         wrap_into_limits(arms, q)
-        for j in range(arms.dof):
-            memory.preferred[j] = (arms.limits[j, 0] + arms.limits[j, 1]) / 2
-        if has_near:
-            nearest_turn(arms, q, memory.near, True)
-            copy(memory.near, memory.preferred)
+        copy(q, memory.preferred)
         for j in range(arms.dof):
             half = max((arms.limits[j, 1] - arms.limits[j, 0]) / 2, 1e-9)
             memory.kept[j] = memory.scale[j]
-            memory.scale[j] = 1.0 if has_near else half
+            memory.scale[j] = 1.0 if has_near else math.pi if half == math.inf else half
+            if half < math.inf:
+                memory.preferred[j] = (arms.limits[j, 0] + arms.limits[j, 1]) / 2
+        if has_near:
+            nearest_turn(arms, q, memory.near, True)
+            copy(memory.near, memory.preferred)
         copy(q, memory.first)
         if not _approach_preferred(description, memory, q):
             copy(memory.first, q)

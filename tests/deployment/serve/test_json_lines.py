@@ -7,14 +7,16 @@ from contextlib import contextmanager
 
 import numpy as np
 import pytest
-from testing.calibrated_arm import calibrated_arm
+from testing.calibrated_arm import calibrated_arm, calibrated_robot
 from testing.closeness import assert_close
+from testing.models import with_limits
 from testing.refusals import numbers_in
 from testing.serving import json_client, running
 
 import pisigma
 from pisigma.deployment.serve import json_lines
 from pisigma.model.folder.model_folder import save_model
+from pisigma.robot import Robot
 from pisigma.robot.kernels.array_kinematics import transform_of, xyzrpy_of
 
 POSE = [800.0, 200.0, 600.0, 10.0, -80.0, 170.0]
@@ -224,6 +226,17 @@ def _lines_of(server):
             return json.loads(file.readline())
 
         yield exchange
+
+
+def test_joints_without_limits_have_null(tmp_path):
+    robot = with_limits(Robot.load("kiro4"), 5, -math.inf, math.inf)
+    folder = tmp_path / "open"
+    folder.mkdir()
+    save_model(calibrated_robot(robot, hybrid=False), folder)
+    with running(folder) as server, json_client(server) as client:
+        (model,) = client.ask(ask="models")["models"]
+    assert model["limits"][5] == [None, None]
+    assert_close(model["limits"][:5], np.degrees(robot.limits[:5]), atol=1e-9)
 
 
 def test_the_example_of_the_documentation_is_answered_as_documented(repository):

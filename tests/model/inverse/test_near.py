@@ -5,12 +5,14 @@ from dataclasses import replace
 
 import pytest
 import torch
+from testing.calibrated_arm import calibrated_robot, joints_of
 from testing.closeness import assert_close
 from testing.models import HOMES, hand_made_model, poses_around, statuses, with_limits
 from testing.refusals import refused
 
 from pisigma.files.errors import PoseError
 from pisigma.model.inverse.corrected_ik import CorrectedIK
+from pisigma.model.inverse.numeric_ik import NumericIK
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.kinematics.status import Status
@@ -102,3 +104,38 @@ def test_near_prefers_a_branch_inside_the_limits():
     assert ik.branches[int(ik(T).branch)] == "elbow_negative"  # the trained one reaches it outside the limits
     assert statuses(ik(T)) == [Status.OUTSIDE_DOMAIN]
     assert statuses(ik(T, branch="elbow_positive")) == [Status.OUTSIDE_JOINT_LIMITS]
+
+
+@pytest.mark.parametrize("name", ["ur5", "panda"])
+def test_joints_without_limits_stay_near(name):
+    """A continuous joint of a URDF file has infinite limits; the Kinova Gen3 has four of them."""
+    robot = Robot.load(name)
+    for joint in (0, 2):
+        robot = with_limits(robot, joint, -math.inf, math.inf)
+    model = calibrated_robot(robot, hybrid=False)
+    q = joints_of(robot, 6, share=0.8)
+    near = q + 0.01
+    near[:, 0] += 6 * math.pi
+    T = model.forward(q)
+    for solve in (CorrectedIK(model), NumericIK(model).solve_batch):
+        found = solve(T, near=near)
+        assert float((found.q - near).abs().max()) < 0.2
+        for solution in (found, solve(T)):
+            assert set(statuses(solution)) <= {Status.REACHED, Status.OUTSIDE_DOMAIN}
+            assert_close(model.forward(solution.q), T, atol=1e-9)
+
+
+def test_redundant_joints_leave_their_limits_where_others_have_none():
+    """Without `near` an arm with a joint without limits moves its other joints to the middle of their ranges."""
+    robot = Robot.load("panda")
+    model, open_model = (
+        calibrated_robot(one, hybrid=False) for one in (robot, with_limits(robot, 0, -math.inf, math.inf))
+    )
+    T = model.forward(joints_of(robot, 20, share=0.9))
+    lower, upper = torch.from_numpy(robot.limits[1:]).T
+
+    def margin(ik):
+        q = ik(T).q[:, 1:]
+        return float((torch.minimum(q - lower, upper - q) / (upper - lower)).amin(1).mean())
+
+    assert margin(CorrectedIK(open_model)) > 0.8 * margin(CorrectedIK(model))
