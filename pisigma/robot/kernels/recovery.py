@@ -202,16 +202,13 @@ def is_redundant(description: Record, memory: Record) -> bool:
 
 @kernel
 def solve_redundant(description: Record, memory: Record, has_near: bool, branch: int) -> int:
-    """Solve a redundant arm: nearest to `memory.near`, else far from limits and singularities.
+    """Solve a redundant arm near `memory.near`, else far from limits and singularities; return its branch, or -1.
 
     Args:
         description: the calibrated arm.
         memory: working memory with the pose; joint values are written into `memory.solution`.
         has_near: whether there are reference joint values.
         branch: index of the requested branch, or -1.
-
-    Returns:
-        Index of their branch, -1 if nothing was found.
     """
     closed = description.closed_form.kind != NO_CLOSED_FORM
     candidates = _candidates(description, memory, has_near, branch) if closed else 0
