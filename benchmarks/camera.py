@@ -3,12 +3,12 @@
     OMP_NUM_THREADS=1 python benchmarks/camera.py [--draws 20] [--images 50]
 
 True arms have errors of 1 mm and 0.3 deg in every parameter. The camera (1920 x 1200 px, f = 1400 px) views a board of
-9 x 6 corners 30 mm apart from 0.3 to 0.7 m, up to 40 deg oblique; the noise of the corners is 0.3 px, the repeatability
-of the robot 0.02 mm and 0.01 deg. The intrinsics are known, or stated by a typical calibration (fx, fy 0.5 px; cx, cy
-1 px; k1 0.002; k2 0.01; p1, p2 2e-4) with errors of that size; then they are used as prior, ignored (free), or
-taken as true (held). Errors are those of the camera centre's position after the best rigid alignment, over other views
-of the board (region) and over 400 postures of the whole joint space (workspace), pooled over draws. The bound includes
-the prior of the intrinsics, but not that of the arm.
+9 x 6 corners 30 mm apart from 0.3 to 0.7 m, tilted by up to 40 deg; the noise of the corners is 0.3 px, the
+repeatability of the robot 0.02 mm and 0.01 deg. The intrinsics are known, or stated by a typical calibration (fx, fy
+0.5 px; cx, cy 1 px; k1 0.002; k2 0.01; p1, p2 2e-4) with errors of that size; then they are used as prior, ignored
+(free), or taken as true (held). Errors are those of the camera centre's position after the best rigid alignment, over
+other views of the board (region) and over 400 postures of the whole joint space (workspace), pooled over draws. The
+bound includes the prior of the intrinsics, but not that of the arm.
 """
 
 import argparse

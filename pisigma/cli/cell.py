@@ -26,7 +26,7 @@ MAX_LINES = 12
 def status(
     cell: Annotated[Path, typer.Argument(metavar="CELL|FOLDER", help="A cell, or a folder of cells.")],
     exit_code: Annotated[
-        bool, typer.Option("--exit-code", help="Exit with status 3 if something has to be done.")
+        bool, typer.Option("--exit-code", help="Exit with status 3 if a step is due.")
     ] = False,
     watch: Annotated[
         float | None, typer.Option(min=1, help="Interval at which to print the status again [s].")
@@ -86,7 +86,7 @@ def _print_status(status: "CellStatus") -> None:
         f"sessions/{name} will be added by the next command that reads rows." for name in facts.not_taken_in
     )
     print_lines(
-        f"sessions/{name} is not read, as it is not a measurement file (.csv); import it if it contains rows."
+        f"sessions/{name} is not read, because it is not a measurement file (.csv); import it if it contains rows."
         for name in facts.not_read
     )
     print_next(status)
@@ -164,9 +164,7 @@ def print_next(status: "CellStatus") -> None:
 def use(
     cell: CellFolder,
     model: Annotated[str | None, typer.Argument(help="Name of the model, unless --undo.")] = None,
-    undo: Annotated[
-        bool, typer.Option("--undo", help="Put the model into use that was in use before the last change.")
-    ] = False,
+    undo: Annotated[bool, typer.Option("--undo", help="Put the previous model back into use.")] = False,
     reason: Reason = "",
     as_json: AsJson = False,
 ) -> None:
@@ -189,7 +187,7 @@ def use(
 def session(
     cell: CellFolder,
     name: Annotated[str, typer.Argument(help="Name of the session.")],
-    set_aside: Annotated[str, typer.Option(help="Reason for no longer using the session.")],
+    set_aside: Annotated[str, typer.Option(help="Exclude the session from further use, for this reason.")],
     as_json: AsJson = False,
 ) -> None:
     """Set a session of a cell aside; its file is kept."""
@@ -209,8 +207,8 @@ def event(
     kind: Annotated[
         str,
         typer.Argument(
-            help="What was changed: instrument, tool, mastering, encoder, collision, maintenance or firmware; "
-            "accepted, if a person accepted the model in use; or controller, with --export."
+            help="Kind of event: a change (instrument, tool, mastering, encoder, collision, maintenance, firmware), "
+            "accepted (a person accepted the model in use) or controller (with --export)."
         ),
     ],
     date: Annotated[str, typer.Option(help="Day of the event, such as 2026-11-22. [default: today]")] = "",
@@ -230,15 +228,15 @@ def event(
     """Record what was changed, that a person accepted the model in use, or what is active on the controller.
 
     Events determine which sessions remain valid. Rows measured after an instrument or tool event have a new frame or
-    target. Sessions from before a mastering, encoder, collision or maintenance event are no longer used for
-    calibration, nor those that were measured with other joint zeros of the controller.
+    target. Sessions before a mastering, encoder, collision or maintenance event are no longer used for
+    calibration, nor are those that were measured with other joint zeros of the controller.
     """
     from pisigma.workflow.cell.cell import Cell
     from pisigma.workflow.cell.exports import set_controller
 
     if (kind == "controller") is (export is None) or (export is not None and by):
         raise typer.BadParameter(
-            "expected --export FILE or none with controller only", param_hint="'--export'"
+            "--export FILE or none applies to the event controller only", param_hint="'--export'"
         )
     opened = Cell.open(cell)
     if export is not None:
@@ -276,7 +274,7 @@ def unpack(
     out: Annotated[Path, typer.Option(help="Folder to write.")],
     as_json: AsJson = False,
 ) -> None:
-    """Restore a cell from a file that `pisigma pack` wrote."""
+    """Restore a cell from a file of `pisigma pack`."""
     from pisigma.workflow.cell.archive import unpack as workflow
 
     opened = workflow(file, out)

@@ -37,14 +37,12 @@ Like = Annotated[
         "ur-calibration and staubli."
     ),
 ]
-Tip = Annotated[
-    str | None, typer.Option(help="With --like, tool link that was stated when the robot was loaded.")
-]
+Tip = Annotated[str | None, typer.Option(help="With --like, tool link with which the robot was loaded.")]
 Geometry = Annotated[
     str | None,
     typer.Option(
-        help="With urdf and dh, the geometry alone (geometric, default), or the one of the joint correction "
-        "of --format onnx (hybrid)."
+        help="With urdf and dh, geometry to write: that of the geometric fit (geometric, default), or the one that "
+        "belongs to the joint correction of --format onnx (hybrid)."
     ),
 ]
 Poses = Annotated[

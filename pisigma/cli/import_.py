@@ -31,7 +31,8 @@ def import_(
     out: Annotated[Path | None, typer.Option(help="Measurement file to write (.csv).")] = None,
     cell: Annotated[Path | None, typer.Option(help="Cell to which the rows are added as a session.")] = None,
     date: Annotated[
-        str, typer.Option(help="Day of the session. [default: column date, name of the file, today]")
+        str,
+        typer.Option(help="Day of the session. [default: from the column date or the file name, else today]"),
     ] = "",
     accept_implausible: Annotated[
         bool, typer.Option("--accept-implausible", help="Add rows even if they must not be trusted.")

@@ -55,7 +55,7 @@ def plan(
     """Plan which poses to measure for an accurate calibration with few of them.
 
     Prints the expected accuracy against the number of poses, and writes the poses in the order of measurement. Add the
-    measured columns and give the file to `pisigma calibrate`.
+    measured columns and pass the file to `pisigma calibrate`.
     """
     from pisigma.planning.plan_file import yaml_of
     from pisigma.planning.subject import Subject as PlanningSubject

@@ -40,7 +40,7 @@ def read_input(path: str | os.PathLike[str], error: type[PisigmaError], max_byte
         what = "the path is not a valid file name"
         raise error(what, expected="a file name", at=Place(path), remedy="check the path") from None
     raise error(
-        f"the file has more than {max_bytes / 1e6:,.3g} MB, which no file of this kind has",
+        f"the file is larger than {max_bytes / 1e6:,.3g} MB, too large for a file of this kind",
         expected=f"{max_bytes} bytes or fewer",
         at=Place(path),
         remedy="check the path",

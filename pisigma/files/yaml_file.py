@@ -114,7 +114,7 @@ def _construct_mapping(loader: Any, node: yaml.MappingNode) -> dict[Any, Any]:
         key = loader.construct_object(key_node, deep=True)
         mark = key_node.start_mark
         if not isinstance(key, str):
-            raise yaml.constructor.ConstructorError(None, None, f"the key {key!r} is not a text", mark)
+            raise yaml.constructor.ConstructorError(None, None, f"the key {key!r} is not text", mark)
         if key in mapping:
             raise yaml.constructor.ConstructorError(None, None, f"the key '{key}' appears twice", mark)
         mapping[key] = loader.construct_object(value_node, deep=True)

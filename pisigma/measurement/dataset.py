@@ -388,7 +388,7 @@ def with_new_frames(measurements: Measurements, lines: Sequence[int]) -> Measure
                 expected=f"a line after the first of the lines {rows[0]} to {rows[-1]} that contain rows",
                 value=line,
                 at=Place(measurements.source),
-                remedy="give a line number as an editor counts",
+                remedy="give a line number as a text editor shows it",
             )
     starts = [max((start for start in lines if start <= line), default=0) for line in measurements.line]
     names = [

@@ -118,7 +118,7 @@ class GrowingFile:
         what = "truncated" if self._text.startswith(text) else "replaced"
         return (
             f"{self._source} was {what}. The {self._accepted.total()} rows that were read so far still count and are "
-            "not read again; start again if they should no longer count.",
+            "not read again; restart the session if they should no longer count.",
         )
 
     def _new_rows(self, data: MeasuredFields) -> list[int]:

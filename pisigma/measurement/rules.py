@@ -292,7 +292,7 @@ def _distance_faults(
             ),
         )
     for row in rows_where(distance & ~anchor & ~pair):
-        remedy = "name its anchor, or the pair of rows that it lies between"
+        remedy = "name its anchor, or the pair of rows between which it was measured"
         yield row, Fault("the distance has neither an anchor nor a pair", of_anchor, remedy=remedy)
     for row in rows_where(anchor & pair):
         problem = f"the distance has both '{of_anchor}' and '{of_pair}'"
@@ -337,7 +337,7 @@ def group_faults(
         for name, rows in _groups(data.text(kind)).items():
             frames = sorted({frame[row] for row in rows})
             for row in rows if len(frames) > 1 else ():
-                problem = f"{kind} '{name}' is in the frames '{frames[0]}' and '{frames[1]}', not in one"
+                problem = f"{kind} '{name}' is in the frames '{frames[0]}' and '{frames[1]}' instead of one"
                 yield (
                     row,
                     Fault(
@@ -372,7 +372,7 @@ def _pair_fault(
     """Return what is wrong with a pair, None if nothing is."""
     column = labels("pair")
     if len(rows) != 2:
-        remedy = "give the two poses that the distance lies between"
+        remedy = "give the two poses between which the distance was measured"
         return Fault(
             "", column, f"two rows of pair '{name}'", f"{len(rows)} row{'s'[: len(rows) - 1]}", remedy
         )

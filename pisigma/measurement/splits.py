@@ -74,7 +74,7 @@ class Splitting:
                     expected=f"{FOLDS} or more different poses for a cross-validation",
                     value=len(set(groups_to_keep_whole(measurements).tolist())),
                     at=Place(measurements.source),
-                    remedy="measure more, about 50 for a good calibration, or do not cross-validate (--folds 0)",
+                    remedy="measure more (about 50 for a good calibration), or do not cross-validate (--folds 0)",
                 )
             splits = repeats(measurements, folds, self.seed, self.by, times)
         if train_rows is None:
@@ -113,7 +113,7 @@ def k_folds(
             expected=f"2 to {len(sizes)} folds of {len(sizes)} {_kind(by)}",
             value=folds,
             at=Place(measurements.source),
-            remedy=f"choose a number of this range, or measure more {more}",
+            remedy=f"choose a number in this range, or measure more {more}",
         )
     fold = torch.zeros(len(sizes), dtype=torch.int64)
     if by in ("joints", "placement", "interleaved"):
@@ -158,7 +158,7 @@ def repeats(
         what = f"{groups} folds of {groups} {_kind(by)}" if by in RANDOM_SPLITS else f"folds by {by}"
         raise MeasurementError(
             option="repeats",
-            expected=f"one repeat, as {what} are the same every time",
+            expected=f"one repeat, because {what} are the same every time",
             value=times,
             at=Place(measurements.source),
             remedy="choose one repeat, or fewer folds by joints or placement",
@@ -265,7 +265,8 @@ def _check_several(measurements: Measurements, sizes: Int64[Tensor, " groups"], 
     if len(sizes) < 2:
         what = "placement" if by == "placement" else "pose, with equal joint values"
         raise MeasurementError(
-            f"all {measurements.rows} rows are of one {what}, so they cannot be split into training and held-out rows",
+            f"all {measurements.rows} rows belong to one {what}, so they cannot be split into training and held-out "
+            "rows",
             option="by",
             value=by,
             at=Place(measurements.source),
@@ -367,7 +368,7 @@ def _group_positions(
     if (count == 0).any():
         row = int((group == int((count == 0).nonzero()[0])).nonzero()[0])
         raise MeasurementError(
-            "no position was measured, so that the rows cannot be split by space",
+            "no position was measured, so the rows cannot be split by space",
             option="by",
             at=measurements.place_of(row),
             remedy="split by joints or by time",

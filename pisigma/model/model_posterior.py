@@ -106,7 +106,8 @@ class ModelPosterior:
         crossed = {*rows.frame} & {*self.geometry.tools} - {"", *self.geometry.bases}
         if crossed:
             raise MeasurementError(
-                f"'{(name := crossed.pop())}' is the frame of rows, but in the model it is mounted on the flange",
+                f"'{(name := crossed.pop())}' is a measuring frame of the rows, but in the model it is mounted on "
+                "the flange",
                 value=name,
                 at=Place(rows.source, column="frame"),
                 remedy="check --fixed-camera if it is a camera",

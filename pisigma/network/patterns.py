@@ -97,7 +97,7 @@ def _check_varying(names: Sequence[str], width: Float64[Tensor, " inputs"], rows
             f"the network input '{name}' does not vary over the {rows} training rows, so no correction can be learned "
             "from it",
             value=name,
-            remedy="measure where it varies, or omit it of the recipe",
+            remedy="measure poses in which it varies, or omit it from the recipe",
         )
 
 
@@ -110,7 +110,7 @@ def _check_count(group: JointGroup, network: PiSigma, fitted: int) -> None:
             "free parameters per joint",
             expected=f"at least {free} rows",
             value=fitted,
-            remedy="measure more poses, or give it fewer inputs or lower orders",
+            remedy="measure more poses, or give the network fewer inputs or lower orders",
         )
 
 

@@ -87,7 +87,7 @@ class PlanSettings:
 
     Attributes:
         count: number of poses to calibrate with.
-        check: number of additional poses that test the calibration (rows of the set test).
+        check: number of additional poses to verify the calibration with (rows of the set test).
         sensor: what is measured: position (of a reflector), pose, distance (from a fixed point) or camera (corners of a
             board).
         camera: camera and board, for the sensor camera only.
@@ -99,8 +99,8 @@ class PlanSettings:
         candidates: number of random candidate poses to choose from.
         candidates_from: CSV file of candidate joint values to choose from, instead of random ones.
         box_mm: box of the reflector's positions, lowest and then highest x, y, z in the robot's base frame [mm].
-        task: CSV file of joint values or tool poses where the robot has to be accurate. Poses are of the nominal or the
-            model's tool. None: the whole workspace.
+        task: CSV file of joint values or tool poses where the robot has to be accurate. Poses are those of the tool of
+            the nominal robot or of the model. None: the whole workspace.
         measured: measurements that already exist (CSV).
         seed: random seed.
         speed_deg_s: joint speed between the poses [deg/s].

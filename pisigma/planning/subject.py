@@ -71,7 +71,7 @@ class Subject:
             return replace(Subject.load(load_model(Path(subject))), folder=Path(subject))
         if subject.nominal is None:
             raise PlanningError(
-                f"model '{subject.name}' does not keep the nominal robot",
+                f"model '{subject.name}' does not store the nominal robot",
                 value=subject.name,
                 remedy="plan for its robot instead",
             )

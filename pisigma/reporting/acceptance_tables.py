@@ -51,7 +51,7 @@ def contradiction(acceptance: Acceptance) -> str:
     """Say that the measured errors are larger than the budget explains."""
     session = "" if acceptance.measured is None else f" of session {acceptance.measured.session}"
     return (
-        f"The measured errors{session} are larger than the budget explains: a component is missing in it, or the robot "
+        f"The measured errors{session} are larger than the budget explains: it lacks a component, or the robot "
         "has changed since its calibration."
     )
 

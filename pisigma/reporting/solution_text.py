@@ -32,7 +32,7 @@ def solution_text(solution: Solution, solver: CorrectedIK) -> ResultText:
         "Solution",
     )
     axes = ", ".join(solution.ignored_axes)
-    remarks = sentences("ignored axes", [f"Axes of the tool that do not count: {axes}."] if axes else [])
+    remarks = sentences("ignored axes", [f"Ignored axes of the tool: {axes}."] if axes else [])
     tables = _one(solution, solver, names[0]) if len(statuses) == 1 else _several(solution, solver, names)
     return ResultText(verdict, tuple(solver.warnings), (remarks, tables) if reached else ())
 

@@ -97,7 +97,7 @@ def read_chain(path: str | os.PathLike[str], base: str | None = None, tip: str |
             origin = np.eye(4)
     if not joints:
         raise RobotError(
-            f"no joint moves between the links '{base}' and '{tip}'",
+            f"there is no moving joint between the links '{base}' and '{tip}'",
             expected="a joint that moves",
             at=Place(path),
             remedy="choose other links with base and tip",

@@ -61,8 +61,8 @@ class BranchSection(Section):
             where = f"branch '{self.name}'" if self.name else "any branch"
             first = int(unreachable.nonzero()[0])
             raise UnreachablePoseError(
-                f"the nominal robot cannot reach {int(unreachable.sum())} of {len(unreachable)} poses on {where}, the "
-                f"first one is pose {first} (from 0)",
+                f"the nominal robot cannot reach {int(unreachable.sum())} of {len(unreachable)} poses on {where}; "
+                f"the first is pose {first} (counted from 0)",
                 option="poses",
                 value=first,
                 remedy="change the region of the poses or the branch",
@@ -184,8 +184,8 @@ def joints_for_poses(
     if not inside.all():
         outside = (~inside).nonzero()
         raise RecipeError(
-            f"{len(outside)} of {len(T)} poses need joint values outside the limits of robot '{robot.nominal.name}', "
-            f"the first one is pose {int(outside[0])} (from 0)",
+            f"{len(outside)} of {len(T)} poses need joint values outside the limits of robot '{robot.nominal.name}'; "
+            f"the first is pose {int(outside[0])} (counted from 0)",
             option="poses",
             value=int(outside[0]),
             remedy="change the region of the poses or the branch",

@@ -183,7 +183,7 @@ def _not_negative(shown: Float64[Tensor, " rows"]) -> Float64[Tensor, " rows"]:
         row = int(shown.argmin())
         raise RecipeError(
             option="distances",
-            expected=f"a distance of 0 mm or more at pose {row} (from 0)",
+            expected=f"a distance of 0 mm or more at pose {row} (counted from 0)",
             value=float(f"{float(shown[row]) * 1e3:.6g}"),
             remedy="choose poses farther away, less noise, or a larger zero_mm",
         )

@@ -177,7 +177,7 @@ def _on_faces(
 
 def _miss(candidates: TouchCandidates, row: int, contact: _Contact) -> Fault:
     """Return what is wrong with a touch that misses; the value is its tip [mm] if it reached the coordinate."""
-    name = f"touch {row} (from 0) along {candidates.touch_axis[row]} of jig '{candidates.frame[row]}'"
+    name = f"touch {row} (counted from 0) along {candidates.touch_axis[row]} of jig '{candidates.frame[row]}'"
     if bool(contact.met[row]):
         tip = ", ".join(f"{value:.1f}" for value in (1e3 * contact.tip[row]).tolist())
         return Fault(f"{name} misses the edges of its face or the joint limits, at {tip} mm", value=tip)

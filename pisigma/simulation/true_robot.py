@@ -73,7 +73,7 @@ def register_error_source(source: type[Source]) -> type[Source]:
         )
     if ERROR_SOURCES.setdefault(kinds[0], source) is not source:
         raise RecipeError(
-            f"the kind '{kinds[0]}' is that of {ERROR_SOURCES[kinds[0]].__name__}",
+            f"the kind '{kinds[0]}' belongs to {ERROR_SOURCES[kinds[0]].__name__}",
             option=source.__name__,
             value=kinds[0],
             remedy="choose another name",
@@ -269,7 +269,7 @@ class TrueRobot:
             index = tuple(missed.nonzero()[0].tolist())
             number = index if len(index) != 1 else index[0]
             raise UnreachablePoseError(
-                f"the true robot does not reach pose {number} (from 0), with residuals of "
+                f"the true robot does not reach pose {number} (counted from 0), with residuals of "
                 f"{float(solution.position_residual[index]) * 1e3:.3g} mm and "
                 f"{float(torch.rad2deg(solution.rotation_residual[index])):.3g} deg",
                 option="T",

@@ -54,9 +54,7 @@ class Uploads:
         """
         for number in numbers:
             if number not in self._files:
-                raise MeasurementError(
-                    "the file is not there any more", value=number, remedy="upload it again"
-                )
+                raise MeasurementError("the file no longer exists", value=number, remedy="upload it again")
         return [self._files[number] for number in numbers]
 
     def without_folder(self, text: str) -> str:

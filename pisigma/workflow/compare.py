@@ -229,7 +229,7 @@ def _parameters_in_words(differences: ParameterDifferences, first: str, second: 
     """Return which parameters differ, and whether the remaining differences are significant."""
     if differences.remainder is None:
         return (
-            "A model has no posterior of its parameters, so that the significance of their differences is unknown; "
+            "A model has no posterior of its parameters, so the significance of their differences is unknown; "
             "make it with `pisigma calibrate`.",
         )
     level = f"at a significance level of {differences.level:.2g} for all parameters together"
@@ -272,13 +272,13 @@ def _warnings(pair: ModelPair, sources: Sequence[ModelSource]) -> tuple[str, ...
             continue
         if (child.metrics.get("parent") or {}).get("sha256") == model_hash(source):
             warnings.append(
-                f"{child.name} was made from {parent.name}, so that their errors are partly the same: differences are "
+                f"{child.name} was made from {parent.name}, so their errors are partly the same: differences are "
                 "more certain than stated."
             )
     data = [model.provenance.data_sha256 for model in models]
     if data[0] and data[0] == data[1]:
         warnings.append(
-            "Both models were made from the same rows, so that their errors are partly the same: differences are more "
+            "Both models were made from the same rows, so their errors are partly the same: differences are more "
             "certain than stated."
         )
     return tuple(warnings)

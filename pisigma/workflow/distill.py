@@ -154,7 +154,7 @@ def distill(
 def _check_parent(parent: CalibratedModel) -> None:
     if parent.network is not None:
         raise ModelError(
-            f"model '{parent.name}' already corrects nominal joint values by a network",
+            f"model '{parent.name}' already corrects nominal joint values with a network",
             expected="a model without a network",
             value=parent.name,
             remedy="export it as it is",
@@ -237,8 +237,8 @@ def _warnings(held_out: DistilledErrors, rows: int, joints: int) -> tuple[str, .
             )
     if rows < _MIN_ROWS_PER_JOINT * joints:
         sentences.append(
-            f"Only {rows} rows of joint values describe the region, instead of {_MIN_ROWS_PER_JOINT * joints} or more: "
-            "it is sparsely covered, and the errors hold only near these rows."
+            f"Only {rows} rows of joint values describe the region, instead of {_MIN_ROWS_PER_JOINT * joints} or "
+            "more: it is sparsely covered, and the errors are valid only near these rows."
         )
     return tuple(sentences)
 
@@ -250,7 +250,7 @@ def _limitations(
     sentences = [
         f"Exactness: on held-out poses of the region the tool is {errors.rms_mm:.4f} mm RMS (95 % within "
         f"{errors.p95_mm:.4f} mm, at most {errors.max_mm:.4f} mm) from the position of the full solution. "
-        "The parent's errors are added to this."
+        "The errors of the parent model come in addition."
     ]
     features = () if parent.hybrid is None else parent.hybrid.correction.features
     harmonics = max((one.fastest for one in features), default=1)
@@ -264,7 +264,9 @@ def _limitations(
     conditions = None if parent.hybrid is None else learned_conditions(parent.hybrid.correction)
     if conditions is not None:
         names = " and ".join(conditions.names)
-        sentences.append(f"Conditions: {names} are assumed to be as usual when the parent was measured.")
+        sentences.append(
+            f"Conditions: {names} are assumed to be at their means over the measurements of the parent."
+        )
     return (
         *sentences,
         "Reach: poses that only the calibrated robot can reach have no nominal joint values to correct, and poses near "

@@ -77,7 +77,7 @@ def sizes_for(model: CalibratedModel, poses: int) -> tuple[NetworkSize, ...]:
     )
     if not sizes:
         raise IdentificationError(
-            f"{poses} poses are too few for any size of network for robot '{model.robot.name}'",
+            f"{poses} poses are too few for a network of any size for robot '{model.robot.name}'",
             value=poses,
             option="--poses",
             remedy="give more, or the orders of a small network",

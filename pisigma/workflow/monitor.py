@@ -340,7 +340,7 @@ def _date_of_file(source: str) -> str:
     date = datetime.date.fromtimestamp(moment).isoformat()
     if not is_date(date):
         raise MeasurementError(
-            expected=f"{EXPECTED_DATE} as the file's time of modification",
+            expected=f"{EXPECTED_DATE} as the file's modification time",
             value=date,
             at=Place(source),
             remedy="give --dates",

@@ -42,9 +42,9 @@ def plan_text(planned: Plan, files: Sequence[Path]) -> ResultText:
         (str(point.poses), *(rounded(error * 1e3) for error in (point.rms, point.p95, point.random_rms)))
         for point in planned.curve
     ]
-    title = "expected errors of the tool's position by number of poses"
+    title = "expected errors of the tool position by number of poses"
     short = rows if len(rows) <= MAX_POINTS else [*rows[:: -(-len(rows) // MAX_POINTS)], rows[-1]]
-    weak = ["What the expected error will mostly come from:", *(f"- {line}" for line in planned.weak)]
+    weak = ["Main contributions to the expected error:", *(f"- {line}" for line in planned.weak)]
     points = sum(map(len, planned.stored.waypoints))
     lines = [planned.candidates.sentence, f"The poses are joined with {counted(points, 'waypoint')}."]
     return ResultText(
@@ -75,7 +75,7 @@ def _plan_verdict(planned: Plan, file: Path) -> Verdict:
         f"with {planned.poses} {more}poses; {rounded(last.random_rms * 1e3)} mm RMS with random poses.",
         f"{cautions}, if the sensor scatters as stated{checked}.",
         f"measure the poses, about {planned.travel / 60:.0f} min at {settings.speed_deg_s:g} deg/s and "
-        f"{settings.settling_s:g} s a pose, with `pisigma measure {file} --rows ROWS.csv`.",
+        f"{settings.settling_s:g} s per pose, with `pisigma measure {file} --rows ROWS.csv`.",
     )
 
 

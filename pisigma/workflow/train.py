@@ -371,8 +371,8 @@ def _held_out_pairs(name: str, robot: Robot, held_out: Measurements) -> Training
     if not pairs.used.all():
         unreached = int((~pairs.used).sum())
         raise RecipeError(
-            f"recipe '{name}': the nominal robot cannot reach {unreached} of {len(pairs.used)} poses of data.held_out, "
-            "so that they have no joint error; change their region.",
+            f"recipe '{name}': the nominal robot cannot reach {unreached} of {len(pairs.used)} poses of "
+            "data.held_out, so they have no joint error; change their region.",
             value=unreached,
         )
     return pairs

@@ -46,7 +46,7 @@ class CameraCell:
 
 @functools.cache
 def camera_cell(count: int, seed: int = 0, noise: ImageNoise = NOISE, is_fixed: bool = False) -> CameraCell:
-    """Return images of the whole board from 0.3 to 0.7 m, at most 40 deg oblique, with all branches of the arm."""
+    """Return images of the whole board from 0.3 to 0.7 m, tilted by at most 40 deg, with all branches of the arm."""
     with no_type_checker():
         nominal = Robot.load("ur5")
         first = CAMERA_IN_BASE if is_fixed else BOARD_IN_BASE

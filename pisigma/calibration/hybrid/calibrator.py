@@ -137,7 +137,7 @@ class HybridCalibrator:
         if serving is None:
             return _geometric_alone(solved, choice, _NOTHING_HELPS)
         choice = serving.choice
-        progress("solving for everything")
+        progress("solving for all parameters")
         whole = solved.problem.rows == choice.rows.problem.rows
         refined = serving.refined if whole else refine(solved.problem, group, choice)
         if refined.regression.effective_share(refined.posterior) > choice.best.largest_share:

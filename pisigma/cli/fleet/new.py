@@ -20,13 +20,13 @@ def new(
         str,
         typer.Argument(
             metavar="[ROBOT]",
-            help="Catalogue name or robot file (YAML or URDF); with --from, the robot of rows that state none.",
+            help="Catalogue name or robot file (YAML or URDF); with --from, robot of the rows that do not state one.",
             autocompletion=complete_robot,
         ),
     ] = "",
     *,
     out: Annotated[
-        Path, typer.Option(help="Folder to write: a cell, or the folder of the cells of a manifest.")
+        Path, typer.Option(help="Folder to write: the cell, or with a manifest the folder of cells.")
     ],
     source: Annotated[
         Path | None,
@@ -44,9 +44,9 @@ def new(
         float | None, typer.Option(help="Limit of the 95 % quantile of the position errors [mm].")
     ] = None,
     base: Annotated[
-        str | None, typer.Option(help="Link of the URDF file in whose frame poses are given.")
+        str | None, typer.Option(help="Base link of a URDF file; poses are in its frame.")
     ] = None,
-    tip: Annotated[str | None, typer.Option(help="Link of the URDF file that is the tool.")] = None,
+    tip: Annotated[str | None, typer.Option(help="Tool link of a URDF file.")] = None,
     camera: Annotated[list[Path] | None, typer.Option(help="Camera file (YAML); may be repeated.")] = None,
     board: Annotated[list[Path] | None, typer.Option(help="Board file (YAML); may be repeated.")] = None,
     fixed_camera: Annotated[
@@ -57,8 +57,8 @@ def new(
 ) -> None:
     """Create a cell: the folder of one robot on its mount, with its settings, sessions, models and history.
 
-    With --from, create the cell of a model folder, whose model goes into use, or a cell for every robot of a manifest.
-    Cells of a manifest that exist get its new rows. Exits with status 3 if a robot of the manifest cannot be used.
+    With --from MODEL_FOLDER, create a cell that uses this model; with --from MANIFEST, create a cell for every robot,
+    or add the new rows if the cell exists. Exits with status 3 if a robot of the manifest cannot be used.
     """
     from pisigma.files.model_files import is_model
     from pisigma.measurement.camera.camera_files import CameraFiles

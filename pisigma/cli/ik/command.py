@@ -21,7 +21,7 @@ Pose = tuple[float, float, float, float, float, float]
 IgnoreAxes = Annotated[
     str | None,
     typer.Option(
-        help="Axes of the tool that do not count: x, y, z, roll, pitch, yaw (about the tool's x, y, z) or none, with "
+        help="Axes of the tool to ignore: x, y, z, roll, pitch, yaw (about the tool's x, y, z) or none, separated by "
         "commas. [default: by the number of joints]"
     ),
 ]
@@ -69,10 +69,10 @@ def ik(
     temperature_c: TemperatureC = None,
     as_json: AsJson = False,
 ) -> None:
-    """Compute the corrected joint values that reach a pose, or those of a file of poses.
+    """Compute the corrected joint values that reach a pose, or every pose of a file.
 
     Exits with status 2 if a pose is unreachable, singular or outside the joint limits, or a row of the file is not a
-    pose; the other solutions are printed or written nevertheless.
+    pose; the other solutions are still printed or written.
     """
     _check_options(pose, poses, out, branch, all_branches)
     for name, given in (("--accuracy", accuracy), ("--path", path)):

@@ -31,7 +31,7 @@ Second = Annotated[
     str | None,
     typer.Argument(
         metavar="B",
-        help="Second model, given in the same way. [default: for a cell, the model in use, with the one before as A]",
+        help="Second model, B. [default: for a cell, the model in use, compared with its predecessor as A]",
         autocompletion=complete_model,
     ),
 ]
@@ -39,7 +39,7 @@ Rows = Annotated[Path | None, typer.Option(help="Measurements (CSV) that both mo
 Program = Annotated[
     Path | None,
     typer.Option(
-        help="Joint values or poses (CSV) of a program taught with A, to see how far it misses its poses under B."
+        help="Joint values or poses (CSV) of a program taught with A; its pose errors under B are computed."
     ),
 ]
 Page = Annotated[Path | None, typer.Option(help="HTML page to write, with a map of the workspace.")]

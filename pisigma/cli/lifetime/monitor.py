@@ -41,9 +41,8 @@ def monitor(
 ) -> None:
     """Check in every session whether the robot has changed, and follow its drift over the months.
 
-    Keeps the sessions in the history of the cell, or of a model outside of a cell in MODEL.history.sqlite next to its
-    folder, so that each call adds to them. Exits with status 3 if recalibrating pays, or a chart or the error is
-    outside its limits.
+    Each call adds its sessions to the history: that of the cell, or MODEL.history.sqlite next to a model folder outside
+    a cell. Exits with status 3 if recalibrating pays, or a chart or the error is outside its limits.
     """
     from pisigma.files.output_file import check_page
     from pisigma.workflow import monitor as workflow

@@ -47,7 +47,7 @@ def recalibrate(
     verbose: Verbose = False,
     as_json: AsJson = False,
 ) -> None:
-    """Bring a model up to date with new rows, and say what has moved since it was made.
+    """Bring a model up to date with new rows, and report what has moved since it was made.
 
     Keeps the model that predicts held-out rows best: the old one with the frames of these rows, the recalibrated one,
     or a calibration from scratch. Exits with status 3 and writes no folder if the result must not be trusted.

@@ -47,7 +47,7 @@ RestFile = Annotated[
     Path | None,
     typer.Option("--rest", help="CSV file of the remaining poses. [default: PLAN.rest.csv next to the plan]"),
 ]
-Once = Annotated[bool, typer.Option("--once", help="Judge the present rows and exit.")]
+Once = Annotated[bool, typer.Option("--once", help="Evaluate the present rows and exit.")]
 View = Annotated[bool, typer.Option("--view", help="Also show robot, rows and errors in the browser.")]
 
 
@@ -126,9 +126,9 @@ def measure(
 ) -> None:
     """Follow the rows measured with a plan: wrong rows, the next pose, the accuracy so far, and when to stop.
 
-    Ends when more poses would not help, or with Ctrl-C. Never overwrites the plan: remaining poses that are planned
-    again are written to --rest. With --json, progress goes to stderr and one JSON object to stdout at the end. Exits
-    with status 3 while all rows have the same fault.
+    Ends when more poses would not help, or with Ctrl-C. Never overwrites the plan: if the remaining poses are planned
+    again, they are written to --rest. With --json, progress goes to stderr and one JSON object to stdout at the end.
+    Exits with status 3 while all rows have the same fault.
     """
     from pisigma.lifetime.cell.controller import checked_in_use
     from pisigma.lifetime.cell.layout import newest_plan

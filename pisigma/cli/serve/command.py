@@ -20,9 +20,7 @@ Model = Annotated[
 ]
 Pin = Annotated[
     bool,
-    typer.Option(
-        "--pin", help="Keep serving the model that is in use at the start, even if the cell changes it."
-    ),
+    typer.Option("--pin", help="Keep serving the model in use at the start, even if the cell changes it."),
 ]
 Models = Annotated[Path | None, typer.Option("--models", help="Folder of model folders to serve by name.")]
 
@@ -36,8 +34,8 @@ def serve(
 ) -> None:
     """Answer requests for corrected joint values, paths and poses, until SIGTERM or Ctrl-C.
 
-    Prints one JSON line with its ports when it is ready. SIGHUP reloads models whose folders have changed. If the model
-    in use of a cell changes, the following requests are answered by the new one.
+    Prints one JSON line with its ports when it is ready. SIGHUP reloads models whose folders have changed. If a cell's
+    model in use changes, later requests are answered with the new one.
     """
     from pisigma.deployment.serve.server import Server
 

@@ -40,7 +40,7 @@ def open_(
 ) -> None:
     """Open a cell as a page in the browser, until Ctrl-C; in an empty or new folder, the page creates the cell.
 
-    Prints the link to the page as its first line. Only somebody who has this link can open the page.
+    Prints the link to the page as its first line. Only people who have this link can open the page.
     """
     from pisigma.workbench.workbench import Workbench
 
@@ -53,7 +53,7 @@ def open_(
         else:
             print_line(bench.url)
             print_line(
-                "Only somebody who has this link can open the page. It stays until Ctrl-C.", to_stderr=True
+                "Only people who have this link can open the page. It stays until Ctrl-C.", to_stderr=True
             )
         sys.stdout.flush()
         with tempfile.TemporaryDirectory(prefix="pisigma-") as folder:

@@ -116,7 +116,7 @@ def _region(model: Path, box: Box | None, joints: Path | None) -> "Region | None
         return Region(q)
     if not all(math.isfinite(value) for value in box) or any(box[i] > box[i + 1] for i in (0, 2, 4)):
         raise PoseError(
-            expected="x_min x_max y_min y_max z_min z_max [mm] with no minimum above its maximum",
+            expected="x_min x_max y_min y_max z_min z_max [mm] with every minimum <= its maximum",
             value=" ".join(f"{value:g}" for value in box),
             option="--region",
         )

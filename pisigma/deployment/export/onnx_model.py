@@ -165,8 +165,8 @@ def export_onnx(model: CalibratedModel, model_sha256: str = "") -> bytes:
     import_onnx()
     if model.robot.coupling is not None:
         raise ModelError(
-            f"the joints of model '{model.name}' are coupled, and a graph would take their values, not the "
-            "controller's",
+            f"the joints of model '{model.name}' are coupled, and a graph would take joint values instead of the "
+            "controller's values",
             value="coupling",
             remedy="use pisigma.load, which converts between them",
         )
@@ -177,7 +177,7 @@ def export_onnx(model: CalibratedModel, model_sha256: str = "") -> bytes:
     raise ModelError(
         f"model '{model.name}' has no network, only a geometry",
         value=model.kind,
-        remedy="export the geometry with --format urdf or dh, or make a network of it with `pisigma distill`",
+        remedy="export the geometry with --format urdf or dh, or distil it into a network with `pisigma distill`",
     )
 
 

@@ -14,20 +14,26 @@ BUILT_IN = {
     "dh": ("pisigma.deployment.export.dh_table", "its DH + Hayati table with base and tool"),
     "offsets": (
         "pisigma.deployment.export.joint_offsets",
-        "the best joint offsets alone, with the loss of accuracy",
+        "the best joint offsets alone, and the accuracy that this loses",
     ),
     "targets": ("pisigma.deployment.export.targets", "corrected targets for --poses"),
     "ur-calibration": (
         "pisigma.deployment.export.controllers.universal_robots",
         "calibration.conf of Universal Robots",
     ),
-    "ur-ros": ("pisigma.deployment.export.controllers.ur_ros", "kinematics YAML of their ROS driver"),
+    "ur-ros": (
+        "pisigma.deployment.export.controllers.ur_ros",
+        "kinematics YAML of the ROS driver of Universal Robots",
+    ),
     "staubli": ("pisigma.deployment.export.controllers.staubli", "dhOffset of a Staubli arm.cfx"),
     "xacro": (
         "pisigma.deployment.export.controllers.xacro",
         "the URDF of --like with calibrated origins as properties",
     ),
-    "epson": ("pisigma.deployment.export.controllers.counts:EPSON", "home offsets of Epson in counts"),
+    "epson": (
+        "pisigma.deployment.export.controllers.counts:EPSON",
+        "home offsets of Epson in encoder counts",
+    ),
     "fanuc-mastering": ("pisigma.deployment.export.controllers.counts:FANUC", "mastering counts of FANUC"),
     "onnx": ("pisigma.deployment.export.onnx_model", "the network alone"),
     "library": ("pisigma.deployment.export.library.c_library", "a shared library for C with a header"),
@@ -50,7 +56,7 @@ def register_export(form: ExportFormat) -> ExportFormat:
     if unknown := sorted(form.options - set(OPTIONS)):
         del _REGISTERED[form.name]
         raise OutputError(
-            f"export format '{form.name}' has the unknown option '{unknown[0]}'",
+            f"export format '{form.name}' declares the unknown option '{unknown[0]}'",
             value=unknown[0],
             remedy=nearest_choice(unknown[0], OPTIONS),
         )
@@ -93,7 +99,7 @@ def export_model(name: str, request: ExportRequest) -> Exported:
         if option not in form.options:
             takers = " or ".join(other for other in export_names() if option in export_format(other).options)
             raise OutputError(
-                f"is an option of --format {takers}, not of {name}",
+                f"applies only to --format {takers}, not to {name}",
                 option=f"--{option.replace('_', '-')}",
                 value=name,
                 remedy="omit it",

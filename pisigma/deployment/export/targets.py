@@ -84,7 +84,7 @@ def _check(request: ExportRequest) -> None:
         )
     elif request.frames is not None or request.tolerance_mm is not None:
         option = "--frames" if request.frames is not None else "--tolerance-mm"
-        raise OutputError("is an option of --program", option=option, remedy="omit it")
+        raise OutputError("applies only with --program", option=option, remedy="omit it")
 
 
 def _check_options(request: ExportRequest) -> None:
@@ -96,7 +96,7 @@ def _check_options(request: ExportRequest) -> None:
         for name, value in (("--targets", kind), ("--config", request.config)):
             if value is not None:
                 raise OutputError(
-                    "is an option of programs; a .csv file includes all targets",
+                    "applies only to programs; a .csv file includes all targets",
                     option=name,
                     value=value,
                     remedy="omit it",

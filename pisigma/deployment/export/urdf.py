@@ -42,7 +42,7 @@ SAME = 1e-9
 def _check(request: ExportRequest) -> None:
     if request.tip is not None and request.like is None:
         raise OutputError(
-            "is a link of the file of --like",
+            "names a link of the file given with --like",
             option="--tip",
             value=request.tip,
             remedy="give both options or none",

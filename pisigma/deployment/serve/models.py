@@ -195,7 +195,7 @@ def model_folders(folder: Path) -> list[Path]:
     folders = [path for path in inside if is_model(path) or any(path.glob("*.safetensors"))]
     if not folders:
         raise ModelError(
-            "the folder has no model folders",
+            "the folder contains no model folders",
             at=Place(folder),
             remedy="give the folder that contains your models",
         )

@@ -155,5 +155,5 @@ def missing_statements(
     if not repeats:
         lines.append("AP and RP: no pose was measured more than once.")
     elif (fewest := min(one.rows for one in repeats)) < CYCLES:
-        lines.append(f"AP and RP of {CYCLES} cycles, as ISO 9283 asks for: one pose has {fewest}.")
+        lines.append(f"AP and RP of {CYCLES} cycles, as ISO 9283 requires: one pose has {fewest}.")
     return (*lines, NO_PATHS)

@@ -49,11 +49,11 @@ _MEANING = {
     (
         "export poses",
         "kinematics",
-    ): f"{_TWICE}, as the poses are for a controller that computes with the nominal robot",
+    ): f"{_TWICE}, because the poses are for a controller that computes with the nominal robot",
     (
         "export joint_zeros",
         "kinematics",
-    ): f"{_TWICE}, as these kinematics already contain the offsets of the joints",
+    ): f"{_TWICE}, because these kinematics already contain the offsets of the joints",
     ("export joint_zeros", "same_zeros"): "the exported offsets are to be added to these",
     ("calibrate", "same_zeros"): "the model is valid only while they are active",
     ("measure", "other_zeros"): "the rows will differ from the model by these joint zeros",
@@ -184,8 +184,8 @@ class Controller:
             assert model is not None  # else they are the same
             which["other_zeros"] = (
                 f"the rows of model '{model.name}' were measured "
-                f"{'without exported joint zeros' if then is None else f'with the joint zeros of {then}'}, "
-                f"and now {'none are active' if zeros is None else f'those of {zeros} are active'}"
+                f"{'without exported joint zeros' if then is None else f'with the joint zeros of {then}'}, but now "
+                f"{'none are active' if zeros is None else f'those of {zeros} are active'}"
             )
         elif zeros is not None:
             which["same_zeros"] = f"the joint zeros of {zeros} are active"
@@ -293,10 +293,10 @@ def record_controller(history: History, sha256: str, day: str, note: str) -> Con
     if not is_date(day):
         raise MeasurementError(expected=EXPECTED_DATE, value=day, option="--date")
     if day > today:
-        raise MeasurementError(expected=f"a day until {today}", value=day, option="--date")
+        raise MeasurementError(expected=f"a day no later than {today}", value=day, option="--date")
     if sha256 and sha256 not in exports:
         raise MeasurementError(
-            expected="a file as `pisigma export CELL` wrote it, or none",
+            expected="an unchanged file of `pisigma export CELL`, or none",
             value=f"SHA-256 {sha256[:16]}",
             option="--export",
             remedy="export it again",

@@ -60,7 +60,7 @@ class ModelPair:
 
         Raises:
             ModelError: the models belong to different robots, have no frame or target in common where these are fixed,
-                or keep no joint values at which both predict a pose.
+                or store no joint values at which both predict a pose.
         """
         _check_one_robot(first, second)
         frame_names = _frame_names(first, second, frames)
@@ -70,7 +70,7 @@ class ModelPair:
         there = torch.isfinite(T_first + T_second).all(-1).all(-1)
         if not bool(there.any()):
             raise ModelError(
-                f"models {first.name} and {second.name} keep no joint values at which both predict a pose",
+                f"models {first.name} and {second.name} store no joint values at which both predict a pose",
                 remedy="make them again with `pisigma calibrate` or `pisigma train`",
             )
         if frames == "fixed":

@@ -139,8 +139,8 @@ class Session:
             frame = {1: "base", last: "tool"}.get(number, "")
             if not observable and frame and any(name.split()[0] == frame for name in self.standing):
                 sentences.append(
-                    f"The zero of joint {number} cannot be distinguished from the {frame}, which was moved since the "
-                    "model was made."
+                    f"The zero of joint {number} cannot be distinguished from the {frame}, which has been moved "
+                    "since the model was made."
                 )
             elif not observable:
                 sentences.append(f"Joint {number} is unobservable: these rows do not determine its zero.")

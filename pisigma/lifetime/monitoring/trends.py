@@ -132,8 +132,11 @@ class Forecast:
         if self.passed:
             return f"The RMS error of the last session is above the limit of {self.limit_mm:g} mm."
         if self.date is None:
-            return f"There is no significant trend by which the RMS error passes {self.limit_mm:g} mm within ten years."
-        return f"The RMS error will pass {self.limit_mm:g} mm around {self.date}, possibly as early as {self.earliest}."
+            return f"No significant trend leads to an RMS error above {self.limit_mm:g} mm within ten years."
+        return (
+            f"The RMS error will exceed {self.limit_mm:g} mm around {self.date}, possibly as early as "
+            f"{self.earliest}."
+        )
 
 
 def charts_of(revolute: Sequence[bool], records: Sequence[Record]) -> tuple[Chart, ...]:

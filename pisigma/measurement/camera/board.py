@@ -66,7 +66,7 @@ class BoardDocument(Section):
         given = [name for name in ("square_mm", "marker_mm", "tag_mm", "spacing_mm") if getattr(self, name)]
         if sorted(expected) != sorted(given):
             raise ValueError(
-                f"expected {' and '.join(expected)} of a board of kind {self.kind}, got {', '.join(given) or 'none'}"
+                f"expected {' and '.join(expected)} for a board of kind {self.kind}, got {', '.join(given) or 'none'}"
             )
         if self.kind == "charuco" and (self.marker_mm or 0.0) >= (self.square_mm or 0.0):
             raise ValueError(f"expected marker_mm < square_mm, got {self.marker_mm} and {self.square_mm} mm")

@@ -97,7 +97,7 @@ class CameraDocument(Section):
         """Refuse a standard deviation below 0."""
         for name, number in () if sigma is None else sigma:
             if number < 0:
-                raise ValueError(f"expected a standard deviation of 0 or more of {name}, got {number:g}")
+                raise ValueError(f"expected a standard deviation >= 0 for {name}, got {number:g}")
         return sigma
 
     def camera(self) -> "Camera":

@@ -125,8 +125,8 @@ def solve_images(
         f"the images do not determine the intrinsics of camera '{camera.name}'",
         value=camera.name,
         at=Place(source),
-        remedy="take images up to 40 deg oblique in which the board fills the whole frame, or keep the intrinsics "
-        "nearer to a calibration (--set intrinsics=prior)",
+        remedy="take images tilted by up to 40 deg in which the board fills the whole frame, or keep the intrinsics "
+        "closer to a calibration (--set intrinsics=prior)",
     )
 
 
@@ -194,7 +194,7 @@ def calibrate_intrinsics(
         raise MeasurementError(
             expected=f"{MIN_IMAGES} or more images of the board",
             value=len(views),
-            remedy="take 20, up to 40 deg oblique",
+            remedy="take 20, tilted by up to 40 deg",
         )
     start = initial_camera(views, name, size)
     everything = INTRINSICS if free_k3 else INTRINSICS[:-1]
@@ -239,7 +239,7 @@ def initial_camera(views: Sequence[BoardView], name: str, size: tuple[int, int])
         raise MeasurementError(
             expected="oblique images of the board, which determine the focal length",
             value="perpendicular ones",
-            remedy="take images up to 40 deg oblique",
+            remedy="take images tilted by up to 40 deg",
         )
     focal = width / np.sqrt(squared)
     return Camera(name, *size, focal, focal, *middle.tolist())

@@ -78,7 +78,7 @@ def _cells(table: Table, faults: Faults) -> list[Sequence[str]]:
     for row, record in enumerate(records):
         expected, got = f"{count} fields as in the header", len(record)
         if got > count:
-            remedy = "remove what is too much (numbers need a decimal point, not a comma)"
+            remedy = "remove the extra fields (numbers need a decimal point, not a comma)"
             faults.add([(row, Fault("", count + 1, expected, got, remedy))])
         elif got < count:
             faults.add([(row, Fault("", names[got], expected, got, "complete the row"))])
@@ -96,7 +96,11 @@ def _numbers(cells: Sequence[str], column: Column, faults: Faults) -> Float64[np
         values = np.array([float(cell) if cell else np.nan for cell in cells])
     except ValueError:
         values = np.array([_number(cell) for cell in cells])
-    empty = "" if column.joint else ", or leave it empty with all that belongs to it if it was not measured"
+    empty = (
+        ""
+        if column.joint
+        else ", or leave it and the other cells of this quantity empty if it was not measured"
+    )
     remedy = f"write one such as -12.5{empty}"
     faults.add(
         (row, Fault("", column.name, "a finite number", cell, remedy))

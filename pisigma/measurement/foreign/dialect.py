@@ -161,7 +161,7 @@ def detect_dialect(lines: Sequence[tuple[int, str]], source: str, decimal: Decim
             expected="a table of numbers with one measurement per line",
             value="no lines with the same number of numbers",
             at=Place(source),
-            remedy="separate cells by tabs, semicolons, commas or blanks",
+            remedy="separate cells with tabs, semicolons, commas or blanks",
         )
     dialect = choices[scores.index(best)]
     if decimal is None:

@@ -312,7 +312,7 @@ def _moving(joints: ConvertedRows, partner: Int64[np.ndarray, " _rows"], within:
         return []
     return [
         f"The joints move by up to {max(moved):.3g} (deg or mm) within {within:g} s of {count} measurements; measure "
-        "while the robot stands still."
+        "while the robot is at rest."
     ]
 
 

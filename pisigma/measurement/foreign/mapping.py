@@ -160,7 +160,7 @@ def _take_stated(proposal: Proposal, name: str, text: str) -> None:
         if target.unit and written and target.unit != written:
             raise MeasurementError(
                 option="--map",
-                expected=f"{written} as the file states",
+                expected=f"{written}, as the file states",
                 value=target.unit,
                 at=Place(file.source, file.header_line, name),
                 remedy=f"map it to {Target(target.quantity, written).text}",
@@ -348,6 +348,7 @@ def _called_means(mapping: FileMapping) -> list[str]:
     column = next(one for one in mapping.columns if statistic_name(records[row][one.index]) == name)
     return [
         f"{mapping.place_of(column, mapping.file.lines[row])}: {len(named)} rows are named "
-        f"'{records[row][column.index]}' and used as measurements, as none is the mean of the rows before it; remove "
+        f"'{records[row][column.index]}' and used as measurements, because none is the mean of the rows before it; "
+        "remove "
         "them if they summarise others."
     ]

@@ -30,7 +30,7 @@ def parse_map(text: str) -> StatedMaps:
         if not os.path.exists(text):
             raise MeasurementError(
                 option="--map",
-                expected="HEADING=COLUMN, such as A1=q1_deg,X=x_mm, or an existing file of --save-map",
+                expected="HEADING=COLUMN, such as A1=q1_deg,X=x_mm, or an existing file written by --save-map",
                 value=text,
             )
         return read_yaml(text, SavedMap, MeasurementError).files
@@ -47,7 +47,7 @@ def parse_map(text: str) -> StatedMaps:
     if heading or "" in stated:
         raise MeasurementError(
             option="--map",
-            expected="HEADING=COLUMN with commas between, such as A1=q1_deg,X=x_mm",
+            expected="HEADING=COLUMN pairs separated by commas, such as A1=q1_deg,X=x_mm",
             value=text,
         )
     return (stated,)

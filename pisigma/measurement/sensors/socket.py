@@ -103,7 +103,7 @@ class SocketSensor(AbstractSensor):
         usual = float((points - middle[socket]).norm(dim=-1).median())
         if usual > MAX_SCATTER * reach:
             raise IdentificationError(
-                expected="rows of one socket at one position by the nominal robot",
+                expected="the nominal robot to place the rows of a socket at one position",
                 value=f"a median distance of {usual * 1e3:.3g} mm from their mean",
                 at=Place(measurements.source),
                 remedy="check the directions and zeros of the joints, the tool, and the names of the sockets",
@@ -267,7 +267,7 @@ def matching_sockets(
             if known != distance:
                 raise IdentificationError(
                     option="socket_distances",
-                    expected=f"one distance of the sockets '{pair[0]}' and '{pair[1]}'",
+                    expected=f"one distance between the sockets '{pair[0]}' and '{pair[1]}'",
                     value=f"{known * 1e3:g} and {distance * 1e3:g} mm",
                 )
             matching[pair] = distance

@@ -52,10 +52,10 @@ class ControllerValues:
         """
         if self.coupling.passive:
             raise PoseError(
-                "other axes than the default ones are not supported for an arm with passive joints",
+                "axes other than the default ones are not supported for an arm with passive joints",
                 value=axes.ignored,
                 option="ignore_axes",
-                remedy="omit it, and tolerances too",
+                remedy="omit ignore_axes and the tolerances",
             )
         return ControllerValues(self.ik.with_axes(axes), self.coupling)
 

@@ -225,7 +225,7 @@ class CorrectedIK(AbstractInverse):
         kernels = self._kernels_of(q)
         if kernels is None and approach is not None:
             raise PoseError(
-                "is supported only for arrays and models with compiled kernels",
+                "requires an array and a model with compiled kernels",
                 option="approach",
                 remedy="give q as an array",
             )

@@ -32,7 +32,7 @@ def unreadable_alarm(row: UnusableRow) -> Alarm:
 
 def of_all_rows(sentence: str) -> Alarm:
     """Return the alarm on a fault of all rows, for example in the header of the file."""
-    return Alarm(1, "setup", f"line 1: {sentence} Correct this before measuring on.", repeat=False)
+    return Alarm(1, "setup", f"line 1: {sentence} Correct this before you continue to measure.", repeat=False)
 
 
 def cleared_message(line: int) -> Alarm:
@@ -134,9 +134,7 @@ def contradiction_alarm(
     usual = float(errors.length[judgement.counts].nanmedian()) * 1e3
     parts = [f"{length * 1e3:.2f} mm"] if length == length else []
     parts += [f"{angle:.3f} deg in orientation"] if angle == angle else []
-    what = (
-        f"line {line}: the measured value is {' and '.join(parts) or 'far'} from what the other rows predict"
-    )
+    what = f"line {line}: the measured value is {' and '.join(parts) or 'far'} from the prediction of the other rows"
     what += f" ({usual:.2f} mm is usual here)" if usual == usual else ""
     other = _other_pose(rows, judgement, row, poses, names)
     if other:

@@ -300,7 +300,7 @@ def stopping_advice(
         )
         gain = 0.0 if ahead is None else (point.predicted_p95 - ahead.predicted_p95) * 1e3
         if ahead is not None and gain < least_gain_mm:
-            more = f"{ahead.poses - point.poses} more poses would lower that by {max(gain, 0.0):.4f} mm only"
+            more = f"{ahead.poses - point.poses} more poses would lower this by only {max(gain, 0.0):.4f} mm"
             return Advice("stop", f"Stop: {now}{limit}; {more}.")
     if not left:
         return Advice("stop", f"Stop: all poses of the plan have been measured{limit}.")

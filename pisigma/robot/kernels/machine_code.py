@@ -158,9 +158,9 @@ def _intermediate_code(forms: KernelForms) -> str:
         return intermediate_code()
     except ImportError:
         raise ModelError(
-            "the package contains no compiled inverse kinematics of its present sources",
+            "the package contains no inverse kinematics compiled from its present source code",
             value="pisigma[compile]",
-            remedy="install pisigma[compile], which makes it, or do without it, which is about 1000 times slower",
+            remedy="install pisigma[compile] to compile it; solving without it is about 1000 times slower",
         ) from None
 
 

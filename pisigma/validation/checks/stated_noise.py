@@ -38,8 +38,8 @@ def check_stated_noise(checked: CheckedCalibration) -> Iterator[Diagnostic]:
                 kind="stated_noise",
                 severity="warning",
                 sentence=f"The residuals of {sensor.name} are {larger:.3g} times as large as the standard "
-                "deviations stated in the rows, which were multiplied by this factor; check their unit, and "
-                "whether the model lacks something.",
+                "deviations stated in the rows, which were multiplied by this factor; check their unit, and whether "
+                "the model lacks an effect.",
                 cause=sensor.name,
                 values={"residual_over_stated": larger},
             )

@@ -52,8 +52,8 @@ def check_unexplained(checked: CheckedCalibration) -> Iterator[Diagnostic]:
             sentence=f"The errors of the {what} are {left:.3g} mm RMS ({nominal:.3g} mm for the nominal robot), but "
             f"robots of this size have less than {LARGE * reach:.2g} mm after a calibration"
             f"{'' if far else ', and calibration hardly helped'}. Mixed populations, a moved frame or tool, joint "
-            "values that were logged too early or rounded, and a scale do not explain them; check what else "
-            "differs between the rows, and the sensor.",
+            "values that were logged too early or rounded, and a scale do not explain them; check the sensor, and "
+            "what else differs between the rows.",
             values={"rms_mm": left, "nominal_rms_mm": nominal},
         )
 

@@ -122,8 +122,8 @@ def rows_of_file(
     errors, residual = _errors(poses_of_rows(model, rows), rows)
     if not (torch.isfinite(errors.position).any() or errors.rotation is not None):
         raise MeasurementError(
-            "no row has a position, an orientation or a socket that was measured twice, so the model cannot be judged "
-            "on this file",
+            "no row has a position, an orientation or a socket that was measured twice, so the model cannot be "
+            "evaluated with this file",
             at=Place(rows.source),
             remedy="give poses or positions, or omit the file",
         )

@@ -61,7 +61,7 @@ class IsoCube:
         if not low <= share <= high:
             raise MeasurementError(
                 option="share",
-                expected=f"a distance of {low:g} to {high:g} of the diagonal from its ends",
+                expected=f"a share of {low:g} to {high:g} of the diagonal",
                 value=share,
             )
         ends = self.corners[list(PLANES[plane])]

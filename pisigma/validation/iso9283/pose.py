@@ -165,5 +165,5 @@ def check_repeats(attained: Float[Tensor, "*batch n 3"], of: str) -> None:
             option="attained",
             expected=f"2 or more repeats of {of}",
             value=attained.shape[-2],
-            remedy="measure 30, as the standard asks for",
+            remedy="measure 30, as the standard requires",
         )

@@ -56,7 +56,7 @@ class ViserBackend:
         path = Path(self._folder.name) / "viser"
         if len(os.fsencode(path)) > MAX_PATH:
             raise OutputError(
-                expected=f"a path of temporary files of at most {MAX_PATH} bytes",
+                expected=f"a path for temporary files of at most {MAX_PATH} bytes",
                 value=str(path),
                 at=Place(path),
                 remedy="set TMPDIR to a shorter one",

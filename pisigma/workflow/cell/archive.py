@@ -47,7 +47,9 @@ def pack(cell: Cell, path: str | os.PathLike[str]) -> int:
         if one.is_symlink() or not one.is_file():
             raise OutputError(expected="regular files in the cell", value="a link or a device", at=Place(one))
     if (size := sum(one.stat().st_size for one in files)) > MAX_BYTES:
-        raise OutputError(expected=f"at most {MAX_BYTES:,} bytes", value=size, at=Place(cell.folder))
+        raise OutputError(
+            expected=f"files of at most {MAX_BYTES:,} bytes in total", value=size, at=Place(cell.folder)
+        )
     try:
         with scratch_beside(target, FILE) as scratch, scratch_beside(target, FILE) as history:
             if cell.history.path in files:
@@ -118,7 +120,9 @@ def _check_members(archive: zipfile.ZipFile, path: str | os.PathLike[str]) -> No
         if leads_out or (mode and not (stat.S_ISREG(mode) or stat.S_ISDIR(mode))):
             raise PlanningError(expected="regular files inside the cell", value=one.filename, at=Place(path))
     if (size := sum(one.file_size for one in archive.infolist())) > MAX_BYTES:
-        raise PlanningError(expected=f"at most {MAX_BYTES:,} bytes", value=size, at=Place(path))
+        raise PlanningError(
+            expected=f"files of at most {MAX_BYTES:,} bytes in total", value=size, at=Place(path)
+        )
 
 
 def _extract(

@@ -26,7 +26,7 @@ ROBOT_FILES = ("robot.yaml", "robot.yml", "robot.urdf")
 NO_VALIDATION = {"folds": 0}
 """Settings of calibrations unless the manifest states others: many robots are calibrated without a cross-validation."""
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
-_EXPECTED_NAME = "1 to 100 letters, digits, '.', '_' or '-', a letter or digit first"
+_EXPECTED_NAME = "1 to 100 letters, digits, '.', '_' or '-', starting with a letter or digit"
 _Row = tuple[Place, Mapping[str, str]]
 
 

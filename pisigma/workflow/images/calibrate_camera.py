@@ -64,8 +64,8 @@ class CameraCalibration:
         tilts = np.rad2deg(self.calibration.tilts)
         return (
             *self.detection.sentences,
-            f"Corners are in {self.calibration.covered.mean():.0%} of the cells of the image; views are "
-            f"{np.median(tilts):.0f} deg oblique (median), from {tilts.min():.0f} to {tilts.max():.0f} deg.",
+            f"Corners are in {self.calibration.covered.mean():.0%} of the cells of the image; views are tilted by "
+            f"{np.median(tilts):.0f} deg (median), from {tilts.min():.0f} to {tilts.max():.0f} deg.",
         )
 
     @property
@@ -80,8 +80,8 @@ class CameraCalibration:
             )
         if np.quantile(calibration.tilts, 2 / 3) < OBLIQUE:
             warnings.append(
-                f"Most images are frontal (two thirds less than {np.rad2deg(OBLIQUE):.0f} deg oblique), so that focal "
-                "lengths can hardly be distinguished from distances; take images 20 to 40 deg oblique."
+                f"Most images are frontal (two thirds are tilted by less than {np.rad2deg(OBLIQUE):.0f} deg), so "
+                "focal lengths can hardly be distinguished from distances; take images tilted by 20 to 40 deg."
             )
         if calibration.disagrees:
             warnings.append(

@@ -118,8 +118,8 @@ def detect(
     files, of_board, of_camera = image_files(images), Board.load(board), Camera.load(camera)
     if of_board.is_symmetric:
         raise MeasurementError(
-            f"a checkerboard of {of_board.rows} x {of_board.columns} corners is symmetric under a rotation by 180 deg, "
-            "so that its first corner is ambiguous",
+            f"a checkerboard of {of_board.rows} x {of_board.columns} corners is symmetric under a rotation by 180 "
+            "deg, so its first corner is ambiguous",
             value=f"{of_board.rows} x {of_board.columns}",
             at=Place(board),
             remedy="use a board with an odd sum of rows and columns, or a ChArUco board",

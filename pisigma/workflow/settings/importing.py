@@ -35,10 +35,10 @@ class ImportSettings:
     """Settings of the import of exports of instruments and controllers.
 
     Attributes:
-        maps: meaning of the columns, such as A1=q1_deg,X=x_mm,note=-, or a file that --save-map wrote. Columns are
+        maps: meaning of the columns, such as A1=q1_deg,X=x_mm,note=-, or a file written by --save-map. Columns are
             named by heading or by number (from 1). Meanings are a column of measurement files (q1_deg), its quantity in
-            another unit (x_in) or in the unit that the file states (x), a value of a rotation (ur_rx_rad), point, time,
-            or - for a column to skip. Of several mappings, the one that fits a file is used.
+            another unit (x_in) or in the unit stated in the file (x), a value of a rotation (ur_rx_rad), point, time,
+            or - for a column to skip. If several mappings are given, each file uses the one that fits it.
         units: units of the columns for which the file states none, such as mm,deg or m,rad.
         rotation: maker whose rotation convention applies, such as kuka or ur, or none to skip rotations. None: from the
             headings.

@@ -16,10 +16,10 @@ class MonitorSettings:
     """Settings of the monitoring of a robot.
 
     Attributes:
-        dates: date of each file, such as 2026-10-01,2026-11-01. None: the column date, else the file's name, else its
-            time of modification.
-        moved: what was moved after the model was made: base, tool or base,tool (empty: neither). None: as the rows
-            show.
+        dates: date of each file, such as 2026-10-01,2026-11-01. None: the column date, else the file name, else its
+            modification time.
+        moved: what was moved after the model was made: base, tool or base,tool (empty: neither). None: detected from
+            the rows.
         limit_mm: limit of the RMS error [mm]; the date of crossing it is predicted.
         history: do not read or write the history of the model, which keeps the sessions of all calls.
         cameras: cameras and boards, for files of detected board corners.

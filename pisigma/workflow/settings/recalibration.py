@@ -19,8 +19,8 @@ class RecalibrationSettings:
     """Settings of a recalibration.
 
     Attributes:
-        moved: what was moved after the model was made: base, tool or base,tool (empty: neither). None: as the rows
-            show.
+        moved: what was moved after the model was made: base, tool or base,tool (empty: neither). None: detected from
+            the rows.
         cameras: cameras and boards, for files of detected board corners.
 
     Raises:

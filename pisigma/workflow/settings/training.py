@@ -15,7 +15,7 @@ class TrainSettings:
     Attributes:
         checkpoints: folder for checkpoints of networks, and of a hybrid on mini-batches. It is kept after the training.
             None: no checkpoints.
-        resume: resume an interrupted training of this folder.
+        resume: resume the interrupted training in this folder.
         show_progress: show the networks' progress bar on stderr, if that is a terminal.
         logs: folder for the metrics of every epoch (metrics.csv), and for TensorBoard if it is installed.
         jobs: number of processes that validate folds and simulations in parallel. Each uses one thread.

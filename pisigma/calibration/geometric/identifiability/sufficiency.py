@@ -95,7 +95,7 @@ def refuse_too_few(
     # Not the rank, which is at most the number of values.
     most = free_parameters(redundancy, True, unknowns)
     raise IdentificationError(
-        f"expected more values than the {most} free parameters, got {values} values of {distinct_rows(problem)} "
+        f"expected more values than the {most} free parameters, got {values} values from {distinct_rows(problem)} "
         "different poses",
         expected=f"more than {most} values",
         value=values,

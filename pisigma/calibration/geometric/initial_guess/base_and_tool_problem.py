@@ -273,8 +273,8 @@ def _check_size(problem: BaseToolProblem, measurements: Measurements) -> None:
     values = 3 * rows + 3 * int(problem.rotated.sum())
     if values < len(problem.active) or rows == 0:
         raise IdentificationError(
-            f"expected at least {len(problem.active)} values for as many unknowns of base and tool, got {values} "
-            f"values of {rows} rows with positions",
+            f"expected at least {len(problem.active)} values for the unknowns of base and tool, got {values} "
+            f"values from {rows} rows with positions",
             expected=f"at least {len(problem.active)} values",
             value=values,
             at=Place(measurements.source),

@@ -128,7 +128,7 @@ class Language:
         other = f"P_{other}" if other.upper() in self.reserved else other
         raise OutputError(
             f"expected a file name that is a valid {self.name} program name: at most {self.longest} letters, digits "
-            "and _, with a letter first, and not a reserved word",
+            "and _, starting with a letter, and not a reserved word",
             expected=f"a {self.name} program name of at most {self.longest} characters",
             value=path.stem,
             option="--out",
@@ -270,7 +270,7 @@ def check_program(path: Path, robot: Robot, cartesian: bool, config: str | None)
         if config is not None:
             endings = " or ".join(suffix for suffix, other in LANGUAGES.items() if other.configuration)
             raise OutputError(
-                f"is an option of {endings} files with --targets cartesian",
+                f"applies only to {endings} files with --targets cartesian",
                 option="--config",
                 value=config,
                 remedy="omit it",

@@ -55,7 +55,7 @@ def check_rewriting(request: ExportRequest) -> None:
     for name, value in (("targets", request.targets), ("config", request.config)):
         if value is not None:
             raise OutputError(
-                "is an option of --poses; the poses of a --program stay poses",
+                "applies only with --poses, because the poses of a --program remain poses",
                 option=f"--{name}",
                 value=value,
                 remedy="omit it",
