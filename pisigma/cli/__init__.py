@@ -1,1 +1,1 @@
-"""The `pisigma` command: one file a subcommand, each thin; what is heavy is imported inside the commands."""
+"""The `pisigma` command: one short file per subcommand; heavy packages are imported inside the commands."""

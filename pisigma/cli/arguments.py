@@ -14,7 +14,7 @@ def complete_robot(incomplete: str) -> list[str]:
 
 
 def complete_model(incomplete: str) -> list[str]:
-    """Model folders, and folders that lead to them."""
+    """Return the model folders and the folders that lead to them, for shell completion."""
     written = Path(incomplete)
     parent = written if incomplete.endswith("/") else written.parent
     folders = [path for path in parent.glob("*/") if str(path).startswith(incomplete.removesuffix("/"))]
@@ -22,7 +22,7 @@ def complete_model(incomplete: str) -> list[str]:
 
 
 def complete_export(incomplete: str) -> list[str]:
-    """Formats of `pisigma export`."""
+    """Return the formats of `pisigma export`, for shell completion."""
     from pisigma.deployment.export.registry import export_names
     from pisigma.files.plugins import load_installed
 

@@ -110,7 +110,7 @@ def cell_at(path: str | Path) -> "Cell | None":
 
 
 def report_overrides(cell: "Cell", step: str, settings: StatedSettings[Any]) -> Mapping[str, Any]:
-    """Print to stderr which settings of a step the command line overrides; return what it states, by keys."""
+    """Print to stderr which settings of a step the command line overrides; return the stated ones by key."""
     for key in sorted(settings.values.keys() & cell.file.stated_values(step).keys()):
         print_line(f"The command line overrides {key} of {cell.file.path}.", to_stderr=True)
     return settings.values
@@ -148,7 +148,7 @@ def output_in_cell(cell: "Cell | None", part: str, suffix: str) -> Path:
 
 
 def next_lines(status: "CellStatus") -> list[str]:
-    """Return the lines that state the next step of a cell, its command on a line of its own."""
+    """Return the lines that state the next step of a cell, with its command on a separate line."""
     reason = status.step.reason.rstrip(".")
     if not status.step.command:
         return wrap_lines([f"Nothing to do: {reason}."])

@@ -1,4 +1,4 @@
-"""How a command ends: its exit status, and a message on stderr for a problem."""
+"""Endings of a command: its exit status, and a message on stderr for a problem."""
 
 import contextlib
 import errno
@@ -52,7 +52,7 @@ PluginFiles = Annotated[
 
 
 def report_problems(command: Callable[..., None]) -> Callable[..., None]:
-    """Make a command load plug-ins, show its whole help, and end problems with a message and an exit status.
+    """Let a command load plug-ins, show its whole help, and end with a message and an exit status if it fails.
 
     It gets the options `--plugin` and `--help-all`. See `exit_with_problem` for the status.
     """
@@ -80,13 +80,13 @@ def report_problems(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def exit_with_problem(problem: BaseException, as_json: bool = False) -> None:
-    """Say what is wrong and end with an exit status.
+    """Print what is wrong and end with an exit status.
 
     The status is 2 if the user's input is at fault, 3 if a model does not meet its limits, 130 after an interruption,
     141 if the reader of the output has gone, and 1 for everything else.
 
     Args:
-        problem: what ended the command.
+        problem: the exception that ended the command.
         as_json: also print the fields of a refused input on stdout, as a JSON object with the key `error`. The whole
             result of a model that does not meet its limits is there already.
     """
@@ -113,7 +113,7 @@ def exit_with_problem(problem: BaseException, as_json: bool = False) -> None:
 
 
 def exit_with_error(sentence: str, status: int = REFUSED) -> NoReturn:
-    """Say what is wrong on stderr and end with an exit status: in one line, which a terminal shows wrapped."""
+    """Print what is wrong on stderr, in one line that is wrapped on a terminal, and end with an exit status."""
     line = f"pisigma: {make_printable(' '.join(sentence.split()))}"
     if sys.stderr.isatty():
         width = shutil.get_terminal_size().columns
@@ -136,6 +136,6 @@ def _defect(problem: BaseException) -> str:
 
 
 def _print_no_more() -> None:
-    """Discard what is left to print: Python would complain once more when it ends."""
+    """Discard the remaining output, because Python would report the closed stream again when it exits."""
     with contextlib.suppress(OSError, ValueError, AttributeError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -1,4 +1,4 @@
-"""`pisigma evaluate`: how well models explain measurements that they were not trained on."""
+"""`pisigma evaluate`: errors of models on measurements that they were not trained on."""
 
 from typing import TYPE_CHECKING, Annotated
 
@@ -108,7 +108,7 @@ def _print(evaluation: "Evaluation", verbose: bool) -> None:
 
 
 def _trust(evaluation: "Evaluation") -> str:
-    """Say whether the models were accepted."""
+    """Return whether the models were accepted."""
     from pisigma.reporting.verdict import counted
 
     stated, warnings = evaluation.settings.limits.stated, evaluation.warnings

@@ -1,4 +1,4 @@
-"""Help of commands: `--help` shows their options in short, `--help-all` also every key of `--set`."""
+"""Help of commands: `--help` shows their options briefly, `--help-all` also every key of `--set`."""
 
 import copy
 import json
@@ -24,7 +24,7 @@ _SHOWS_ALL = "pisigma.help_all"
 
 
 class ShortHelpCommand(TyperCommand):
-    """A command whose `--help` shows its options in short, and whose `--help-all` shows the keys of `--set` too."""
+    """A command whose `--help` shows its options briefly, and whose `--help-all` shows the keys of `--set` too."""
 
     @property
     def keys(self) -> dict[str, Setting]:
@@ -33,7 +33,7 @@ class ShortHelpCommand(TyperCommand):
         return {key: one for key, one in known.items() if one.option.is_key}
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
-        """Write the options in short and say how many there are, or all of them with the keys of `--set`."""
+        """Write the options briefly, with their number, or in full with the keys of `--set`."""
         if ctx.meta.get(_SHOWS_ALL):
             super().format_options(ctx, formatter)
             if self.keys:
@@ -50,7 +50,7 @@ class ShortHelpCommand(TyperCommand):
         formatter.write_text(f"--help-all shows all {count} options{keys}.")
 
     def make_context(self, info_name: Any, args: Any, parent: Any = None, **extra: Any) -> Any:
-        """Parse the arguments; with `--json`, print what is wrong with them as JSON too."""
+        """Parse the arguments; with `--json`, also print errors in them as JSON."""
         with _usage_errors_as_json("--json" in args):
             try:
                 return super().make_context(info_name, args, parent, **extra)
@@ -69,7 +69,7 @@ class ShortHelpCommand(TyperCommand):
             problem.message = f"No such option: {problem.option_name}. Use --set {key}={value}."
 
     def invoke(self, ctx: Any) -> Any:
-        """Run the command; with `--json`, print what is wrong with its options as JSON too."""
+        """Run the command; with `--json`, also print errors in its options as JSON."""
         with _usage_errors_as_json(bool(ctx.params.get("as_json"))):
             return super().invoke(ctx)
 

@@ -87,7 +87,7 @@ def _take_in(
     as_json: bool,
     exports: Sequence[Path] = (),
 ) -> None:
-    """Take rows in as a session of a cell; `exports` are the files that they were converted from."""
+    """Add rows to a cell as a session; `exports` are the files that they were converted from."""
     entry = cell.take_in(rows, accept_implausible, date)
     cell.sessions.set_imported_aside(exports, entry)
     if as_json:

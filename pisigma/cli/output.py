@@ -1,4 +1,4 @@
-"""What commands print: tables and sentences for people on stdout, or one JSON object.
+"""Output of commands: tables and sentences for people on stdout, or one JSON object.
 
 The contents of files reach a terminal as text only: see `pisigma.files.errors.make_printable`.
 """
@@ -26,7 +26,7 @@ _ONLY_FOR_PRINTING = ("as_json", "verbose", "help_all")
 
 
 def print_json(result: Any) -> None:
-    """Print one JSON object on stdout; unknown numbers have to be None, as JSON has no NaN."""
+    """Print one JSON object on stdout; unknown numbers must be None, because JSON has no NaN."""
     typer.echo(json.dumps(result, allow_nan=False))
 
 
@@ -36,13 +36,13 @@ def print_line(line: str, to_stderr: bool = False) -> None:
 
 
 def print_lines(lines: Iterable[str], indent: str = "") -> None:
-    """Print sentences, each wrapped to the width of the screen; further lines of one are indented."""
+    """Print sentences, each wrapped to the width of the screen; continuation lines are indented."""
     for line in wrap_lines(lines, indent):
         typer.echo(line)
 
 
 def wrap_lines(lines: Iterable[str], indent: str = "") -> list[str]:
-    """Wrap sentences to the width of the screen; further lines of one are indented."""
+    """Wrap sentences to the width of the screen; continuation lines are indented."""
     width = screen_width()
     return [
         part
@@ -66,7 +66,7 @@ def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]
 def table_lines(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
     """Lay out a table: numbers are aligned right, and headings and texts are wrapped where the screen is narrow.
 
-    Numbers and words are never cut: a table of too long ones is wider than the screen.
+    Numbers and words are never cut, so a table with long ones may be wider than the screen.
     """
     from rich.box import SIMPLE_HEAD
     from rich.table import Table

@@ -1,4 +1,4 @@
-"""Progress of long commands on stderr: what is being done, which step of how many, and the time left."""
+"""Progress of long commands on stderr: the current step, its number, and the time left."""
 
 import threading
 import time
@@ -23,7 +23,7 @@ def progress_of(title: str) -> Iterator[Callable[[str], None]]:
     """Show what a command is doing: a line that changes on a terminal, otherwise a line per step.
 
     Yields:
-        What to call with what is being done now; numbered steps, such as "repeat 1 of 3, fold 2 of 5: series", also
+        A function to call with the current step; numbered steps, such as "repeat 1 of 3, fold 2 of 5: series", also
         show the time left.
     """
     from rich.console import Console
@@ -37,7 +37,7 @@ def progress_of(title: str) -> Iterator[Callable[[str], None]]:
 
 
 class _Shown:
-    """What is shown of a command."""
+    """Displayed progress of a command."""
 
     def __init__(self, title: str, status: "Status | None") -> None:
         self.title, self.status = title, status
@@ -47,7 +47,7 @@ class _Shown:
         self.timer: threading.Timer | None = None
 
     def show_step(self, what: str) -> None:
-        """Show what is being done now."""
+        """Show the current step."""
         self.what = what
         if self.status is not None:
             from rich.text import Text
@@ -84,5 +84,5 @@ class _Shown:
         typer.echo(self._line(self.step), err=True)
 
     def _line(self, what: str) -> str:
-        """Write what is being done, with the time left where steps are numbered."""
+        """Write the current step, with the time left if steps are numbered."""
         return make_printable(f"{self.title}: {self.left.after(what)}")

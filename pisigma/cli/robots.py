@@ -1,4 +1,4 @@
-"""`pisigma robots`: the catalogue, robots from files of controllers, and poses to check a robot by."""
+"""`pisigma robots`: the catalogue, robots from files of controllers, and poses for checking a robot description."""
 
 from dataclasses import asdict
 from pathlib import Path
@@ -142,7 +142,7 @@ def _list(as_json: bool) -> None:
 
 
 def _check(robot: str, base: str | None, tip: str | None, as_json: bool) -> None:
-    """Print the pose of the tool by a description."""
+    """Print the poses of the tool according to a description."""
     from pisigma.robot.description import Robot
     from pisigma.robot.kinematics.closed_form import closed_form_solver
     from pisigma.robot.pendant_poses import pendant_poses

@@ -1,6 +1,6 @@
-"""What people read of a command: the verdict first, then warnings, then tables as far as a screen has room for them.
+"""Terminal output of a command: the verdict, then warnings, then tables as far as they fit on a screen.
 
-Nothing is lost by that: `--verbose` prints everything, and so do cards and pages.
+Nothing is lost: `--verbose` prints everything, and so do cards and pages.
 """
 
 from collections.abc import Sequence
@@ -27,12 +27,12 @@ def print_screen(
     verbose: bool = False,
     next_step: Sequence[str] = (),
 ) -> None:
-    """Print a result, and repeat the accuracy at its end where that has left the screen.
+    """Print a result, and repeat the accuracy at the end if it has scrolled off the screen.
 
     Args:
         verdict: verdict in three sentences.
         warnings: sentences; all are printed.
-        blocks: the most important first; those for which there is no room are named only.
+        blocks: the most important first; those for which there is no room are only named.
         details: printed with `verbose` alone.
         closing: what was written where.
         verbose: print everything.

@@ -23,7 +23,7 @@ Group = TypeVar("Group")
 
 @dataclass(frozen=True)
 class StatedSettings(Generic[Group]):
-    """Settings as a command line states them, for commands that may take the others from a cell.
+    """Settings that a command line states, for commands that may take the others from a cell.
 
     Attributes:
         group: class of the settings.
@@ -62,7 +62,8 @@ def takes_settings(command: Callable[..., None]) -> Callable[..., None]:
         groups[one.name] = group, bool(others)  # type: ignore[assignment]
         if get_origin(one.annotation) is StatedSettings:
             as_stated.add(one.name)
-        parameters += [_parameter(one) for one in flat_settings(group) if not one.option.is_key]  # type: ignore[arg-type]
+        parameters += [_parameter(one) for one in flat_settings(group) if not one.option.is_key]  # type:
+        # ignore[arg-type]
         end = len(parameters)
     known = {key: one for group, _ in groups.values() for key, one in by_key(group).items()}
     context = next((one.name for one in parameters if one.annotation is typer.Context), _CONTEXT)
@@ -102,7 +103,7 @@ def _assignments(known: Mapping[str, Setting]) -> inspect.Parameter:
 
 
 def _stated(values: dict[str, Any], known: Mapping[str, Setting], running: Any) -> dict[str, Any]:
-    """Take the options of settings out of the values of a command; return what the command line states, by keys."""
+    """Remove the options of settings from the values of a command, and return the stated ones by key."""
     stated = read_assignments(values.pop(_SET, None) or (), known, "--set")
     for key, setting in known.items():
         if setting.option.is_key:

@@ -34,7 +34,7 @@ class DriftGroup:
         scale: standard deviation of every unknown at size 1 [m or rad].
         size: size of the drift; 0 if the group has not drifted.
         fixed_size: whether the size is given rather than estimated, as for a base that was relocated.
-        log_prior_penalty: increase of the log evidence that a drift of the group needs [nats].
+        log_prior_penalty: increase of the log evidence that is required for a drift of the group [nats].
         single: whether the group is one motion rather than a set of many independent changes.
     """
 

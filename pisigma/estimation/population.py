@@ -9,7 +9,7 @@ from scipy.stats import chi2
 from torch import Tensor
 
 MIN_ROBOTS = 5
-"""With fewer robots, scatter between them cannot be distinguished from the uncertainty of each."""
+"""Minimum number of robots; with fewer, scatter between them cannot be distinguished from their uncertainties."""
 EM_STEPS = 60
 SEARCH_STEPS = 25
 """Expectation-maximisation steps while outliers are searched for; these need not converge."""
@@ -168,7 +168,7 @@ def _maximised(
 ) -> Population:
     """Compute one step of expectation-maximisation.
 
-    The covariance of geometric parameters is shrunk towards its diagonal, the more the fewer robots there are.
+    The covariance of geometric parameters is shrunk towards its diagonal, more strongly for fewer robots.
 
     Args:
         evidence: information on every robot.

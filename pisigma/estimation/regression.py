@@ -27,7 +27,8 @@ class Posterior:
         prior: prior with estimated sizes.
         noise: standard deviation for every sensor [m or rad], or a factor on the stated ones.
         square: `Σ base x²` over the unknowns of every group.
-        determined: effective number of unknowns of every group that the data determine; the prior determines the rest.
+        determined: effective number of unknowns of every group that the data determine; the prior determines the
+            others.
         misfit: `Σ (y - X x)²` for every sensor.
         used: effective number of values of every sensor that the unknowns absorb.
     """

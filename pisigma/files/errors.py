@@ -267,7 +267,7 @@ _PACKAGES = {"cv2": "opencv-python-headless"}
 
 
 def fault_of_machine(problem: BaseException) -> str:
-    """Say which file cannot be used, or that memory ran out; "" for every other problem."""
+    """Describe which file cannot be used, or that memory ran out; "" for every other problem."""
     if isinstance(problem, OSError) and problem.filename is not None:
         return f"{problem.filename}: cannot be used ({problem.strerror}); check the path."
     if isinstance(problem, MemoryError):

@@ -15,7 +15,7 @@ from pisigma.files.scratch import FILE, remove_stale_scratch, scratch_beside
 def check_output(
     path: Path, suffixes: tuple[str, ...] = (), what: str = "", inputs: Iterable[Input] = ()
 ) -> None:
-    """Check that a file may be written, before the work rather than after it.
+    """Check that a file may be written, before the work starts.
 
     Args:
         path: the file.

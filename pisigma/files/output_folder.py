@@ -21,7 +21,7 @@ def check_folder(
     inputs: Iterable[Input] = (),
     names: Collection[str] = MODEL_FILES,
 ) -> None:
-    """Check that a model may be written to a folder, before the work rather than after it.
+    """Check that a model may be written to a folder, before the work starts.
 
     Args:
         folder: folder to write; it may be missing, empty or, with `overwrite`, a model.

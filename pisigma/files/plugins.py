@@ -1,6 +1,6 @@
 """Plug-ins: modules from outside the package that register sensors, features, exports, error sources or closed forms.
 
-A plug-in is a program that runs with the rights of the user. So only installed packages (entry points of the group
+A plug-in is a program that runs with the user's permissions. So only installed packages (entry points of the group
 `pisigma.plugins`) and the command line (`--plugin FILE`) can name one: never a model, a recipe, a manifest or a cell,
 which may come from someone else.
 """

@@ -40,7 +40,7 @@ def share_done(what: str) -> float | None:
 
 
 def step_name(what: str) -> str:
-    """Return the step of what is being done, without its details."""
+    """Return the current step, without its details."""
     last = max((match.end() for match in _STEP.finditer(what)), default=0)
     return what[:last] if last else what.partition(": ")[0]
 
@@ -53,7 +53,7 @@ class TimeLeft:
         self._last = 0.0
 
     def after(self, what: str) -> str:
-        """Return what is being done now, with the time left where steps are numbered."""
+        """Return the current step, with the time left if steps are numbered."""
         share, now = share_done(what), time.monotonic()
         if share is None:
             return what

@@ -23,7 +23,7 @@ UNITS = {"mm": ("m", 1e-3), "mrad": ("rad", 1e-3), "deg": ("rad", math.pi / 180.
 
 @dataclass(frozen=True)
 class Option:
-    """How the command line states a setting, where that does not follow from its name and type.
+    """Command-line form of a setting, where it does not follow from the name and type.
 
     Attributes:
         name: name of the option, such as "--camera"; None: made from the name of the setting.
@@ -109,7 +109,7 @@ class Setting:
 
     @property
     def spelling(self) -> str:
-        """How the command line states the setting, such as "--folds" or "--set seed"."""
+        """Spelling of the setting on the command line, such as "--folds" or "--set seed"."""
         return f"--set {self.key}" if self.option.is_key else self.name
 
     def read(self, stated: Any) -> Any:
@@ -159,7 +159,7 @@ def build_settings(group: type, stated: Mapping[str, Any], is_optional: bool = F
     Args:
         group: class of the settings.
         stated: values by `Setting.key`, as on a command line; other settings keep their defaults.
-        is_optional: return None if nothing is stated of the class.
+        is_optional: return None if no setting of the class is stated.
 
     Raises:
         PisigmaError: some settings are stated that need others, or a value is not valid, such as a number that is not

@@ -34,7 +34,8 @@ class ConditionFeatures(AbstractFeature):
     A condition is expressed in standard deviations from its mean over the measured rows, so that missing
     conditions count as their means. The payload also multiplies the gravity torques of a mass in the last row's frame;
     its effect is proportional, beyond the measured values too. Beyond the lowest and highest measured temperature the
-    correction is constant, because thermal expansion of an arm is not linear and extrapolation soon does harm.
+    correction is constant, because thermal expansion of an arm is not linear and extrapolating it would soon increase
+    the errors.
 
     Attributes:
         names: names of the conditions.

@@ -147,7 +147,7 @@ class MeasuredFields:
 
     @cached_property
     def _filled_rows(self) -> dict[str, Bool[Tensor, " rows"]]:
-        """Which rows are filled, by numeric field; cached on first use."""
+        """Masks of the rows with a value, by numeric field; cached on first use."""
         return {}
 
     def select(self, rows: Tensor) -> "MeasuredFields":

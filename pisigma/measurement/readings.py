@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float64
 from pisigma.measurement.faults import Fault
 
 RowFault = tuple[Bool[np.ndarray, " rows"], Callable[[int], str | Fault]]
-"""Which rows are at fault, and a function that returns what is wrong with one of them."""
+"""Mask of the rows at fault, and a function that returns what is wrong with one of them."""
 
 Readings = Mapping[str, Float64[np.ndarray, " rows"] | Sequence[str]]
 """The cells of a sensor by column, in SI units; NaN and "" for empty cells."""

@@ -20,7 +20,7 @@ _BEYOND = {
     "payload_kg": "the effect of the payload is extrapolated linearly",
     "temperature_c": "the correction stays that of the nearest measured temperature",
 }
-"""How a model extrapolates outside the measured values of a condition."""
+"""Extrapolation of a model outside the measured values of a condition."""
 
 
 def under_stated_conditions(

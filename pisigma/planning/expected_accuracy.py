@@ -212,7 +212,7 @@ class CameraProspects:
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """What limits the accuracy, what is not identifiable, and how exactly the board has to be placed."""
+        """Sentences on what limits the accuracy, what is not identifiable, and how exactly to place the board."""
         better = {
             f"{MORE_IMAGES} more images": self.more_images,
             "corners without noise": self.exact_corners,
@@ -233,7 +233,7 @@ class CameraProspects:
 
 
 def _unidentifiable(arm: ArmInSurroundings, is_fixed: bool) -> tuple[str, ...]:
-    """Say which parameters the unknown target and frame absorb: those of the last row, and those along axis 1."""
+    """Describe which parameters the unknown target and frame absorb: those of the last row, and along axis 1."""
     frame, target = ("camera", "board") if is_fixed else ("board", "camera")
     first, last = arm.robot.joint_rows[0] + 1, arm.robot.joint_rows[-1] + 1
     return (

@@ -14,7 +14,7 @@ _SHARE = f"{100 * COVERAGE:.0f} %"
 
 
 def acceptance_sentences(acceptance: Acceptance) -> tuple[str, ...]:
-    """Say what the budget predicts, what was measured, what the limit is, and who accepted the model."""
+    """Summarise the predicted budget, the measured errors, the limit, and who accepted the model."""
     budget, measured, lines = acceptance.budget, acceptance.measured, list[str]()
     if budget.components:
         start = f"With the stated components alone, {_SHARE}" if budget.missing else _SHARE
@@ -48,7 +48,7 @@ def acceptance_sentences(acceptance: Acceptance) -> tuple[str, ...]:
 
 
 def contradiction(acceptance: Acceptance) -> str:
-    """Say that the measured errors are larger than the budget explains."""
+    """State that the measured errors are larger than the budget explains."""
     session = "" if acceptance.measured is None else f" of session {acceptance.measured.session}"
     return (
         f"The measured errors{session} are larger than the budget explains: it lacks a component, or the robot "

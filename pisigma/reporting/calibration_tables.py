@@ -70,7 +70,7 @@ def undetermined_lines(summary: CalibrationSummary) -> list[str]:
 
 
 def _scale(scale: ScaleFigures) -> str:
-    """Say what a wrong scale of the sensor would explain, and the resulting error of positions."""
+    """Describe what a wrong scale of the sensor would explain, and the resulting error of positions."""
     return (
         f"links that are {scale.factor:.5f} times as long as nominal (standard deviation {scale.sigma:.2g}) cannot "
         "be distinguished from a sensor whose scale is off by that factor, as both give the same held-out errors. The "
@@ -111,7 +111,7 @@ def learned_lines(hybrid: HybridFigures) -> list[str]:
 
 
 def coverage_line(figures: AbstractValidationFigures) -> str:
-    """Say how often held-out coordinates are within the predicted intervals; "" if none are predicted."""
+    """State how often held-out coordinates are within the predicted intervals; "" if none are predicted."""
     return "".join(_say("coverage", figures))
 
 
@@ -130,17 +130,17 @@ def curve_table(points: Sequence[LearningPoint]) -> Table:
 
 
 def folds_text(figures: ValidationFigures) -> str:
-    """Say how rows were held out, such as "6 folds, 8 repeats"."""
+    """Describe how rows were held out, such as "6 folds, 8 repeats"."""
     return _say("folds", figures)[0]
 
 
 def cross_validation_text(figures: ValidationFigures) -> str:
-    """Say the same as a clause: "6-fold cross-validation, 8 repeats: each of 720 rows was ..."."""
+    """Describe the same as a clause: "6-fold cross-validation, 8 repeats: each of 720 rows was ..."."""
     return _say("cross_validation", figures)[0]
 
 
 def simulations_text(figures: ValidationFigures) -> str:
-    """Say which simulated rows were held out."""
+    """Describe which simulated rows were held out."""
     return _say("simulations", figures)[0]
 
 
@@ -150,7 +150,7 @@ def held_out_lines(figures: ValidationFigures) -> list[str]:
 
 
 def noise_text(noise: NoiseFigures) -> str:
-    """Say how much a sensor scatters."""
+    """Describe the scatter of a sensor."""
     return _say("noise", noise)[0]
 
 

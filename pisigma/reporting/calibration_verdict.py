@@ -32,7 +32,7 @@ def error_table(figures: ValidationFigures) -> Table:
 
 
 def how_held_out(figures: ValidationFigures, summary: CalibrationSummary) -> str:
-    """Say which rows the errors are of."""
+    """Describe which rows the errors belong to."""
     if figures is summary.cross_validation:
         repeats = f", {figures.repeats} repeats" if figures.repeats else ""
         if (figures.folds or 1) > 1:
@@ -46,7 +46,7 @@ def how_held_out(figures: ValidationFigures, summary: CalibrationSummary) -> str
 
 
 def of_what(summary: CalibrationSummary) -> str:
-    """Say of what and in which frame the errors are."""
+    """Describe the quantity of the errors and the frame in which they are measured."""
     sensors = {noise.sensor for noise in summary.noise}
     if "corner" in sensors:
         return "the poses that images give, camera relative to board"
@@ -126,7 +126,7 @@ def scale_matters(summary: CalibrationSummary, odds: float = LIKELY_SCALE) -> bo
 
 
 def scale_text(scale: ScaleFigures) -> str:
-    """Say how likely a wrong scale of the sensor is, and what error would follow."""
+    """Describe how likely a wrong scale of the sensor is, and the error that it would cause."""
     digits = 1 - math.floor(math.log10(scale.sigma)) if scale.sigma > 0 else 5
     return (
         f"scale of the sensor: lengths of the arm come out {scale.factor:.{digits}f} +- {scale.sigma:.{digits}f} "
@@ -136,7 +136,7 @@ def scale_text(scale: ScaleFigures) -> str:
 
 
 def scale_error(scale: ScaleFigures) -> str:
-    """Say what follows if the scale of the sensor is wrong."""
+    """Describe the consequence of a wrong scale of the sensor."""
     return (
         f"If the sensor's scale is wrong, true positions are off by {scale.rms_mm:.2g} mm RMS in addition to the "
         "errors shown; check it with a scale bar."

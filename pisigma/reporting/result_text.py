@@ -1,4 +1,4 @@
-"""What people read of a result, in any layout: the verdict, warnings, sentences and tables.
+"""Text of a result, for any layout: the verdict, warnings, sentences and tables.
 
 Commands print it on a screen, and pages show it in the browser.
 """

@@ -13,7 +13,7 @@ QUANTITIES = ("q", "q_nominal", "correction")
 """Joint values of a solution."""
 
 FAILURES = tuple(status for status in Status if status not in (Status.REACHED, Status.OUTSIDE_DOMAIN))
-"""What ends a command with exit status 2."""
+"""Statuses that end a command with exit status 2."""
 
 
 def solution_text(solution: Solution, solver: CorrectedIK) -> ResultText:

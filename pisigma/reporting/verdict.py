@@ -16,7 +16,7 @@ SMALLEST = 1e-4
 
 @dataclass(frozen=True)
 class Verdict:
-    """What a user needs to know of a result.
+    """The essentials of a result for a user.
 
     Attributes:
         accuracy: how accurate it is, with the kind of the figures.
@@ -32,7 +32,7 @@ class Verdict:
 
     @property
     def short(self) -> str:
-        """The accuracy and whether to trust it, in a line."""
+        """The accuracy and whether to trust it, on one line."""
         accuracy = self.accuracy.partition("; ")[0].partition(". ")[0].rstrip(".")
         trust = re.split(r"[:,;.] ?", self.trust)[0]
         return f"Verdict: {accuracy}. Trust: {trust}."

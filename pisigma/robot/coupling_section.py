@@ -37,7 +37,7 @@ class FourBarSection(Section):
 
 
 class CoupledJointSection(Section):
-    """How one joint follows the controller's values: `q_dh = f(sum of factor · q_controller + offset)`.
+    """Relation of one joint to the controller's values: `q_dh = f(sum of factor · q_controller + offset)`.
 
     Attributes:
         joint: name of the joint's row.

@@ -23,7 +23,7 @@ class BusyError(Exception):
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a step found.
+    """Result of a step.
 
     Attributes:
         text: the result for people; None if the step was refused.

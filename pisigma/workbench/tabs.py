@@ -1,4 +1,4 @@
-"""What the tabs of a page show, read from the cell."""
+"""Contents of the tabs of a page, read from the cell."""
 
 import shlex
 from collections.abc import Mapping, Sequence

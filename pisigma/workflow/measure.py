@@ -325,7 +325,7 @@ class MeasuringSession:
 
     @property
     def _counting(self) -> Bool[Tensor, " rows"]:
-        """Which rows are used."""
+        """Mask of the rows that are used."""
         return self._judged.rows_that_count
 
     @property

@@ -27,7 +27,7 @@ NEXT_STEPS = {
     "setup_fault": "correct what is named above and measure again.",
     "implausible": "correct what is named above and measure again.",
 }
-"""What to do after each verdict of a verification."""
+"""Next step after each verdict of a verification."""
 
 
 def plan_text(planned: Plan, files: Sequence[Path]) -> ResultText:
@@ -65,7 +65,7 @@ def plan_text(planned: Plan, files: Sequence[Path]) -> ResultText:
 
 
 def _plan_verdict(planned: Plan, file: Path) -> Verdict:
-    """Say how accurate a calibration with the poses is expected to be."""
+    """Describe how accurate a calibration with the poses is expected to be."""
     last, settings, warnings = planned.curve[-1], planned.stored.settings, planned.warnings
     cautions = f"with caution ({counted(len(warnings), 'warning')})" if warnings else "yes"
     checked = f"; {counted(planned.checks, 'pose')} will check it" if planned.checks else ""
@@ -80,7 +80,7 @@ def _plan_verdict(planned: Plan, file: Path) -> Verdict:
 
 
 def _curve_lines(planned: Plan) -> list[str]:
-    """Say what the curve does not show, and how many poses the limit needs, if there is one."""
+    """Describe what the curve does not show, and how many poses the limit requires, if there is one."""
     lines, last, settings = [], planned.curve[-1], planned.stored.settings
     limit = settings.limit_mm
     if settings.criterion == "D" and last.rms > last.random_rms:
@@ -143,14 +143,14 @@ def session_text(state: SessionState, closing: Sequence[str] = ()) -> ResultText
 
 
 def _narrow(state: SessionState) -> list[str]:
-    """Say which joints were measured over less than half of the planned range."""
+    """List which joints were measured over less than half of the planned range."""
     narrow = [span for span in state.coverage if span.planned < 0.5]
     names = ", ".join(f"{span.name} ({100 * span.planned:.0f} %)" for span in narrow)
     return [f"less than half of the planned range was measured of: {names}."] if narrow else []
 
 
 def accuracy_text(point: AccuracyPoint) -> str:
-    """Say how accurate a calibration is."""
+    """Describe how accurate a calibration is."""
     texts = [_errors("predicted", point.predicted_rms, point.predicted_p95)]
     texts += [_errors("held-out rows", point.cross_validated_rms, point.cross_validated_p95)]
     texts += [_errors("check poses", point.checked_rms, point.checked_p95)]

@@ -60,7 +60,8 @@ class GeometricCalibrator:
         robot: the nominal robot.
         free: "identifiable" (all that the data determine), "joint_offsets" (theta of revolute and d of prismatic
             joints), or names of parameters, such as "a_2". Base and tool are added to these, see below.
-        base: "free", or "fixed" to the robot's (then only those of its parameters that `free` names are estimated).
+        base: "free", or "fixed" to that of the robot (then only those of its parameters that are named in `free` are
+            estimated).
         tool: the same for the tool; "position" frees x, y and z only.
         elimination: how redundant parameters are removed: "exact" (rank and pivoted QR), "pairwise" (Pearson
             correlation, as in Park et al. 2022), or "none". The predicted poses do not depend on it.
@@ -176,7 +177,7 @@ class GeometricCalibrator:
         return build_setup(self.robot, measurements, options, self.prior, self.loss)
 
     def _finds(self, group: str) -> bool:
-        """Say whether bases or tools need a start: they are free, or named (all six parameters of a base)."""
+        """Return whether bases or tools need a start: they are free, or named (all six parameters of a base)."""
         if getattr(self, group) != "fixed":
             return True
         if isinstance(self.free, str):

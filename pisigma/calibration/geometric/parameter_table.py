@@ -126,7 +126,7 @@ def _without_rows(
 
 
 def _determines_all(information: Float64[Tensor, "own own"]) -> bool:
-    """Say whether information determines its parameters in every direction."""
+    """Return whether information determines its parameters in every direction."""
     scale = information.diagonal().clamp(min=1e-300).rsqrt()
     return float(torch.linalg.eigvalsh(information * scale * scale[:, None])[0]) >= LOST
 

@@ -224,7 +224,7 @@ class CalibrationResult:
 
     @cached_property
     def warning_details(self) -> tuple[CalibrationWarning, ...]:
-        """What the measurements do not determine, what to measure next, and what does not fit."""
+        """Warnings on what the measurements do not determine, what to measure next, and what does not fit."""
         return (
             *measurement_advice(self.solved.setup, self.solved.findings.estimated),
             *_warnings(self.solved),

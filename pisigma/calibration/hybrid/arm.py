@@ -74,7 +74,7 @@ class JointCoverage:
         return torch.stack(columns, -1)
 
     def contains(self, q: Float[Tensor, "*batch dof"]) -> Bool[Tensor, "*batch"]:
-        """Say whether all joint values are in measured ranges, up to rounding; NaN never is."""
+        """Return whether all joint values are in measured ranges, up to rounding; NaN never is."""
         return self.distance_outside(q).amax(-1) <= MEASURED_ROUNDING
 
 

@@ -105,7 +105,7 @@ def held_out_rows(
 
     Args:
         design: the unknowns.
-        posterior: posterior by all rows.
+        posterior: posterior from all rows.
         group: see `Rows.group`.
         folds: groups that are held out together.
         updates: updates of noise and prior sizes for every fold.
@@ -211,10 +211,10 @@ def choose_final_correction(
 ) -> FinalCorrection | None:
     """Find the largest part of the selected features that increases no sensor's errors, with exact fits of each part.
 
-    Held-out errors by linearisation are those of an exact fit only if the linearisation is accurate. It is for many
-    poses or positions. For few of them, or for other sensors, the rows of the search are held out again, fold by fold,
-    of exact fits with and without the correction. A part is accepted if it increases the errors and held-out errors of
-    no sensor, and clearly reduces the held-out errors of one.
+    Held-out errors computed by linearisation equal those of an exact fit only if the linearisation is accurate, as it
+    is for many poses or positions. For few of them, or for other sensors, the rows of the search are held out again,
+    fold by fold, from exact fits with and without the correction. A part is accepted if it increases the errors and
+    held-out errors of no sensor, and clearly reduces the held-out errors of one.
 
     Returns:
         The accepted part; None if the geometric calibration is to be kept.

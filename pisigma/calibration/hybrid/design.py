@@ -314,7 +314,7 @@ class AbstractDesignRegression(AbstractRegression):
         """Leave out each fold and predict it, with the prior sizes and the noise of a posterior.
 
         Args:
-            posterior: posterior by all values.
+            posterior: posterior from all values.
             folds: groups that are held out together, see `Rows.group`.
         """
 
@@ -339,6 +339,6 @@ class AbstractDesignRegression(AbstractRegression):
             features: the additional features.
 
         Returns:
-            The gain, infinite if a fit is as fast; and start values of the prior sizes of the features.
+            The gain, or infinity if a fit takes no longer; and start values of the prior sizes of the features.
         """
         return math.inf, None

@@ -1,4 +1,4 @@
-"""Noise of the sensors of a calibration, and what it means for rows that state their standard deviations or do not."""
+"""Noise of the sensors of a calibration, for rows with and without stated standard deviations."""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -13,13 +13,13 @@ MAX_ABSOLUTE = 0.01
 
 @dataclass(frozen=True)
 class CalibrationNoise:
-    """Noise of the sensors of a calibration, in the form that its rows have.
+    """Noise of the sensors of a calibration: standard deviations, or factors on those stated in the rows.
 
     Attributes:
         value: by sensor, the standard deviation of its readings [m or rad]; a factor on the stated ones where the rows
             state them.
         stated: by sensor whose rows state them, the median of the stated standard deviations [m or rad]; None for
-            folders of earlier versions, which do not say.
+            folders of earlier versions, which do not store them.
     """
 
     value: Mapping[str, float] = field(default_factory=dict)
@@ -44,7 +44,7 @@ class CalibrationNoise:
         return CalibrationNoise(value, kept | dict(other.stated or {}))
 
     def noise_of_earlier_rows(self, sensor: AbstractSensor) -> float | None:
-        """Return the noise of earlier rows of a sensor, in the form of its new rows; None for a new sensor.
+        """Return the noise of earlier rows of a sensor, in the form required by its new rows; None for a new sensor.
 
         Args:
             sensor: sensor with the rows.

@@ -136,9 +136,9 @@ def linearise_rows(
 def with_frames_of(solved: SolvedCalibration, refined: RefinedFit) -> IdentifiedGeometry:
     """Return the geometry of the hybrid, with floating frames moved onto those of the geometric calibration.
 
-    Residuals of sockets, and of distances from anchors at unknown points, do not change by any motion of the whole
-    frame. But nominal joint values and predictions of both calibrations must refer to the same base. Therefore every
-    such frame is moved so that the poses of the hybrid are nearest to the geometric ones.
+    Residuals of sockets, and of distances from anchors at unknown points, do not change if the whole frame is moved.
+    But nominal joint values and predictions of both calibrations must refer to the same base. Therefore every such
+    frame is moved so that the poses of the hybrid are nearest to the geometric ones.
 
     Args:
         solved: the geometric calibration.

@@ -67,7 +67,7 @@ class HybridResult:
         return self.geometric.outliers if self.learned is None else self.learned.outliers
 
     def arm(self) -> HybridArm | None:
-        """Return the corrected arm with the base of the first frame and the tool of the first target; None without."""
+        """Return the corrected arm, with base of the first frame and tool of the first target; None without one."""
         if self.learned is None:
             return None
         learned = self.learned

@@ -100,7 +100,7 @@ class FeatureFit:
         return " + ".join(chosen.label for chosen in self.design.features) or "geometry"
 
     def gain(self, before: "FeatureFit") -> float:
-        """Compute by how many standard errors the held-out squares are smaller than another fit's; 0 without any."""
+        """Compute the decrease of the held-out squares from another fit [standard errors]; 0 if none were held out."""
         if self.held_out is None or before.held_out is None:
             return 0.0
         return self.held_out.gain(self.posterior.noise, before.held_out, before.posterior.noise)
@@ -194,7 +194,7 @@ class FeatureSearch:
     ) -> FeatureFit:
         """Select features greedily: other features first, then growing ones as long as they improve the fit.
 
-        With few rows, single features cannot be distinguished from the noise that the others cause; so all features are
+        With few rows, single features cannot be distinguished from the noise that the others cause, so all features are
         also tried together.
 
         Args:

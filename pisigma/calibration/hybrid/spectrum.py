@@ -106,7 +106,7 @@ def _lines_of_joint(
 
 
 def _distinguishable(G: Complex128[Tensor, " _orders"], lowest: int) -> Bool[Tensor, " _orders"]:
-    """Say which orders can be distinguished: on a grid of joint values, up to half of the harmonic that is constant.
+    """Return which orders can be distinguished: on a grid of joint values, up to half of the constant harmonic.
 
     Args:
         G: sums of the curvature times powers of `exp(i angle)`, near G_0 for powers that are equal at all values.

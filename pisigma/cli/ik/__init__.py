@@ -1,1 +1,1 @@
-"""`pisigma ik`: the command, and how solutions are printed and written."""
+"""`pisigma ik`: the command, and the output of its solutions."""

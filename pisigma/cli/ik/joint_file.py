@@ -53,7 +53,7 @@ class FailedRow:
 
 @dataclass
 class PoseFileResult:
-    """How the poses of a file were solved.
+    """Outcome of solving the poses of a file.
 
     Attributes:
         rows: number of rows.
@@ -81,7 +81,7 @@ class PoseFileResult:
         return values | ({"switches": switches} if path else {})
 
     def problem(self, source: Path) -> str | None:
-        """Say which rows failed and why; None if none did."""
+        """Describe which rows failed and why; None if none did."""
         if not self.failed:
             return None
         first, *others = self.first_failed
@@ -193,7 +193,7 @@ def _solve(
 
 
 def _too_far(chunk: PoseChunk, robot: Robot) -> list[str]:
-    """Say why each pose cannot be one of the robot; "" if it can."""
+    """Return why each pose cannot be a pose of the robot; "" if it can."""
     distance = (chunk.T[:, :3, 3] - torch.from_numpy(robot.base[:3].copy())).norm(dim=-1)
     reasons = [""] * len(chunk.line)
     for row in (distance > FAR * robot.reach).nonzero()[:, 0].tolist() if robot.reach > 0 else []:

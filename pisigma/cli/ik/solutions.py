@@ -14,8 +14,8 @@ _LISTED = 10
 def solution_records(solution: Solution, solver: CorrectedIK) -> list[dict[str, Any]]:
     """Return one record per solution: status, joint values, branch.
 
-    A robot whose joints all turn gets `q_deg`, `q_nominal_deg`, `correction_deg` as lists; with a prismatic
-    joint `q`, `q_nominal`, `correction` are lists of `{"joint", "value", "unit"}`. What is not known is None.
+    For a robot with revolute joints only, `q_deg`, `q_nominal_deg`, `correction_deg` are lists; with a prismatic
+    joint `q`, `q_nominal`, `correction` are lists of `{"joint", "value", "unit"}`. Unknown values are None.
     """
     records = []
     measures = solution.domain_measure.tolist()
@@ -40,12 +40,12 @@ def solution_records(solution: Solution, solver: CorrectedIK) -> list[dict[str, 
 
 
 def failure(solution: Solution, places: Sequence[str], any_will_do: bool) -> str | None:
-    """Say which poses the robot cannot take as asked; None if it can take all.
+    """Describe which poses the robot cannot reach as requested; None if it can reach all.
 
     Args:
         solution: the solutions.
         places: name of each of them.
-        any_will_do: whether one that reaches is enough (all branches of one pose).
+        any_will_do: whether one solution that reaches the pose is enough (all branches of one pose).
     """
     statuses = statuses_of(solution)
     failed = [row for row, status in enumerate(statuses) if status in FAILURES]

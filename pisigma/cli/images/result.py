@@ -1,4 +1,4 @@
-"""What the commands for images write and print."""
+"""Output of the commands for images."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -57,5 +57,5 @@ def write_result(
 
 
 def trust_text(warnings: int, otherwise: str) -> str:
-    """Say whether to trust a result with as many warnings."""
+    """Return whether to trust a result with this number of warnings."""
     return f"with caution ({counted(warnings, 'warning')})." if warnings else otherwise

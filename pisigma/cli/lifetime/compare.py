@@ -1,4 +1,4 @@
-"""`pisigma compare`: how two models of one robot differ, and what that means for the tool."""
+"""`pisigma compare`: differences between two models of one robot, and their effect on the tool."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -112,7 +112,7 @@ def _print(compared: "ComparedModels", page: Path | None, verbose: bool) -> None
 
 
 def _verdict(compared: "ComparedModels") -> Verdict:
-    """Say how far two models differ, and which is better."""
+    """Describe how far two models differ, and which is better."""
     first, second = compared.models
     errors = compared.workspace.errors.figures.figures_by_name
     count, better = len(compared.parameters.differing), compared.better

@@ -1,4 +1,4 @@
-"""`pisigma monitor`: whether a robot has changed since its model was made, and how it drifts over the months."""
+"""`pisigma monitor`: changes of a robot since its model was made, and its drift over the months."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -67,7 +67,7 @@ def monitor(
 def _monitor_cell(
     cell: "Cell", settings: StatedSettings[MonitorSettings], page: Path | None, as_json: bool, verbose: bool
 ) -> None:
-    """Judge the sessions of a cell that its model in use was not made of."""
+    """Check the sessions of a cell that its model in use was not fitted to."""
     from pisigma.files.output_file import check_page
 
     if page is not None:

@@ -86,13 +86,13 @@ def recalibrate_into(
         context: context of the command, for the card.
         model: folder of the model.
         data: files of the rows.
-        settings: how.
+        settings: settings of the recalibration.
         out: folder to write; None for none.
         accept_implausible: write the model even if it must not be trusted.
         overwrite: replace the model in the folder.
         as_json: print one JSON object.
         verbose: print all tables.
-        nominal: the robot whose fleet the model has to be the prior of; None for any model.
+        nominal: the robot, if the model must be the prior of its fleet; None for any model.
 
     Raises:
         ModelError: the model belongs to another robot, or is not a fleet prior.

@@ -53,7 +53,7 @@ View = Annotated[bool, typer.Option("--view", help="Also show robot, rows and er
 
 @dataclass(frozen=True)
 class PageOptions:
-    """How a session is shown in the browser.
+    """Display of a session in the browser.
 
     Attributes:
         host: address to serve the page at (0.0.0.0: also for other machines).
@@ -83,12 +83,14 @@ def serve_session_page(
     page: PageOptions | None,
     camera: "CameraSettings | None" = None,
 ) -> Iterator[Callable[["SessionState"], None]]:
-    """Serve the page of a session, and yield what shows a state on it; on a terminal the page stays until Ctrl-C.
+    """Serve the page of a session, and yield a function that shows a state on it.
+
+    On a terminal the page stays until Ctrl-C.
 
     Args:
         arm: the robot in its cell.
         limit_mm: limit for 95 % of the errors [mm]; None for no limit.
-        page: how it is shown; None for no page.
+        page: options of the page; None for no page.
         camera: the camera that measures; None for another sensor.
 
     Raises:
@@ -167,7 +169,7 @@ def measure(
 def _printer(
     session: "MeasuringSession", title: str, as_json: bool
 ) -> Iterator[Callable[["SessionStep"], None]]:
-    """Yield what prints a step: on a changing page on a terminal, otherwise in lines."""
+    """Yield a function that prints a step: on a page that is redrawn on a terminal, otherwise as lines."""
     from rich.console import Console
     from rich.live import Live
 

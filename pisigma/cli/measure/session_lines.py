@@ -20,7 +20,7 @@ SHOWN_ROWS, SHOWN_ALARMS, SHOWN_POINTS = 8, 4, 8
 
 
 def step_lines(step: SessionStep) -> Iterator[str]:
-    """Say what is new, in a line each; many rows or alarms of one kind in one line."""
+    """Describe what is new, one line each; many rows or alarms of one kind share a line."""
     yield from step.growth.notices
     if step.growth.waiting and not step.state.rows.line:
         yield f"Waiting: {step.growth.waiting}"
@@ -38,7 +38,7 @@ def step_lines(step: SessionStep) -> Iterator[str]:
 
 
 def _row_lines(state: SessionState, lines: Sequence[int]) -> Iterator[str]:
-    """Say how far new rows are from what the others predict: each row, or all of many."""
+    """Describe how far new rows are from the prediction of the others: each row, or all if there are many."""
     rows = [state.rows.line.index(line) for line in lines]
     if len(lines) <= MAX_ALIKE:
         yield from (f"line {line}: {row_text(state, row)}" for line, row in zip(lines, rows, strict=True))
@@ -56,7 +56,7 @@ def _row_lines(state: SessionState, lines: Sequence[int]) -> Iterator[str]:
 
 
 def row_text(state: SessionState, row: int) -> str:
-    """Say how far a row is from what the others predict."""
+    """Describe how far a row is from the prediction of the others."""
     error = float((state.rows.error[row] ** 2).sum() ** 0.5)
     kind = " (check)" if state.rows.check[row] else ""
     if error != error:
@@ -65,7 +65,7 @@ def row_text(state: SessionState, row: int) -> str:
 
 
 def next_text(state: SessionState) -> str:
-    """Say which pose is next."""
+    """Describe which pose is next."""
     following = state.next_pose
     if following is None:
         return "No pose is left."

@@ -119,7 +119,7 @@ def _print_training(summary: "TrainingSummary", folder: Path, seconds: float, ve
 
 
 def _worst_joint(summary: "TrainingSummary") -> str:
-    """Say how large the error of the worst joint is on average, before and after the correction."""
+    """Describe the mean error of the worst joint, before and after the correction."""
     errors = {one.name: (one.held_out or one.training, one.held_out is None) for one in summary.joints}
     known = {name: one for name, one in errors.items() if one[0] is not None}
     if not known:
@@ -151,7 +151,7 @@ def _redundancy(summary: "CalibrationSummary") -> Iterator[Block]:
 def _sets_side_by_side(
     ours: Sequence[Sequence[str]], papers: Sequence[Sequence[str]]
 ) -> list[tuple[str, str, str]]:
-    """Return a row per set, with equal sets in one."""
+    """Return one row per set; equal sets share a row."""
     pairs = [(members, next((one for one in papers if set(one) == set(members)), ())) for members in ours]
     pairs += [((), one) for one in papers if set(one) not in [set(members) for members in ours]]
     return [

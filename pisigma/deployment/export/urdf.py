@@ -110,7 +110,7 @@ def robot_into_urdf(
     comments: tuple[str, ...] = (),
     base: str | None = None,
 ) -> str:
-    """Return the file with the origins of a calibrated robot; links, meshes, limits and the rest are kept.
+    """Return the file with the origins of a calibrated robot; links, meshes, limits and everything else are kept.
 
     Every joint after the first has its calibrated pose in the preceding link. Links keep their poses relative to their
     joints, so that meshes still fit. Two links are added: `calibrated_frame`, the parent of the base, is the frame of

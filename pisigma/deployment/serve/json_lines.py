@@ -144,7 +144,7 @@ class JsonLines(AbstractProtocol):
         return _line({"id": None, "error": str(problem)})
 
     def _job(self, request: dict[str, Any]) -> tuple[_Job, bool, dict[str, str]]:
-        """Return the function that computes an answer, whether it is slow, and what names its model in the answer.
+        """Return the function that computes an answer, whether it is slow, and the name of its model in the answer.
 
         Raises:
             RequestError: the request is invalid.

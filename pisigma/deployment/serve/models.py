@@ -64,12 +64,12 @@ class ServedModel:
 
     @cached_property
     def full_name(self) -> dict[str, str]:
-        """What names the model in answers."""
+        """Name of the model in answers."""
         return {"model": self.name}
 
     @cached_property
     def short_name(self) -> dict[str, str]:
-        """What names the model in brief answers: hexadecimal digits, which no simple parser takes for a status."""
+        """Name of the model in brief answers: hexadecimal digits, which a simple parser cannot mistake for a status."""
         return {"sha256": self.short_hash.hex()}
 
     @cached_property

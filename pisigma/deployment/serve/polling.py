@@ -1,4 +1,4 @@
-"""Busy polling for the next request while requests are frequent, as waking up takes longer than answering."""
+"""Busy polling for the next request while requests are frequent, because waking up takes longer than answering."""
 
 import math
 import selectors

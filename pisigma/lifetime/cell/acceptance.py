@@ -1,4 +1,4 @@
-"""What the acceptance of a cell's robot needs: instrument, uncertainty budget, measured errors, who accepted it."""
+"""Acceptance of a cell's robot: instrument, uncertainty budget, measured errors, and who accepted it."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -96,7 +96,7 @@ class Acceptance:
 
         It is False for a budget without the scatter of the calibration. Otherwise the mean square of the measured
         coordinates over `u_c²` is compared with the quantile `EXPLAINED` of the F distribution. Its degrees of freedom
-        are the number of rows, as the coordinates of a row may be correlated, and those of the budget.
+        are the number of rows, because the coordinates of a row may be correlated, and those of the budget.
         """
         if self.measured is None or all(one.name != SCATTER for one in self.budget.components):
             return False

@@ -1,4 +1,4 @@
-"""What is active on the controller of a cell, and what this means for every command.
+"""Exports that are active on the controller of a cell, and their consequences for every command.
 
 Two kinds of exports are active on a controller. Its *kinematics* convert joint values to poses; the joint values of the
 arm keep their meaning, so measured rows do not depend on them. Its *joint zeros* change what joint values mean: a model
@@ -101,7 +101,7 @@ class Active:
 
 @dataclass(frozen=True)
 class Controller:
-    """What was active on a controller when.
+    """History of the exports that were active on a controller.
 
     Attributes:
         changes: all changes in the order of their days.
@@ -117,7 +117,7 @@ class Controller:
         return Controller(history.controller(), history.exports())
 
     def active(self, day: str = "9999", time: str = "") -> dict[Contents, Active]:
-        """Return what was active after a day, by what it contains.
+        """Return the exports that were active after a day, by their contents.
 
         Args:
             day: the day (ISO 8601).
@@ -135,7 +135,7 @@ class Controller:
         return found
 
     def during(self, session: SessionEntry) -> dict[Contents, Active]:
-        """Return what was active during a session: of a change of its day, what was recorded before it was added."""
+        """Return the exports that were active during a session; of its day, those recorded before it was added."""
         return self.active(session.day, session.taken_in)
 
     @property
@@ -150,7 +150,7 @@ class Controller:
         return _hash(self.during(session)) == _hash(self.active())
 
     def behind(self, model: ModelEntry, sessions: tuple[SessionEntry, ...]) -> dict[Contents, Active]:
-        """Return what was active when the newest rows of a model were measured."""
+        """Return the exports that were active when the newest rows of a model were measured."""
         newest = [one for one in sessions if one.name == model.sessions.split(",")[-1]]
         return self.during(newest[0]) if newest else self.active(model.day or model.made[:10], model.made)
 
@@ -171,7 +171,7 @@ class Controller:
             command: a key of `RULES`.
             model: the model that the command uses; None if it uses none.
             sessions: all sessions of the cell.
-            at: what was active when the rows were measured; None: what is active now.
+            at: exports that were active when the rows were measured; None: those that are active now.
         """
         present = self.active() if at is None else at
         behind = present if model is None else self.behind(model, sessions)
@@ -200,7 +200,7 @@ class Controller:
 
 @dataclass(frozen=True)
 class Findings:
-    """What follows for a command from what is active on the controller.
+    """Consequences for a command of the exports that are active on the controller.
 
     Attributes:
         refusal: why the command is refused; empty if it is not.
@@ -240,12 +240,12 @@ def valid_sessions(
 
 
 def _hash(active: dict[Contents, Active]) -> str:
-    """Return what identifies joint zeros; empty if none are active."""
+    """Return a hash that identifies joint zeros; empty if none are active."""
     return active["joint_zeros"].export.sha256 if "joint_zeros" in active else ""
 
 
 def records(active: dict[Contents, Active]) -> list[dict[str, str]]:
-    """Return what is active as plain values."""
+    """Return the active exports as plain values."""
     return [one.to_json() for one in active.values()]
 
 

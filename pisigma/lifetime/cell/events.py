@@ -9,7 +9,7 @@ from pisigma.measurement.dates import EXPECTED_DATE, is_date
 EventKind = Literal[
     "instrument", "tool", "mastering", "encoder", "collision", "maintenance", "firmware", "accepted"
 ]
-"""What was changed: the instrument (tracker, camera, board) was set up again, the tool or reflector was replaced, or
+"""Kind of event: the instrument (tracker, camera, board) was set up again, the tool or reflector was replaced, or
 the arm was changed (see `ARM_EVENTS`). "firmware" and "accepted", by a person, are only recorded."""
 ARM_EVENTS: frozenset[EventKind] = frozenset(("mastering", "encoder", "collision", "maintenance"))
 """Events after which earlier sessions no longer describe the arm."""
@@ -60,7 +60,7 @@ def check_event(kind: str, day: str, person: str) -> None:
         person: who accepted the model or reports the change.
 
     Raises:
-        MeasurementError: the kind is unknown, the day is not a valid date, or nobody is named who accepted.
+        MeasurementError: the kind is unknown, the day is not a valid date, or the person who accepted is not named.
     """
     check_choice(MeasurementError, "event", kind, get_args(EventKind))
     if not is_date(day):

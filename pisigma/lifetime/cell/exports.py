@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 Contents = Literal["joint_values", "poses", "description", "kinematics", "joint_zeros"]
-"""What an exported file contains: corrected joint values (or the means to compute them), corrected poses for a
+"""Contents of an exported file: corrected joint values (or the means to compute them), corrected poses for a
 controller that computes with the nominal robot, a description of the robot for other programs, the kinematics with
 which a controller converts joint values to poses, or the zeros of the joints on a controller."""
 ON_CONTROLLER: tuple[Contents, ...] = ("kinematics", "joint_zeros")

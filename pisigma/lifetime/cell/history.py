@@ -326,7 +326,7 @@ class History:
             person: who accepted the model or reports the change.
 
         Raises:
-            MeasurementError: the kind is unknown, the day is not a valid date, or nobody is named who accepted.
+            MeasurementError: the kind is unknown, the day is not a valid date, or the person who accepted is not named.
             ModelError: no model is in use that could be accepted.
         """
         day, model = day or datetime.date.today().isoformat(), ""
@@ -343,7 +343,7 @@ class History:
         return event
 
     def _take_over(self, database: sqlite3.Connection) -> Sequence[Path]:
-        """Add what earlier versions stored elsewhere.
+        """Add the records that earlier versions stored elsewhere.
 
         Versions before 2 stored monitored sessions in a file next to each model of the cell; only the description of a
         model states whether it has a posterior.

@@ -28,7 +28,7 @@ class ModelInUse:
         cell: folder of the cell.
         folder: folder of the model that was loaded last.
         problem: why the model in use is not loaded; empty if it is.
-        findings: what follows from what is active on the controller; with a refusal no model must be used.
+        findings: consequences of the exports that are active on the controller; with a refusal no model must be used.
     """
 
     def __init__(self, cell: Path, command: str, load: Callable[[Path], None]) -> None:
@@ -36,7 +36,7 @@ class ModelInUse:
 
         Args:
             cell: folder of the cell.
-            command: what uses the model, a key of `controller.RULES`.
+            command: command that uses the model, a key of `controller.RULES`.
             load: function that loads a model folder and replaces the model that answers. If it raises an error, the
                 model before continues to answer.
 
@@ -74,7 +74,7 @@ class ModelInUse:
                 self.problem = str(problem)
 
     def follow(self, report: Callable[[str], None] = lambda sentence: None) -> None:
-        """Look for changes in a background thread, until `stop` is called or this object is not used any more.
+        """Look for changes in a background thread, until `stop` is called or this object is no longer used.
 
         Args:
             report: function that is called with every new sentence of `warnings`.
@@ -89,16 +89,16 @@ class ModelInUse:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What a user has to know: that the model is refused, why it is not loaded, and warnings."""
+        """Findings for the user: that the model is refused, why it is not loaded, and warnings."""
         return tuple(filter(None, (self.findings.refusal, self.problem, *self.findings.warnings)))
 
     def _find(self) -> Findings:
-        """Return what follows for the model in use from what is active on the controller."""
+        """Return the findings for the model in use with the exports that are active on the controller."""
         history = History(self.cell / HISTORY)
         return findings(history, self._command, history.in_use)
 
     def _state(self) -> tuple[int, int, int] | None:
-        """Return what changes with every change of the history; None without a history."""
+        """Return values that change with every change of the history; None without a history."""
         try:
             found = os.stat(self.cell / HISTORY)
         except OSError:

@@ -74,7 +74,7 @@ class CandidateChoice:
 
     @property
     def sentence(self) -> str:
-        """Which candidate is kept, with the errors of all."""
+        """Sentence on which candidate is kept, with the errors of all."""
         if not self.rows:
             return f"{self.names[self.kept]} is kept: there are too few rows for a cross-validation."
         sizes = {name: size * 1e3 for name, size in self.rms.items() if size is not None}

@@ -30,7 +30,7 @@ class ContradictingRowFigures(Section):
 
     @property
     def sentence(self) -> str:
-        """Which row was left out, why, and what to do."""
+        """Sentence on which row was left out, why, and what to do."""
         sizes = ((self.residual_mm, "mm"), (self.residual_deg, "deg"))
         missed = " and ".join(f"{size:.3g} {unit}" for size, unit in sizes if size is not None)
         return (

@@ -15,7 +15,7 @@ from pisigma.measurement.faults import Fault
 SPREADSHEET_ERRORS = frozenset(
     ("#N/A", "#NV", "#REF!", "#VALUE!", "#DIV/0!", "#NAME?", "#NUM!", "#NULL!", "#SPILL!", "#CALC!")
 )
-"""What spreadsheets write to cells that they cannot calculate."""
+"""Texts that spreadsheets write to cells that they cannot calculate."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -121,7 +121,7 @@ class SensorRows:
 
     @property
     def has_corner_poses(self) -> Bool[Tensor, " rows"]:
-        """Which rows contain a complete pose from the corners of a board in an image, with its covariance."""
+        """Mask of the rows with a complete pose from the corners of a board in an image, with its covariance."""
         return self.measurements.is_measured("corner") & self.measurements.is_measured("pose")
 
     def readings(self, name: str) -> Float64[Tensor, " rows"]:

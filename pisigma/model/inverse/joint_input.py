@@ -13,7 +13,7 @@ from pisigma.robot.kernels.array_kinematics import is_tensor
 
 
 class _Fault(NamedTuple):
-    """What an argument has to be, and how to correct it."""
+    """Requirement on an argument, and how to correct it."""
 
     option: str
     expected: str

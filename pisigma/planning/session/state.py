@@ -134,7 +134,7 @@ class AccuracyPoint:
 
 @dataclass(frozen=True)
 class Advice:
-    """What to do next.
+    """Advice on what to do next.
 
     Attributes:
         action: "measure" the next pose, "repeat" a pose, "correct" a fault of all rows, or "stop".

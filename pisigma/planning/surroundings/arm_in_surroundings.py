@@ -46,7 +46,7 @@ class Faults:
         return Counter(self.reasons[reason] for reason in first.tolist())
 
     def sentence(self, pose: int) -> str | None:
-        """Say why a pose is not allowed; None if it is allowed."""
+        """Return why a pose is not allowed; None if it is allowed."""
         failed = self.failed[pose].nonzero()[:, 0].tolist()
         return "; ".join(self.reasons[column] for column in failed) + "." if failed else None
 

@@ -1,4 +1,4 @@
-"""What to measure next and what to trust, as sentences with figures."""
+"""Advice on what to measure next and what to trust, as sentences with figures."""
 
 import math
 
@@ -31,7 +31,7 @@ def advice_for(
     limit: AccuracyLimit,
     causes: tuple[str, ...] = (),
 ) -> tuple[str, ...]:
-    """Say what to measure next and what to trust, the most useful first.
+    """Recommend what to measure next and what to trust, the most useful advice first.
 
     Args:
         model: the model.
@@ -104,7 +104,7 @@ def _orientations(model: CalibratedModel, summary: CalibrationSummary) -> tuple[
 
 
 def _conditions(rows: JudgedRows | None) -> list[str]:
-    """Say which payload and temperature the figures hold for, where a file could have stated them."""
+    """Describe for which payload and temperature the figures are valid, where a file could have stated them."""
     if rows is None or (rows.origin == "held_out" and rows.measurements.position is None):
         return []
     lines: list[str] = []

@@ -106,7 +106,7 @@ def causes_of(summary: CalibrationSummary | None, diagnostics: Sequence[Diagnost
 
 
 def _without_poses(model: CalibratedModel, joints: tuple[JudgedJoint, ...]) -> Verdict:
-    """Say what joint errors show where no pose was judged."""
+    """Describe what the joint errors show if no pose was evaluated."""
     if not joints:
         advice = "Give a file with measurements that the model was not calibrated with."
         return Verdict(say("no_figures", model)[0], "", advice, held_out=False)
@@ -117,7 +117,7 @@ def _without_poses(model: CalibratedModel, joints: tuple[JudgedJoint, ...]) -> V
 
 
 def _worst(model: CalibratedModel, rows: JudgedRows | None) -> tuple[str, str]:
-    """Say where errors are largest: a clause for the verdict and a sentence; both empty without rows."""
+    """Describe where errors are largest: a clause for the verdict and a sentence; both are empty without rows."""
     largest = None if rows is None else largest_errors(rows)
     if rows is None or largest is None:
         return "", ""
@@ -286,7 +286,7 @@ def report_content(
 def _missing_parameters(
     model: CalibratedModel, summary: CalibrationSummary | None, correlations: ParameterCorrelations
 ) -> tuple[str, ...]:
-    """Say what the folder does not keep about the parameters."""
+    """List what the folder does not store about the parameters."""
     if summary is not None:
         text = "The model folder does not keep the correlations as numbers; calibrate again to have them."
         return () if correlations.tables else (text,)

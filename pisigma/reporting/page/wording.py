@@ -44,32 +44,32 @@ say = functools.partial(sentences, "report.txt.j2")
 
 
 def rows_text(accuracy: Accuracy) -> str:
-    """Say which rows the errors belong to and which models predicted them."""
+    """Describe which rows the errors belong to and which models predicted them."""
     figures = accuracy.validation
     folds = cross_validation_text(figures) if figures is not None and (figures.folds or 1) > 1 else ""
     return say("judged_rows", accuracy, folds)[0]
 
 
 def dependence_text(dependence: Dependence) -> str:
-    """Say whether errors depend on a quantity."""
+    """Return whether errors depend on a quantity."""
     return " ".join(say("dependence", dependence, dependence.test))
 
 
 def names_text(errors: ErrorsByName) -> str:
-    """Say whether errors differ between frames or targets."""
+    """Return whether errors differ between frames or targets."""
     return say("by_name", errors)[0]
 
 
 def map_text(error_map: ErrorMap) -> str:
-    """Say which points a map shows."""
+    """Describe which points a map shows."""
     return say("map", error_map)[0]
 
 
 def layer_text(layer: Layer, error_map: ErrorMap) -> str:
-    """Say what the values of a layer are."""
+    """Describe the values of a layer."""
     return say("layer", layer.key, error_map.origin)[0]
 
 
 def curve_text(curve: CorrectionCurve) -> str:
-    """Say how large the correction of a joint is and where it was measured."""
+    """Describe how large the correction of a joint is and where it was measured."""
     return say("curve", curve)[0]

@@ -49,7 +49,7 @@ class TaskAxes:
 
     @cached_property
     def free(self) -> tuple[bool, ...]:
-        """Which of `AXES` are excluded from least squares and residuals."""
+        """Mask of the `AXES` that are excluded from least squares and residuals."""
         return tuple(value < 0 or value == math.inf for value in self.tolerance)
 
     @cached_property

@@ -90,7 +90,7 @@ class CheckedCalibration:
 
 
 Move = Literal["frame", "tool", "joint_zero"]
-"""What may have moved since a model was made; see the kinds of `Cause`."""
+"""Things that may have moved since a model was made; see the kinds of `Cause`."""
 MOVES: Final[frozenset[Move]] = frozenset({"frame", "tool", "joint_zero"})
 LARGE_SHARE = 2e-3
 """Errors as a share of the reach above which a mistake or a motion is their cause, and not wear."""
@@ -225,7 +225,7 @@ class RowsUnderModel:
         return find_setup_faults(self.model, self.nominal, self.rows, self.fitted, frames_only=True)
 
     def is_move(self, fault: SetupFault) -> bool:
-        """Say whether a fault is an allowed motion: of frames, tools, or the zero of a single joint."""
+        """Return whether a fault is an allowed motion: of frames, tools, or the zero of a single joint."""
         return self.may_move.issuperset(fault.kinds) and len(set(fault.joints)) <= 1
 
 
@@ -249,7 +249,7 @@ def kinds_to_fit(
 
 
 def _unknown(names: tuple[str, ...], known: Collection[str]) -> bool:
-    """Say whether a frame or target is unknown to a model, see `pisigma.model.calibrated_model.known_names`."""
+    """Return whether a frame or target is unknown to a model, see `pisigma.model.calibrated_model.known_names`."""
     if not set(known) - {""}:
         return len(set(names)) > 1
     return not set(names) <= set(known) and not (len(known) == 1 and not any(names))

@@ -85,7 +85,7 @@ def many_wrong(rows: Measurements, wrong: Bool[Tensor, " rows"]) -> Diagnostic:
 
 
 def _cause(judged: RowsUnderModel, wrong: Bool[Tensor, " rows"]) -> str:
-    """Say what explains the wrong rows; empty if nothing does."""
+    """Describe what explains the wrong rows; empty if nothing does."""
     faults = find_setup_faults(judged.model, None, judged.rows.select(wrong), judged.fitted)
     if not faults:
         return ""
@@ -147,7 +147,7 @@ def _apart(judged: RowsUnderModel, T: Float64[Tensor, "rows 4 4"]) -> Bool[Tenso
 
 
 def _joints_explain(judged: RowsUnderModel) -> bool:
-    """Say whether moved joint zeros explain all rows (linearised at the fitted poses)."""
+    """Return whether moved joint zeros explain all rows (linearised at the fitted poses)."""
     error = judged.measured.position - judged.predicted[:, :3, 3]
     J = judged.zero_columns()[1][..., :3, 3].flatten(1).t()
     solution = torch.linalg.lstsq(J, error.flatten(), driver="gelsd").solution
@@ -207,7 +207,7 @@ def _two_sizes(checked: CheckedCalibration) -> Iterator[Diagnostic]:
 
 
 def _differ(found: Populations) -> bool:
-    """Say whether these are two populations, and not what unmodelled errors of one arm look like."""
+    """Return whether these are two populations, and not what unmodelled errors of one arm look like."""
     return (
         found.log_bayes_factor > CERTAIN
         and found.factor > LARGE[found.differing] * max((1 - HARDLY_USED) / (1 - found.used), 1.0)
@@ -253,7 +253,7 @@ MAX_PLACES = 8
 
 
 class Distinction(NamedTuple):
-    """What distinguishes some rows from the others.
+    """A property that distinguishes some rows from the others.
 
     Attributes:
         by: "name", "range" (of the file), "period" (every n-th row), "value", or "nothing" if the rows are scattered.

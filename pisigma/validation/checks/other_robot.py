@@ -21,7 +21,7 @@ NEARER = 1 / 3
 """Errors of another robot over those of this one below which it is reported. A nominal arm explains its own
 measurements to a thousandth of its reach, so two different robots differ by more."""
 MIN_ROWS = 6
-"""With fewer rows, base and tool alone fit another robot to the rows."""
+"""Minimum number of rows; with fewer, base and tool alone fit another robot to the rows."""
 MAX_ROWS = 200
 """Rows that suffice to distinguish robots."""
 

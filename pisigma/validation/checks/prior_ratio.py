@@ -77,7 +77,7 @@ def class_of(checked: CheckedCalibration, large: Sequence[PriorRatio]) -> RobotC
 
 
 def predicts_held_out_rows(checked: CheckedCalibration) -> bool:
-    """Say whether held-out rows are predicted far better than by the nominal robot.
+    """Return whether held-out rows are predicted far better than by the nominal robot.
 
     Without held-out rows, the errors of the rows of the calibration are used, scaled up for the degrees of freedom of
     the geometric calibration.

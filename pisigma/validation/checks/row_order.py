@@ -83,7 +83,7 @@ def _values(motion: Motion, rows: Measurements) -> dict[str, float | int | str]:
 
 
 def _texts(motion: Motion, rows: Measurements) -> tuple[str, str]:
-    """Say what moved, at which row and how far; and what to do."""
+    """Describe what moved, at which row and how far, and what to do."""
     what = {"frame": "measuring frame", "target": "target on the tool", "tool": "tool"}[motion.moved]
     what += f" '{motion.name}'" if motion.name and motion.moved != "tool" else ""
     x, y, z = motion.shift * 1e3

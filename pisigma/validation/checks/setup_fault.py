@@ -30,7 +30,7 @@ UNRELATED = (
     "different rows belong together; check whether one of them was sorted or comes from another program."
 )
 MIN_ROWS_OF_SIZE = 4
-"""With fewer rows, the positions may be near each other by chance."""
+"""Minimum number of rows; with fewer, the positions may be near each other by chance."""
 SCALE = 30.0
 """Spread of the measured over that of the nominal positions above which (or below whose inverse) the unit is wrong."""
 ARM_SHARE = 0.3

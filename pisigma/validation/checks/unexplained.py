@@ -59,7 +59,7 @@ def check_unexplained(checked: CheckedCalibration) -> Iterator[Diagnostic]:
 
 
 def _explained(checked: CheckedCalibration, left: float) -> bool:
-    """Say whether rounding or the stated noise of the sensor makes errors of this size [mm]."""
+    """Return whether rounding or the stated noise of the sensor makes errors of this size [mm]."""
     sigma = checked.rows.sigma_position
     noise = 0.0 if sigma is None else 3**0.5 * float(sigma.nanmedian()) * 1e3
     return noise > NOISE * left or joint_rounding(checked.geometric, checked.rows) is not None

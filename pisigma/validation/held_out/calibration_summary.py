@@ -68,7 +68,7 @@ class ParameterFigures(Section):
 
 
 class RedundancyFigures(Section):
-    """Which parameters the data determine; see `pisigma.calibration.geometric.identifiability`.
+    """Identifiability: which parameters the data determine; see `pisigma.calibration.geometric.identifiability`.
 
     Attributes:
         kept: an identifiable set of parameters.
@@ -366,6 +366,6 @@ def _or_none(value: float) -> float | None:
 
 
 def has_orientation(model: CalibratedModel) -> bool:
-    """Say whether a model knows the orientation of its tools; without measured orientations, it does not."""
+    """Return whether a model knows the orientation of its tools; without measured orientations, it does not."""
     summary = CalibrationSummary.read(model)
     return summary is None or any(noise.sensor in ("rotation", "corner") for noise in summary.noise)

@@ -74,7 +74,7 @@ def fit_where_it_helps(calibrator: Calibrator, rows: Measurements, progress: Pro
 def _helps(
     calibrator: GeometricCalibrator, result: CalibrationResult, rows: Measurements, progress: Progress
 ) -> bool:
-    """Say whether there are enough values per parameter, or else whether a fit predicts held-out poses better."""
+    """Return whether there are enough values per parameter, or else whether a fit predicts held-out poses better."""
     ratio = distinct_values(result.solved.problem) / max(result.solved.findings.estimated, 1)
     if ratio >= MIN_RATIO:
         return True
@@ -91,7 +91,7 @@ def _helps(
 
 
 def _evident(calibrator: GeometricCalibrator, result: CalibrationResult, rows: Measurements) -> bool:
-    """Say whether the residuals of the fitted arm are significantly smaller than those of the nominal one.
+    """Return whether the residuals of the fitted arm are significantly smaller than those of the nominal one.
 
     This is the F test of nested models, with the effective number of parameters under their prior.
     """

@@ -171,7 +171,7 @@ def predicted_at(model: CalibratedModel, rows: Measurements) -> Float64[Tensor, 
 
 
 def is_inside_range(model: CalibratedModel, q: Float64[Tensor, "rows dof"]) -> Bool[Tensor, " rows"]:
-    """Say whether every joint value is in the measured range; always true if the model does not store it."""
+    """Return whether every joint value is in the measured range; always true if the model does not store it."""
     if model.hybrid is None:
         return torch.ones(len(q), dtype=torch.bool)
     return model.hybrid.coverage.contains(q)

@@ -313,7 +313,7 @@ def _distances(
 
 
 def inside_domain(model: CalibratedModel, measurements: Measurements) -> Bool[Tensor, " rows"] | None:
-    """Say which rows are inside a model's domain, in which its correction was learned.
+    """Return which rows are inside a model's domain, in which its correction was learned.
 
     Returns:
         None if the model has no domain, as geometric calibrations.

@@ -174,7 +174,7 @@ def _bases(
 
 
 def judgeable_rows(measurements: Measurements, test: Tensor, training: Measurements) -> Tensor:
-    """Say which test rows have a target, and an anchor (or its stated position), that the training rows have.
+    """Return which test rows have a target, and an anchor (or its stated position), that training rows have.
 
     Args:
         measurements: all rows.

@@ -114,7 +114,7 @@ def largest_cube(
 
 
 def _full(held: Tensor, cells: int) -> Tensor:
-    """Say where a cube of `cells` cells starts whose grid points are all reachable; `held` is the cumulative count."""
+    """Return where a cube of `cells` cells with only reachable grid points starts; `held` is the cumulative count."""
     k = cells + 1
     sums = held
     for axis in range(3):

@@ -21,7 +21,7 @@ DOMINANT_SHARE = 0.8
 _JOINT_ROWS = (("held_out", True), ("training", False))
 
 RowOrigin = Literal["file", "training", "test", "cross_validation", "simulation", "poses"]
-"""Which rows errors belong to.
+"""Origin of the rows that errors belong to.
 
 "file": rows of a file that the model was not calibrated with. "training": rows that it was calibrated with. "test":
 rows that its file marks as test. "cross_validation": rows held out in k-fold cross-validation, or once.

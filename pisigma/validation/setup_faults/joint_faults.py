@@ -232,7 +232,7 @@ def _zero_cause(joints: tuple[int, ...], offset: list[float], robot: Robot) -> C
 
 
 def is_quarter(angle: float) -> bool:
-    """Say whether an angle [rad] is a multiple of 90 deg."""
+    """Return whether an angle [rad] is a multiple of 90 deg."""
     return abs(math.remainder(angle, QUARTER)) < 1e-12
 
 

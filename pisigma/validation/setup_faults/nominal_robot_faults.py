@@ -41,7 +41,7 @@ MAX_ROWS = 1_000
 MAX_ROWS_NOMINAL = 150
 """The same with the nominal robot, where base and tool are fitted under every hypothesis."""
 MIN_ROWS_NOMINAL = 24
-"""With fewer rows, base and tool, as 39 unknowns of an affine fit, leave too few degrees of freedom."""
+"""Minimum number of rows; with fewer, an affine fit (39 unknowns) leaves too few degrees of freedom."""
 MAX_ZERO = 3 * HOBBY.largest.joint_offset
 """[rad] Largest plausible error of the zero of a revolute joint."""
 MAX_SLIDE = 3 * HOBBY.largest.length
@@ -192,7 +192,7 @@ def _with_joints(
 
 
 def are_unrelated(robot: Robot, measurements: Measurements) -> bool:
-    """Say whether positions are unrelated to the joint values of their rows, for example because one was sorted."""
+    """Return whether positions are unrelated to the joint values of their rows, for example because one was sorted."""
     rows = largest_group(measurements)
     if rows.rows < MIN_ROWS_NOMINAL:
         return False
@@ -240,7 +240,7 @@ def spread(rows: Int64[Tensor, " rows"], most: int) -> Int64[Tensor, " chosen"]:
 
 
 def explains_nothing(T: Float64[Tensor, "rows 4 4"], position: Float64[Tensor, "rows 3"]) -> bool:
-    """Say whether predicted poses explain measured positions no better than chance, by an F test of the affine fit.
+    """Return whether predicted poses explain measured positions no better than chance, by an F test of the affine fit.
 
     Args:
         T: predicted poses.

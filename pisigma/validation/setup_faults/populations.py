@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float64, Int64
 from pisigma.validation.setup_faults.ordered_rows import OrderedRows, inverse_of
 
 MIN_ROWS = 20
-"""With fewer rows two arms cannot be distinguished."""
+"""Minimum number of rows; with fewer, two arms cannot be distinguished."""
 MAX_ROWS = 300
 """Rows that the populations are fitted to, evenly over all rows."""
 MIN_SHARE = 0.1

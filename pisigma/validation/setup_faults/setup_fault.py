@@ -48,7 +48,7 @@ class SetupFault:
 
     @property
     def sentence(self) -> str:
-        """What is wrong, what the errors fall to with it corrected, and what to check."""
+        """Sentence on what is wrong, on the errors with it corrected, and on what to check."""
         clause = self.clause[:1].upper() + self.clause[1:]
         if not np.isfinite(self.after):
             return f"{clause}; {self.advice}."

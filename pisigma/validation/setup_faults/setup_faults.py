@@ -118,7 +118,7 @@ def judged_values(model: CalibratedModel, measurements: Measurements) -> Measure
 
 
 def is_implausible(figures: ModelFigures, model: CalibratedModel) -> bool:
-    """Say whether errors of positions or of orientations are too large for a calibrated robot.
+    """Return whether errors of positions or of orientations are too large for a calibrated robot.
 
     Args:
         figures: figures of the model, or of another one with its base and tool.

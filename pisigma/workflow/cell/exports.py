@@ -15,7 +15,7 @@ from pisigma.lifetime.cell.history import now
 from pisigma.workflow.cell.cell import Cell
 
 NONE = "none"
-"""What is stated instead of a file if no export is active on the controller."""
+"""Word that is stated instead of a file if no export is active on the controller."""
 
 
 def export_from_cell(cell: Cell, form: str, request: ExportRequest) -> Exported:

@@ -27,7 +27,7 @@ from pisigma.workflow.cell.cell_file import CellFile, cell_template
 
 @dataclass(frozen=True)
 class NewCell:
-    """What a new cell consists of.
+    """Contents of a new cell.
 
     Attributes:
         robot: the nominal robot, a catalogue name, or a robot file (YAML or URDF), which is copied into the cell.

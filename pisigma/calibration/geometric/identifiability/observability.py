@@ -1,4 +1,4 @@
-"""How well a set of poses determines parameters: observability indices O1 to O5, and weak directions."""
+"""Observability of parameters by a set of poses: observability indices O1 to O5, and weak directions."""
 
 from dataclasses import dataclass, replace
 

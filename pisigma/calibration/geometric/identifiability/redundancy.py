@@ -82,7 +82,7 @@ class Redundancy:
         return _dependencies(self.information, self.kept, self.removed)
 
     def dependency_sentence_of(self, name: str) -> str | None:
-        """Return the sentence of the dependency of a parameter, the shortest if there are several; None without."""
+        """Return the (shortest) sentence on the dependency of a parameter; None if there is none."""
         having = [dependency for dependency in self.dependencies if name in dependency.names]
         return min(having, key=lambda dependency: len(dependency.names)).sentence if having else None
 
@@ -170,7 +170,7 @@ def _rank(R: Float64[np.ndarray, "rank columns"], tolerance: float) -> int:
 def selection_weights(
     parameters: Sequence[Parameter], sizes: Float64[np.ndarray, " parameters"]
 ) -> Float64[np.ndarray, " parameters"]:
-    """Compute weights by which parameters are kept; of equal ones the earlier is kept."""
+    """Compute the weights that decide which parameters are kept; of equal ones, the first is kept."""
     weights = np.array([_WEIGHT[parameter.group] for parameter in parameters])
     result: np.ndarray = weights * (1 + 1e-3 * (np.abs(sizes) > 1e-9) - 1e-6 * np.arange(len(weights)))
     return result
@@ -270,7 +270,7 @@ def _pivots(rest: np.ndarray, rounding: np.ndarray) -> list[tuple[int, float]]:
 
 
 def _needed(columns: np.ndarray, left: np.ndarray, freedom: int) -> bool:
-    """Say whether the columns explain most of the remaining residuals, by share and F statistic."""
+    """Return whether the columns explain most of the remaining residuals, by share and F statistic."""
     extra = columns.shape[1]
     if extra == 0 or freedom <= extra:
         return False

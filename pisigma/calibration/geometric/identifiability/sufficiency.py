@@ -1,4 +1,4 @@
-"""Whether measurements determine the free parameters, what they leave undetermined, and what to measure next."""
+"""Sufficiency of measurements for the free parameters: what they leave undetermined, and what to measure next."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -190,7 +190,7 @@ def _undetermined(setup: CalibrationSetup) -> tuple[CalibrationWarning, ...]:
 
 
 def determines_scale(setup: CalibrationSetup) -> bool:
-    """Say whether the measurements determine the scale.
+    """Return whether the measurements determine the scale.
 
     Sockets fit a robot of any size; touches determine lengths by faces at different coordinates. Orientations alone do
     not determine the scale, but lengths then have no effect either, so nothing must be fixed.

@@ -53,7 +53,7 @@ class BaseToolFit:
 
     @property
     def status(self) -> str:
-        """How the least squares ended, and how many unknowns the data do not determine."""
+        """Reason for which the least squares ended, and number of unknowns that the data do not determine."""
         normal = self.solution.linearisation.normal
         if len(normal) == 0:
             return "nothing was free"

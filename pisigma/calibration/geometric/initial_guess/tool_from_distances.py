@@ -51,7 +51,7 @@ MAX_WRONG_SHARE = 0.25
 class _Distances:
     """Distances of one target's rows to anchors, and to the other rows of pairs (anchor -1).
 
-    The length of `R · tool + p - anchor` is measured; in pairs, R and p are differences of both rows.
+    The length of `R · tool + p - anchor` is measured; for pairs, R and p are the differences between the two rows.
     """
 
     R: Float64[Tensor, "rows 3 3"]

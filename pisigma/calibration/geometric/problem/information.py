@@ -48,7 +48,7 @@ class Information:
 
     @property
     def residual(self) -> Float64[np.ndarray, " rank"]:
-        """Small vector with the same products with `jacobian` and itself as r with J and itself."""
+        """Small vector whose products with `jacobian` and with itself equal those of r with J and with itself."""
         return self.root[:, -2]
 
     @property

@@ -25,7 +25,7 @@ SHORTEST_STEP = 1e-3
 
 
 class SolutionStatus(Enum):
-    """How a search ended; the value is the predicate of a sentence."""
+    """Reason for which a search ended; the value is the predicate of a sentence."""
 
     CONVERGED = "converged: the last step changed no parameter by more than 0.001 of its standard error"
     EXACT = "converged: the residuals are at rounding level"

@@ -157,7 +157,7 @@ def loss_scale(
 
 
 def rejects_rows(sensors: Sequence[AbstractSensor], losses: Sequence[AbstractLoss], view: SensorView) -> bool:
-    """Say whether the loss gives any row of a sensor weight 0."""
+    """Return whether the loss gives any row of a sensor weight 0."""
     of_each = zip(sensors, losses, view.sums, view.scales, strict=True)
     return any(
         bool((loss.weight(sums.distance / scale, sensor.components) == 0).any())

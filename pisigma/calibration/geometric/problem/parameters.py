@@ -161,7 +161,7 @@ class ParameterSpace:
 
     @cached_property
     def is_length(self) -> Bool[Tensor, " parameters"]:
-        """Which parameters are lengths."""
+        """Mask of the parameters that are lengths."""
         return torch.tensor([parameter.unit == "m" for parameter in self.parameters])
 
     @cached_property

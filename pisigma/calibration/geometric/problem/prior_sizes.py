@@ -42,7 +42,7 @@ def prior_group_of(column: str, nonzero: bool) -> int:
     """Return the group of a parameter.
 
     Args:
-        column: "theta", "d", "a", "alpha" or "beta"; others have no prior, so that their group does not matter.
+        column: "theta", "d", "a", "alpha" or "beta"; others have no prior, so their group does not matter.
         nonzero: whether its nominal value is larger than its tolerance.
     """
     if column in ("d", "a"):
@@ -145,5 +145,5 @@ def settled_scales(
 
 
 def has_converged(before: Tensor, after: Tensor, share: float) -> bool:
-    """Say whether two estimates (of noise or prior scales) differ by less than a relative tolerance."""
+    """Return whether two estimates (of noise or prior scales) differ by less than a relative tolerance."""
     return bool(((after / before - 1).abs() < share).all())

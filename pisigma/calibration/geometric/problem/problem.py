@@ -312,7 +312,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         return J
 
     def combine_sums(self, point: Tensor, view: SensorView) -> Linearisation[Tensor]:
-        """Combine the sensors' sums, divided by their variances, and the prior to a linearisation."""
+        """Combine the sensors' sums, divided by their variances, and the prior into a linearisation."""
         off = self._off(point)
         precision = view.scaled_precision(self._prior, self.prior_group)
         pull = off * precision

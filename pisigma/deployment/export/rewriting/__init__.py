@@ -1,1 +1,1 @@
-"""Existing programs of controllers whose pose targets are rewritten; everything else in them stays."""
+"""Existing programs of controllers whose pose targets are rewritten; everything else in them is unchanged."""

@@ -129,9 +129,9 @@ class _Reader:
         return self.scan.program(self.names)
 
     def _foreign(self) -> str:
-        """Why a call of another module's routine makes frames and tools uncertain; "" without one.
+        """Return why a call of another module's routine makes frames and tools uncertain; "" without such a call.
 
-        Its data persist, and a module begins again, so that the place of the call does not matter.
+        The data persist and a module may run again, so the position of the call does not matter.
         """
         own = {match[1].upper() for match in _ROUTINE.finditer(self.text)}
         for match in _CALL.finditer(mask_comments(self.text, _RECORD)):
@@ -208,7 +208,7 @@ class _Reader:
         pose: Pose,
         poses: Sequence[Frame],
     ) -> list[Edit]:
-        """Repeat the move before itself for every waypoint, as fly-by points."""
+        """Insert a copy of the move for every waypoint before the move, as fly-by points."""
         start = self.scan.line_start(move.start())
         text, (begin, end) = self.scan.text, pose.span
         literal = _TARGET.search(text, text.rfind("[", 0, begin))

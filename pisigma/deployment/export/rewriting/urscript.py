@@ -155,7 +155,7 @@ class _Reader:
         pose: Pose,
         poses: Sequence[Frame],
     ) -> list[Edit]:
-        """Repeat the move before itself for every waypoint, with a small blend radius."""
+        """Insert a copy of the move for every waypoint before the move, with a small blend radius."""
         start, count = self.scan.line_start(call.start()), len(operands)
         ends = torch.stack([*poses[count - 1 :: count], pose.T])[:, :3, 3]
         nearest = float((ends[1:] - ends[:-1]).norm(dim=-1).min())

@@ -28,7 +28,7 @@ from pisigma.validation.held_out.frames.row_errors import errors_of_rows
 from pisigma.validation.held_out.pose_statistics import ErrorVectors
 
 FrameKind = Literal["base", "tool"]
-"""What can be fitted: the base in every frame of the rows, the tool of every target."""
+"""Frames that can be fitted: the base in every frame of the rows, the tool of every target."""
 
 MIN_CONFIGURATIONS = 6
 """Different joint vectors that a frame or a target needs: 18 values for the 9 parameters of base and tool."""

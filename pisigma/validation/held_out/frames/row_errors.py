@@ -52,7 +52,7 @@ def errors_of_rows(T: Float64[Tensor, "rows 4 4"], measurements: Measurements) -
 
 
 def other_lengths(measurements: Measurements) -> Bool[Tensor, " rows"]:
-    """Say which rows have a length of another sensor and no position."""
+    """Return which rows have a length of another sensor but no position."""
     kinds = [kind for kind in measurements.kinds if kind in SENSORS and SENSORS[kind].unit == "m"]
     there = torch.zeros(measurements.rows, dtype=torch.bool)
     for kind in kinds:
@@ -61,7 +61,7 @@ def other_lengths(measurements: Measurements) -> Bool[Tensor, " rows"]:
 
 
 def has_position(measurements: Measurements) -> Bool[Tensor, " rows"]:
-    """Say which rows have a position."""
+    """Return which rows have a position."""
     if measurements.position is None:
         return torch.zeros(measurements.rows, dtype=torch.bool)
     return torch.isfinite(measurements.position).all(-1)
