@@ -118,6 +118,6 @@ def _trust(evaluation: "Evaluation") -> str:
     if evaluation.diagnostics:
         return f"no: {evaluation.diagnostics[0].sentence}"
     if not stated:
-        return f"not decided{cautions}, as no limit was stated (--max-p95-mm and others)."
+        return f"not decided{cautions}, because no limit was stated (--max-p95-mm and others)."
     limits = ", ".join(f"{name} {limit:g}" for name, limit in stated.items())
     return f"accepted{cautions}: every model stays within {limits}."

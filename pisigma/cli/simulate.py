@@ -48,7 +48,7 @@ def simulate(
         )
     if at is not None and (held_out or images is not None):
         raise RecipeError(
-            "--at states other poses than --held-out and --images", option="--at", remedy="omit it"
+            "--at cannot be combined with --held-out or --images", option="--at", remedy="omit it"
         )
     if images is not None:
         _write_images(read, images, as_json)

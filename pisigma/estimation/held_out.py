@@ -68,7 +68,7 @@ class HeldOutErrors:
         return HeldOutErrors(*(torch.cat([getattr(part, name) for part in parts]) for name in names))
 
     def rms(self, noise: Sequence[float], unit: Sequence[float]) -> float:
-        """Return the RMS error in units of other standard deviations than the noise, such as those of another model."""
+        """Return the RMS error in units of standard deviations other than the noise, such as those of another model."""
         return float(self._squares(noise, unit).mean().sqrt())
 
     def gain(self, noise: Sequence[float], before: "HeldOutErrors", noise_before: Sequence[float]) -> float:

@@ -69,7 +69,7 @@ class SessionEvidence:
     """Evidence of a session's rows under a model's posterior, for all hypotheses about what moved.
 
     The values are normal with the covariance `V = A A^T + B B^T + (f σ)²`. A are their derivatives along the directions
-    of the posterior's root, so that geometry, frames and correction have the uncertainty of the model; B are those with
+    of the posterior's root, so geometry, frames and correction have the uncertainty of the model; B are those with
     respect to unknowns with a wide prior, such as the base of a tracker that was relocated. A hypothesis adds
     `s² Z Z^T` for its unknowns; its evidence is the mean over sizes s and noise factors f, each in closed form (see
     `pisigma.estimation.drift.DriftSearch`). Bayes factors times prior odds give the probabilities (Kass

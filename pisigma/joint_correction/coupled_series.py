@@ -24,7 +24,7 @@ class CoupledSeries(AbstractFeature):
         Δ_i = δC_ij · q_j + Σ_k (a_k sin k φ_j + b_k cos k φ_j) + Σ_l (∂f_i/∂ln l) δl/l
 
     δC_ij is the error of the factor. φ_j is the angle of the axis; for a prismatic axis an angle with a period of twice
-    its travel, so that low harmonics describe the straightness and yaw of a rail (a joint that follows it with the
+    its travel, so low harmonics describe the straightness and yaw of a rail (a joint that follows it with the
     factor 0). The last sum is over the lengths l of the bars of a four-bar linkage. Errors of gears before the coupling
     depend on φ_j (Judd and Knasinski 1990, IEEE Transactions on Robotics and Automation 6(1), 20-30).
     """

@@ -107,7 +107,7 @@ class OnnxGraph:
         """Add `atan2(sine, cosine)` in full double precision, for values of any length.
 
         Runtimes have no inverse trigonometric functions in double. The one in float returns an angle a; the exact angle
-        is `a + asin(u)` with `u = (sine cos a - cosine sin a) / length`, about 1e-7, so that two terms of asin suffice.
+        is `a + asin(u)` with `u = (sine cos a - cosine sin a) / length`, about 1e-7, so two terms of asin suffice.
         """
         node, doubles, floats = self.add_node, self._onnx.TensorProto.DOUBLE, self._onnx.TensorProto.FLOAT
         high, wide = node("Abs", sine), node("Abs", cosine)

@@ -247,7 +247,7 @@ def _reading_faults(data: MeasuredFields, labels: FieldLabels) -> Iterator[RowAn
 
 
 def _with_column(what: str | Fault, column: str) -> Fault:
-    """Return what a sensor says of a row as a fault, in a column where it names none."""
+    """Return the fault that a sensor reports for a row, in a default column if it names none."""
     fault = Fault(what) if isinstance(what, str) else what
     return fault if fault.column is not None else replace(fault, column=column)
 

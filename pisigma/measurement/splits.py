@@ -92,7 +92,7 @@ def k_folds(
         folds: number of folds, 2 or more; None for as many as there are groups to keep whole.
         seed: random seed by joints and by placement; unused otherwise.
         by: "joints": groups of equal joint values, shuffled and assigned such that folds are as equal as the groups
-            allow; "interleaved": the same unshuffled, so that groups of one size alternate between the folds, as in
+            allow; "interleaved": the same unshuffled, so groups of one size alternate between the folds, as in
             scikit-learn's GroupKFold; "time": contiguous blocks in the order of the groups' first rows; "space":
             blocks from cutting the measured positions recursively across their widest axis; "placement": assigned
             like joints, but whole placements (see `placements`); rows of none are never held out.

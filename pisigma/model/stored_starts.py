@@ -24,7 +24,7 @@ class StoredStarts:
         robot: robot that the joint values belong to.
         q: joint values [rad or m].
         T: poses T_base_tool at these.
-        lever: half the robot's reach over sqrt(2) [m], as a small rotation by φ changes R by sqrt(2) φ.
+        lever: half the robot's reach over sqrt(2) [m], because a small rotation by φ changes R by sqrt(2) φ.
         points: `(starts, 12)`: the poses as points, see `as_points`.
     """
 

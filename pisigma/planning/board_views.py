@@ -162,7 +162,7 @@ class BoardViews:
     ]:
         """Return points of the sheet in the camera's frame [m], their pixels, and whether the projection is regular.
 
-        Far outside the image the polynomials of a distortion model fold back, so that a pixel has several points.
+        Far outside the image the polynomials of a distortion model fold back, so a pixel has several points.
         """
         points = self._sheet @ T_camera_board[:, :3, :3].mT + T_camera_board[:, None, :3, 3]
         in_front = points.clone()

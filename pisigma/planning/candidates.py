@@ -168,7 +168,7 @@ def read_candidates(
 
 
 def _repeats(q: Float64[Tensor, "poses dof"]) -> Bool[Tensor, " poses"]:
-    """Return which poses equal an earlier one, so that they would be planned twice, or for calibration and check."""
+    """Return which poses equal an earlier one, so they would be planned twice, or for calibration and check."""
     steps = (q / SAME_JOINTS).round().numpy()
     _, first, group = np.unique(steps, axis=0, return_index=True, return_inverse=True)
     return torch.from_numpy(first[group.reshape(-1)] < np.arange(len(q)))

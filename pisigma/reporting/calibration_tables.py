@@ -73,7 +73,8 @@ def _scale(scale: ScaleFigures) -> str:
     """Describe what a wrong scale of the sensor would explain, and the resulting error of positions."""
     return (
         f"links that are {scale.factor:.5f} times as long as nominal (standard deviation {scale.sigma:.2g}) cannot "
-        "be distinguished from a sensor whose scale is off by that factor, as both give the same held-out errors. The "
+        "be distinguished from a sensor whose scale is off by that factor, because both give the same held-out "
+        "errors. The "
         f"odds are {scale.odds:.2g} to 1 for one common factor rather than an error of each link; if the scale "
         f"is off, true positions are off by {scale.rms_mm:.2g} mm RMS in addition to all errors shown"
     )

@@ -75,7 +75,7 @@ def _accuracy(summary: CalibrationSummary) -> str:
         )
     figures = figures or summary.calibrated
     if figures is None or not figures.models:
-        return "not known, as no row was judged."
+        return "not known, because no row was judged."
     (first, nominal), *_ = figures.models.items()
     *_, best = figures.models.values()
     than = f"; {first} {rms_text(nominal, figures.rows)}" if best is not nominal else ""

@@ -162,7 +162,7 @@ def best_base_and_tool(
         measured: measured poses.
     """
     base, tool = _affine_base_and_tool(T, measured)
-    # The closed form minimises another norm than the errors, so a few steps of Levenberg-Marquardt follow.
+    # The closed form minimises a norm other than that of the errors, so a few steps of Levenberg-Marquardt follow.
     damping = torch.full_like(T[..., 0, 0, 0], INITIAL_DAMPING)
     cost = measured.squared_errors(base[..., None, :, :] @ T @ tool[..., None, :, :]).sum(-1)
     for _ in range(MAX_ITERATIONS):

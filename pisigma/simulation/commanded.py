@@ -169,7 +169,7 @@ def joints_for_poses(
     """Return joint values with which the true robot reaches desired poses.
 
     Encoder steps are ignored: the joint values would reach the poses exactly without an encoder; with one, the robot
-    stops at the nearest pulse, so that measured poses differ slightly from desired ones.
+    stops at the nearest pulse, so measured poses differ slightly from desired ones.
 
     Args:
         robot: the true robot.

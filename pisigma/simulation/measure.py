@@ -63,7 +63,7 @@ def simulate(
         directions of approach if joints have backlash.
 
     Raises:
-        PoseError: q has another number of columns than the robot has joints.
+        PoseError: the number of columns of q is not the robot's number of joints.
     """
     approach = robot.draw_approach(q)
     T = robot.forward(q, approach)

@@ -132,7 +132,7 @@ def _approach(
 ) -> _Contact:
     """Move the commanded tips by the gaps of the true tips until these are closed.
 
-    The true tip moves almost as far as the commanded one, so that every iteration leaves a few percent of the gap.
+    The true tip moves almost as far as the commanded one, so every iteration leaves a few percent of the gap.
     """
     Ts_jig_base = torch.stack([p.T_jig_base for p in placements])[candidates.placement]
     true_Ts_jig_base = torch.stack([p.true_T_jig_base for p in placements])[candidates.placement]

@@ -168,7 +168,7 @@ class TrueRobot:
     def draw_approach(self, q: Float64[Tensor, "rows dof"]) -> Float64[Tensor, "rows dof"] | None:
         """Return random directions of approach of every joint, +1 or -1; None if no joint has play.
 
-        They are the same at every call, as the seed depends only on the sources' seeds and the joint values.
+        They are the same at every call, because the seed depends only on the sources' seeds and the joint values.
         """
         if not bool(self.half_play.any()):
             return None
@@ -188,7 +188,7 @@ class TrueRobot:
             approach: direction of approach of every joint; None for the middle of all play.
 
         Raises:
-            PoseError: q has another number of columns than the robot has joints.
+            PoseError: the number of columns of q is not the robot's number of joints.
         """
         self.nominal.check_joint_count(q.shape[-1])
         total = torch.zeros_like(q) if approach is None else -self.half_play.to(q) * approach
@@ -221,7 +221,7 @@ class TrueRobot:
         errors, a few percent.
 
         Raises:
-            PoseError: `actual` has another number of columns than the robot has joints.
+            PoseError: the number of columns of `actual` is not the robot's number of joints.
             UnreachablePoseError: the robot has encoder steps, or the errors are too steep to be inverted.
         """
         if self.has_encoder:
@@ -260,7 +260,8 @@ class TrueRobot:
             start: joint values near the solution, for example of the nominal inverse kinematics; broadcasts.
 
         Raises:
-            PoseError: T is not a rigid transform, or `start` has another number of columns than the robot has joints.
+            PoseError: T is not a rigid transform, or the number of columns of `start` is not the robot's number of
+                joints.
             UnreachablePoseError: the true robot cannot reach a pose, or not on this branch; or it has encoder steps.
         """
         solution = solve_numeric(self.geometry, T, start)

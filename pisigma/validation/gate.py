@@ -124,7 +124,7 @@ def _against_robot(rows: Measurements, robot: Robot) -> Iterator[Iterable[Diagno
 def _as_calibrated(rows: Measurements, robot: Robot) -> tuple[Diagnostic, ...]:
     """Check a calibration of the rows.
 
-    It has no joint correction, so that residuals above the stated noise are no finding yet.
+    It has no joint correction, so residuals above the stated noise are no finding yet.
     """
     try:
         found = diagnostics_of_rows(GeometricCalibrator(robot), rows)

@@ -69,7 +69,7 @@ class Field:
 
 
 def form_of(step: str, file: CellFile) -> list[Field]:
-    """Return the fields of a step; files and cameras are not among them, as a page must not name paths."""
+    """Return the fields of a step; files and cameras are omitted because a page must not name paths."""
     stated, fields = file.stated_values(step), []
     for one in _settings(step):
         key, option = one.key, one.name

@@ -310,7 +310,7 @@ class _Problem:
             return None
         high = points[reached].poses
         low = points[reached - 1].poses if reached else 0
-        while high - low > 1:  # bisection, as the expected error decreases with the number of poses
+        while high - low > 1:  # bisection, because the expected error decreases with the number of poses
             middle = (low + high) // 2
             (point,) = self._curve(chosen, [middle])
             low, high = (low, middle) if point.p95 <= limit else (middle, high)

@@ -344,7 +344,7 @@ def _compared_fold(
 
 
 def _check_one_pose(measurements: Measurements) -> None:
-    """Check that all rows are of one frame and one target, as an inverse calibration has one base and one tool.
+    """Check that all rows are of one frame and one target, because an inverse calibration has one base and one tool.
 
     Raises:
         MeasurementError: there are several; the message names the first row of another one.

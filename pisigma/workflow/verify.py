@@ -76,7 +76,7 @@ class Verification:
         verdict: "better" or "not_better" where the confidence interval of the mean difference shows that the corrected
             model explains the rows better than the nominal robot, or not; "undecided" where it shows neither; "moved"
             where the arm has moved according to the model's posterior and recalibrating pays; "setup_fault" where a
-            setup fault explains the errors, so that they prove nothing; "implausible" where they are too large for a
+            setup fault explains the errors, so they prove nothing; "implausible" where they are too large for a
             calibrated robot and nothing explains them.
         sentence: the verdict with figures.
         ratio: mean position error of the corrected model over that of the nominal robot; NaN where that is 0.

@@ -178,7 +178,7 @@ class HybridCalibrator:
         Rows that the geometric calibration does not explain need not be outliers. Therefore a first hybrid model is
         fitted to all rows except those with errors that no robot has, and rows are weighted by their residuals from it.
 
-        If gravity seems to act in another direction than down, both are tried, because torques along other axes may
+        If gravity seems to act in a direction other than down, both are tried, because torques along other axes may
         imitate products.
         """
         problem, view = solved.problem, sensor_view_of(solved.solution.linearisation)

@@ -49,7 +49,7 @@ class HybridResult:
 
     Attributes:
         geometric: the calibration without a correction.
-        learned: the correction; None if none was kept, so that the geometric calibration is the result.
+        learned: the correction; None if none was kept, so the geometric calibration is the result.
         uncertainty: uncertainty of predicted positions.
         trials: the trials, in order.
         verdict: what was kept and why, as a sentence.

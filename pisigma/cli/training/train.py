@@ -123,7 +123,7 @@ def _worst_joint(summary: "TrainingSummary") -> str:
     errors = {one.name: (one.held_out or one.training, one.held_out is None) for one in summary.joints}
     known = {name: one for name, one in errors.items() if one[0] is not None}
     if not known:
-        return "not known, as no row was judged"
+        return "not known, because no row was judged"
     name, (worst, is_fit) = max(known.items(), key=lambda one: one[1][0].after.values[0])  # type: ignore[union-attr]
     assert worst is not None
     after, before = (rounded(one.values[0]) for one in (worst.after, worst.before))

@@ -75,7 +75,7 @@ def joints_by_axes(robot: Robot) -> Float64[np.ndarray, "dof axes"]:
     """Return the derivative of theta or d of every joint by the offset of every axis of the controller.
 
     Raises:
-        RobotError: a joint is passive or driven by a four-bar linkage, so that its zero is not that of a single axis.
+        RobotError: a joint is passive or driven by a four-bar linkage, so its zero is not that of a single axis.
     """
     if robot.coupling is None:
         return np.diag(robot.directions)

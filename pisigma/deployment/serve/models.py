@@ -46,7 +46,7 @@ class ServedModel:
         Raises:
             ModelError: the folder is not a complete model.
         """
-        # before it is loaded, as the folder may be written again meanwhile
+        # before it is loaded, because the folder may be written again meanwhile
         sha256 = model_hash(folder) if is_model(folder) else ""
         ik = load(folder)
         ik(np.eye(4), near=np.zeros(len(ik.joints)), throw=False)

@@ -91,7 +91,7 @@ class ZeroMq:
         while drained < MAX_DRAIN_BYTES:
             stopping = self._stopping.is_set()  # before reading, so that earlier messages are answered
             try:
-                # waits also when stopping, as the next messages of a full queue take a moment
+                # waits also when stopping, because the next messages of a full queue take a moment
                 client, *parts = self._socket.recv_multipart()
             except self._again:
                 if stopping:

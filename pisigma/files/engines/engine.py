@@ -59,7 +59,7 @@ class AbstractEngine(ABC):
 
 
 def pack_arguments(work: Callable[[Item], Result], chunk: Sequence[Item]) -> tuple[Plugins, bytes]:
-    """Return the arguments of `process_chunk`; plug-ins are separate, as they have to be loaded first."""
+    """Return the arguments of `process_chunk`; plug-ins are separate, because they have to be loaded first."""
     return loaded_plugins(), pickle.dumps((work, list(chunk)))
 
 

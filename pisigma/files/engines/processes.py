@@ -103,7 +103,8 @@ def run_in_threads(tasks: Sequence[Callable[[], Result]], one_at_a_time: bool) -
 
     Args:
         tasks: functions without arguments; none may change data that others read.
-        one_at_a_time: whether to run the tasks sequentially, as a single one keeps all cores busy or needs much memory.
+        one_at_a_time: whether to run the tasks sequentially, because one alone keeps all cores busy or needs much
+            memory.
     """
     import torch  # here, so that workers, which import this module, start without it
 

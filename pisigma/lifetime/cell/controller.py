@@ -20,7 +20,7 @@ from pisigma.measurement.dates import EXPECTED_DATE, is_date
 
 Situation = Literal["kinematics", "same_zeros", "other_zeros"]
 """The controller computes with exported kinematics; exported joint zeros are active, with which the rows of the model
-were measured; other joint zeros are active than those with which the rows of the model were measured."""
+were measured; the active joint zeros differ from those with which the rows of the model were measured."""
 Effect = Literal["allow", "warn", "refuse"]
 
 RULES: dict[str, tuple[Effect, Effect, Effect]] = {

@@ -53,7 +53,7 @@ class ModelInUse:
         load(self.folder)
 
     def check(self, always: bool = False) -> None:
-        """Load the model in use if it is another one than before.
+        """Load the model in use if it has changed.
 
         Args:
             always: also load a model again that could not be loaded before, and the same model if it was changed.

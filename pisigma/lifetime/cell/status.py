@@ -181,7 +181,7 @@ def _no_session(facts: CellFacts) -> Step | None:
     ended = [one for one in facts.events if one.kind in ARM_EVENTS] if facts.sessions else []
     why = f"{ended[-1].kind} on {ended[-1].day} ended the validity of all sessions" if ended else ""
     if any(not one.set_aside and not facts.controller.is_present(one) for one in facts.sessions):
-        why = "all sessions were measured with other joint zeros than those that are active on the controller"
+        why = "all sessions were measured with joint zeros other than those that are active on the controller"
     if not facts.plans or why:
         return Step("no_plan", why or "there is no plan and no session", facts.command("plan"))
     return _to_measure(facts, facts.unmeasured_plan or f"plan '{facts.plans[-1]}'")

@@ -81,7 +81,7 @@ class ModelPair:
 
     @property
     def training_joints(self) -> Float64[Tensor, "points dof"]:
-        """Joint values that the models keep of their training rows, half from each [rad or m]."""
+        """Joint values that the models store from their training rows, half from each [rad or m]."""
         generator = torch.Generator().manual_seed(0)
         sampled = [
             model.starts[torch.randperm(len(model.starts), generator=generator)[: POINTS // 2]]
@@ -91,7 +91,7 @@ class ModelPair:
 
     @property
     def workspace(self) -> Float64[Tensor, "samples dof"]:
-        """Joint values that the models keep, and random ones within their common ranges [rad or m]."""
+        """Joint values that the models store, and random ones within their common ranges [rad or m]."""
         kept = torch.unique(torch.cat([self.first.starts, self.second.starts]), dim=0)
         ranges = [(model.starts.amin(0), model.starts.amax(0)) for model in (self.first, self.second)]
         low, high = torch.maximum(ranges[0][0], ranges[1][0]), torch.minimum(ranges[0][1], ranges[1][1])

@@ -230,7 +230,7 @@ class _Solved:
         return any(is_frame(one.group.what) and one.size >= MIN_MOVE for one in self.probable_movements)
 
     def arm_with(self, motions: tuple[DriftGroup, ...]) -> AdaptedArm:
-        """Return the arm with moved bases and tools and some movements fitted; the rest is that of the model."""
+        """Return the arm with moved bases and tools and some movements fitted; everything else is as in the model."""
         return AdaptedArm.from_unknowns(self.problem, self.unknowns(motions))
 
     def score_ratio(self, before: tuple[DriftGroup, ...], after: tuple[DriftGroup, ...]) -> float:
@@ -241,7 +241,7 @@ class _Solved:
         return first / second if second > 0 else 1.0
 
     def unknowns(self, motions: tuple[DriftGroup, ...]) -> Float64[Tensor, " unknowns"]:
-        """Return the mean unknowns with moved bases and tools and some movements; the rest is that of the model."""
+        """Return the mean unknowns with moved bases and tools and some movements; all others are as in the model."""
         standing = tuple(group for group in self.problem.groups if group.fixed_size)
         drift = Drift((*standing, *motions), self.noise * self.explanation.noise_factor)
         shift: Tensor = PosteriorUpdate(self.problem.root[:, :0], self.values, drift).shift
@@ -312,7 +312,7 @@ def _judged(solved: _Solved, relocated: dict[FrameKey, float]) -> Session:
     determined = sum(len(group.index) for group in of_arm if group.single)
     optimism = math.sqrt(
         count / max(count - determined, 1)
-    )  # residuals are too small, as the rows determined the movement
+    )  # residuals are too small, because the rows determined the movement
     return Session(
         rows=every.rows,
         unchanged=explanation.unchanged,

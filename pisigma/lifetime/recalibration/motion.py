@@ -74,7 +74,7 @@ def session_diagnostics(
     if session.rms_after > limit:
         sentence = (
             f"{rows.source}: the RMS error is {session.rms * 1e3:.4g} mm, and no movement explains it to less than "
-            f"{limit * 1e3:.3g} mm: another robot than that of model '{model.name}' was measured, or a column or unit "
+            f"{limit * 1e3:.3g} mm: a robot other than that of model '{model.name}' was measured, or a column or unit "
             "is wrong; run `pisigma verify` on these rows."
         )
         return (Diagnostic(kind="implausible_errors", severity="implausible", sentence=sentence),)

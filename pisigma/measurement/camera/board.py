@@ -153,7 +153,7 @@ class Board:
 
     @property
     def is_symmetric(self) -> bool:
-        """Whether the board looks the same rotated by 180 deg, so that an image does not determine its numbering.
+        """Whether the board looks the same rotated by 180 deg, so an image does not determine its numbering.
 
         This is so for checkerboards whose number of rows plus columns of corners is even.
         """

@@ -116,7 +116,8 @@ class MatrixSection(BaseModel):
 class MatrixDocument(BaseModel):
     """A camera file of ROS (`camera_info`) or of OpenCV's calibration sample.
 
-    Fisheye lenses are refused, as their coefficients have another meaning, and binned images, as their pixels do.
+    Fisheye lenses are refused because their coefficients have another meaning, and binned images because their pixels
+    do.
     """
 
     model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)

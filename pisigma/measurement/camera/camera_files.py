@@ -15,7 +15,7 @@ MAX_REPEATABILITY = 0.01, 0.105
 
 @dataclass(frozen=True)
 class Repeatability:
-    """Repeatability of the robot: how far it is off, independently in each image, the pose of its joint values.
+    """Repeatability of the robot: deviation of its pose from that of its joint values, independent in each image.
 
     Attributes:
         length: standard deviation of the robot's position repeatability, per axis [m], for images.

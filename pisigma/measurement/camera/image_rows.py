@@ -224,7 +224,7 @@ def _target_pose(pose: BoardPose, is_fixed: bool) -> tuple[np.ndarray, np.ndarra
 
 def _inverse_root(covariance: np.ndarray) -> np.ndarray:
     """Return the lower triangular W with `W^T W` = inverse of a covariance."""
-    # scaled to unit variances first, as the square root of a mix of metres and radians is ill-conditioned
+    # scaled to unit variances first, because the square root of a mix of metres and radians is ill-conditioned
     scale = np.sqrt(covariance.diagonal())
     root: np.ndarray = np.linalg.inv(np.linalg.cholesky(covariance / scale / scale[:, None])) / scale
     return root

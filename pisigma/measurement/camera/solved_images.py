@@ -225,7 +225,7 @@ def initial_camera(views: Sequence[BoardView], name: str, size: tuple[int, int])
     the focal length.
 
     Raises:
-        MeasurementError: all images are perpendicular to the board, so that they do not determine it.
+        MeasurementError: all images are perpendicular to the board, so they do not determine it.
     """
     middle, width = (np.array(size) - 1) / 2, float(size[0])
     slopes, constants = list[float](), list[float]()

@@ -193,7 +193,7 @@ class _Layout:
     def poses(
         self, values: Float64[np.ndarray, "rows columns"], faults: dict[int, Fault]
     ) -> tuple[Float64[Tensor, "rows 4 4"], Bool[Tensor, " rows"]]:
-        """Return T_base_tool of rows, and which are valid; quaternions of another norm than 1 are added to `faults`."""
+        """Return T_base_tool of rows, and which are valid; quaternions whose norm is not 1 are added to `faults`."""
         position, angles = (
             torch.from_numpy(np.stack([to_si(values[:, place], column.unit) for place, column in group], -1))
             for group in (self.position, self.orientation)

@@ -45,7 +45,7 @@ def read_fields(
     of length (each also in `_m`), of which every row contains at most one: `x_mm,y_mm,z_mm`; `socket`, the name of the
     fixed point that the ball sits in; `touch_axis` (x, y or z) and `touch_mm` with `frame`, the jig; `distance_mm` with
     `anchor`, the name of a fixed point whose position `anchor_x_mm,anchor_y_mm,anchor_z_mm` may be given, or with
-    `pair`, the name of the two rows that it lies between, given in both.
+    `pair`, a name that is given in the two rows between which it was measured.
 
     Optional are `roll_deg,pitch_deg,yaw_deg` (RotZ(roll) · RotY(pitch) · RotX(yaw)) or `qx,qy,qz,qw`, `target`,
     `frame`, `sigma_mm` (of the row's length), `sigma_deg`, `set`, `payload_kg`, `temperature_c`, and `approach1` and so
@@ -271,7 +271,7 @@ def import_hint(path: str | os.PathLike[str]) -> str:
 
 
 def is_measurement_file(path: str | os.PathLike[str]) -> bool:
-    """Return whether a file's header has the columns of measurement files or of corners, so that it is no export."""
+    """Return whether a file's header has the columns of measurement files or of corners, so it is not an export."""
     try:
         header = read_table(path).header
         return set(CORNERS) <= set(header) or all(find_column(name) or name in CORNERS for name in header)

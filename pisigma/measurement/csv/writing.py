@@ -1,4 +1,4 @@
-"""Write a measurement file that reads back the same, completely or not at all."""
+"""Write a measurement file that reads back unchanged, completely or not at all."""
 
 import csv
 import io
@@ -78,7 +78,7 @@ def _numbers(data: MeasuredFields, revolute: Sequence[bool]) -> dict[str, Float6
 
 
 def _check(data: MeasuredFields, texts: Mapping[str, Sequence[str]]) -> None:
-    """Refuse what would not read back."""
+    """Refuse values that would not read back unchanged."""
     nothing = ~torch.stack([data.is_measured(kind) for kind in (*KINDS, *READINGS)]).any(0).cpu()
     if bool(nothing.any()):
         raise MeasurementError(
@@ -98,7 +98,7 @@ def _check(data: MeasuredFields, texts: Mapping[str, Sequence[str]]) -> None:
 
 
 def _fits_cell(text: str) -> bool:
-    """Return whether a name reads back the same."""
+    """Return whether a name reads back unchanged."""
     try:
         text.encode("utf-8")
     except UnicodeEncodeError:

@@ -93,8 +93,8 @@ def read_export(
         most: largest size of the file [bytes].
 
     Raises:
-        MeasurementError: the file cannot be read, is not text, does not contain a table of numbers, or a row has
-            another number of cells than the others.
+        MeasurementError: the file cannot be read, is not text, does not contain a table of numbers, or the number of
+            cells of a row differs from that of the others.
     """
     source = make_printable(str(path), cut=False)
     lines = _lines_of(decode_text(read_input(path, MeasurementError, most), source), source)

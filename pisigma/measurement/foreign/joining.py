@@ -40,7 +40,7 @@ class JoinedRows:
         rows: the measurements in their order, with joint values.
         used: file and line of the rows of the log that were joined.
         unmatched: rows of both files that have no partner.
-        unused: rows of the log that need no partner, as another row has their point or nothing was measured then.
+        unused: rows of the log that need no partner, because another row has their point or nothing was measured then.
         warnings: warnings, each a sentence.
     """
 
@@ -137,7 +137,7 @@ def _check_names(
 ) -> list[str]:
     """Refuse joined rows whose points have different names in both files.
 
-    If no name is in both files, the numbers at their ends are compared, which may start at different numbers.
+    If no name is in both files, the numbers at their ends are compared, which may count from different starts.
 
     Returns:
         Warnings of names that cannot be compared.
@@ -167,8 +167,8 @@ def _check_names(
         name = ours[row]
         if other >= 0 and name in lines and theirs[other] and theirs[other] != name:
             raise MeasurementError(
-                f"joining by {by} joins the point with '{_point(joints, other)}' of line {joints.lines[other]} of "
-                f"{joints.source}, in which '{_point(measured, row)}' is the point of line {lines[name]}",
+                f"joining by {by} pairs this point with '{_point(joints, other)}' (line {joints.lines[other]} of "
+                f"{joints.source}), but that file has '{_point(measured, row)}' in line {lines[name]}",
                 at=Place(measured.source, measured.lines[row]),
                 value=_point(measured, row),
                 remedy="join by point, or omit the column of the names with --map",

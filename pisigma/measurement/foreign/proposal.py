@@ -180,7 +180,7 @@ def _is_counter(file: ExportFile) -> bool:
 
 
 def _check_times(proposal: Proposal, of_index: Mapping[int, str]) -> None:
-    """Refuse a column whose numbers rise or fall from row to row, as it may contain times.
+    """Refuse a column whose numbers rise or fall from row to row, because it may contain times.
 
     Args:
         proposal: the mapping of a file without headings.

@@ -234,7 +234,7 @@ class IntrinsicsSensor(AbstractSensor):
         return residual
 
     def derivative(self, motion: ToolMotion, unknowns: Unknowns, rows: slice) -> Derivative:
-        """Return 0, as the values do not depend on the tool."""
+        """Return 0, because the values do not depend on the tool."""
         return torch.zeros_like(motion.derivative[:, :1]).expand(-1, NUMBERS, -1)
 
     def unknown_derivatives(
@@ -311,7 +311,7 @@ class BoardScaleSensor(AbstractSensor):
         return residual
 
     def derivative(self, motion: ToolMotion, unknowns: Unknowns, rows: slice) -> Derivative:
-        """Return 0, as the values do not depend on the tool."""
+        """Return 0, because the values do not depend on the tool."""
         return torch.zeros_like(motion.derivative[:, :1])
 
     def unknown_derivatives(

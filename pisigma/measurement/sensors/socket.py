@@ -196,7 +196,7 @@ class SocketDistanceSensor(AbstractSensor):
         return residual[None]
 
     def derivative(self, motion: ToolMotion, unknowns: Unknowns, rows: slice) -> Derivative:
-        """Return 0, as the distances do not depend on the tool."""
+        """Return 0, because the distances do not depend on the tool."""
         return torch.zeros_like(motion.derivative[:, :1])
 
     def unknown_derivatives(

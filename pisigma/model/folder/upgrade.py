@@ -174,7 +174,7 @@ def _in_order(uncertainty: dict[str, Any], document: Mapping[str, Any], path: Pa
     if uncertainty.pop("products"):
         if GearLines.name in features and document.get("kind") != "hybrid_calibration":
             raise ModelError(
-                "an earlier version recalibrated products and gear lines with weights in the wrong order, so that the "
+                "an earlier version recalibrated products and gear lines with weights in the wrong order, so the "
                 "model itself is wrong",
                 expected="an uncertainty whose weights are in a known order",
                 at=Place(path),

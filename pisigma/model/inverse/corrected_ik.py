@@ -250,7 +250,7 @@ class CorrectedIK(AbstractInverse):
         return J.reshape(*values.shape[:-1], 6, values.shape[-1])
 
     def under(self, *, payload_kg: float | None = None, temperature_c: float | None = None) -> "CorrectedIK":
-        """Return the corrected inverse kinematics at another payload or temperature than the mean of the calibration.
+        """Return the corrected inverse kinematics at a payload or temperature other than the mean of the calibration.
 
         Outside the measured range the correction stays that of the nearest measured temperature, and the effect of the
         payload is extrapolated linearly; `warnings` of the result then says so.

@@ -365,7 +365,7 @@ class _Poses:
 
 
 def _among(every: Solution, rank: Tensor, branches: Sequence[int]) -> Tensor:
-    """Return ranks of solutions, `_LOST` on other branches than the requested ones."""
+    """Return ranks of solutions, `_LOST` on branches other than the requested ones."""
     return torch.where(torch.isin(every.branch, torch.tensor(branches)), rank, _LOST)
 
 

@@ -26,7 +26,7 @@ CHUNK = 8_192
 """Steps whose transitions between all pairs of branches are in memory at the same time."""
 _TURN = 2 * math.pi
 _OTHER_BRANCH = 1e4
-"""[rad²] Cost of a start on another branch than the requested one; less than that of a jump."""
+"""[rad²] Cost of a start on a branch other than the requested one; less than that of a jump."""
 _LATER = 1e-3
 """[rad²] Cost of a start on a later branch if none is requested, per place in the order of branches."""
 _STILL = 1e-9

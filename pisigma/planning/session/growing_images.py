@@ -18,7 +18,7 @@ from pisigma.robot.description import Robot
 
 
 def growing_file(path: str | os.PathLike[str], robot: Robot, settings: PlanSettings) -> GrowingFile:
-    """Open the growing file of a plan's rows, or of corners in images where a camera measures."""
+    """Open the growing file of a plan's rows, or of corners in images if a camera measures."""
     camera = settings.camera
     return GrowingFile(path, robot, None if camera is None else ImageReader(camera.files, robot))
 

@@ -98,7 +98,7 @@ def other_joint_values(
 def _in_other_unit(
     robot: Robot, q: Float64[Tensor, "1 dof"], poses: Float64[Tensor, "poses dof"], names: Sequence[str]
 ) -> str:
-    """Find the planned pose that a row is at if its angles are in another unit than stated; "" where there is none."""
+    """Find the planned pose that a row is at if its angles are not in the stated unit; "" if there is none."""
     stated = {
         180 / torch.pi: "radians labelled as degrees",
         torch.pi / 180: "degrees labelled as radians",

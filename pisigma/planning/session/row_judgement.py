@@ -156,7 +156,7 @@ class RowModel:
     def leave_one_out(self) -> LeaveOneOutErrors:
         """Predict every kept row from the other kept ones, and all other rows from the kept ones.
 
-        A robot may have larger errors than its class: the scale is estimated from the kept rows, so that squared errors
+        A robot may have larger errors than its class: the scale is estimated from the kept rows, so squared errors
         are compared with Fisher's F distribution.
         """
         from scipy.special import fdtrc  # scipy.stats takes a second to import

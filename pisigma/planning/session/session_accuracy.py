@@ -87,7 +87,7 @@ def _calibrated(
     result = fit_where_it_helps(HybridCalibrator(robot), rows, progress)
     assert isinstance(result, HybridResult)
     if result.learned is None and np.array_equal(result.geometric.robot.dh, robot.dh):
-        # with too few rows the arm stays nominal, so that the posterior of the fit does not contain its errors
+        # with too few rows the arm stays nominal, so the posterior of the fit does not contain its errors
         posterior = before.given_poses(rows.q)
     else:
         posterior = RobotPosterior.from_result(result, before.instrument)

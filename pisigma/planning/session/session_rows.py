@@ -216,7 +216,7 @@ class FurtherPoses:
         measured: Float64[Tensor, "rows dof"],
         remaining: Int64[Tensor, " remaining"],
     ) -> StoredPlan | None:
-        """Select the remaining poses again, given the rows so far; the next pose and those for testing stay.
+        """Select the remaining poses again, given the rows so far; the next pose and those for testing are kept.
 
         Args:
             plan: the present plan.
@@ -277,13 +277,13 @@ def stopping_advice(
     expected: Sequence[AccuracyPoint],
     left: int,
 ) -> Advice:
-    """Decide whether to measure on or to stop, and why.
+    """Decide whether to continue measuring or to stop, and why.
 
     Args:
         limit_mm: limit of the 95 % quantile of the errors [mm]; None for no limit.
         least_gain_mm: decrease of that quantile by the next `AHEAD` poses below which to stop [mm].
         reached: accuracy so far. The limit is reached when the last two points are below it: estimates from few rows
-            scatter, so that a first point below the limit is often there by chance.
+            scatter, so a first point below the limit is often there by chance.
         expected: expected accuracy after the remaining poses.
         left: number of remaining poses.
     """

@@ -355,7 +355,7 @@ def _dots(axes: Axes, x: np.ndarray, y: np.ndarray, color: str) -> None:
 
 
 def _plain_log(axes: Axes) -> None:
-    """Label a logarithmic axis with plain numbers such as 0.02; few ticks, as each takes a millisecond."""
+    """Label a logarithmic axis with plain numbers such as 0.02; few ticks, because each takes a millisecond."""
     low, high = axes.get_ylim()
     axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if low > 0 and high < 300 * low else (1,)))
     axes.yaxis.set_major_formatter("{x:g}")

@@ -120,7 +120,7 @@ def singularity_measure(robot: Robot, q: Float[Tensor, "*batch dof"]) -> Float[T
         q: joint values [rad or m].
 
     Raises:
-        PoseError: q has another number of columns than the robot has joints.
+        PoseError: the number of columns of q is not the robot's number of joints.
     """
     _, J = joint_jacobian(robot, q)
     return smallest_singular_value(robot, J)

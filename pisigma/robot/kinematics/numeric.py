@@ -91,7 +91,7 @@ def solve_numeric(
     """Find joint values near a start that reach the poses.
 
     Each step solves `(JᵀJ + λ) dq = Jᵀe`, with lengths in characteristic lengths and the damping λ proportional to the
-    squared error (Sugihara 2011), so that convergence is quadratic near the solution. For each pose, a step that
+    squared error (Sugihara 2011), so convergence is quadratic near the solution. For each pose, a step that
     increases the error is rejected and the damping factor increased; otherwise the factor is decreased. Converged poses
     are not updated any more. No gradients flow through the solution; joint limits are checked at the end only.
 

@@ -159,7 +159,9 @@ def _bounds(
 
 def _rays(camera: Camera, u: np.ndarray, v: np.ndarray) -> Float64[np.ndarray, "2 v u"]:
     """Return x / z and y / z of the rays of a grid of pixels."""
-    from scipy.interpolate import RectBivariateSpline  # here, as it takes 0.3 s of every recipe to import
+    from scipy.interpolate import (
+        RectBivariateSpline,
+    )  # here, because it takes 0.3 s of every recipe to import
 
     nodes_u, nodes_v = (np.linspace(at[0], at[-1], 4 + int((at[-1] - at[0]) / NODE_STEP)) for at in (u, v))
     at_nodes = camera.undistort(np.stack(np.meshgrid(nodes_u, nodes_v), -1))

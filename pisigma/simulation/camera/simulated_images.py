@@ -31,7 +31,7 @@ from pisigma.simulation.true_robot import TrueRobot
 CANDIDATES = 8
 """Number of candidates per view, of which those far apart in joint space are chosen."""
 MAX_ATTEMPTS = 100
-"""Number of draws per candidate, as some cannot be reached."""
+"""Number of draws per candidate, because some cannot be reached."""
 GIVEN_FILES = ("joints.csv", "camera.yaml", "board.yaml")
 
 

@@ -221,13 +221,13 @@ def _two_populations(rows: Measurements, found: Populations) -> Diagnostic:
     distinction = distinguishing_property(rows, second)
     size, moved = int(second.sum()), f"{length_text(math.hypot(*found.difference[:3]))}"
     difference, advice = {
-        "arm": ("belong to another arm than the others", "Calibrate each robot with its own rows"),
+        "arm": ("belong to a different arm from the others", "Calibrate each robot with its own rows"),
         "tool": (
-            f"belong to another target than the others, {moved} away on the tool",
+            f"belong to a different target from the others, {moved} away on the tool",
             "Name another target in these rows (column 'target'), or leave them out",
         ),
         "frame": (
-            "are in another frame than the others, because the instrument or the robot was moved",
+            "are in a different frame from the others, because the instrument or the robot was moved",
             "Name another frame in these rows (column 'frame'), or leave them out",
         ),
     }[found.differing]

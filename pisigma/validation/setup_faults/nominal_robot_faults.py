@@ -349,9 +349,7 @@ def _other_names(rows: Measurements, number: Int64[Tensor, " rows"], names: tupl
         f"{_where(rows, row)} fits '{better[row]}' instead of '{rows.target[row]}'"
         for row in wrong[:MAX_EXAMPLES]
     ]
-    clause = (
-        f"the targets seem to be mixed up: {len(wrong)} of {rows.rows} rows fit another target than they name"
-    )
+    clause = f"the targets seem to be mixed up: {len(wrong)} of {rows.rows} rows fit a target that they do not name"
     return Cause("target", clause, f"check the column 'target': {join_words(examples)}", 2.0)
 
 

@@ -50,12 +50,12 @@ class ModelRows:
     moved: tuple[str, ...]
 
     def settings_to_fit(self, settings: Any) -> Any:
-        """Return settings that also fit a frame and tool that were changed; cameras are removed, as rows are read."""
+        """Return settings that also fit a changed frame and tool; cameras are removed, because the rows are read."""
         fit_frame, fit_tool = settings.fit_frame or self.fit_frame, settings.fit_tool or self.fit_tool
         return replace(settings, cameras=None, fit_frame=fit_frame, fit_tool=fit_tool)
 
     def settings_to_recalibrate(self, settings: RecalibrationSettings) -> RecalibrationSettings:
-        """Return settings with what was moved, unless they state it; cameras are removed, as rows are read."""
+        """Return settings with what was moved, unless they state it; cameras are removed, because rows are read."""
         moved = (self.moved or None) if settings.moved is None else settings.moved
         return replace(settings, cameras=None, moved=moved)
 

@@ -59,7 +59,7 @@ class DetectedCorners:
 
     @property
     def tables(self) -> tuple[tuple[str, Table], ...]:
-        """No tables, as there is one row per corner."""
+        """No tables, because there is one row per corner."""
         return ()
 
     def to_json(self) -> dict[str, object]:

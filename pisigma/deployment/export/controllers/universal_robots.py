@@ -38,7 +38,7 @@ _LINE = r"(?m)^[ \t]*{key}[ \t]*=[ \t]*\[([^\]\n]*)\]"
 def without_beta(origins: list[Frame], own: Robot) -> Robot:
     """Convert a robot to the maker's rows, in which beta is 0 and the last row has neither a nor alpha.
 
-    Two lines have one common normal. If they are nearly parallel it is far away, so that d of that row and of the next
+    Two lines have one common normal. If they are nearly parallel it is far away, so d of that row and of the next
     are large and nearly cancel, as in the maker's files. Of the two directions of a normal, the one that changes theta
     by less than 90 deg is used.
 

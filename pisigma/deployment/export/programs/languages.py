@@ -326,7 +326,7 @@ def program_text(targets: Targets, path: Path, cartesian: bool, config: str | No
 
 
 def _check_turns(targets: Targets) -> None:
-    """Check that all joint values have the same number of turns, as one configuration states it for all."""
+    """Check that all joint values have the same number of turns, because one configuration states it for all."""
     turns = torch.floor(targets.q / (2 * torch.pi) + 0.5)
     if len(turns) and bool((turns != turns[0]).any()):
         row = int((turns != turns[0]).any(-1).nonzero()[0, 0])

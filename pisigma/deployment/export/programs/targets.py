@@ -96,7 +96,7 @@ class Targets:
         )
 
     def check_complete(self) -> None:
-        """Check that no target is missing, as a program must not skip one.
+        """Check that no target is missing, because a program must not skip one.
 
         Raises:
             UnreachablePoseError: a pose has no target; the message states line and status.

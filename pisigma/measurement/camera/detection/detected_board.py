@@ -36,7 +36,7 @@ DAMPING = 1e-9
 LOG_BLURS = np.log((0.2, 6.0))
 """Logarithms of the smallest and largest blur [px] of a fit."""
 MAX_SHIFT = 0.5
-"""[px] Shift of a corner above which a fit is discarded, as it has fitted something else."""
+"""[px] Shift of a corner above which a fit is discarded, because it has fitted something else."""
 INITIAL_BLUR = 1.0
 """[px] Initial standard deviation of the blur in a fit."""
 

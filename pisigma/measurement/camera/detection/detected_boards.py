@@ -119,7 +119,7 @@ def predict_boards(images: Sequence[BoardImage], camera: Camera, board: Board) -
     """Predict corners by the pose of the board in every image; images that no pose explains lose their corners.
 
     Raises:
-        MeasurementError: an image has another size than those of the camera.
+        MeasurementError: the size of an image differs from that of the camera's images.
     """
     checked, predicted, corners = list[BoardImage](), {}, board.corners
     for one in images:

@@ -170,7 +170,7 @@ def detect_board(path: Path, board: Board, max_blur: float) -> BoardImage:
 def read_image(path: str | os.PathLike[str]) -> Image:
     """Read the gray values of an image file in any format of OpenCV.
 
-    The orientation in its metadata is ignored, as the intrinsics are those of the sensor.
+    The orientation in its metadata is ignored, because the intrinsics are those of the sensor.
 
     Raises:
         MeasurementError: it cannot be read or is not an image.

@@ -32,7 +32,7 @@ def detect_charuco(image: Image, board: Board) -> DetectedBoard | NoBoard:
 def detect_apriltags(image: Image, board: Board) -> DetectedBoard | NoBoard:
     """Find the corners of the AprilTags that are completely visible, as intersections of lines along their sides.
 
-    Blur rounds the corners of tags, so that gradients there are biased inwards; their sides are not affected.
+    Blur rounds the corners of tags, so gradients there are biased inwards; their sides are not affected.
     """
     quads, numbers, _ = cv2.aruco.ArucoDetector(dictionary_of(board)).detectMarkers(image)
     number = np.zeros(0, dtype=np.int64) if numbers is None else np.asarray(numbers, dtype=np.int64).ravel()

@@ -133,7 +133,7 @@ def first_joint(
 
     Returns:
         The distance [m] ahead of axis 1, the azimuth [rad], whether a solution exists, and whether the point is on the
-        axis, so that joint 1 is arbitrary.
+        axis, so joint 1 is arbitrary.
     """
     x, y = P[0, 3], P[1, 3]
     square = x * x + y * y - side * side

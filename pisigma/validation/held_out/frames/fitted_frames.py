@@ -43,7 +43,7 @@ def fitted_kinds(fit_frame: bool, fit_tool: bool) -> tuple[FrameKind, ...]:
 
 
 def with_names_of(model: CalibratedModel, rows: Measurements, fitted: Collection[FrameKind]) -> Measurements:
-    """Replace the names of fitted frames and targets by some name of the model, as their poses do not matter."""
+    """Replace the names of fitted frames and targets by some name of the model, because their poses do not matter."""
     if "base" in fitted:
         rows = replace(rows, frame=(next(iter(model.bases), ""),) * rows.rows)
     if "tool" in fitted:
