@@ -43,7 +43,7 @@ class Candidates:
         number: number of each in the file, or among the poses that were drawn; from 1.
         looked_at: number of poses that were drawn or read.
         refused: number of refused poses by reason.
-        workspace: joint values where the robot shall be accurate, and that may be waypoints [rad or m]: the candidates
+        workspace: joint values where the robot must be accurate, and that may be waypoints [rad or m]: the candidates
             themselves; with a camera, which sees its board from a small part of the workspace only, poses that the
             surroundings allow.
     """

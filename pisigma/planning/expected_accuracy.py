@@ -173,7 +173,7 @@ class CameraProspects:
             posterior: unknowns of the robot before the first image.
             candidates: views of the board.
             chosen: indices of the planned ones.
-            task: joint values where the robot shall be accurate [rad or m].
+            task: joint values where the robot must be accurate [rad or m].
             views: conditions under which the camera sees the board.
             arm: the robot in its surroundings.
         """

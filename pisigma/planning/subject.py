@@ -54,7 +54,7 @@ class Subject:
         Args:
             subject: a robot, a name of the catalogue, a robot file (YAML or URDF), a model, an object that has a model,
                 or a model folder.
-            base: link of a URDF file that poses are given in.
+            base: base link of a URDF file; poses are in its frame.
             tip: link of a URDF file that is the tool.
 
         Raises:

@@ -36,7 +36,7 @@ _say = functools.partial(sentences, "calibration.txt.j2")
 def parameter_table(parameters: Sequence[ParameterFigures]) -> Table:
     """Make a table with one row per parameter: its figures, and the remark in a few words.
 
-    Figures have as many digits as their standard error deserves. A change of less than two standard errors cannot be
+    Figures are rounded according to their standard errors. A change of less than two standard errors cannot be
     distinguished from 0.
     """
     return Table(PARAMETER_COLUMNS, tuple(_parameter_row(one) for one in parameters))

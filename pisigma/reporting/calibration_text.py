@@ -54,19 +54,19 @@ def calibration_text(
 
 
 def _accuracy(summary: CalibrationSummary) -> Iterator[Block]:
-    """Lay out the errors of rows that were held out, and what is to be said of them."""
+    """Lay out the errors of rows that were held out, and the remarks on them."""
     judged = [one for one in (summary.cross_validation, summary.held_out, summary.test) if one is not None]
     for figures in judged:
         title = f"errors of {of_what(summary)}, {how_held_out(figures, summary)}"
         yield table_block(title, *error_table(figures), "errors of held-out rows")
         if figures.socket_distance is not None:
-            what = "stated distances of sockets, under calibrations without them"
-            yield table_block(what, *distance_table(figures.socket_distance), "distances of sockets")
+            what = "stated distances between sockets, under calibrations without them"
+            yield table_block(what, *distance_table(figures.socket_distance), "distances between sockets")
         yield sentences("remarks on the held-out rows", tables.held_out_lines(figures))
 
 
 def _learned(summary: CalibrationSummary) -> Iterator[Block]:
-    """Lay out the joint correction, and what else was tried."""
+    """Lay out the joint correction, and the others that were tried."""
     if summary.hybrid is not None:
         yield sentences("joint correction", tables.learned_lines(summary.hybrid))
         yield table_block("joint corrections that were tried", *tables.trial_table(summary.hybrid), "trials")
@@ -78,7 +78,7 @@ def _learned(summary: CalibrationSummary) -> Iterator[Block]:
 
 
 def _fit(summary: CalibrationSummary) -> Iterator[Block]:
-    """Lay out the errors of the rows that were calibrated with, and how the search ended."""
+    """Lay out the errors of the calibration rows, and how the search ended."""
     if summary.calibrated is not None:
         what = f"errors of the rows used in the calibration, {how_held_out(summary.calibrated, summary)}"
         yield table_block(what, *error_table(summary.calibrated), "errors of the fit")

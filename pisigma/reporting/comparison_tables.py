@@ -66,7 +66,9 @@ def comparison_blocks(
 
     shown = blocks(whole=verbose)
     if comparison.socket_distance is not None:
-        shown.append(table_block("stated distances of sockets", *distance_table(comparison.socket_distance)))
+        shown.append(
+            table_block("stated distances between sockets", *distance_table(comparison.socket_distance))
+        )
     return shown, [] if verbose else blocks(whole=True)
 
 

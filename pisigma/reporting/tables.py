@@ -71,7 +71,7 @@ def pose_table(models: Mapping[str, ErrorFigures]) -> str:
 
 
 def distance_table(distances: SocketDistances) -> Table:
-    """Make a table of stated distances of sockets, and the errors of every model [mm]."""
+    """Make a table of stated distances between sockets, and the errors of every model [mm]."""
     models = list(distances.each[0].errors_mm)
     rows = [
         (

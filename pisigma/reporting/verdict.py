@@ -1,4 +1,4 @@
-"""A verdict on a result in three sentences, and numbers with as many digits as they deserve."""
+"""A verdict on a result in three sentences, and numbers rounded to their meaningful digits."""
 
 import math
 import re
@@ -39,7 +39,7 @@ class Verdict:
 
     @property
     def lines(self) -> tuple[tuple[str, str], ...]:
-        """Each sentence after what it is about."""
+        """The sentences, each after its heading."""
         return ((self.heading, self.accuracy), ("Trust", self.trust), ("Next", self.next_step))
 
 

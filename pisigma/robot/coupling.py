@@ -186,7 +186,7 @@ class Coupling:
         return np.where(reached[:, None], every[np.arange(len(q)), best], q), reached
 
     def _turns(self) -> Float64[np.ndarray, "turns dof"]:
-        """Return all combinations of -1, 0 or 1 full turns of the coupled revolute joints; others have own limits."""
+        """Return all combinations of -1, 0 or 1 full turns of coupled revolute joints; others have separate limits."""
         shared = (self.matrix != 0).sum(0) > 1
         coupled = ((self.matrix != 0).sum(1) > 1) | (self.matrix[:, shared] != 0).any(1)
         choices = [(-1, 0, 1) if both else (0,) for both in np.logical_and(coupled, self.turning).tolist()]

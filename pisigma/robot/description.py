@@ -92,7 +92,7 @@ class Robot:
 
         Args:
             robot: catalogue name or path of a file.
-            base: link of a URDF file that poses are given in; None for the root link.
+            base: base link of a URDF file; poses are in its frame. None for the root link.
             tip: link of a URDF file that is the tool; None if only one link has no child.
 
         Raises:

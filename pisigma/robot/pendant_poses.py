@@ -56,7 +56,7 @@ def pendant_poses(
 
     Args:
         robot: a robot, a name of the catalogue, or a robot file (YAML or URDF).
-        base: link of a URDF file that poses are given in.
+        base: base link of a URDF file; poses are in its frame.
         tip: link of a URDF file that is the tool.
 
     Raises:

@@ -47,7 +47,7 @@ class Chain:
 
     Attributes:
         name: name of the robot.
-        base: link that poses are given in.
+        base: base link; poses are in its frame.
         tip: link whose pose is computed.
         joints: joints that move, from base to tip.
         end: pose of the tip in the frame of the last joint.

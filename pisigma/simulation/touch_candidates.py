@@ -164,8 +164,8 @@ class TouchCandidatesSection(Section):
         tilt_deg: largest tilt of the torch from vertical [deg].
         least_lean_deg: smallest angle between the torch and the face [deg], so that its tip touches first.
         margin_mm: smallest distance of the point from edges of the face and from blocks on it [mm].
-        travel_mm: distance before and behind the face that the tip must be able to move along its normal, as true robot
-            and placement differ from the nominal ones [mm].
+        travel_mm: distance before and behind the face that the tip must be able to move along its normal, because true
+            robot and placement differ from the nominal ones [mm].
         shaft_mm: length of the torch behind its tip, as a straight line, that must be clear of the jig [mm].
         least_singular_value: smallest singularity measure of the robot; see `singularity_measure`.
         branch: branch of the inverse kinematics.
@@ -189,7 +189,7 @@ class TouchCandidatesSection(Section):
             placements: placements of the jigs.
 
         Raises:
-            RecipeError: the robot cannot make as many touches, or the sections do not fit together.
+            RecipeError: the robot cannot make the requested number of touches, or the sections do not fit together.
             MeasurementError: there is no such jig.
         """
         check_names(placements)

@@ -1,4 +1,4 @@
-"""The step that runs: one at a time, with progress, who started it, and a way to stop it."""
+"""The running step: one at a time, with its progress, the person who started it, and a way to stop it."""
 
 import datetime
 import sys
@@ -61,7 +61,7 @@ class Job:
         step: name of the step.
         person: who started it.
         command: command line that does the same.
-        what: what is being done, with the time left.
+        what: the current activity, with the time left.
         stopped_by: who asked to stop it; "" if nobody did.
     """
 
@@ -74,7 +74,7 @@ class Job:
     left: TimeLeft = field(default_factory=TimeLeft)
 
     def progress(self, what: str) -> None:
-        """Note what is being done, or end the step if a person stopped it.
+        """Record the current activity, or end the step if a person stopped it.
 
         Raises:
             StoppedError: a person stopped it.
@@ -115,7 +115,7 @@ class Jobs:
             self.version += 1
 
     def stop(self, person: str, number: str) -> None:
-        """Stop the running step when it next says what it does; it leaves nothing half written.
+        """Stop the running step when it next reports progress; it leaves nothing half written.
 
         Args:
             person: who stops it.

@@ -213,7 +213,7 @@ def export(cell: Cell, form: Form, files: Mapping[str, Path]) -> Outcome:
 
     Args:
         cell: the cell.
-        form: "format", "out" (name of the file, empty for the day of today), and options of the format.
+        form: "format", "out" (name of the file, empty for today's date), and options of the format.
         files: uploaded files, by the options that take them.
     """
     name = form.get("format", "")

@@ -52,7 +52,7 @@ class TimelineEntry:
         day: day or time (ISO 8601).
         kind: "session", "event", "model", "check" or "use".
         text: what happened.
-        alarm: whether it asks for attention.
+        alarm: whether it requires attention.
     """
 
     day: str
@@ -129,7 +129,7 @@ class Tabs:
 
 
 def _more(name: str, cell: Cell, status: CellStatus, texts: Mapping[str, str]) -> dict[str, Any]:
-    """Return what only one tab shows."""
+    """Return the values that only one tab shows."""
     match name:
         case "status":
             return {"timeline": timeline(status), "kinds": get_args(EventKind)}

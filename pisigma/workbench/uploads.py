@@ -1,4 +1,4 @@
-"""Files that a page received, under names of their own in a folder that only this user can enter."""
+"""Files that a page received, under unique names in a folder that only this user can enter."""
 
 import itertools
 import re
@@ -25,7 +25,7 @@ class Uploads:
         self._numbers = map(str, itertools.count(1))  # several files may arrive at once
 
     def add(self, name: str, content: bytes) -> str:
-        """Keep a file; return the number by which it is asked for.
+        """Store a file; return the number by which it is requested.
 
         Args:
             name: name that the browser states; its folders are removed.

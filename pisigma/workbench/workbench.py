@@ -49,7 +49,7 @@ MAX_PERSON, MAX_COMMAND = 60, 2000
 
 
 def answers(function: Callable[["Workbench", web.Request], Awaitable[web.StreamResponse]]) -> Any:
-    """Answer a refused input with its sentence, and a running step with who started it."""
+    """Answer a refused input with its message, and a request during a step with the person who started it."""
 
     @functools.wraps(function)
     async def answer(self: "Workbench", request: web.Request) -> web.StreamResponse:

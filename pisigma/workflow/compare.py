@@ -165,7 +165,7 @@ def compare(
     program: str | os.PathLike[str] | None = None,
     settings: ComparisonSettings = ComparisonSettings(),
 ) -> ComparedModels:
-    """Compare the parameters of two models of one robot, and what the differences mean for the tool.
+    """Compare the parameters of two models of one robot, and the effect of their differences on the tool.
 
     Args:
         first: a model or its folder, or "nominal" (the nominal robot) or "geometric" (the geometric part of a hybrid)

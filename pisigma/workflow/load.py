@@ -61,7 +61,7 @@ class CellIK(CorrectedIK):
         return (*self._loaded.warnings, *self._in_use.warnings)
 
     def __getattribute__(self, name: str) -> Any:
-        """Return the attributes that are not of this class from the model in use."""
+        """Return the attributes that this class does not have from the model in use."""
         of_self = name in ("present", "warnings", "_in_use", "_load", "_loaded") or name.startswith("__")
         return object.__getattribute__(self, name) if of_self else getattr(self.present, name)
 
@@ -70,7 +70,7 @@ def load(folder: str | os.PathLike[str], pin: bool = False) -> CorrectedIK:
     """Load a model folder, or the model in use of a cell, as corrected inverse kinematics.
 
     Args:
-        folder: what `pisigma calibrate`, `pisigma train` or `pisigma new` wrote.
+        folder: folder written by `pisigma calibrate`, `pisigma train` or `pisigma new`.
         pin: of a cell, keep the model that is in use now; else a change is taken over between two calls.
 
     Raises:

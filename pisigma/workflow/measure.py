@@ -1,4 +1,4 @@
-"""Measure with a plan: takes rows as they are measured, and returns their faults, the next pose and when to stop."""
+"""Measuring with a plan: accepts rows as they are measured, and returns faults, the next pose and when to stop."""
 
 import contextlib
 import os

@@ -230,7 +230,7 @@ def monitor(
     settings: MonitorSettings = MonitorSettings(),
     progress: Progress = lambda what: None,
 ) -> Monitoring:
-    """Find out for every session whether the robot is unchanged or what moved, and chart all sessions.
+    """Determine for every session whether the robot is unchanged or what moved, and chart all sessions.
 
     Args:
         model: model of `pisigma calibrate` or `pisigma recalibrate`, an object that contains one, or its folder. Only

@@ -59,7 +59,7 @@ MAX_ROUNDS = 4
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """Result of `plan`: poses to measure, and the accuracy that they are expected to give.
+    """Result of `plan`: poses to measure, and the accuracy that is expected from them.
 
     Attributes:
         stored: the poses in their order, and the settings of the plan.

@@ -162,7 +162,7 @@ def _errors(name: str, rms: float, p95: float) -> str:
 
 
 def monitoring_text(monitoring: Monitoring, closing: Sequence[str] = ()) -> ResultText:
-    """Lay out a monitoring: the verdict, a line for every session, and what the sessions say together.
+    """Lay out a monitoring: the verdict, a line for every session, and the conclusions from all sessions.
 
     Args:
         monitoring: the monitoring.
@@ -182,7 +182,7 @@ def monitoring_text(monitoring: Monitoring, closing: Sequence[str] = ()) -> Resu
         _monitoring_verdict(monitoring, advice),
         tuple(monitoring.warnings),
         (
-            sentences("what the sessions say together", together),
+            sentences("conclusions from all sessions", together),
             sentences("what has changed", [*said[-MAX_SESSIONS:], *unobservable], "  "),
             table_block(f"last sessions of {name}", *session_table(sessions[-MAX_SESSIONS:])),
             *([charts] if len(monitoring.records) > 1 else []),
@@ -193,7 +193,7 @@ def monitoring_text(monitoring: Monitoring, closing: Sequence[str] = ()) -> Resu
 
 
 def _monitoring_verdict(monitoring: Monitoring, advice: str) -> Verdict:
-    """Judge a robot by its sessions; `advice` says how to recalibrate it where that pays."""
+    """Judge a robot by its sessions; `advice` states how to recalibrate it if that pays."""
     sessions, untrusted = monitoring.sessions, len(monitoring.untrusted)
     changed = [one for one in sessions if one.session.verdict != "unchanged"]
     last = f"{sessions[-1].date}, {rounded(sessions[-1].session.rms * 1e3, 0)} mm RMS" if sessions else "none"

@@ -17,7 +17,7 @@ class UpgradeResult:
 
     Attributes:
         models: results of the models.
-        before: version of the schema of the history before; that of now if there was no history.
+        before: version of the schema of the history before; the same as `after` if there was no history.
         after: version of the schema of the history now.
     """
 

@@ -137,7 +137,7 @@ class Verification:
 def read_for_verification(
     path: MeasurementFiles, model: CalibratedModel, cameras: CameraFiles | None = None
 ) -> Measurements:
-    """Read measurements without checking joint limits, as swapped columns exceed them.
+    """Read measurements without checking joint limits, because swapped columns exceed them.
 
     Rows of the set "train" are left out where the file has a column "set".
 

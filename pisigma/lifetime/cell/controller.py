@@ -281,7 +281,7 @@ def record_controller(history: History, sha256: str, day: str, note: str) -> Con
 
     Args:
         history: history of the cell.
-        sha256: SHA-256 of the exported file; empty: no export is active any more.
+        sha256: SHA-256 of the exported file; empty: no export is active after it.
         day: day from which it is active (ISO 8601). "": today.
         note: free text.
 

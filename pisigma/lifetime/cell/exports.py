@@ -38,7 +38,7 @@ class ControllerEntry:
 
     Attributes:
         day: day from which it is active (ISO 8601).
-        sha256: SHA-256 of the exported file; empty if no export is active any more.
+        sha256: SHA-256 of the exported file; empty if no export is active after it.
         note: free text.
         recorded: time at which it was recorded (ISO 8601, UTC).
     """

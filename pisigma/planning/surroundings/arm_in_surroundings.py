@@ -109,7 +109,8 @@ class ArmInSurroundings:
     def unseparated_links(self) -> tuple[str, ...]:
         """Sentence on links that are not checked against each other because their stated radii are too large.
 
-        Links that touch in more than half of random poses are not checked, see `Capsules.pairs_to_check`. Mostly empty.
+        Links that touch in more than half of random poses are not checked, see `Capsules.pairs_to_check`. Usually
+        empty.
         """
         tool = (
             None

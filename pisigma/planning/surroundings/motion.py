@@ -44,7 +44,7 @@ class Motions:
     def points_between(
         self, start: Float64[Tensor, " dof"], end: Float64[Tensor, " dof"]
     ) -> Float64[Tensor, "points dof"] | None:
-        """Return the waypoints of a motion, empty if it is free without; None if none were found."""
+        """Return the waypoints of a motion, empty if it needs none; None if none were found."""
         if bool(self.are_free(start[None], end[None])):
             return self.pool[:0]
         (pair,) = zip(_names(start[None]), _names(end[None]), strict=True)

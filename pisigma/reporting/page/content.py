@@ -53,7 +53,7 @@ class Verdict:
         sentence: how accurate the model is, how much better than nominal, where it is worst and what limits it.
         worst: where it is worst, as a sentence.
         limit: what limits it, as a sentence: the first diagnosed cause, else scatter or model.
-        held_out: whether the sentence refers to rows that the model was made without.
+        held_out: whether the sentence refers to rows that were not used to make the model.
         joint: the worst joint of a network, where no pose was judged.
     """
 
@@ -161,7 +161,7 @@ class ReportContent:
         advice: what to measure next, one sentence each.
         provenance: names and values.
         joints: errors of the joints of a network; empty for other models.
-        missing: what the report cannot say and why, one sentence each.
+        missing: what the report cannot state and why, one sentence each.
         missing_parameters: what the folder does not keep about the parameters, one sentence each.
         correlation_png: figure of the folder, where it does not keep the correlations as numbers.
     """

@@ -109,7 +109,7 @@ def _distinct_solutions(description: Record, memory: Record, most: int) -> int:
 def _solve_by_network(
     description: Record, memory: Record, has_near: bool, branch: int, wanted: int, out: Array
 ) -> None:
-    """Do the same for a network that corrects the nominal joint values."""
+    """Solve the pose with a network that corrects the nominal joint values."""
     chosen, inside = choose_corrected(description, memory, has_near, branch, wanted)
     numeric = description.closed_form.kind == arrays.NO_CLOSED_FORM and within_reach(
         description, memory, memory.pose
@@ -163,7 +163,7 @@ def _solve_in_order(description: Record, memory: Record, wanted: int) -> int:
 
 @kernel
 def _follow(description: Record, memory: Record, branch: int) -> bool:
-    """Solve from the nominal joint values of a branch on, shifted to the turns of `memory.q`."""
+    """Solve from the nominal joint values of a branch, shifted to the turns of `memory.q`."""
     arms = description.arms
     copy(memory.branches[branch], memory.q)
     if not search(description, memory, memory.pose, memory.q):

@@ -131,7 +131,7 @@ def _take_row(values: Array, row: int, target: Array, dof: int) -> None:
 
 @kernel
 def _take_approach(approach: Array, row: int, target: Array, dof: int) -> None:
-    """Do the same for approach directions, which are 0 if not stated."""
+    """Copy the approach directions of a pose, which are 0 if not stated."""
     if approach.shape[0] > 0:
         _take_row(approach, row, target, dof)
     else:

@@ -167,8 +167,9 @@ def _intermediate_code(forms: KernelForms) -> str:
 def _native_machine() -> Any:
     """Return the processor of this process, without 512-bit registers.
 
-    Sums over six joints do not fill them, and after a millisecond without any the processor takes its time to switch
-    them on: a pose of a UR10 hybrid took 15.3 us then, 12.3 us in a row, and without them 12.5 and 11.2 us.
+    Sums over six joints do not fill them, and the processor needs time to switch them on after a millisecond without
+    use: a pose of a UR10 hybrid took 15.3 us after such a pause and 12.3 us in a sequence, against 12.5 and 11.2 us
+        without them.
     """
     features = (
         llvm.get_host_cpu_features().flatten().replace("+avx512", "-avx512").replace("+avx10", "-avx10")

@@ -23,7 +23,7 @@ def kernel(function: Function) -> Function:
 
 
 def contracted_kernel(function: Function) -> Function:
-    """Do the same, but allow fused multiply-add operations."""
+    """Compile a function like `kernel`, but allow fused multiply-add operations."""
     return njit(error_model="numpy", fastmath={"contract"})(inspect.unwrap(function))  # type: ignore[return-value]
 
 

@@ -93,7 +93,7 @@ def solve_numeric(
     Each step solves `(JᵀJ + λ) dq = Jᵀe`, with lengths in characteristic lengths and the damping λ proportional to the
     squared error (Sugihara 2011), so convergence is quadratic near the solution. For each pose, a step that
     increases the error is rejected and the damping factor increased; otherwise the factor is decreased. Converged poses
-    are not updated any more. No gradients flow through the solution; joint limits are checked at the end only.
+    are no longer updated. No gradients flow through the solution; joint limits are checked at the end only.
 
     Args:
         robot: the robot, with any number of joints.

@@ -65,7 +65,7 @@ class RandomViews(Section):
             is_fixed: whether the camera is fixed and the board is on the flange.
 
         Raises:
-            RecipeError: the robot has no closed form, or does not reach as many views.
+            RecipeError: the robot has no closed form, or does not reach the requested number of views.
         """
         solver, rng = self.check(robot), np.random.default_rng(self.seed)
         chosen, needed = list[Tensor](), CANDIDATES * self.count

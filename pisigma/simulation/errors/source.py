@@ -26,7 +26,7 @@ class GeometryChange:
     Attributes:
         dh: errors of the DH rows `(rows, 5)` [rad or m].
         base: errors of x, y, z [m], roll, pitch, yaw [rad] of the base.
-        tool: errors of x, y, z [mm], roll, pitch, yaw [deg] of the tool.
+        tool: errors of x, y, z [m], roll, pitch, yaw [rad] of the tool.
     """
 
     dh: Float64[np.ndarray, "rows 5"]

@@ -1,4 +1,4 @@
-"""Interface of the checks of calibrations and of rows, and what they see: a calibration, or rows under a model."""
+"""Interface of the checks of calibrations and of rows, and their inputs: a calibration, or rows under a model."""
 
 import math
 from collections.abc import Callable, Collection, Iterator, Mapping

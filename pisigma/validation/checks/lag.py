@@ -1,4 +1,4 @@
-"""Whether joint values were logged before the robot arrived, or after it had left the pose."""
+"""Check whether joint values were logged before the robot arrived, or after it had left the pose."""
 
 import math
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""Whether only some of the rows agree with a model, and the others belong to another setup."""
+"""Check whether only some of the rows agree with a model, and the others belong to another setup."""
 
 import itertools
 import math
@@ -207,7 +207,7 @@ def _two_sizes(checked: CheckedCalibration) -> Iterator[Diagnostic]:
 
 
 def _differ(found: Populations) -> bool:
-    """Return whether these are two populations, and not what unmodelled errors of one arm look like."""
+    """Return whether these are two populations rather than unmodelled errors of one arm."""
     return (
         found.log_bayes_factor > CERTAIN
         and found.factor > LARGE[found.differing] * max((1 - HARDLY_USED) / (1 - found.used), 1.0)

@@ -1,4 +1,4 @@
-"""Whether another robot of the catalogue was measured."""
+"""Check whether another robot of the catalogue was measured."""
 
 from collections.abc import Iterator
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Checks of rows without positions, such as balls in sockets, and of stated distances of sockets."""
+"""Checks of rows without positions, such as balls in sockets, and of stated distances between sockets."""
 
 import math
 from collections.abc import Collection, Iterator, Sequence
@@ -35,7 +35,7 @@ step [rad or m]."""
 
 
 def distance_diagnostics(comparison: ModelComparison, figures: ModelFigures) -> Iterator[Diagnostic]:
-    """Report stated distances of sockets that a model contradicts by more than its rows scatter.
+    """Report stated distances between sockets that a model contradicts by more than its rows scatter.
 
     Args:
         comparison: comparison of models on the rows of the sockets.
@@ -63,7 +63,7 @@ def diagnosed_lengths(
     fitted: Collection[FrameKind],
     may_move: Collection[Move],
 ) -> tuple[tuple[Diagnostic, ...], tuple[SetupFault, ...]]:
-    """Report what is wrong with rows without positions whose errors are too large for wear.
+    """Report the causes of errors that are too large for wear, in rows without positions.
 
     The hypotheses are a reversed sign of every joint, a swap of two neighbouring joints, a moved zero of every
     joint and another tool, one at a time.

@@ -1,4 +1,4 @@
-"""Whether the geometric errors have a size that is possible for the nominal robot and its class."""
+"""Check whether the geometric errors have a size that is possible for the nominal robot and its class."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -54,7 +54,9 @@ def check_prior_ratio(checked: CheckedCalibration) -> Iterator[Diagnostic]:
 
 
 def class_of(checked: CheckedCalibration, large: Sequence[PriorRatio]) -> RobotClass | None:
-    """Find the class of a robot with errors of these sizes: the stated one, or the narrowest from the maker's on.
+    """Find the class of a robot with errors of these sizes: the stated one, or the narrowest that allows them.
+
+    The search for the narrowest class starts with that of the maker.
 
     A wider class than the manufacturer's is accepted for joint zeros only: lengths and angles of another class belong
     to another robot, unless the user states the class.

@@ -1,4 +1,4 @@
-"""Whether joint values or positions were rounded so coarsely that rounding explains a part of the errors."""
+"""Check whether joint values or positions were rounded so coarsely that rounding explains a part of the errors."""
 
 import math
 from collections.abc import Iterator, Sequence

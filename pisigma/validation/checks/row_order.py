@@ -1,4 +1,4 @@
-"""Whether the measuring frame or the tool moved while the rows were measured, before and after a calibration."""
+"""Check whether the measuring frame or the tool moved while the rows were measured, before and after a calibration."""
 
 import math
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""Whether all lengths of the arm are wrong by one factor: a wrong unit, or the scale of the instrument."""
+"""Check whether all lengths of the arm are wrong by one factor: a wrong unit, or the scale of the instrument."""
 
 import math
 from collections.abc import Iterator

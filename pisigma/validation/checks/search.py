@@ -1,4 +1,4 @@
-"""Whether the search for the parameters ended at a minimum, and whether the arm was calibrated at all."""
+"""Check whether the search for the parameters ended at a minimum, and whether the arm was calibrated at all."""
 
 from collections.abc import Iterator
 

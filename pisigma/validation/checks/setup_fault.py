@@ -1,4 +1,4 @@
-"""Whether a fault of the setup or the file explains errors that are too large for the nominal robot."""
+"""Check whether a fault of the setup or the file explains errors that are too large for the nominal robot."""
 
 from collections.abc import Iterator
 from functools import lru_cache

@@ -1,4 +1,4 @@
-"""Whether the standard deviations stated in the rows agree with their residuals."""
+"""Check whether the standard deviations stated in the rows agree with their residuals."""
 
 import math
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""Whether the temperatures of the rows are plausible for a robot in degrees Celsius."""
+"""Check whether the temperatures of the rows are plausible for a robot in degrees Celsius."""
 
 from collections.abc import Iterator
 

@@ -1,4 +1,4 @@
-"""Whether the errors of held-out rows are far larger than those of calibrated robots."""
+"""Check whether the errors of held-out rows are far larger than those of calibrated robots."""
 
 import math
 from collections.abc import Iterator

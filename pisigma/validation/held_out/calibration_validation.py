@@ -51,7 +51,7 @@ class CalibrationValidation:
         models: errors by name: "nominal" (the nominal arm with base and tool fitted to the training rows), "geometric",
             and "hybrid" if requested, which selects its features on the training rows alone.
         spread: position errors with their predicted standard deviations under the hybrid; None without a hybrid.
-        distances: errors of stated distances of sockets that were held out.
+        distances: errors of stated distances between sockets that were held out.
         frames_fitted: number of frames that were held out completely; their bases were fitted to the held-out rows.
         sockets_held_out: number of sockets that were held out completely; their errors are relative to the mean
             predicted position of the ball.
@@ -127,7 +127,7 @@ class JudgedFold:
     Attributes:
         test: numbers of the held-out rows.
         errors: their errors by model.
-        distances: errors of stated distances of sockets that its calibration did not use.
+        distances: errors of stated distances between sockets that its calibration did not use.
         spread: position errors and their predicted standard deviations under the hybrid.
         frames: number of frames that were held out completely.
         sockets: number of sockets that were held out completely.
@@ -339,7 +339,7 @@ def _judge(
 ) -> JudgedFold:
     """Judge all models on held-out rows, with missing frames fitted by a calibrator, if there is one.
 
-    Held-out distances of sockets are judged on all rows.
+    Held-out distances between sockets are judged on all rows.
     """
     if calibrator is not None:
         results = {name: with_frames(calibrator, fitted, held_out) for name, fitted in results.items()}

@@ -209,7 +209,7 @@ class ModelComparison:
         rows_without_position: number of rows without a position or another length that can be judged.
         configurations: number of different configurations of the compared rows.
         bootstrap: settings of the confidence intervals.
-        socket_distance: errors of stated distances of sockets; None if none is stated.
+        socket_distance: errors of stated distances between sockets; None if none is stated.
     """
 
     models: tuple[ModelFigures, ...]
@@ -249,7 +249,7 @@ def compare_models(
         measurements: the rows, in the frames that the models were fitted in.
         bootstrap: settings of the confidence intervals; None for `Bootstrap()`.
         fitted: frames or targets that are fitted to the rows for every model; see `errors_in_fitted_frames`.
-        socket_distances: stated distances of sockets of the rows [m].
+        socket_distances: stated distances between sockets of the rows [m].
 
     Raises:
         MeasurementError: no lengths were measured, a model does not have a frame or target, no row is predicted by all
@@ -307,7 +307,7 @@ def compare_models(
 def _distances(
     models: Mapping[str, CalibratedModel], rows: Measurements, stated: Mapping[PairOfSockets, float]
 ) -> SocketDistances | None:
-    """Compute the figures of stated distances of sockets, each at the mean predicted position of its ball."""
+    """Compute the figures of stated distances between sockets, each at the mean predicted position of its ball."""
     poses = {name: poses_of_rows(model, rows) for name, model in models.items() if stated}
     return distance_figures([DistanceErrors.from_poses(poses, stated, rows)])
 

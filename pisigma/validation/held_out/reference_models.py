@@ -23,7 +23,7 @@ def nominal_model(model: CalibratedModel, turned: bool) -> CalibratedModel:
         turned: whether orientations are compared and therefore fitted too.
 
     Raises:
-        ModelError: the model does not keep enough joint values to fit base and tool.
+        ModelError: the model does not store enough joint values to fit base and tool.
     """
     if model.calibrated is None:
         return replace(model, network=None, domain=None)

@@ -207,7 +207,7 @@ def judgeable_rows(measurements: Measurements, test: Tensor, training: Measureme
 
 @dataclass(frozen=True, eq=False)
 class DistanceErrors:
-    """Errors of stated distances of sockets.
+    """Errors of stated distances between sockets.
 
     Attributes:
         stated: stated distances by the names of two sockets [m].

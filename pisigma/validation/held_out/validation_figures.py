@@ -32,7 +32,7 @@ class DistanceFigures(Section):
 
 
 class StatedDistance(Section):
-    """A stated distance of two sockets [mm], and its errors under calibrations that do not use it [mm].
+    """A stated distance between two sockets [mm], and its errors under calibrations that do not use it [mm].
 
     Errors are predicted minus stated; for several repeats of a cross-validation, their mean.
     """
@@ -43,7 +43,7 @@ class StatedDistance(Section):
 
 
 class SocketDistances(Section):
-    """Errors of `count` stated distances of sockets under calibrations that do not use them.
+    """Errors of `count` stated distances between sockets under calibrations that do not use them.
 
     Attributes:
         each: the single distances.

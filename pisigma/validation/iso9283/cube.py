@@ -80,7 +80,7 @@ def largest_cube(
     nearest to the middle of the region is returned.
 
     Args:
-        reaches: says which positions in the base frame [m] are reachable with the orientation under test.
+        reaches: returns which positions in the base frame [m] are reachable with the orientation under test.
         low: lowest corner of the region to search [m].
         high: highest corner of it [m].
         spacing: spacing of the grid [m]; the edge of the cube is a multiple of it.

@@ -89,7 +89,7 @@ def directional_position_variation(
     `vAP_P = max_{h,k} √((x̄_h - x̄_k)² + (ȳ_h - ȳ_k)² + (z̄_h - z̄_k)²)`.
 
     Args:
-        attained: positions [m]; the standard asks for three directions, perpendicular to each other.
+        attained: positions [m]; the standard requires three directions, perpendicular to each other.
     """
     middle = barycentre(attained)
     apart = middle[..., :, None, :] - middle[..., None, :, :]

@@ -161,7 +161,7 @@ def _named_otherwise(robot: Robot, measurements: Measurements, usual: float) -> 
 def _labelled(
     rows: Measurements, T: Float64[Tensor, "rows 4 4"], measured: MeasuredPoses
 ) -> list[Hypothesis]:
-    """Make hypotheses from other names of targets; see `target_labellings`."""
+    """Make hypotheses with other names of the targets; see `target_labellings`."""
     return [
         Hypothesis(rows.q, one.T, measured, (one.cause,), 3 * one.targets)
         for one in target_labellings(rows, T, measured)

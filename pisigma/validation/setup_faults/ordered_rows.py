@@ -124,7 +124,7 @@ class OrderedRows:
 
     @cached_property
     def clipped(self) -> Float64[np.ndarray, "rows values"]:
-        """Residuals, those of far rows shortened, so that they do not decide where a fault is sought."""
+        """Residuals, with those of far rows shortened so that they do not decide where a fault is sought."""
         lengths = np.linalg.norm(self.residual, axis=1)
         longest = CAP * np.quantile(lengths, 0.75)
         shortened: np.ndarray = (

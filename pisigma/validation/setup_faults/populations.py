@@ -308,7 +308,7 @@ class Mixture:
 
     @property
     def are_distinct(self) -> bool:
-        """Whether these are two populations, and not the shape of a single one."""
+        """Whether these are two populations rather than the shape of a single one."""
         return (
             self.log_bayes_factor > math.log(100.0)
             and min(self.share, 1 - self.share) >= MIN_SHARE

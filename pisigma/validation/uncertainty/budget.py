@@ -82,8 +82,8 @@ class UncertaintyBudget:
         """Radius about the commanded position that contains the tool with the probability `COVERAGE` [m].
 
         It is `u_c √(3 F)` with the quantile F of the F distribution with 3 and the effective degrees of freedom, for
-        three coordinates with independent normal errors of the same size; with infinitely many degrees of freedom it
-        is `2.80 u_c`, as `χ²` with 3 degrees of freedom has the 95 % quantile 7.81.
+        three coordinates with independent normal errors of the same size; with infinitely many degrees of freedom it is
+        `2.80 u_c`, because the 95 % quantile of `χ²` with 3 degrees of freedom is 7.81.
         """
         from scipy import stats
 

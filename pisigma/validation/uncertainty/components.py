@@ -35,8 +35,8 @@ def uncertainty_budget(
     """Compose the budget of one coordinate of the tool's position, with the correction active.
 
     The scatter of the calibration contains the repeatability of the robot, the random errors of the instrument and
-    what the model cannot express; the certificate of the instrument covers its random errors too. The budget is
-    therefore rather too large than too small.
+    what the model cannot express; the certificate of the instrument covers its random errors too. The budget therefore
+    tends to be too large rather than too small.
 
     Args:
         model: the model.

@@ -1,4 +1,4 @@
-"""Who may open a page: a token in the link, then a cookie, and only pages of the same origin."""
+"""Access to a page: a token in the link, then a cookie, and only from pages of the same origin."""
 
 import contextlib
 import ipaddress

@@ -37,7 +37,7 @@ class FrontServer:
         """Start serving.
 
         Args:
-            pages: what answers a method and a path in the folder of the pages, such as ("GET", "/").
+            pages: functions that answer a method and a path in the folder of the pages, such as ("GET", "/").
             host: address to listen on; at 127.0.0.1 only this machine can open the pages.
             port: port to listen on; if it is taken, the next free one.
             closing: called in the thread of the server at its end.

@@ -81,7 +81,7 @@ class MeshBody(AbstractBody):
         Args:
             robot: robot as loaded from the file.
             path: URDF file.
-            base: link that poses are given in, as in `Robot.load`.
+            base: base link, as in `Robot.load`.
             tip: link that is the tool, as in `Robot.load`.
             inside: folder that contains all meshes that may be read; None for any folder.
 

@@ -125,7 +125,7 @@ class SessionScene:
         Args:
             rows: rows; those that cannot be judged yet are drawn at the tool of the nominal robot.
             top: error at the end of the colour scale [m].
-            magnification: length of the arrows over that of the errors.
+            magnification: ratio of the lengths of the arrows to those of the errors.
         """
         self._begin("/rows")
         if not rows.line:

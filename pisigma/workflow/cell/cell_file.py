@@ -84,8 +84,8 @@ class CellDocument(Section):
 
     Attributes:
         robot: catalogue name, or a robot file (YAML or URDF) inside the cell.
-        base: link of the URDF file in whose frame poses are given; None for its root.
-        tip: link of the URDF file that is the tool; None for its only end.
+        base: base link of the URDF file; poses are in its frame. None for its root.
+        tip: tool link of the URDF file; None for its only end.
         sensor: sensor that measures the robot.
         limit_mm: limit of the 95 % quantile of the position errors [mm]; None for no limit.
         instrument: measuring instrument and its calibration certificate; None if it is not stated.

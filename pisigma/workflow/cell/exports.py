@@ -44,7 +44,7 @@ def set_controller(
 
     Args:
         cell: the cell.
-        file: the file as `export_from_cell` wrote it; "none": no export is active any more.
+        file: the file as `export_from_cell` wrote it; "none": no export is active after it.
         day: day from which it is active (ISO 8601). "": today.
         note: free text.
     """

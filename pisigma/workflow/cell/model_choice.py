@@ -247,7 +247,7 @@ def put_into_use(history: History, model: str, reason: str, undo: bool = False) 
 
     Args:
         history: history of the cell.
-        model: name of a model of the cell; empty if none is in use any more.
+        model: name of a model of the cell; empty if none is in use after it.
         reason: reason to record.
         undo: whether this undoes the last change.
 

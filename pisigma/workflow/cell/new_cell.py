@@ -33,8 +33,8 @@ class NewCell:
         robot: the nominal robot, a catalogue name, or a robot file (YAML or URDF), which is copied into the cell.
         sensor: "tracker", "camera", "sockets", "draw-wire" or "touch".
         limit_mm: limit of the 95 % quantile of the position errors [mm]; None for no limit.
-        base: link of the URDF file in whose frame poses are given; None for its root.
-        tip: link of the URDF file that is the tool; None for its only end.
+        base: base link of the URDF file; poses are in its frame. None for its root.
+        tip: tool link of the URDF file; None for its only end.
         cameras: cameras and boards, whose files are copied into the cell.
         calibrate: settings of `pisigma calibrate` by their keys, for a short `cell.yaml`. None: a `cell.yaml` that
             lists all settings of all steps as comments.

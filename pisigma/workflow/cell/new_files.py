@@ -27,7 +27,7 @@ def free_path(folder: Path, name: str, suffix: str, taken: Collection[str] = ())
 
 
 def output_path(cell: str | os.PathLike[str], part: str, suffix: str) -> Path:
-    """Return a new path in a folder of a cell, named after the day of today; the folder is created.
+    """Return a new path in a folder of a cell, named after today's date; the folder is created.
 
     Args:
         cell: folder of the cell.

@@ -38,7 +38,7 @@ class NewCells:
         cells: folders of all cells of the manifest, sorted by name.
         created: number of cells that did not exist before.
         sessions: number of files of rows that were copied into cells.
-        refused: why a robot has no cell, or a cell not all of its rows, by its id.
+        refused: by id, why a robot has no cell, or its cell lacks some of its rows.
     """
 
     cells: tuple[Path, ...]
@@ -65,7 +65,7 @@ def new_cells(source: Path, out: Path, common: NewCell) -> NewCells:
     Args:
         source: manifest or folder.
         out: folder of the cells.
-        common: what all cells have in common; its robot is that of rows that state none, "" for none.
+        common: settings that all cells have in common; its robot is that of the rows that state none, "" for none.
 
     Raises:
         FleetError: there is no robot, an id is not valid or appears twice, or no robot can be used.

@@ -80,9 +80,9 @@ def run_fleet(
 ) -> FleetRun:
     """Advance all cells in a folder: calibrate, verify, monitor and recalibrate as the status of each requires.
 
-    See `pisigma.workflow.cell.advance.advance`. A cell with bad rows is reported and does not stop the others. What a
-    cell contains is always whole, so that a later call continues after an interruption; a cell whose status names no
-    step is not opened.
+    See `pisigma.workflow.cell.advance.advance`. A cell with bad rows is reported and does not stop the others. The
+    contents of a cell are always complete, so a later call continues after an interruption; a cell whose status names
+    no step is not opened.
 
     Args:
         folder: folder of cells; `results.parquet` is written there.

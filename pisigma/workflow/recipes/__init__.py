@@ -1,1 +1,1 @@
-"""Recipe files: what to train, on what."""
+"""Recipe files, which state what to train and on which data."""

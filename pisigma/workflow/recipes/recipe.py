@@ -121,8 +121,8 @@ class CalibrationSection(Section):
 
     Attributes:
         free: parameters to identify, "identifiable", "joint_offsets" or names.
-        base: "free" to identify the base, or "fixed" to that of the robot.
-        tool: "free" to identify the tool, or "fixed" to that of the robot.
+        base: "free" to identify the base, or "fixed" to use that of the robot.
+        tool: "free" to identify the tool, or "fixed" to use that of the robot.
         elimination: how redundant parameters are eliminated, "exact", "pairwise" (as in the paper) or "none".
         prior: prior of the geometric errors, null for none.
         robust: whether outliers are down-weighted.
