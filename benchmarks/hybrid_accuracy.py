@@ -20,7 +20,7 @@ from torch import Tensor
 
 from pisigma.calibration.hybrid.calibrator import HybridCalibrator
 from pisigma.measurement.dataset import Measurements
-from pisigma.measurement.splits import k_folds, with_fewer
+from pisigma.measurement.splits import k_folds, with_fewer_training_rows
 from pisigma.robot import Robot
 from pisigma.validation.held_out.pose_statistics import PredictedSpread, predicted_spread
 
@@ -58,7 +58,7 @@ def folds(name: str, robot: Robot, data: Measurements) -> Iterator[Case]:
 def few(name: str, robot: Robot, data: Measurements) -> Iterator[Case]:
     """Return decreasing numbers of the training rows of the five folds, for the UR10 only."""
     for rows in FEW if name == "ur10" else ():
-        for train, test in with_fewer(data, k_folds(data, 5, 0), rows, 0):
+        for train, test in with_fewer_training_rows(data, k_folds(data, 5, 0), rows, 0):
             yield Case(f"{name} {rows} rows", robot, data.select(train), data.select(test))
 
 

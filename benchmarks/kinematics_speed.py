@@ -29,7 +29,7 @@ from pisigma.robot import Robot, catalogue
 from pisigma.robot.kinematics.components import (
     IDENTITY,
     as_transform,
-    follow_xyzrpy,
+    compose_xyzrpy,
     rotate_x,
     rotate_y,
     rotate_z,
@@ -46,7 +46,7 @@ def build_peer(robot: Robot) -> SerialChain:
     frame.
     """
     like = torch.zeros((), dtype=torch.float64)
-    fixed = follow_xyzrpy(IDENTITY, robot.base.tolist())
+    fixed = compose_xyzrpy(IDENTITY, robot.base.tolist())
     root = Frame("root", Link("root"), Joint("root", dtype=torch.float64))
     parent = root
     for row, (theta, d, a, alpha, beta) in zip(robot.rows, robot.dh.tolist(), strict=True):
@@ -55,7 +55,7 @@ def build_peer(robot: Robot) -> SerialChain:
             parent.add_child(frame)
             parent, fixed = frame, IDENTITY
         fixed = rotate_y(rotate_x(translate(rotate_z(fixed, theta), a, 0.0, d), alpha), beta)
-    tool = as_transform(follow_xyzrpy(fixed, robot.tool.tolist()), like)
+    tool = as_transform(compose_xyzrpy(fixed, robot.tool.tolist()), like)
     parent.add_child(_frame("tool", tool, "fixed", 1))
     return SerialChain(Chain(root, dtype=torch.float64), "tool", dtype=torch.float64)
 

@@ -20,7 +20,7 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.planning.plan_settings import PlanSettings
 from pisigma.planning.session.row_judgement import judge_rows
 from pisigma.planning.surroundings.arm_in_surroundings import ArmInSurroundings
-from pisigma.validation.held_out.few_rows import fit_where_it_helps
+from pisigma.validation.held_out.few_rows import fit_if_better
 from pisigma.workflow.measure import MeasuringSession
 from pisigma.workflow.plan import plan
 from pisigma.workflow.settings.measuring import MeasureSettings
@@ -134,7 +134,7 @@ def session(arm: Arm, how: str) -> tuple[int, float]:
             measuring.update()
     rows = measuring.rows
     assert rows is not None
-    errors = fit_where_it_helps(HybridCalibrator(arm.nominal), rows, lambda what: None).errors_of(arm.test)
+    errors = fit_if_better(HybridCalibrator(arm.nominal), rows, lambda what: None).errors_of(arm.test)
     return rows.rows, float(errors["position"].norm(dim=1).quantile(0.95)) * 1e3
 
 

@@ -30,7 +30,7 @@ from pisigma.planning.plan_settings import Criterion
 from pisigma.planning.pose_selection import select_poses
 from pisigma.planning.robot_posterior import Instrument, RobotPosterior
 from pisigma.robot import Robot
-from pisigma.validation.held_out.few_rows import fit_where_it_helps
+from pisigma.validation.held_out.few_rows import fit_if_better
 from pisigma.validation.held_out.trained_calibrations import Calibrator, Result
 
 DATA = Path(os.environ.get("PISIGMA_DATA", "../shared/data"))
@@ -146,7 +146,7 @@ class Arm:
 
     def figures(self, q: Tensor, posterior: RobotPosterior) -> Figures:
         """Return the result for measured poses."""
-        result = fit_where_it_helps(HybridCalibrator(self.nominal), self.rows(q), lambda what: None)
+        result = fit_if_better(HybridCalibrator(self.nominal), self.rows(q), lambda what: None)
         assert isinstance(result, HybridResult)
         both = posterior.given_poses(q), RobotPosterior.from_result(result, posterior.instrument)
         return Figures(rms_mm(result, self.test), *(rms_of(one.tool(self.test.q)) * 1e3 for one in both))

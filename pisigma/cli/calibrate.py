@@ -13,7 +13,7 @@ from pisigma.cli.arguments import (
     complete_model,
     complete_robot,
 )
-from pisigma.cli.cell import cell_at, next_lines, refuse_with_cell, report_overrides
+from pisigma.cli.cell import cell_at, next_step_lines, refuse_with_cell, report_overrides
 from pisigma.cli.lifetime.recalibrate import recalibrate_into
 from pisigma.cli.output import (
     command_line,
@@ -133,7 +133,7 @@ def _calibrate_cell(
             remark = [f"Model '{entry.name}': {entry.remark}."]
         assert isinstance(calibration, Calibration)  # there is no prior
         text = calibration_text(calibration.summary, folder, calibration.seconds)
-        print_result(text, verbose, [*wrap_lines(remark), *next_lines(cell.status())])
+        print_result(text, verbose, [*wrap_lines(remark), *next_step_lines(cell.status())])
     if entry is None:
         raise AcceptanceError(
             "no model was stored, because the result must not be trusted, for the reasons above."

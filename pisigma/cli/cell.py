@@ -147,7 +147,7 @@ def output_in_cell(cell: "Cell | None", part: str, suffix: str) -> Path:
     return output_path(cell.folder, part, suffix)
 
 
-def next_lines(status: "CellStatus") -> list[str]:
+def next_step_lines(status: "CellStatus") -> list[str]:
     """Return the lines that state the next step of a cell, with its command on a separate line."""
     reason = status.step.reason.rstrip(".")
     if not status.step.command:
@@ -157,7 +157,7 @@ def next_lines(status: "CellStatus") -> list[str]:
 
 def print_next(status: "CellStatus") -> None:
     """Print the next step of a cell."""
-    for line in next_lines(status):
+    for line in next_step_lines(status):
         print_line(line)
 
 

@@ -7,7 +7,7 @@ import typer
 
 from pisigma.cli.arguments import AsJson, Verbose, complete_robot
 from pisigma.cli.calibrate import Base, Tip
-from pisigma.cli.cell import cell_at, next_lines, refuse_with_cell, report_overrides
+from pisigma.cli.cell import cell_at, next_step_lines, refuse_with_cell, report_overrides
 from pisigma.cli.output import print_json
 from pisigma.cli.progress import progress_of
 from pisigma.cli.screen import print_result
@@ -96,4 +96,4 @@ def _plan_cell(
         print_json({"file": str(out), **planned.to_json(), "next": cell.status().step.to_json()})
     else:
         text = plan_text(planned, [out, yaml_of(out), *programs])
-        print_result(text, verbose, next_lines(cell.status()))
+        print_result(text, verbose, next_step_lines(cell.status()))

@@ -62,8 +62,7 @@ def takes_settings(command: Callable[..., None]) -> Callable[..., None]:
         groups[one.name] = group, bool(others)  # type: ignore[assignment]
         if get_origin(one.annotation) is StatedSettings:
             as_stated.add(one.name)
-        parameters += [_parameter(one) for one in flat_settings(group) if not one.option.is_key]  # type:
-        # ignore[arg-type]
+        parameters += [_parameter(one) for one in flat_settings(group) if not one.option.is_key]  # type: ignore[arg-type]
         end = len(parameters)
     known = {key: one for group, _ in groups.values() for key, one in by_key(group).items()}
     context = next((one.name for one in parameters if one.annotation is typer.Context), _CONTEXT)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pisigma.cli.arguments import AsJson, ModelOrCell, Verbose
-from pisigma.cli.cell import cell_at, next_lines, refuse_with_cell, report_overrides
+from pisigma.cli.cell import cell_at, next_step_lines, refuse_with_cell, report_overrides
 from pisigma.cli.output import print_json, screen_width
 from pisigma.cli.progress import progress_of
 from pisigma.cli.screen import print_result
@@ -98,6 +98,6 @@ def _verify_cell(
             [f"Model '{entry.name}' is in use."] if in_use is not None and in_use.name == entry.name else []
         )
         text = verification_text(verification, screen_width(), verbose)
-        print_result(text, verbose, [*lines, *next_lines(cell.status())])
+        print_result(text, verbose, [*lines, *next_step_lines(cell.status())])
     if not verification.accepted:
         raise AcceptanceError(verification.sentence)

@@ -266,7 +266,7 @@ _PACKAGES = {"cv2": "opencv-python-headless"}
 """Packages whose module has another name, by that name."""
 
 
-def fault_of_machine(problem: BaseException) -> str:
+def system_fault(problem: BaseException) -> str:
     """Describe which file cannot be used, or that memory ran out; "" for every other problem."""
     if isinstance(problem, OSError) and problem.filename is not None:
         return f"{problem.filename}: cannot be used ({problem.strerror}); check the path."

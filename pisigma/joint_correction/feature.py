@@ -163,7 +163,7 @@ class AbstractFeature(ABC):
         return f"{self.name} {self.size}" if self.size else self.name
 
 
-def turning_rate(robot: Robot) -> Float[np.ndarray, " dof"]:
+def angle_per_joint_value(robot: Robot) -> Float[np.ndarray, " dof"]:
     """Return the angle of a joint's periodic functions per joint value: 1 for a revolute joint [rad/rad].
 
     The period of a prismatic joint is twice its travel [rad/m], or twice the reach if it has no limits.

@@ -8,7 +8,12 @@ from jaxtyping import Float, Float64, Int64, Shaped
 from pydantic import Field
 from torch import Tensor
 
-from pisigma.joint_correction.feature import AbstractFeature, FeatureOptions, FeatureSection, turning_rate
+from pisigma.joint_correction.feature import (
+    AbstractFeature,
+    FeatureOptions,
+    FeatureSection,
+    angle_per_joint_value,
+)
 from pisigma.joint_correction.onnx_graph import OnnxGraph
 from pisigma.measurement.conditions import JointState
 from pisigma.robot.description import Robot
@@ -142,7 +147,7 @@ class FourierSeries(AbstractFeature):
             raise ValueError(f"expected at least one harmonic of a Fourier series, got {harmonics}.")
         self.harmonics = self.size = self.fastest = harmonics
         self.fine = fine
-        self._rate = torch.from_numpy(turning_rate(robot))
+        self._rate = torch.from_numpy(angle_per_joint_value(robot))
         k = torch.arange(1, harmonics + 1)
         starts = FINE_BAND_STARTS if fine else BAND_STARTS
         band = torch.bucketize(k, torch.tensor(starts), right=True) - 1

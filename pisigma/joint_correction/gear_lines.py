@@ -10,7 +10,12 @@ from jaxtyping import Float, Float64
 from pydantic import Field
 from torch import Tensor
 
-from pisigma.joint_correction.feature import AbstractFeature, FeatureOptions, FeatureSection, turning_rate
+from pisigma.joint_correction.feature import (
+    AbstractFeature,
+    FeatureOptions,
+    FeatureSection,
+    angle_per_joint_value,
+)
 from pisigma.joint_correction.fourier_series import add_harmonics, sines_cosines
 from pisigma.joint_correction.onnx_graph import OnnxGraph
 from pisigma.measurement.conditions import JointState
@@ -77,7 +82,7 @@ class GearLines(AbstractFeature):
         if len(self.orders) != robot.dof or not most:
             raise ValueError(f"expected orders for each of {robot.dof} joints, got {self.orders}.")
         self.fastest = max(map(max, filter(None, self.orders)))
-        self._rate = torch.from_numpy(turning_rate(robot))
+        self._rate = torch.from_numpy(angle_per_joint_value(robot))
         padded = [[*of_joint, *[0] * (most - len(of_joint))] for of_joint in self.orders]
         self._orders = torch.tensor(padded, dtype=torch.float64)
         self.used = (self._orders > 0).repeat(1, 2)

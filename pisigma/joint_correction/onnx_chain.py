@@ -8,7 +8,7 @@ import torch
 
 from pisigma.joint_correction.onnx_graph import OnnxGraph
 from pisigma.robot.description import Robot
-from pisigma.robot.kinematics.components import IDENTITY, as_transform, follow_row
+from pisigma.robot.kinematics.components import IDENTITY, as_transform, compose_row
 from pisigma.robot.row import Row
 from pisigma.robot.se3 import transform_from_xyzrpy
 
@@ -104,7 +104,7 @@ def _combined(graph: OnnxGraph, value: str, parts: Sequence[np.ndarray]) -> str:
 def _still(robot: Robot) -> list[np.ndarray]:
     """Return the transform of every row at joint value 0."""
     like = torch.zeros((), dtype=torch.float64)
-    return [as_transform(follow_row(IDENTITY, row), like).numpy() for row in robot.dh.tolist()]
+    return [as_transform(compose_row(IDENTITY, row), like).numpy() for row in robot.dh.tolist()]
 
 
 def _matrix(frame: np.ndarray) -> np.ndarray:

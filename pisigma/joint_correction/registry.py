@@ -34,7 +34,7 @@ def register_feature(feature: type[AbstractFeature]) -> type[AbstractFeature]:
     return feature
 
 
-def feature_named(name: str) -> type[AbstractFeature]:
+def feature_by_name(name: str) -> type[AbstractFeature]:
     """Return the feature with a name.
 
     Raises:
@@ -46,7 +46,7 @@ def feature_named(name: str) -> type[AbstractFeature]:
     return FEATURES[name]
 
 
-def features_from_outside() -> tuple[str, ...]:
+def plugin_features() -> tuple[str, ...]:
     """Return the names of the features that are not part of pisigma."""
     return tuple(name for name, feature in FEATURES.items() if feature.__module__.split(".")[0] != "pisigma")
 
@@ -63,7 +63,7 @@ def feature_section(value: Any) -> FeatureSection:
     if isinstance(value, FeatureSection):
         return value
     name = value.get("name") if isinstance(value, dict) else None
-    return feature_named(str(name)).section.model_validate(value)
+    return feature_by_name(str(name)).section.model_validate(value)
 
 
 def feature_from(robot: Robot, section: FeatureSection) -> AbstractFeature:
@@ -76,7 +76,7 @@ def feature_from(robot: Robot, section: FeatureSection) -> AbstractFeature:
     Raises:
         ValueError: the values are not valid for the feature.
     """
-    return feature_named(section.name).from_section(robot, section)
+    return feature_by_name(section.name).from_section(robot, section)
 
 
 for _feature in (

@@ -42,7 +42,7 @@ class FileGrowth:
     waiting: str = ""
 
     @property
-    def is_news(self) -> bool:
+    def has_changes(self) -> bool:
         """Whether there are new rows, or the file was truncated or replaced."""
         return self.rows is not None or bool(self.left_out or self.notices)
 

@@ -79,7 +79,7 @@ class Splitting:
             splits = repeats(measurements, folds, self.seed, self.by, times)
         if train_rows is None:
             return splits
-        return [with_fewer(measurements, folds, train_rows, self.seed) for folds in splits]
+        return [with_fewer_training_rows(measurements, folds, train_rows, self.seed) for folds in splits]
 
 
 def k_folds(
@@ -236,7 +236,7 @@ def draw_rows(measurements: Measurements, rows: int, seed: int) -> Int64[Tensor,
     return torch.isin(group, order[:count]).nonzero()[:, 0].to(measurements.q.device)
 
 
-def with_fewer(
+def with_fewer_training_rows(
     measurements: Measurements, splits: Sequence[TrainTest], rows: int, seed: int
 ) -> tuple[TrainTest, ...]:
     """Draw training rows in every fold of a cross-validation, and keep its held-out rows. See `draw_rows`.

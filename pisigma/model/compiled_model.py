@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from pisigma.files.errors import ModelError
-from pisigma.joint_correction.feature import scaled_joints, turning_rate
+from pisigma.joint_correction.feature import angle_per_joint_value, scaled_joints
 from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.stored_starts import StoredStarts, middle_of_starts
@@ -141,7 +141,7 @@ def _correction(model: CalibratedModel) -> tuple[arrays.Correction, tuple[str, .
             )
     fixed, starts = correction.fixed.numpy(), np.cumsum([0, *(len(values) for values in numbers.values())])
     compiled = arrays.Correction(
-        rate=turning_rate(robot),
+        rate=angle_per_joint_value(robot),
         middle=-zero * half,
         half=half,
         values=np.concatenate([np.zeros(0), *numbers.values()]),
@@ -160,7 +160,9 @@ def _correction(model: CalibratedModel) -> tuple[arrays.Correction, tuple[str, .
 def _coverage(model: CalibratedModel) -> arrays.Coverage:
     if model.hybrid is None:
         none = np.zeros(0)
-        return arrays.Coverage(np.zeros(0, dtype=np.int64), none, none, turning_rate(model.identified))
+        return arrays.Coverage(
+            np.zeros(0, dtype=np.int64), none, none, angle_per_joint_value(model.identified)
+        )
     own = model.hybrid.coverage
     return arrays.Coverage(own.joint.numpy(), own.middle.numpy(), own.half.numpy(), own.rate.numpy())
 

@@ -14,7 +14,7 @@ from pisigma.estimation.covariance_root import CovarianceRoot
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel, Provenance
 from pisigma.model.stored_starts import nearest_branch, spread_rows
-from pisigma.model.training_rows import kept_rows
+from pisigma.model.training_rows import stored_training_rows
 from pisigma.robot.description import Robot
 from pisigma.robot.kinematics.closed_form import closed_form_solver
 
@@ -38,7 +38,7 @@ def model_of_calibration(
         measurements: rows that it was calibrated with.
         recipe: name and SHA-256 of the recipe; empty texts without one.
     """
-    made_of = kept_rows(nominal, measurements)
+    made_of = stored_training_rows(nominal, measurements)
     provenance = Provenance(
         recipe=recipe[0],
         recipe_sha256=recipe[1],

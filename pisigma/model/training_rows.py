@@ -18,7 +18,7 @@ MAX_KEPT_ROWS = 10_000
 """Most rows of which a model stores joint values and readings."""
 
 
-def kept_rows(robot: Robot, rows: Measurements, before: RowValues | None = None) -> RowValues:
+def stored_training_rows(robot: Robot, rows: Measurements, before: RowValues | None = None) -> RowValues:
     """Return the values of training rows that a model stores, after those of its earlier training rows `before`."""
     values = RowValues.from_rows(rows.as_fields(), robot)
     values = values if before is None else before + values
@@ -48,10 +48,10 @@ def without_known_rows(model: CalibratedModel, rows: Measurements) -> tuple[Meas
             at=Place(rows.source),
             remedy="measure new rows",
         )
-    return rows.select(~known), again_warnings(rows, known, f"training rows of {model.name}")
+    return rows.select(~known), repeated_row_warnings(rows, known, f"training rows of {model.name}")
 
 
-def again_warnings(rows: Measurements, known: Bool[Tensor, " rows"], of: str) -> tuple[str, ...]:
+def repeated_row_warnings(rows: Measurements, known: Bool[Tensor, " rows"], of: str) -> tuple[str, ...]:
     """Return a warning that names repeated rows, which are left out; empty if there are none."""
     count = int(known.sum())
     if not count:

@@ -11,7 +11,7 @@ from pisigma.files.errors import PlanningError
 from pisigma.measurement.camera.board import Board
 from pisigma.measurement.camera.camera import Camera
 from pisigma.measurement.camera.corner_file import read_rows
-from pisigma.measurement.csv.reading import holds_measurements, read_joints
+from pisigma.measurement.csv.reading import contains_measurements, read_joints
 from pisigma.measurement.dataset import Measurements
 from pisigma.planning.board_sight import BoardSight
 from pisigma.planning.board_views import BoardViews
@@ -78,7 +78,7 @@ def with_measured(settings: PlanSettings, arm: ArmInSurroundings) -> ArmInSurrou
     Raises:
         MeasurementError: the file of candidates cannot be used.
     """
-    if settings.candidates_from is None or not holds_measurements(settings.candidates_from):
+    if settings.candidates_from is None or not contains_measurements(settings.candidates_from):
         return arm
     return arm.with_measured(read_joints(settings.candidates_from, arm.robot))
 

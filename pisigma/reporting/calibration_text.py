@@ -8,9 +8,9 @@ from pisigma.reporting.calibration_tables import parameter_table, undetermined_l
 from pisigma.reporting.calibration_verdict import (
     POSSIBLE_SCALE,
     calibration_verdict,
+    error_quantity,
     error_table,
-    how_held_out,
-    of_what,
+    held_out_text,
     scale_error,
     scale_matters,
     scale_text,
@@ -57,7 +57,7 @@ def _accuracy(summary: CalibrationSummary) -> Iterator[Block]:
     """Lay out the errors of rows that were held out, and the remarks on them."""
     judged = [one for one in (summary.cross_validation, summary.held_out, summary.test) if one is not None]
     for figures in judged:
-        title = f"errors of {of_what(summary)}, {how_held_out(figures, summary)}"
+        title = f"errors of {error_quantity(summary)}, {held_out_text(figures, summary)}"
         yield table_block(title, *error_table(figures), "errors of held-out rows")
         if figures.socket_distance is not None:
             what = "stated distances between sockets, under calibrations without them"
@@ -80,7 +80,7 @@ def _learned(summary: CalibrationSummary) -> Iterator[Block]:
 def _fit(summary: CalibrationSummary) -> Iterator[Block]:
     """Lay out the errors of the calibration rows, and how the search ended."""
     if summary.calibrated is not None:
-        what = f"errors of the rows used in the calibration, {how_held_out(summary.calibrated, summary)}"
+        what = f"errors of the rows used in the calibration, {held_out_text(summary.calibrated, summary)}"
         yield table_block(what, *error_table(summary.calibrated), "errors of the fit")
     count = len(summary.outliers)
     worst = f"; the worst is {summary.outliers[0].place}" if count else ""

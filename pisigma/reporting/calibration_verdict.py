@@ -31,7 +31,7 @@ def error_table(figures: ValidationFigures) -> Table:
     return Table(("error", *models), tuple(rows))
 
 
-def how_held_out(figures: ValidationFigures, summary: CalibrationSummary) -> str:
+def held_out_text(figures: ValidationFigures, summary: CalibrationSummary) -> str:
     """Describe which rows the errors belong to."""
     if figures is summary.cross_validation:
         repeats = f", {figures.repeats} repeats" if figures.repeats else ""
@@ -45,7 +45,7 @@ def how_held_out(figures: ValidationFigures, summary: CalibrationSummary) -> str
     )
 
 
-def of_what(summary: CalibrationSummary) -> str:
+def error_quantity(summary: CalibrationSummary) -> str:
     """Describe the quantity of the errors and the frame in which they are measured."""
     sensors = {noise.sensor for noise in summary.noise}
     if "corner" in sensors:
@@ -81,7 +81,7 @@ def _accuracy(summary: CalibrationSummary) -> str:
     than = f"; {first} {rms_text(nominal, figures.rows)}" if best is not nominal else ""
     images = any(noise.sensor == "corner" for noise in summary.noise)
     scatter = ", with the scatter of the images" if images else ""
-    return f"{rms_text(best, figures.rows)} RMS{scatter}, {how_held_out(figures, summary)}{than}."
+    return f"{rms_text(best, figures.rows)} RMS{scatter}, {held_out_text(figures, summary)}{than}."
 
 
 def _trust(summary: CalibrationSummary, warnings: int) -> str:

@@ -57,6 +57,6 @@ def robot_of_origins(
     return moved.with_geometry(base=xyzrpy_of(base), tool=xyzrpy_of(tool))
 
 
-def in_few_rows(robot: Robot) -> Robot:
+def with_one_row_per_joint(robot: Robot) -> Robot:
     """Return the same robot with one row per joint and no inflated lengths: nearly parallel axes get Hayati's rows."""
     return robot_of_origins(robot, *joint_origins(robot))

@@ -11,9 +11,9 @@ from pisigma.model.model_posterior import FLEET_PRIOR
 from pisigma.robot.description import Robot
 from pisigma.validation.checks.check import Move, RowsUnderModel
 from pisigma.validation.checks.other_robot import other_robot_diagnostics
-from pisigma.validation.checks.other_sensors import diagnosed_lengths
+from pisigma.validation.checks.other_sensors import diagnose_lengths
 from pisigma.validation.checks.registry import ROW_CHECKS, diagnostics_of_rows
-from pisigma.validation.checks.setup_fault import joint_columns, setup_diagnostics, size_of_positions
+from pisigma.validation.checks.setup_fault import check_position_size, joint_columns, setup_diagnostics
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.held_out.frames.fitted_frames import FrameKind
 from pisigma.validation.setup_faults.setup_fault import SetupFault
@@ -91,10 +91,10 @@ def check_rows_by_model(
     may_move: Collection[Move] = (),
     nominal: CalibratedModel | None = None,
 ) -> RowVerdict:
-    """Run the checks of `ROW_CHECKS`, or those of `diagnosed_lengths` for rows without positions; see `check_rows`."""
+    """Run the checks of `ROW_CHECKS`, or those of `diagnose_lengths` for rows without positions; see `check_rows`."""
     judged = RowsUnderModel.from_rows(model, rows, fitted, may_move, nominal)
     if judged is None and rows.position is None:
-        diagnostics, faults = diagnosed_lengths(model, rows, fitted, may_move)
+        diagnostics, faults = diagnose_lengths(model, rows, fitted, may_move)
         return RowVerdict(diagnostics, None, faults)
     if judged is None:
         return RowVerdict()
@@ -114,7 +114,7 @@ def _until_implausible(checks: Iterable[Iterable[Diagnostic]]) -> tuple[Diagnost
 def _against_robot(rows: Measurements, robot: Robot) -> Iterator[Iterable[Diagnostic]]:
     """Run the checks by the nominal robot, the most reliable first."""
     yield setup_diagnostics(robot, rows)
-    yield size_of_positions(robot, rows)
+    yield check_position_size(robot, rows)
     yield joint_columns(robot, rows)
     yield other_robot_diagnostics(robot, rows)
     if rows.rows >= MIN_ROWS_TO_CALIBRATE:

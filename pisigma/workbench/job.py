@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from pisigma.files.errors import fault_of_machine, missing_extra
+from pisigma.files.errors import missing_extra, system_fault
 from pisigma.files.progress import Progress, TimeLeft
 from pisigma.reporting.result_text import ResultText
 
@@ -144,7 +144,7 @@ class Jobs:
         except ImportError as problem:
             found = Outcome(refusal=str(missing_extra(problem) or problem))
         except Exception as problem:
-            if not (fault := fault_of_machine(problem)):
+            if not (fault := system_fault(problem)):
                 traceback.print_exc(file=sys.stderr)
             found = Outcome(
                 refusal=fault

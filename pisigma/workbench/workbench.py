@@ -18,7 +18,7 @@ from aiohttp.typedefs import Handler
 
 from pisigma.files.errors import (
     PisigmaError,
-    fault_of_machine,
+    system_fault,
 )
 from pisigma.files.progress import Progress
 from pisigma.lifetime.cell.status import CellStatus
@@ -62,7 +62,7 @@ def answers(function: Callable[["Workbench", web.Request], Awaitable[web.StreamR
             }
             return web.json_response(fields, status=422)
         except (OSError, MemoryError) as problem:
-            if not (fault := fault_of_machine(problem)):
+            if not (fault := system_fault(problem)):
                 raise
             return web.json_response({"error": self._uploads.without_folder(fault), "field": ""}, status=422)
         except BusyError:

@@ -14,7 +14,7 @@ from pisigma.estimation.loss import HampelLoss, SquaredLoss
 from pisigma.files.errors import IdentificationError
 from pisigma.files.model_files import HELD_OUT_CSV
 from pisigma.files.progress import Progress
-from pisigma.joint_correction.registry import features_from_outside
+from pisigma.joint_correction.registry import plugin_features
 from pisigma.measurement.camera.corner_file import MeasurementFiles, read_rows
 from pisigma.measurement.dataset import Measurements, with_new_frames
 from pisigma.measurement.joint_range import row_warnings, with_limits_of_rows
@@ -263,7 +263,7 @@ def calibrator_of(
     )
     if settings.model != "hybrid":
         return geometric
-    features = (*features_from_outside(), *HybridCalibrator.features)
+    features = (*plugin_features(), *HybridCalibrator.features)
     return HybridCalibrator(
         geometric,
         features=features if settings.features is None else settings.features,

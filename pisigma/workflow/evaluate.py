@@ -22,7 +22,7 @@ from pisigma.validation.checks.wrong_rows import without_wrong_rows
 from pisigma.validation.gate import check_rows
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.held_out.frames.fitted_frames import FrameKind, fitted_remark
-from pisigma.validation.held_out.frames.row_errors import places_remark
+from pisigma.validation.held_out.frames.row_errors import fitted_points_remark
 from pisigma.validation.held_out.model_comparison import ModelComparison, ModelFigures, compare_models
 from pisigma.validation.held_out.pose_statistics import image_remark
 from pisigma.validation.held_out.reference_models import geometric_model, nominal_model
@@ -174,7 +174,7 @@ def evaluate(
         warnings=(
             *right.warnings,
             *fitted_remark(rows, settings.fitted),
-            *places_remark(rows),
+            *fitted_points_remark(rows),
             *image_remark(rows),
             *_warnings(comparison),
             *(

@@ -70,7 +70,7 @@ def follow(session: MeasuringSession, file: GrowingFile, once: bool = False) -> 
             if work is not None and worked:
                 alarms += work.result()
                 work = None
-            if worked or growth.is_news or growth.waiting != waiting:
+            if worked or growth.has_changes or growth.waiting != waiting:
                 waiting, before, state = growth.waiting, state, session.state
                 new = tuple(
                     point for point in state.reached if all(point is not one for one in before.reached)
@@ -98,7 +98,7 @@ def check_programs(programs: Sequence[Path], robot: Robot, inputs: Sequence[Path
         check_program(program, robot, False, None)
 
 
-def rest_file(plan: Path, rows: Path, stated: Path | None) -> Path:
+def remaining_poses_file(plan: Path, rows: Path, stated: Path | None) -> Path:
     """Return the file for the remaining poses.
 
     Args:

@@ -20,7 +20,7 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.fields import UnusableRow
 from pisigma.planning.plan_file import StoredPlan, read_plan
 from pisigma.planning.plan_inputs import find_candidates, with_measured
-from pisigma.planning.session.row_alarms import NEAR_POSE, joint_differences, of_all_rows
+from pisigma.planning.session.row_alarms import NEAR_POSE, alarm_of_all_rows, joint_differences
 from pisigma.planning.session.session_accuracy import (
     SessionAccuracy,
     cross_validated,
@@ -189,7 +189,7 @@ class MeasuringSession:
         found = setup_sentence(rows.select(usable), counts, self._against)
         with self._lock:
             self._setup, self._looked_at = found, rows.rows
-            new = [of_all_rows(found)] if found and not before else []
+            new = [alarm_of_all_rows(found)] if found and not before else []
             self._setup_alarms += new
         return tuple(new)
 
@@ -365,7 +365,7 @@ class MeasuringSession:
     def _advice(self, left: int) -> Advice:
         """Return the advice: correct a fault of the setup, else repeat a wrong row, else continue or stop."""
         if self._setup:
-            return Advice("correct", of_all_rows(self._setup).sentence)
+            return Advice("correct", alarm_of_all_rows(self._setup).sentence)
         last = None if self._rows is None else self._rows.line[-1]
         again = next((one for one in self._alarms if one.line == last), None)
         if again is not None and again.repeat:

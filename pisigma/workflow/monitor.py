@@ -50,7 +50,7 @@ from pisigma.model.model_posterior import FLEET_PRIOR, ModelPosterior
 from pisigma.model.stated_conditions import condition_warnings
 from pisigma.validation.gate import check_rows_by_model
 from pisigma.validation.held_out.diagnostic import Diagnostic
-from pisigma.workflow.recalibrate import may_move, right_rows
+from pisigma.workflow.recalibrate import filtered_rows, may_move
 from pisigma.workflow.settings.monitoring import MonitorSettings
 from pisigma.workflow.settings.recalibration import RecalibrationSettings
 
@@ -264,7 +264,7 @@ def monitor(
     for date, day in _by_day(rows, settings.dates):
         progress(f"{Path(day.source).name}, {date}")
         warnings += row_warnings(loaded.robot, day)
-        right = right_rows(RecalibrationSettings(settings.moved), loaded, posterior.with_model_names(day))
+        right = filtered_rows(RecalibrationSettings(settings.moved), loaded, posterior.with_model_names(day))
         warnings += right.warnings
         day, again = new_rows(loaded, right.rows, date, earlier, trusted)
         warnings += again

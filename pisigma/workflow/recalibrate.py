@@ -43,11 +43,11 @@ from pisigma.model.training_rows import with_wide_limits, without_known_rows
 from pisigma.reporting.derived_cards import write_recalibration_card
 from pisigma.robot.description import Robot
 from pisigma.validation.checks.check import MOVES, Move
-from pisigma.validation.checks.wrong_rows import RowsWithoutWrongOnes, without_wrong_rows
+from pisigma.validation.checks.wrong_rows import FilteredRows, without_wrong_rows
 from pisigma.validation.gate import check_rows
 from pisigma.validation.held_out.calibration_validation import errors_under
 from pisigma.validation.held_out.distillation_summary import ParentFigures
-from pisigma.validation.held_out.few_rows import fit_where_it_helps
+from pisigma.validation.held_out.few_rows import fit_if_better
 from pisigma.validation.held_out.frames.fitted_frames import fitted_kinds
 from pisigma.validation.held_out.trained_calibrations import fit
 from pisigma.validation.setup_faults.explanations import PLAUSIBLE_SHARE
@@ -140,7 +140,7 @@ def recalibrate(
     measurements = read_rows(data, nominal, settings.cameras)
     rows, again = without_known_rows(parent, posterior.with_model_names(measurements.split_sets()[0]))
     progress("checking the rows")
-    right = RowsWithoutWrongOnes(rows) if parent.kind == FLEET_PRIOR else right_rows(settings, parent, rows)
+    right = FilteredRows(rows) if parent.kind == FLEET_PRIOR else filtered_rows(settings, parent, rows)
     verdict = check_rows(right.rows, parent, settings.fitted, may_move(settings))
     progress("what has moved")
     elsewhere = _moved_frames(parent, posterior, rows, settings)
@@ -228,7 +228,7 @@ def _kept_model(
 ) -> CalibratedModel:
     """Return the model of the candidate that is kept."""
     if choice.kept == "scratch":
-        fitted = fit_where_it_helps if choice.rms["scratch"] is None else fit
+        fitted = fit_if_better if choice.rms["scratch"] is None else fit
         result = fitted(calibrator, rows, progress)
         assert isinstance(result, HybridResult)
         return replace(model_of_hybrid(parent.name, calibrator.geometric.robot, result, rows), kind=KIND)
@@ -330,9 +330,9 @@ def may_move(settings: RecalibrationSettings) -> frozenset[Move]:
     return MOVES if settings.moved is None else frozenset({"joint_zero"})
 
 
-def right_rows(
+def filtered_rows(
     settings: RecalibrationSettings, model: CalibratedModel, rows: Measurements
-) -> RowsWithoutWrongOnes:
+) -> FilteredRows:
     """Return the rows without single wrong ones, also with base and tool fitted where these may have moved."""
     right = without_wrong_rows([model], rows, settings.fitted)
     if right.warnings or settings.moved is not None:

@@ -121,7 +121,7 @@ def report(
     remarks: tuple[str, ...] = ()
     diagnostics: tuple[Diagnostic, ...] = ()
     if data is not None:
-        rows, remarks = _right_rows(loaded, read_rows(data, loaded.robot, cameras))
+        rows, remarks = _filtered_rows(loaded, read_rows(data, loaded.robot, cameras))
         diagnostics = check_rows(rows, loaded).implausible
     content = report_content(loaded, Path(model), rows, remarks, diagnostics)
     progress("drawing")
@@ -129,7 +129,7 @@ def report(
     return Report(content, figures, diagnostics, time.perf_counter() - started, acceptance)
 
 
-def _right_rows(model: CalibratedModel, rows: Measurements) -> tuple[Measurements, tuple[str, ...]]:
+def _filtered_rows(model: CalibratedModel, rows: Measurements) -> tuple[Measurements, tuple[str, ...]]:
     """Return the rows without single wrong ones, unless the model was made from exactly these, and warnings."""
     remarks = limit_warnings(model.robot, rows)
     if model.provenance.data_sha256 == rows.content_hash():

@@ -25,7 +25,7 @@ from pisigma.validation.checks.wrong_rows import without_wrong_rows
 from pisigma.validation.gate import check_rows
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.held_out.frames.fitted_frames import FrameKind, fitted_remark
-from pisigma.validation.held_out.frames.row_errors import places_remark
+from pisigma.validation.held_out.frames.row_errors import fitted_points_remark
 from pisigma.validation.held_out.model_comparison import Difference, ModelComparison, compare_models
 from pisigma.validation.held_out.pose_statistics import image_remark
 from pisigma.validation.held_out.reference_models import geometric_model, nominal_model
@@ -220,7 +220,7 @@ def verify(
             *_warnings(loaded, rows, comparison, faults, motion),
             *([] if motion is None or verdict == "moved" else motion_warnings(motion)),
             *fitted_remark(rows, settings.fitted),
-            *places_remark(rows),
+            *fitted_points_remark(rows),
             *image_remark(rows),
         ),
         seconds=time.perf_counter() - started,

@@ -3,12 +3,12 @@
 from pathlib import Path
 
 from gate.commands import COMMANDS, answer
-from gate.table import Mistake, right_rows
+from gate.table import Mistake, filtered_rows
 
 
 def disagreements(mistake: Mistake, folder: Path) -> list[str]:
     """List the commands whose result differs from the table."""
-    rows, found = mistake.change(right_rows()), []
+    rows, found = mistake.change(filtered_rows()), []
     for command in COMMANDS:
         got = answer(command, rows, folder)
         stopped, wanted = got.status in (2, 3), bool(mistake.kinds)

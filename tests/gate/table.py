@@ -38,7 +38,7 @@ class Mistake:
     unnoticed: Mapping[str, str] = field(default_factory=dict)
 
 
-def right_rows(seed: int = 2) -> Measurements:
+def filtered_rows(seed: int = 2) -> Measurements:
     """Return rows without a mistake, of the model's robot."""
     return replace(rows_later(ROWS, seed), line=tuple(range(2, ROWS + 2)), source="rows.csv")
 

@@ -9,7 +9,7 @@ from testing.closeness import assert_close
 
 from pisigma.joint_correction.backlash import Backlash
 from pisigma.joint_correction.conditions import ConditionFeatures
-from pisigma.joint_correction.feature import FeatureOptions, scaled_joints, turning_rate, unit_inputs
+from pisigma.joint_correction.feature import FeatureOptions, angle_per_joint_value, scaled_joints, unit_inputs
 from pisigma.joint_correction.fourier_series import (
     BAND_SIZES,
     BAND_STARTS,
@@ -96,7 +96,8 @@ def test_the_period_of_an_unlimited_prismatic_joint_is_twice_the_reach():
     rows = (Row("slide", "prismatic"), Row("turn", "revolute"))
     robot = Robot("r", "", "", rows, np.array([[0, 0.3, 0.4, 0, 0], [0, 0, 1.5, 0, 0]]))
     assert_close(
-        torch.from_numpy(turning_rate(robot)), torch.tensor([math.pi / 2.0, 1.0], dtype=torch.float64)
+        torch.from_numpy(angle_per_joint_value(robot)),
+        torch.tensor([math.pi / 2.0, 1.0], dtype=torch.float64),
     )
 
 

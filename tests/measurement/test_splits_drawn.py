@@ -6,7 +6,7 @@ from testing.refusals import refused
 
 from pisigma.files.errors import MeasurementError
 from pisigma.measurement.dataset import Measurements
-from pisigma.measurement.splits import draw_rows, k_folds, with_fewer
+from pisigma.measurement.splits import draw_rows, k_folds, with_fewer_training_rows
 
 
 def repeats(configurations: int, each: int) -> Measurements:
@@ -46,10 +46,10 @@ def test_more_rows_than_there_are_are_refused(rows: int) -> None:
 def test_the_held_out_rows_of_a_fold_stay() -> None:
     data = repeats(50, 1)
     folds = k_folds(data, 5, 0)
-    fewer = with_fewer(data, folds, 11, 0)
+    fewer = with_fewer_training_rows(data, folds, 11, 0)
     for (train, test), (drawn, kept) in zip(folds, fewer, strict=True):
         assert torch.equal(test, kept)
         assert len(drawn) == 11
         assert set(drawn.tolist()) <= set(train.tolist())
     with refused(MeasurementError, option="train_rows", value=41):
-        with_fewer(data, folds, 41, 0)
+        with_fewer_training_rows(data, folds, 41, 0)

@@ -12,7 +12,7 @@ import pytest
 import torch
 from testing.closeness import assert_close
 
-from pisigma.deployment.export.urdf import CALIBRATED_FRAME, CALIBRATED_TOOL, robot_into_urdf
+from pisigma.deployment.export.urdf import CALIBRATED_FRAME, CALIBRATED_TOOL, update_urdf
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.writing import BASE_LINK, TOOL_LINK, robot_to_urdf
@@ -41,7 +41,7 @@ def test_peers_compute_the_same_tool_pose(peer, name, in_template, tmp_path, rep
     low, high = np.clip(robot.limits, -3.0, 3.0).T
     q = random.uniform(low, high, (100, robot.dof))
     links = (CALIBRATED_FRAME, CALIBRATED_TOOL) if in_template else (BASE_LINK, TOOL_LINK)
-    file.write_text(robot_into_urdf(robot, nominal, file) if in_template else robot_to_urdf(robot))
+    file.write_text(update_urdf(robot, nominal, file) if in_template else robot_to_urdf(robot))
     script = Path(repository) / "benchmarks" / "urdf_peers.py"
     run = subprocess.run(
         [python, str(script), peer, str(file), *links],

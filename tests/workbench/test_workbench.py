@@ -350,7 +350,7 @@ def test_a_machine_that_cannot_is_not_a_defect(browser_with_link, bench, monkeyp
 
     monkeypatch.setitem(STEPS, "plan", full)
     monkeypatch.setattr(bench._uploads, "add", full)
-    expected = fault_of_machine(problem)
+    expected = system_fault(problem)
     assert expected
     assert ended(browser_with_link, bench, "plan").refusal == expected
     assert json.loads(browser_with_link.ask("/upload?name=a", "POST", b"1").body)["error"] == expected

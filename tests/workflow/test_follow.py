@@ -7,7 +7,7 @@ from testing.refusals import refused
 
 from pisigma.files.errors import MeasurementError, OutputError
 from pisigma.measurement.growing_file import GrowingFile
-from pisigma.workflow.follow import follow, rest_file
+from pisigma.workflow.follow import follow, remaining_poses_file
 from pisigma.workflow.measure import MeasuringSession
 from pisigma.workflow.settings.measuring import MeasureSettings
 
@@ -56,8 +56,8 @@ def test_a_missing_file_ends_the_session(tmp_path):
 def test_remaining_poses_are_never_written_over_inputs(tmp_path):
     plan, rows = tmp_path / "poses.csv", tmp_path / "rows.csv"
     plan.write_text("")
-    assert rest_file(plan, rows, None) == tmp_path / "poses.rest.csv"
-    assert rest_file(tmp_path / "poses.plan.yaml", rows, None) == tmp_path / "poses.rest.csv"
+    assert remaining_poses_file(plan, rows, None) == tmp_path / "poses.rest.csv"
+    assert remaining_poses_file(tmp_path / "poses.plan.yaml", rows, None) == tmp_path / "poses.rest.csv"
     for taken in (plan, tmp_path / "poses.plan.yaml"):
         with pytest.raises(OutputError):
-            rest_file(plan, rows, taken)
+            remaining_poses_file(plan, rows, taken)

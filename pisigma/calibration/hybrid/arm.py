@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Float64, Int64
 from torch import Tensor
 
-from pisigma.joint_correction.feature import turning_rate
+from pisigma.joint_correction.feature import angle_per_joint_value
 from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.robot.description import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
@@ -20,7 +20,7 @@ LARGEST_GAP = math.radians(60)
 
 @dataclass(frozen=True, eq=False)
 class JointCoverage:
-    """Measured ranges of every joint's values, as angles (see `turning_rate`).
+    """Measured ranges of every joint's values, as angles (see `angle_per_joint_value`).
 
     Attributes:
         joint: number of the joint of every range.
@@ -39,7 +39,7 @@ class JointCoverage:
     @staticmethod
     def from_joints(robot: Robot, q: Float64[Tensor, "rows dof"]) -> "JointCoverage":
         """Compute the ranges covered by measured joint values."""
-        rate = torch.from_numpy(turning_rate(robot))
+        rate = torch.from_numpy(angle_per_joint_value(robot))
         turning = tuple(bool(turns) for turns in robot.revolute)
         return JointCoverage._around(list((q.cpu() * rate).t()), rate, turning)
 

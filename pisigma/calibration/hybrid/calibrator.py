@@ -43,7 +43,7 @@ from pisigma.joint_correction.fourier_series import USUAL_HARMONICS
 from pisigma.joint_correction.gear_lines import GearLines
 from pisigma.joint_correction.gravity_torques import Direction
 from pisigma.joint_correction.input_products import InputProducts
-from pisigma.joint_correction.registry import FEATURES, feature_named
+from pisigma.joint_correction.registry import FEATURES, feature_by_name
 from pisigma.measurement.conditions import stated_conditions
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import groups_of_equal_joints, held_out_groups
@@ -243,7 +243,7 @@ class HybridCalibrator:
         growing: list[AbstractFeature] = []
         others: list[AbstractFeature] = []
         for name in self.features:
-            tried = feature_named(name).candidates(self.geometric.robot, options, solved.problem.state)
+            tried = feature_by_name(name).candidates(self.geometric.robot, options, solved.problem.state)
             if not any(feature.size for feature in tried):
                 others += tried
             elif growing:

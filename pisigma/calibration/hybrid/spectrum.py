@@ -8,7 +8,7 @@ from torch import Tensor
 
 from pisigma.calibration.hybrid.design import Design, Rows
 from pisigma.estimation.regression import Posterior
-from pisigma.joint_correction.feature import turning_rate
+from pisigma.joint_correction.feature import angle_per_joint_value
 
 HIGHEST = 3_000
 """[1/turn] Motors with 10 pole pairs and gears of 1:101 have cogging at 2,020; an error of 0.1 mrad shifts the phase of
@@ -43,7 +43,7 @@ def find_spectral_lines(
         Orders per joint [1/turn] (for a prismatic joint per twice its travel).
     """
     slope, curvature = _slope_and_curvature(design, rows, posterior)
-    angle = design.problem.q * torch.from_numpy(turning_rate(design.problem.space.robot)).to(slope)
+    angle = design.problem.q * torch.from_numpy(angle_per_joint_value(design.problem.space.robot)).to(slope)
     least = log_number_of_orders(angle.shape[1])
     columns = zip(angle.t(), slope.t(), curvature.t(), strict=True)
     return tuple(_lines_of_joint(*column, lowest, least) for column in columns)

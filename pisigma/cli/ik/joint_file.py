@@ -209,8 +209,8 @@ def _cells(
     solution: Solution, lines: Sequence[int], solver: CorrectedIK, accuracy: bool
 ) -> Iterator[list[str]]:
     """Return the cells of solved poses; unknown values are empty."""
-    per_file_unit = np.array([180 / math.pi if revolute else 1e3 for revolute in solver.revolute])
-    joints = np.concatenate([np.asarray(q) * per_file_unit for q in (solution.q, solution.q_nominal)], -1)
+    file_units_per_si = np.array([180 / math.pi if revolute else 1e3 for revolute in solver.revolute])
+    joints = np.concatenate([np.asarray(q) * file_units_per_si for q in (solution.q, solution.q_nominal)], -1)
     measures = [
         np.asarray(solution.position_residual) * 1e3,
         np.rad2deg(np.asarray(solution.rotation_residual)),

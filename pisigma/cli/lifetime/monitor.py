@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pisigma.cli.arguments import AsJson, ModelOrCell, Verbose
-from pisigma.cli.cell import cell_at, next_lines, refuse_with_cell, report_overrides
+from pisigma.cli.cell import cell_at, next_step_lines, refuse_with_cell, report_overrides
 from pisigma.cli.endings import NOT_ACCEPTED
 from pisigma.cli.output import print_json
 from pisigma.cli.progress import progress_of
@@ -95,4 +95,4 @@ def _print(
         print_json(monitoring.to_json() | ({} if status is None else {"next": status.step.to_json()}))
         return
     text = monitoring_text(monitoring, [] if page is None else [f"Page written to {page}."])
-    print_result(text, verbose, [] if status is None else next_lines(status))
+    print_result(text, verbose, [] if status is None else next_step_lines(status))

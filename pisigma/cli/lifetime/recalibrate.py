@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pisigma.cli.arguments import AcceptImplausible, AsJson, ModelOrCell, Overwrite, Verbose
-from pisigma.cli.cell import cell_at, next_lines, refuse_with_cell, report_overrides
+from pisigma.cli.cell import cell_at, next_step_lines, refuse_with_cell, report_overrides
 from pisigma.cli.output import command_line, print_json, saved_model_folder
 from pisigma.cli.progress import progress_of
 from pisigma.cli.screen import print_result
@@ -150,5 +150,5 @@ def _print(
         return
     lines: list[str] = []
     if cell is not None and (in_use := cell.history.in_use) is not None:
-        lines = [f"Model '{in_use.name}' is in use.", *next_lines(cell.status())]
+        lines = [f"Model '{in_use.name}' is in use.", *next_step_lines(cell.status())]
     print_result(recalibration_text(recalibration, folder), verbose, lines)

@@ -132,19 +132,19 @@ def measure(
     again, they are written to --rest. With --json, progress goes to stderr and one JSON object to stdout at the end.
     Exits with status 3 while all rows have the same fault.
     """
-    from pisigma.lifetime.cell.controller import checked_in_use
+    from pisigma.lifetime.cell.controller import model_in_use_warnings
     from pisigma.lifetime.cell.layout import newest_plan
     from pisigma.planning.session.growing_images import growing_file
-    from pisigma.workflow.follow import check_programs, follow, rest_file
+    from pisigma.workflow.follow import check_programs, follow, remaining_poses_file
     from pisigma.workflow.measure import MeasuringSession
 
-    for sentence in checked_in_use(plan, "measure"):
+    for sentence in model_in_use_warnings(plan, "measure"):
         print_line(f"pisigma: {sentence}", to_stderr=True)
     chosen = settings_at(plan, "measure", settings)
     plan = newest_plan(plan)
     session = MeasuringSession.read(plan, chosen)
     growing = growing_file(rows, session.plan.arm.robot, session.plan.settings)
-    rest = rest_file(plan, rows, rest)
+    rest = remaining_poses_file(plan, rows, rest)
     check_programs(program or [], session.plan.arm.robot, (plan, rows, rest))
     try:
         with (

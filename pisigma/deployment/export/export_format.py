@@ -148,7 +148,7 @@ class ExportFormat:
     check: Callable[[ExportRequest], None] = lambda request: None
     contains: Contents = "description"
 
-    def contains_for(self, request: ExportRequest) -> Contents:
+    def contents_for(self, request: ExportRequest) -> Contents:
         """Return what the file of a request contains; targets of programs may be poses instead of joint values."""
         is_pose = request.program is not None or request.targets == "cartesian"
         return "poses" if is_pose else self.contains

@@ -123,7 +123,7 @@ def add_joint_correction(graph: OnnxGraph, correction: JointCorrection, q: str) 
     return total
 
 
-def add_beyond(graph: OnnxGraph, coverage: JointCoverage, q: str) -> str:
+def add_distance_outside(graph: OnnxGraph, coverage: JointCoverage, q: str) -> str:
     """Add the largest angle of a joint outside its measured values, `(batch, 1)` [rad]; see `JointCoverage`."""
     node, joint = graph.add_node, coverage.joint.numpy()
     angle = node("Mul", graph.columns(q, joint.tolist()), coverage.rate.numpy()[joint])
@@ -227,7 +227,7 @@ def _forward(model: CalibratedModel, arm: HybridArm, sha256: str) -> bytes:
         correction, "correction", [dof], f"correction that is added to the joint values [{units}]"
     )
     graph.add_output(
-        add_beyond(graph, arm.coverage, q),
+        add_distance_outside(graph, arm.coverage, q),
         "beyond_measured",
         [1],
         "0 inside the measured joint values, else the largest angle of a joint outside of them [rad]",

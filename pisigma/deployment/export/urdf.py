@@ -53,14 +53,14 @@ def _check(request: ExportRequest) -> None:
 def _write(request: ExportRequest) -> Exported:
     model = request.load()
     chosen = chosen_geometry(model, request.geometry)
-    text = text_in_urdf(request, chosen.robot, model.robot, chosen.comments) or robot_to_urdf(
+    text = updated_urdf_text(request, chosen.robot, model.robot, chosen.comments) or robot_to_urdf(
         chosen.robot, chosen.comments
     )
     facts = model_facts(model) | {"geometry": chosen.name}
     return Exported(text, facts, chosen.comments, warnings=_warnings(request, model.robot, text))
 
 
-def text_in_urdf(
+def updated_urdf_text(
     request: ExportRequest, robot: Robot, nominal: Robot, comments: tuple[str, ...]
 ) -> str | None:
     """Write a robot into the URDF file of --like, or by default into the one that the model folder includes.
@@ -79,7 +79,7 @@ def text_in_urdf(
     if like is None:
         return None
     base, tip = source.group("base", "tip") if source else (None, None)
-    return robot_into_urdf(robot, nominal, like, request.tip or tip, comments, base)
+    return update_urdf(robot, nominal, like, request.tip or tip, comments, base)
 
 
 def _warnings(request: ExportRequest, nominal: Robot, text: str) -> tuple[str, ...]:
@@ -102,7 +102,7 @@ def _warnings(request: ExportRequest, nominal: Robot, text: str) -> tuple[str, .
 FORMAT = ExportFormat("urdf", "a URDF", (".urdf",), _write, frozenset(("like", "tip", "geometry")), _check)
 
 
-def robot_into_urdf(
+def update_urdf(
     calibrated: Robot,
     nominal: Robot,
     path: str | os.PathLike[str],

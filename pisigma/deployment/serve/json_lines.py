@@ -260,7 +260,7 @@ def _solve(model: ServedModel, request: dict[str, Any]) -> tuple[str, dict[str, 
 
 def _record(model: ServedModel, row: list[float], ignored_axes: tuple[str, ...]) -> dict[str, Any]:
     """Make the answer to one pose from the row of `CompiledIK.solve_packed`."""
-    units = model.per_file_unit
+    units = model.file_units_per_si
     position, rotation, measure, status, branch = row[2 * len(units) :]
     values: dict[str, Any] = {model.joints_key: None, "status": STATUS_NAMES[status]}
     if status in _REACHING:
@@ -291,7 +291,7 @@ def _follow(model: ServedModel, request: dict[str, Any]) -> tuple[str, dict[str,
         )
     T = np.reshape([pose_entries(pose, f"path[{row}]") for row, pose in enumerate(poses)], (-1, 4, 4))
     path = _for_task(model, request).path(T, near=_near(model, request), branch=read_branch(request))
-    q = (np.asarray(path.solution.q) * np.array(model.per_file_unit)).tolist()
+    q = (np.asarray(path.solution.q) * np.array(model.file_units_per_si)).tolist()
     return "path", {
         model.joints_key: [row if math.isfinite(row[0]) else None for row in q],
         "status": [STATUS_NAMES[status] for status in path.solution.status.tolist()],
@@ -311,7 +311,7 @@ def _forward(model: ServedModel, request: dict[str, Any]) -> tuple[str, dict[str
 
 
 def _model_record(model: ServedModel) -> dict[str, Any]:
-    per_unit = np.array(model.per_file_unit)[:, None] * model.ik.limits
+    per_unit = np.array(model.file_units_per_si)[:, None] * model.ik.limits
     return {
         "name": model.name,
         "sha256": model.sha256,
@@ -346,7 +346,7 @@ def _joints(model: ServedModel, request: dict[str, Any], in_degrees: str, mixed:
             option=other,
             remedy=f"give '{wanted}' in {_units(model)}",
         )
-    values, units = read_numbers(request, wanted, len(model.ik.joints)), model.per_file_unit
+    values, units = read_numbers(request, wanted, len(model.ik.joints)), model.file_units_per_si
     return [value / unit for value, unit in zip(values, units, strict=True)]
 
 

@@ -73,7 +73,7 @@ class ServedModel:
         return {"sha256": self.short_hash.hex()}
 
     @cached_property
-    def per_file_unit(self) -> list[float]:
+    def file_units_per_si(self) -> list[float]:
         """For every joint, degrees per radian or millimetres per metre."""
         return [180 / math.pi if is_revolute else 1e3 for is_revolute in self.ik.revolute]
 

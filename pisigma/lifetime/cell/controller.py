@@ -134,7 +134,7 @@ class Controller:
                 found[export.contains] = Active(export, one.day)
         return found
 
-    def during(self, session: SessionEntry) -> dict[Contents, Active]:
+    def active_during(self, session: SessionEntry) -> dict[Contents, Active]:
         """Return the exports that were active during a session; of its day, those recorded before it was added."""
         return self.active(session.day, session.taken_in)
 
@@ -145,18 +145,22 @@ class Controller:
         pairs = zip(self.changes, ["", *hashes], hashes, strict=False)
         return tuple(one for one, before, after in pairs if before != after)
 
-    def is_present(self, session: SessionEntry) -> bool:
+    def matches_session(self, session: SessionEntry) -> bool:
         """Return whether a session was measured with the joint zeros that are active now."""
-        return _hash(self.during(session)) == _hash(self.active())
+        return _hash(self.active_during(session)) == _hash(self.active())
 
-    def behind(self, model: ModelEntry, sessions: tuple[SessionEntry, ...]) -> dict[Contents, Active]:
+    def active_when_fitted(
+        self, model: ModelEntry, sessions: tuple[SessionEntry, ...]
+    ) -> dict[Contents, Active]:
         """Return the exports that were active when the newest rows of a model were measured."""
         newest = [one for one in sessions if one.name == model.sessions.split(",")[-1]]
-        return self.during(newest[0]) if newest else self.active(model.day or model.made[:10], model.made)
+        return (
+            self.active_during(newest[0]) if newest else self.active(model.day or model.made[:10], model.made)
+        )
 
     def fits(self, model: ModelEntry, sessions: tuple[SessionEntry, ...]) -> bool:
         """Return whether the joint zeros that are active now are those with which the rows of a model were measured."""
-        return _hash(self.behind(model, sessions)) == _hash(self.active())
+        return _hash(self.active_when_fitted(model, sessions)) == _hash(self.active())
 
     def findings(
         self,
@@ -174,7 +178,7 @@ class Controller:
             at: exports that were active when the rows were measured; None: those that are active now.
         """
         present = self.active() if at is None else at
-        behind = present if model is None else self.behind(model, sessions)
+        behind = present if model is None else self.active_when_fitted(model, sessions)
         which: dict[Situation, str] = {}
         if "kinematics" in present:
             which["kinematics"] = f"the controller computes poses with {present['kinematics']}"
@@ -236,7 +240,7 @@ def valid_sessions(
     """
     since = max((one.day for one in events if one.kind in ARM_EVENTS), default="")
     present = [one for one in sessions if not one.set_aside and one.day >= since]
-    return tuple(one for one in present if controller.is_present(one))
+    return tuple(one for one in present if controller.matches_session(one))
 
 
 def _hash(active: dict[Contents, Active]) -> str:
@@ -261,10 +265,10 @@ def checked_model_folder(path: Path, command: str) -> tuple[Path, tuple[str, ...
         ModelError: no model of the cell is in use, or the command is refused because of what is active on the
             controller.
     """
-    return model_folder(path), checked_in_use(path, command)
+    return model_folder(path), model_in_use_warnings(path, command)
 
 
-def checked_in_use(path: Path, command: str) -> tuple[str, ...]:
+def model_in_use_warnings(path: Path, command: str) -> tuple[str, ...]:
     """Return warnings for a command on the model in use of a cell, if there is one; () for a path that is not a cell.
 
     Raises:

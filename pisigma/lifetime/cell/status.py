@@ -180,7 +180,7 @@ def _no_session(facts: CellFacts) -> Step | None:
         return None
     ended = [one for one in facts.events if one.kind in ARM_EVENTS] if facts.sessions else []
     why = f"{ended[-1].kind} on {ended[-1].day} ended the validity of all sessions" if ended else ""
-    if any(not one.set_aside and not facts.controller.is_present(one) for one in facts.sessions):
+    if any(not one.set_aside and not facts.controller.matches_session(one) for one in facts.sessions):
         why = "all sessions were measured with joint zeros other than those that are active on the controller"
     if not facts.plans or why:
         return Step("no_plan", why or "there is no plan and no session", facts.command("plan"))
@@ -328,7 +328,7 @@ def _wrongly_fitted(facts: CellFacts, model: ModelEntry) -> tuple[State, str] | 
 
 def _p95(facts: CellFacts, model: ModelEntry) -> float | None:
     """Return the last known 95 % quantile of the position errors of a model [mm]; None if it is unknown."""
-    found = [one.p95_mm for one in facts.errors_of(model.name, "verify") if one.p95_mm is not None]
+    found = [one.p95_mm for one in facts.trusted_checks_of(model.name, "verify") if one.p95_mm is not None]
     return found[-1] if found else model.p95_mm
 
 

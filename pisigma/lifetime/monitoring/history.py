@@ -16,7 +16,7 @@ from pisigma.lifetime.monitoring.session import JointZeros, Session
 from pisigma.measurement.copies import RowValues, copies_of_known
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.model.training_rows import again_warnings
+from pisigma.model.training_rows import repeated_row_warnings
 
 _SESSION = TypeAdapter(Session)
 _VALUES = ("numbers", "steps", "kind", "file")
@@ -185,7 +185,7 @@ def new_rows(
     for values, of in those:
         if values is not None and rows.rows:
             again = copies_of_known(rows.as_fields(), model.robot, values)
-            warnings += again_warnings(rows, again, of)
+            warnings += repeated_row_warnings(rows, again, of)
             rows = rows.select(~again)
     return rows, tuple(warnings)
 

@@ -20,9 +20,9 @@ from pisigma.model.calibrated_model import CalibratedModel, Frames, Provenance
 from pisigma.model.geometric_model import branches_of
 from pisigma.model.model_posterior import FLEET_PRIOR
 from pisigma.model.stored_starts import spread_rows
-from pisigma.model.training_rows import kept_rows
+from pisigma.model.training_rows import stored_training_rows
 from pisigma.robot.se3 import invert, transform_from_xyzrpy, xyzrpy_from_transform
-from pisigma.validation.checks.mixed_rows import MIN_WRONG_SHARE, many_wrong
+from pisigma.validation.checks.mixed_rows import MIN_WRONG_SHARE, too_many_wrong_rows
 from pisigma.validation.gate import check_rows
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.held_out.pose_statistics import image_deviation
@@ -79,7 +79,7 @@ def recalibrated_model(model: CalibratedModel, adaptation: Adaptation, rows: Mea
         hybrid_bases=geometry.bases if hybrid else {},
         hybrid_tools=geometry.tools if hybrid else {},
         uncertainty=PositionUncertainty(space, geometry, known.features, root, known.prior_scale, noise),
-        made_of=kept_rows(nominal, rows, model.made_of),
+        made_of=stored_training_rows(nominal, rows, model.made_of),
         provenance=Provenance(
             data_source=rows.file_names,
             data_sha256=rows.content_hash(),
@@ -136,7 +136,7 @@ def recalibration_diagnostics(
     if len(wrong) > MIN_WRONG_SHARE * rows.rows:
         chosen = torch.zeros(rows.rows, dtype=torch.bool)
         chosen[list(wrong)] = True
-        return (many_wrong(rows, chosen),)
+        return (too_many_wrong_rows(rows, chosen),)
     if judged.kept == "scratch" and (
         implausible := check_rows(rows, parent.nominal or parent.robot).implausible
     ):

@@ -24,7 +24,7 @@ from pisigma.estimation.drift import DriftGroup, LinearValues
 from pisigma.estimation.loss import HampelLoss
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import groups_to_keep_whole
-from pisigma.measurement.sensors.intrinsics import without_stated
+from pisigma.measurement.sensors.intrinsics import without_stated_priors
 from pisigma.measurement.sensors.registry import unknown_groups
 from pisigma.measurement.sensors.sensor import ParameterUnit, UnknownGroup
 from pisigma.model.calibrated_model import CalibratedModel, Frames
@@ -105,7 +105,7 @@ def recalibration_problem(
         PoseError: the joint values do not fit the robot.
     """
     posterior.space.robot.check_joint_count(rows.q.shape[1])
-    usable, rows = usable_rows(without_stated(rows, posterior.geometry.unknowns))
+    usable, rows = usable_rows(without_stated_priors(rows, posterior.geometry.unknowns))
     space = _joined_space(posterior.space, rows)
     known = {("base", name) for name in posterior.geometry.bases}
     known |= {("tool", name) for name in posterior.geometry.tools}

@@ -186,7 +186,7 @@ def read_joints(path: str | os.PathLike[str], robot: Robot) -> Float64[Tensor, "
     return torch.from_numpy(robot.to_dh(values))
 
 
-def holds_measurements(path: str | os.PathLike[str]) -> bool:
+def contains_measurements(path: str | os.PathLike[str]) -> bool:
     """Return whether a file contains measured values in addition to joint values, unlike those of `pisigma ik`.
 
     Raises:

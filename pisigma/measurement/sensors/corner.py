@@ -239,7 +239,7 @@ def as_poses(
     )
 
 
-def with_held_camera(measurements: Measurements, length: float, angle: float) -> Measurements:
+def with_fixed_intrinsics(measurements: Measurements, length: float, angle: float) -> Measurements:
     """Return rows of images with fixed intrinsics and board scale, and with additional noise of their poses.
 
     Args:

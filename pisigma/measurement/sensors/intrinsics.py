@@ -109,7 +109,7 @@ def intrinsics_information(
     return U, mean
 
 
-def without_stated(measurements: Measurements, counted: Mapping[str, Collection[str]]) -> Measurements:
+def without_stated_priors(measurements: Measurements, counted: Mapping[str, Collection[str]]) -> Measurements:
     """Return rows of images without the priors of some cameras and boards.
 
     Args:

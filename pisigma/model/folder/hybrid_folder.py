@@ -21,7 +21,7 @@ from pisigma.calibration.hybrid.noise import CalibrationNoise
 from pisigma.calibration.hybrid.uncertainty import PositionUncertainty
 from pisigma.estimation.covariance_root import CovarianceRoot
 from pisigma.files.model_files import WEIGHTS
-from pisigma.joint_correction.feature import AbstractFeature, turning_rate
+from pisigma.joint_correction.feature import AbstractFeature, angle_per_joint_value
 from pisigma.joint_correction.input_products import InputProducts
 from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.joint_correction.registry import feature_from
@@ -254,7 +254,7 @@ def _coverage(robot: Robot, tensors: Mapping[str, Tensor]) -> JointCoverage:
             file=WEIGHTS,
             value="coverage.joint",
         )
-    rate = torch.from_numpy(turning_rate(robot))
+    rate = torch.from_numpy(angle_per_joint_value(robot))
     turning = tuple(bool(is_revolute) for is_revolute in robot.revolute)
     return JointCoverage(joint, middle, half, rate, turning)
 

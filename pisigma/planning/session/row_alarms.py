@@ -30,7 +30,7 @@ def unreadable_alarm(row: UnusableRow) -> Alarm:
     return Alarm(row.line, "unreadable", f"line {row.line}: {row.reason}.", repeat=True)
 
 
-def of_all_rows(sentence: str) -> Alarm:
+def alarm_of_all_rows(sentence: str) -> Alarm:
     """Return the alarm on a fault of all rows, for example in the header of the file."""
     return Alarm(1, "setup", f"line 1: {sentence} Correct this before you continue to measure.", repeat=False)
 

@@ -26,7 +26,7 @@ from pisigma.files.errors import IdentificationError
 from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.joint_correction.gravity_torques import GravityTorques
 from pisigma.measurement.dataset import Measurements
-from pisigma.measurement.sensors.corner import CornerSensor, with_held_camera
+from pisigma.measurement.sensors.corner import CornerSensor, with_fixed_intrinsics
 from pisigma.measurement.sensors.intrinsics import NOISE_COLUMN
 from pisigma.robot.description import Robot
 from pisigma.robot.robot_class import RobotClass
@@ -119,7 +119,7 @@ class RowModel:
             PoseError: the joint values do not fit the robot.
         """
         calibrator = GeometricCalibrator(robot)
-        setup = calibrator.build(with_held_camera(rows, REPEATABILITY["m"], REPEATABILITY["rad"]))
+        setup = calibrator.build(with_fixed_intrinsics(rows, REPEATABILITY["m"], REPEATABILITY["rad"]))
         floating = set(floating_bases(setup))
         chosen = [index for index in calibrator.candidates(setup.problem.space) if index not in floating]
         active = [*setup.free_unknowns, *chosen]

@@ -20,7 +20,7 @@ from pisigma.planning.robot_posterior import RobotPosterior
 from pisigma.planning.session.state import AccuracyPoint
 from pisigma.robot.description import Robot
 from pisigma.validation.held_out.calibration_validation import errors_under, validate
-from pisigma.validation.held_out.few_rows import fit_where_it_helps
+from pisigma.validation.held_out.few_rows import fit_if_better
 
 FOLDS = 5
 """Folds of the cross-validation."""
@@ -84,7 +84,7 @@ def _calibrated(
         IdentificationError: the rows are too few, or contradict each other.
         MeasurementError: too few of them can be held out.
     """
-    result = fit_where_it_helps(HybridCalibrator(robot), rows, progress)
+    result = fit_if_better(HybridCalibrator(robot), rows, progress)
     assert isinstance(result, HybridResult)
     if result.learned is None and np.array_equal(result.geometric.robot.dh, robot.dh):
         # with too few rows the arm stays nominal, so the posterior of the fit does not contain its errors

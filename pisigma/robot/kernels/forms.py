@@ -16,7 +16,8 @@ class CompiledForm:
     Both are called as `function(arms, correction, first, memory, q)` with `kernels.arrays.Arms` and `Correction`, the
     index in `correction.values` of the first number that the feature's `pack` gave, `kernels.layout.MEMORY`, and the
     joint values [rad or m]. They may read `memory.turning` (sines and cosines of the joints' angles, see
-    `turning_rate`), `memory.phi` (inputs of product units) and `memory.approach` (+1, -1, or 0 where not stated).
+    `angle_per_joint_value`), `memory.phi` (inputs of product units) and `memory.approach` (+1, -1, or 0 where not
+    stated).
 
     Attributes:
         add: adds corrections of all joints to `memory.delta` [rad or m].

@@ -129,14 +129,14 @@ def translate(frame: Frame, along_x: Scalar, along_y: Scalar, along_z: Scalar) -
     return x, y, z, p
 
 
-def follow_xyzrpy(frame: Frame, xyzrpy: Sequence[Scalar]) -> Frame:
+def compose_xyzrpy(frame: Frame, xyzrpy: Sequence[Scalar]) -> Frame:
     """Return `frame · Trans(x, y, z) · RotZ(roll) · RotY(pitch) · RotX(yaw)`."""
     x, y, z, roll, pitch, yaw = xyzrpy
     moved = translate(frame, x, y, z)
     return rotate_x(rotate_y(rotate_z(moved, roll), pitch), yaw)
 
 
-def follow_row(frame: Frame, row: Sequence[Scalar]) -> Frame:
+def compose_row(frame: Frame, row: Sequence[Scalar]) -> Frame:
     """Return `frame · RotZ(theta) · Trans(a, 0, d) · RotX(alpha) · RotY(beta)` for a row theta, d, a, alpha, beta."""
     theta, d, a, alpha, beta = row
     return rotate_y(rotate_x(translate(rotate_z(frame, theta), a, 0.0, d), alpha), beta)

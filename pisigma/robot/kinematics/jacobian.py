@@ -12,8 +12,8 @@ from pisigma.robot.kinematics.components import (
     Frame,
     Scalar,
     as_transform,
+    compose_xyzrpy,
     cross,
-    follow_xyzrpy,
     product,
     stack_components,
     subtract,
@@ -82,7 +82,7 @@ def motion_components(
         if row.type != "fixed":
             joints.append(frames.before)
         frame = frames.after
-    tool = follow_xyzrpy(frame, geometry.tool)
+    tool = compose_xyzrpy(frame, geometry.tool)
     rows: list[list[Scalar]] = [[] for _ in range(6)]
     for joint, before in zip(robot.joints, joints, strict=True):
         axis, origin = before[2], before[3]

@@ -224,7 +224,7 @@ class RowsUnderModel:
         """Motions of frames and tools of any size that explain the errors."""
         return find_setup_faults(self.model, self.nominal, self.rows, self.fitted, frames_only=True)
 
-    def is_move(self, fault: SetupFault) -> bool:
+    def is_allowed_motion(self, fault: SetupFault) -> bool:
         """Return whether a fault is an allowed motion: of frames, tools, or the zero of a single joint."""
         return self.may_move.issuperset(fault.kinds) and len(set(fault.joints)) <= 1
 

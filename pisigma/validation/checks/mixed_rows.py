@@ -65,12 +65,12 @@ def check_mixed_rows(judged: RowsUnderModel) -> Iterator[Diagnostic]:
 
 def mixed_rows(judged: RowsUnderModel, wrong: Bool[Tensor, " rows"]) -> Diagnostic:
     """Report that some rows do not agree with the others, what distinguishes them, and what explains them."""
-    found = many_wrong(judged.rows, wrong)
+    found = too_many_wrong_rows(judged.rows, wrong)
     sentence = f"{found.sentence.removesuffix(ADVICE)}{_cause(judged, wrong)}{ADVICE}"
     return found.model_copy(update={"sentence": sentence})
 
 
-def many_wrong(rows: Measurements, wrong: Bool[Tensor, " rows"]) -> Diagnostic:
+def too_many_wrong_rows(rows: Measurements, wrong: Bool[Tensor, " rows"]) -> Diagnostic:
     """Report that more rows are wrong than can be left out."""
     distinction = distinguishing_property(rows, wrong)
     return Diagnostic(

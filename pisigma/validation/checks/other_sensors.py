@@ -57,7 +57,7 @@ def distance_diagnostics(comparison: ModelComparison, figures: ModelFigures) -> 
             )
 
 
-def diagnosed_lengths(
+def diagnose_lengths(
     model: CalibratedModel,
     rows: Measurements,
     fitted: Collection[FrameKind],

@@ -74,11 +74,11 @@ def check_setup_of_rows(judged: RowsUnderModel) -> Iterator[Diagnostic]:
         faults = judged.setup_faults
     else:
         faults = () if {"frame", "tool"} <= judged.may_move else judged.moved_frames
-    if faults and not any(map(judged.is_move, faults)):
+    if faults and not any(map(judged.is_allowed_motion, faults)):
         yield combine_alternatives(faults).diagnostic()
 
 
-def size_of_positions(robot: Robot, rows: Measurements) -> Iterator[Diagnostic]:
+def check_position_size(robot: Robot, rows: Measurements) -> Iterator[Diagnostic]:
     """Compare the spread of the measured positions with that of the nominal robot's."""
     group = largest_group(rows)
     if group.position is None or group.rows < MIN_ROWS_OF_SIZE:

@@ -29,7 +29,7 @@ MAX_NAMED = 5
 
 
 @dataclass(frozen=True, eq=False)
-class RowsWithoutWrongOnes:
+class FilteredRows:
     """Rows without those that are wrong.
 
     Attributes:
@@ -45,7 +45,7 @@ class RowsWithoutWrongOnes:
 
 def without_wrong_rows(
     models: Iterable[CalibratedModel], rows: Measurements, fitted: Collection[FrameKind] = ()
-) -> RowsWithoutWrongOnes:
+) -> FilteredRows:
     """Leave out single rows that are too far off under every model to be measured correctly.
 
     Args:
@@ -55,10 +55,10 @@ def without_wrong_rows(
     """
     found = [_far_rows(model, rows, fitted) for model in models]
     if not found or any(one is None for one in found):
-        return RowsWithoutWrongOnes(rows)
+        return FilteredRows(rows)
     numbers = sorted(set.intersection(*(set(one) for one in found if one is not None)))
     if not 0 < len(numbers) <= max(MAX_WRONG_SHARE * rows.rows, 1):
-        return RowsWithoutWrongOnes(rows)
+        return FilteredRows(rows)
     kept = torch.ones(rows.rows, dtype=torch.bool)
     kept[numbers] = False
     sizes = found[0] or {}
@@ -71,7 +71,7 @@ def without_wrong_rows(
         f"{len(numbers)} {have} than any calibrated robot, while the others agree with the model, and {are} left "
         f"out: {', '.join(named)}{more}; check these measurements, or measure the poses again."
     )
-    return RowsWithoutWrongOnes(rows.select(kept.nonzero()[:, 0]), (warning,), tuple(numbers))
+    return FilteredRows(rows.select(kept.nonzero()[:, 0]), (warning,), tuple(numbers))
 
 
 def _far_rows(

@@ -17,7 +17,7 @@ from pisigma.files.progress import Progress, no_progress, with_stage
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.sensors.registry import SENSORS
 from pisigma.measurement.sensors.socket import PairOfSockets
-from pisigma.measurement.splits import TrainTest, with_fewer
+from pisigma.measurement.splits import TrainTest, with_fewer_training_rows
 from pisigma.validation.held_out.pose_statistics import (
     PoseErrors,
     PredictedSpread,
@@ -300,7 +300,7 @@ def learning_curve(
     """
     points = []
     for rows in sorted(sizes):
-        fewer = with_fewer(measurements, splits, rows, seed)
+        fewer = with_fewer_training_rows(measurements, splits, rows, seed)
         of_rows = with_stage(progress, f"{rows} training rows")
         points.append((rows, validate(calibrator, measurements, fewer, of_rows, jobs)))
     if whole is not None:

@@ -45,7 +45,7 @@ USED_UP = 0.9
 """Share of the values of a sensor used up by the parameters above which its noise is not determined."""
 
 
-def fit_where_it_helps(calibrator: Calibrator, rows: Measurements, progress: Progress) -> Result:
+def fit_if_better(calibrator: Calibrator, rows: Measurements, progress: Progress) -> Result:
     """Calibrate; with few rows, the fitted arm is kept only if it is shown to be better than the nominal one.
 
     Args:
@@ -123,7 +123,7 @@ def fit_with_folds(
             process.
 
     Returns:
-        The calibration, see `fit_where_it_helps`, and the folds for `joined_repeats`.
+        The calibration, see `fit_if_better`, and the folds for `joined_repeats`.
 
     Raises:
         IdentificationError: the rows do not determine the parameters; for a fold it is raised by the iterator.
@@ -131,10 +131,10 @@ def fit_with_folds(
     """
     validating = with_stage(progress, "cross-validation")
     if jobs is None or not repeats:
-        result = fit_where_it_helps(calibrator, rows, with_stage(progress, "calibration"))
+        result = fit_if_better(calibrator, rows, with_stage(progress, "calibration"))
         return result, judged_folds(calibrator, training, repeats, validating)
     folds = fold_tasks(calibrator, training, repeats, no_progress)
     progress(f"calibration and {len(folds)} folds in {jobs} processes")
-    fitting = partial(fit_where_it_helps, calibrator, rows, no_progress)
+    fitting = partial(fit_if_better, calibrator, rows, no_progress)
     results: Iterator[Any] = run_in_processes([fitting, *folds], jobs)  # a calibration, and then folds
     return next(results), results

@@ -88,7 +88,7 @@ def base_and_tool(calibrator: GeometricCalibrator) -> GeometricCalibrator:
 def drop_missing_frames(
     calibrator: Calibrator,
     rows: Measurements,
-    of: Measurements,
+    all_rows: Measurements,
     held_out: Collection[PairOfSockets] = (),
 ) -> Calibrator:
     """Remove stated frames and socket distances from a calibrator that some of the rows lack.
@@ -96,15 +96,16 @@ def drop_missing_frames(
     Args:
         calibrator: calibrator for all rows.
         rows: the rows that it will be fitted to.
-        of: all rows; frames and distances that these lack too are kept, so that the calibrator refuses them.
+        all_rows: rows of all folds; frames and distances that these lack too are kept, so that the calibrator refuses
+            them.
         held_out: socket distances to remove in addition.
     """
     if isinstance(calibrator, HybridCalibrator):
-        geometric = drop_missing_frames(calibrator.geometric, rows, of, held_out)
+        geometric = drop_missing_frames(calibrator.geometric, rows, all_rows, held_out)
         assert isinstance(geometric, GeometricCalibrator)
         return replace(calibrator, robot=geometric)
-    no_frame = set(of.frame) - set(rows.frame)
-    no_socket = (set(of.socket or ()) - set(rows.socket or ())) - {""}
+    no_frame = set(all_rows.frame) - set(rows.frame)
+    no_socket = (set(all_rows.socket or ()) - set(rows.socket or ())) - {""}
     return replace(
         calibrator,
         frames={name: base for name, base in calibrator.frames.items() if name not in no_frame},

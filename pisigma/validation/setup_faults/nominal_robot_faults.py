@@ -199,7 +199,7 @@ def are_unrelated(robot: Robot, measurements: Measurements) -> bool:
     rows = rows.select(spread(torch.arange(rows.rows), MAX_ROWS_NOMINAL))
     assert rows.position is not None
     spread_out = float((rows.position - rows.position.mean(0)).square().sum(1).mean().sqrt())
-    return spread_out > usual_error(robot, rows.q) and explains_nothing(
+    return spread_out > usual_error(robot, rows.q) and fits_by_chance(
         forward_kinematics(robot, rows.q), rows.position
     )
 
@@ -239,7 +239,7 @@ def spread(rows: Int64[Tensor, " rows"], most: int) -> Int64[Tensor, " chosen"]:
     return rows[torch.linspace(0, len(rows) - 1, count).round().long()]
 
 
-def explains_nothing(T: Float64[Tensor, "rows 4 4"], position: Float64[Tensor, "rows 3"]) -> bool:
+def fits_by_chance(T: Float64[Tensor, "rows 4 4"], position: Float64[Tensor, "rows 3"]) -> bool:
     """Return whether predicted poses explain measured positions no better than chance, by an F test of the affine fit.
 
     Args:

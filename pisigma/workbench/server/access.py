@@ -78,7 +78,7 @@ class Access:
         Raises:
             HTTPForbidden: the request comes from another page, or from a browser without the cookie.
         """
-        if not is_own_host(request.host):
+        if not is_local_host(request.host):
             raise web.HTTPForbidden(text=f"The host {escape(request.host)[:100]} is not this machine.")
         if request.match_info.get("token") is not None:
             return
@@ -106,7 +106,7 @@ class Access:
         return response
 
 
-def is_own_host(host: str) -> bool:
+def is_local_host(host: str) -> bool:
     """Return whether a Host header names this machine: by a number, or by a name that only this machine has.
 
     A foreign page whose name was made to point to this machine (DNS rebinding) is recognised by its name.

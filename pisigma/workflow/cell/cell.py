@@ -270,7 +270,7 @@ class Cell:
             MeasurementError: no session is newer than the model.
         """
         entry = self._candidate(None)
-        warnings, sessions = self.on_controller("monitor", entry), self.sessions.new_to(entry)
+        warnings, sessions = self.controller_warnings("monitor", entry), self.sessions.new_to(entry)
         found: Monitoring | None = None
         for one in sessions:
             seen = self.sessions.rows_for(entry, self.sessions.as_measured(one), one.day)
@@ -326,7 +326,7 @@ class Cell:
         parent, chosen, seen = self._new_rows("recalibrate", None, session)
         settings = seen.settings_to_recalibrate(self.file.settings_of_step("recalibrate", **changed))
         result = recalibrate(self.model_folder(parent.name), seen.rows, settings, progress)
-        result = with_warnings(result, self.on_controller("recalibrate", parent))
+        result = with_warnings(result, self.controller_warnings("recalibrate", parent))
         if not (result.trusted or accept_implausible):
             doubt = result.diagnostics[0].sentence
             refused = ("recalibrate", parent.name, chosen.name, "not_trusted", doubt)
@@ -359,7 +359,7 @@ class Cell:
         name = self.history.before_in_use if model is None else self.history.model(model).name
         if name is None:
             raise ModelError("no model was in use before", at=Place(self.folder), option="--undo")
-        warnings = self.on_controller("use", self.history.model(name)) if name else ()
+        warnings = self.controller_warnings("use", self.history.model(name)) if name else ()
         put_into_use(self.history, name, reason or ("undo" if model is None else "by hand"), model is None)
         return warnings
 
@@ -367,7 +367,7 @@ class Cell:
         """Return the status of the cell and its next step."""
         return status_of(self.folder)
 
-    def on_controller(self, command: str, model: ModelEntry | None) -> tuple[str, ...]:
+    def controller_warnings(self, command: str, model: ModelEntry | None) -> tuple[str, ...]:
         """Return warnings because of what is active on the controller; raise a ModelError if a rule refuses it."""
         return findings(self.history, command, model).accepted(self.folder)
 
@@ -394,6 +394,6 @@ class Cell:
     ) -> tuple[ModelEntry, SessionEntry, ModelRows]:
         """Return a model, a session (by default the newest to which it was not fitted), and its rows with its names."""
         entry = self._candidate(model)
-        self.on_controller(command, entry)
+        self.controller_warnings(command, entry)
         chosen = self.sessions.choose(entry, session)
         return entry, chosen, self.sessions.rows_for(entry, self.sessions.as_measured(chosen), chosen.day)

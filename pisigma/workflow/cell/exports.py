@@ -30,7 +30,7 @@ def export_from_cell(cell: Cell, form: str, request: ExportRequest) -> Exported:
         ModelError: no model is in use, or a correction would be applied twice with what is active on the controller.
         PisigmaError: see `export_model`.
     """
-    contains = export_format(form).contains_for(request)
+    contains = export_format(form).contents_for(request)
     folder, warnings = checked_model_folder(cell.folder, f"export {contains}")
     exported = export_model(form, replace(request, model=folder))
     cell.history.add(ExportEntry(request.out.name, _sha256(request.out), form, contains, folder.name, now()))

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 _SIGNS = {"point": ".", "comma": ","}
 
 
-def stated_map(stated: str) -> Sequence[Mapping[str, str]]:
+def parse_maps(stated: str) -> Sequence[Mapping[str, str]]:
     """Return column mappings from text or from a file."""
     from pisigma.measurement.foreign.saved_map import parse_map
 
@@ -51,7 +51,7 @@ class ImportSettings:
         MeasurementError: `join` is not a valid choice.
     """
 
-    maps: Annotated[Sequence[Mapping[str, str]], Option("--map", kind=str, read=stated_map)] = ()
+    maps: Annotated[Sequence[Mapping[str, str]], Option("--map", kind=str, read=parse_maps)] = ()
     units: Annotated[str, Option("--unit")] = ""
     rotation: str | None = None
     decimal: Annotated[

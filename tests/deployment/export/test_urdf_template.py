@@ -10,7 +10,7 @@ from testing.closeness import assert_close
 from testing.refusals import refused
 from testing.urdf import UrdfJoint, peer_poses, urdf_text
 
-from pisigma.deployment.export.urdf import robot_into_urdf
+from pisigma.deployment.export.urdf import update_urdf
 from pisigma.files.errors import RobotError
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
@@ -64,7 +64,7 @@ def test_only_origins_change(path, tmp_path):
     nominal = Robot.load(path, tip="tool0")
     robot = calibrated_like(nominal, 1)
     out = tmp_path / "out.urdf"
-    out.write_text(robot_into_urdf(robot, nominal, path, "tool0", ("said -- once",)))
+    out.write_text(update_urdf(robot, nominal, path, "tool0", ("said -- once",)))
     q = joint_values(robot)
     again = Robot.load(out, base="calibrated_frame", tip="calibrated_tool")
     assert_close(forward_kinematics(again, q), forward_kinematics(robot, q), atol=1e-12)
@@ -95,7 +95,7 @@ def test_only_origins_change(path, tmp_path):
 def test_the_nominal_robot_changes_nothing(path, tmp_path):
     nominal = Robot.load(path, tip="tool0")
     out = tmp_path / "out.urdf"
-    out.write_text(robot_into_urdf(nominal, nominal, path, "tool0"))
+    out.write_text(update_urdf(nominal, nominal, path, "tool0"))
     again = Robot.load(out, tip="tool0", base="world")
     assert_close(again.dh, nominal.dh, atol=1e-14)
     for name, origin in (("calibrated_frame_joint", np.zeros(6)), ("calibrated_tool_joint", np.zeros(6))):
@@ -121,7 +121,7 @@ def test_any_chain(tmp_path_factory, seed, count):
     path.write_text(urdf_text(chain))
     nominal = Robot.load(path)
     robot = calibrated_like(nominal, seed)
-    path.write_text(robot_into_urdf(robot, nominal, path))
+    path.write_text(update_urdf(robot, nominal, path))
     q = joint_values(robot)
     assert_close(peer_poses(path, "calibrated_tool", q), forward_kinematics(robot, q), atol=1e-10)
     assert_close(forward_kinematics(Robot.load(path), q), forward_kinematics(robot, q), atol=1e-12)
@@ -130,12 +130,12 @@ def test_any_chain(tmp_path_factory, seed, count):
 def test_files_of_other_robots_are_refused(path):
     nominal = Robot.load(path, tip="tool0")
     with refused(RobotError, option="--like", value="one, two, three"):
-        robot_into_urdf(Robot.load("ur10"), Robot.load("ur10"), path, "tool0")
+        update_urdf(Robot.load("ur10"), Robot.load("ur10"), path, "tool0")
     longer = nominal.with_geometry(nominal.dh + 0.01)
     with refused(RobotError, option="--like", expected="the nominal geometry of the model"):
-        robot_into_urdf(longer, longer, path, "tool0")
+        update_urdf(longer, longer, path, "tool0")
     with pytest.raises(RobotError, match="2"):
-        robot_into_urdf(nominal, nominal, path)
+        update_urdf(nominal, nominal, path)
 
 
 def test_missing_values_that_simulators_require_are_filled_in(path, tmp_path):
@@ -143,7 +143,7 @@ def test_missing_values_that_simulators_require_are_filled_in(path, tmp_path):
     text = TEXT.replace('<link name="bracket"/>', f'<link name="bracket">{mass}</link>')
     path.write_text(text.replace('effort="7"', 'effort="0"'))
     nominal = Robot.load(path, tip="tool0")
-    after = etree.fromstring(robot_into_urdf(nominal, nominal, path, "tool0").encode())
+    after = etree.fromstring(update_urdf(nominal, nominal, path, "tool0").encode())
     masses = {link.get("name"): link.find("inertial/mass") for link in after.iter("link")}
     stated = {name: mass.get("value") for name, mass in masses.items() if mass is not None}
     assert stated == {"bracket": "3", "b": "1", "c": "1"}  # the bracket is fixed to link a
@@ -154,7 +154,7 @@ def test_missing_values_that_simulators_require_are_filled_in(path, tmp_path):
 def test_a_base_that_is_not_the_root(path, tmp_path):
     nominal = Robot.load(path, base="bracket", tip="tool0")
     robot, out = calibrated_like(nominal, 2), tmp_path / "out.urdf"
-    out.write_text(robot_into_urdf(robot, nominal, path, "tool0", base="bracket"))
+    out.write_text(update_urdf(robot, nominal, path, "tool0", base="bracket"))
     q = joint_values(robot)
     again = Robot.load(out, base="calibrated_frame", tip="calibrated_tool")
     assert_close(forward_kinematics(again, q), forward_kinematics(robot, q), atol=1e-12)

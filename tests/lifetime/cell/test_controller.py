@@ -93,19 +93,19 @@ def test_zeros_that_were_removed_are_missing_for_a_model_that_was_measured_with_
     changes = Controller((change("2026-01-20", "offsets"), change("2026-03-01", "")), (OFFSETS,))
     assert changes.findings("serve", NEWER, (BEFORE, AFTER)).refusal
     assert not changes.findings("serve", MODEL, (BEFORE, AFTER)).refusal
-    assert [changes.is_present(one) for one in (BEFORE, AFTER)] == [True, False]
+    assert [changes.matches_session(one) for one in (BEFORE, AFTER)] == [True, False]
 
 
 def test_a_session_of_the_day_of_a_change_counts_as_measured_before_if_it_was_added_before():
     changes = controller("offsets", day=AFTER.day)
-    assert changes.is_present(session(AFTER.day, "09:00:00"))
-    assert not changes.is_present(session(AFTER.day, "07:00:00"))
+    assert changes.matches_session(session(AFTER.day, "09:00:00"))
+    assert not changes.matches_session(session(AFTER.day, "07:00:00"))
 
 
 def test_a_model_without_sessions_was_measured_until_it_was_made():
     elsewhere = replace(MODEL, sessions="", day="")
-    assert "joint_zeros" in controller("offsets").behind(elsewhere, ())
-    assert "joint_zeros" not in controller("offsets", day="2026-03-01").behind(elsewhere, ())
+    assert "joint_zeros" in controller("offsets").active_when_fitted(elsewhere, ())
+    assert "joint_zeros" not in controller("offsets", day="2026-03-01").active_when_fitted(elsewhere, ())
 
 
 def test_sessions_with_other_zeros_are_not_valid_and_a_plan_is_due():

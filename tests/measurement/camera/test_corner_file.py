@@ -16,7 +16,7 @@ from pisigma.measurement.camera.camera import Camera
 from pisigma.measurement.camera.camera_files import CameraFiles, Repeatability
 from pisigma.measurement.camera.corner_file import read_rows
 from pisigma.measurement.dataset import Measurements
-from pisigma.measurement.sensors.intrinsics import boards, without_stated
+from pisigma.measurement.sensors.intrinsics import boards, without_stated_priors
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.simulation.camera.simulated_images import ImageNoise
 
@@ -66,7 +66,7 @@ def test_a_model_that_names_neither_frame_nor_target_takes_images(tmp_path: Path
     rows = read_rows(tmp_path / "corners.csv", cell.nominal, camera_files(tmp_path))
     renamed = replace(rows, frame=("",) * 3, target=("",) * 3)
     assert boards(rows) == boards(renamed) == ("board",) * 3
-    assert without_stated(renamed, {}).rows == 3
+    assert without_stated_priors(renamed, {}).rows == 3
 
 
 def test_several_cameras_and_other_sensors_in_one_file(tmp_path: Path) -> None:

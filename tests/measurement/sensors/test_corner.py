@@ -17,7 +17,7 @@ from pisigma.measurement.camera.camera_files import Repeatability
 from pisigma.measurement.camera.image_rows import image_measurements
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.sensors.corner import position_sigmas
-from pisigma.measurement.sensors.intrinsics import without_stated
+from pisigma.measurement.sensors.intrinsics import without_stated_priors
 
 
 def test_derivatives_are_those_of_the_weighted_errors() -> None:
@@ -90,8 +90,8 @@ def test_faulty_weights_are_refused(tmp_path: Path, cells: str, column: str, val
 def test_priors_that_a_model_includes_are_not_counted_again() -> None:
     images = image_measurements(camera_cell(8).images, CAMERA, BOARD, False, Repeatability())
     plain = Measurements(q=images.q, position=images.position)
-    assert without_stated(plain, {"camera": ["wrist"]}) is plain
-    counted = without_stated(images, {"camera": ["wrist"], "board": ["board"]})
+    assert without_stated_priors(plain, {"camera": ["wrist"]}) is plain
+    counted = without_stated_priors(images, {"camera": ["wrist"], "board": ["board"]})
     calibrator = GeometricCalibrator(camera_cell(8).nominal)
     before, after = (calibrator.build(rows).problem for rows in (images, counted))
     first, second = (

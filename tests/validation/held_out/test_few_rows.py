@@ -13,7 +13,7 @@ from pisigma.calibration.hybrid.calibrator import HybridCalibrator
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot
 from pisigma.validation.held_out.calibration_validation import errors_under
-from pisigma.validation.held_out.few_rows import fit_where_it_helps
+from pisigma.validation.held_out.few_rows import fit_if_better
 from pisigma.validation.held_out.trained_calibrations import base_and_tool
 
 
@@ -29,7 +29,7 @@ def test_few_poses_are_at_most_a_little_worse_than_the_nominal_arm(shared_data):
         chosen = torch.from_numpy(rng.permutation(rows.rows))
         few, others = rows.select(chosen[:count]), rows.select(chosen[-200:])
         with no_type_checker():
-            results = (fit_where_it_helps(calibrator, few, nothing), base_and_tool(calibrator).fit(few))
+            results = (fit_if_better(calibrator, few, nothing), base_and_tool(calibrator).fit(few))
             fitted, nominal = (errors_under(result, others).figures.rms_mm for result in results)
         ratios.append(fitted / nominal)
     assert max(ratios) <= 1.05
@@ -40,9 +40,7 @@ def test_few_poses_are_at_most_a_little_worse_than_the_nominal_arm(shared_data):
 def test_an_arm_without_errors_stays_nominal(hybrid):
     arm = simulate("ur10", rows=7, noise=1e-3, turn_noise=1e-3, length=1e-6, angle=1e-6)
     calibrator = GeometricCalibrator(arm.nominal)
-    result = fit_where_it_helps(
-        HybridCalibrator(calibrator) if hybrid else calibrator, arm.measurements, nothing
-    )
+    result = fit_if_better(HybridCalibrator(calibrator) if hybrid else calibrator, arm.measurements, nothing)
     robot = (result.geometric if hybrid else result).robot
     assert np.array_equal(robot.dh, arm.nominal.dh)
 
@@ -53,6 +51,6 @@ def test_ten_positions_of_an_arm_with_clear_errors_are_fitted():
     few, others = rows.select(torch.arange(10)), rows.select(torch.arange(10, 110))
     calibrator = GeometricCalibrator(arm.nominal)
     with no_type_checker():
-        results = (fit_where_it_helps(calibrator, few, nothing), base_and_tool(calibrator).fit(few))
+        results = (fit_if_better(calibrator, few, nothing), base_and_tool(calibrator).fit(few))
         fitted, nominal = (errors_under(result, others).figures.rms_mm for result in results)
     assert fitted < 0.2 * nominal

@@ -15,7 +15,7 @@ from pisigma.deployment.serve.metrics import Metrics
 from pisigma.deployment.serve.models import ServedModels
 from pisigma.files.errors import MeasurementError, ModelError
 from pisigma.lifetime.cell import controller
-from pisigma.lifetime.cell.controller import RULES, checked_in_use, checked_model_folder
+from pisigma.lifetime.cell.controller import RULES, checked_model_folder, model_in_use_warnings
 from pisigma.workflow.cell.exports import export_from_cell, set_controller
 
 pytestmark = pytest.mark.usefixtures("quick_pictures")
@@ -44,7 +44,7 @@ COMMANDS = {
     "export joint_zeros": lambda cell, folder: exported(cell, folder, "offsets"),
     "verify": lambda cell, folder: cell.verify(),
     "evaluate": lambda cell, folder: cell.evaluate(),
-    "measure": lambda cell, folder: checked_in_use(cell.folder, "measure"),
+    "measure": lambda cell, folder: model_in_use_warnings(cell.folder, "measure"),
     "import": lambda cell, folder: cell.take_in(measured(6, 9), day=day(0)),
     "monitor": lambda cell, folder: cell.monitor(),
     "recalibrate": lambda cell, folder: cell.recalibrate(),

@@ -114,7 +114,7 @@ def prior_scales(
     return torch.where(effective > least, sized, before)
 
 
-def settled_scales(
+def converged_prior_scales(
     normal: Float64[Tensor, "active active"],
     pull: Float64[Tensor, " active"],
     precision: Float64[Tensor, " active"],

@@ -28,9 +28,9 @@ from pisigma.calibration.geometric.problem.noise import (
 from pisigma.calibration.geometric.problem.parameters import EVERYWHERE, ParameterSpace, PriorSizes
 from pisigma.calibration.geometric.problem.prior_sizes import (
     SMALLEST_PRIOR,
+    converged_prior_scales,
     has_converged,
     prior_scales,
-    settled_scales,
 )
 from pisigma.estimation.loss import AbstractLoss, SquaredLoss
 from pisigma.measurement.conditions import JointState
@@ -250,7 +250,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         if refine:
             return scale
         normal, descent = self._data_sums(view)
-        return settled_scales(normal, descent + normal @ off, *prior, scale, floor)
+        return converged_prior_scales(normal, descent + normal @ off, *prior, scale, floor)
 
     @cached_property
     def _sized(self) -> bool:

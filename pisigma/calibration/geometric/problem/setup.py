@@ -306,7 +306,7 @@ class IdentifiedGeometry:
 def identified_geometry(setup: CalibrationSetup, point: Float64[Tensor, " parameters"]) -> IdentifiedGeometry:
     """Convert a point of the problem to the user's coordinates."""
     space = setup.problem.space
-    dh, bases, tools = behind_anchors(setup, point)
+    dh, bases, tools = in_user_coordinates(setup, point)
     return IdentifiedGeometry(
         robot=space.robot.with_geometry(dh=dh, base=bases[0], tool=tools[0]),
         bases=dict(zip(space.frames, bases, strict=True)),
@@ -320,7 +320,7 @@ def identified_geometry(setup: CalibrationSetup, point: Float64[Tensor, " parame
     )
 
 
-def behind_anchors(
+def in_user_coordinates(
     setup: CalibrationSetup, point: Float64[Tensor, " parameters"]
 ) -> tuple[Float64[np.ndarray, "rows 5"], Float64[np.ndarray, "frames 6"], Float64[np.ndarray, "targets 6"]]:
     """Return rows, bases and tools at a point of the problem, in the user's coordinates."""
@@ -344,7 +344,7 @@ def coordinate_change(
     """
     space, anchors = setup.problem.space, setup.anchors
     _, bases, tools = space.split(point)
-    _, user_bases, user_tools = (torch.from_numpy(block) for block in behind_anchors(setup, point))
+    _, user_bases, user_tools = (torch.from_numpy(block) for block in in_user_coordinates(setup, point))
     change = torch.eye(len(point), dtype=point.dtype)
     for k, anchor in enumerate(anchors.bases.cpu()):
         first = space.indices_of("base").start + 6 * k

@@ -21,7 +21,7 @@ from pisigma.deployment.export.controllers.ur_models import (
 from pisigma.deployment.export.dh_table import header_comment
 from pisigma.files.errors import Place, RobotError
 from pisigma.files.input_file import read_text
-from pisigma.robot.chains import in_few_rows, robot_of_origins
+from pisigma.robot.chains import robot_of_origins, with_one_row_per_joint
 from pisigma.robot.description import Robot
 from pisigma.robot.urdf_frames import Frame
 
@@ -100,7 +100,7 @@ def read_calibration(text: str, source: str, nominal: Robot) -> Robot:
     dh = own.dh.copy()
     for key, column in KEYS.items():
         dh[:, column] += _numbers(text, key, source)
-    return in_few_rows(with_frames(own.with_geometry(dh=dh), text))
+    return with_one_row_per_joint(with_frames(own.with_geometry(dh=dh), text))
 
 
 def _numbers(text: str, key: str, source: str) -> list[float]:

@@ -203,15 +203,15 @@ def _placed(model: str, own: Robot, described: Robot) -> tuple[float, Controller
     q = torch.rand((_POSES, JOINTS), generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 6 - 3
     T = forward_kinematics(described, q)
 
-    def laid(base: Frame, tool: Frame) -> tuple[float, Robot]:
+    def described_with(base: Frame, tool: Frame) -> tuple[float, Robot]:
         robot = own.with_geometry(base=xyzrpy_of(base), tool=xyzrpy_of(tool))
         return float((forward_kinematics(robot, q) - T)[:, :3, 3].norm(dim=-1).mean()), robot
 
-    distance, robot = laid(base, tool)
+    distance, robot = described_with(base, tool)
     if _EXACT < distance < 4 * FARTHEST:
         robot, _ = solve_approximation(ApproximationProblem(robot, q, T, ()))
         base, tool = _right(frame_of(robot.base)), _right(frame_of(robot.tool))
-        distance, robot = laid(base, tool)
+        distance, robot = described_with(base, tool)
     return distance, ControllerGeometry(model, own, base, tool, described)
 
 

@@ -3,12 +3,12 @@
 import re
 
 from pisigma.deployment.export.controllers.controller_file import ControllerFile, FileText
-from pisigma.deployment.export.urdf import text_in_urdf
+from pisigma.deployment.export.urdf import updated_urdf_text
 from pisigma.files.errors import OutputError
 from pisigma.robot.urdf_file import XACRO
 
 
-def with_properties(urdf: str) -> str:
+def urdf_to_xacro(urdf: str) -> str:
     """Convert URDF text to xacro with the origins of its joints as properties at the top."""
     from lxml import etree
 
@@ -28,20 +28,20 @@ def with_properties(urdf: str) -> str:
     return f'<?xml version="1.0"?>\n{etree.tostring(top, encoding="unicode")}\n'
 
 
-def write_overlay(content: FileText) -> str:
+def write_xacro(content: FileText) -> str:
     """Write the xacro file from the URDF file that the nominal robot was loaded from.
 
     Raises:
         OutputError: there is no such file.
     """
-    urdf = text_in_urdf(content.request, content.robot, content.nominal, content.comments)
+    urdf = updated_urdf_text(content.request, content.robot, content.nominal, content.comments)
     if urdf is None:
         raise OutputError(
             "--format xacro needs the URDF file of the robot",
             option="--like",
             remedy="give that file with --like",
         )
-    return with_properties(urdf)
+    return urdf_to_xacro(urdf)
 
 
 FILE = ControllerFile(
@@ -53,7 +53,7 @@ FILE = ControllerFile(
         "The origins of the joints are properties, so one calibration can be replaced by another; `xacro FILE` "
         "expands it. The link calibrated_frame is the frame of the poses, calibrated_tool the tool.",
     ),
-    text=write_overlay,
+    text=write_xacro,
     read=None,
     check=lambda robot: None,
     options=frozenset(("like", "tip")),

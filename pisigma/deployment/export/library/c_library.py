@@ -59,7 +59,7 @@ def _link(code: bytes, compiler: str) -> bytes:
     """
     sources = Path(__file__).parent
     sizes = {
-        "LAYOUT": f"{layout_key()}ULL",
+        "LAYOUT": f"{library_key()}ULL",
         "DESCRIPTION_SIZE": DESCRIPTION.itemsize,
         "MEMORY_SIZE": MEMORY.itemsize,
     }
@@ -92,7 +92,7 @@ FORMAT = ExportFormat(
 )
 
 
-def layout_key() -> int:
+def library_key() -> int:
     """Return the first 64 bits of the sources' hash, by which a library recognises its model files."""
     return int(source_hash()[:16], 16)
 
@@ -122,7 +122,7 @@ def model_file(model: CalibratedModel) -> bytes:
     axes = np.zeros(8)
     axes[: compiled.task_axes.row.size] = compiled.task_axes.row.ravel()
     head = _HEAD.pack(
-        b"PSIGIK01", layout_key(), *sizes, arm, *bounds.ravel(), len(compiled.task_axes.row), *axes
+        b"PSIGIK01", library_key(), *sizes, arm, *bounds.ravel(), len(compiled.task_axes.row), *axes
     )
     content = head + names + b"".join(segments)
     return content + struct.pack("=I", zlib.crc32(content))

@@ -22,7 +22,7 @@ from pisigma.deployment.export.rewriting.scan import (
     ScannedProgram,
     axes_in_use,
     external_axes,
-    groups_of,
+    waypoint_groups,
 )
 from pisigma.robot.se3 import transform_from_xyzrpy
 
@@ -168,7 +168,7 @@ class _Reader:
         letter, between = ("L", "") if count == 1 else ("C", f"{self.scan.line_end}    :  ")
         lines = (
             f"   1:{letter} {between.join(group)} {speed[1] if speed else ''} CNT100 ;{self.scan.line_end}"
-            for group in groups_of(names, count)
+            for group in waypoint_groups(names, count)
         )
         end, target = self.text.rindex("/END"), line.start("body") + move.start("target")
         passed = [Edit((target, target + len(move["target"])), names[-1])] if count == 2 else []

@@ -24,9 +24,9 @@ from pisigma.deployment.export.rewriting.scan import (
     argument_spans,
     axes_in_use,
     external_axes,
-    groups_of,
     mask_comments,
     numbers_in,
+    waypoint_groups,
 )
 from pisigma.robot.se3 import transform_from_xyzrpy
 
@@ -202,7 +202,7 @@ class _Reader:
         smooth = "" if re.match(r"\s*S(LIN|CIRC)", word, re.IGNORECASE) else " C_DIS"
         lines = (
             f"{word}{', '.join(f'{{{_six(T)}}}' for T in group)}{smooth}{self.scan.line_end}"
-            for group in groups_of(poses, len(operands))
+            for group in waypoint_groups(poses, len(operands))
         )
         edits = [Edit((start, start), "".join(lines))]
         if len(operands) == 2:

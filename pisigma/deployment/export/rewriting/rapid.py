@@ -24,9 +24,9 @@ from pisigma.deployment.export.rewriting.scan import (
     argument_spans,
     axes_in_use,
     external_axes,
-    groups_of,
     mask_comments,
     numbers_in,
+    waypoint_groups,
 )
 from pisigma.measurement.foreign.rotations import MAX_SKEWNESS
 from pisigma.robot.se3 import rotation_from_quaternion, transform
@@ -219,7 +219,7 @@ class _Reader:
         word = f"{indent[0] if indent else ''}Move{'L' if count == 1 else 'C'}"
         lines = (
             f"{word} {', '.join(f'[{pose.write(T)}{rest}' for T in group)}, {speed}, z1, {last};{self.scan.line_end}"
-            for group in groups_of(poses, count)
+            for group in waypoint_groups(poses, count)
         )
         passed = [Edit(spans[0], f"[{pose.write(poses[-1])}{rest}")] if count == 2 else []
         return [Edit((start, start), "".join(lines)), *passed]

@@ -284,7 +284,7 @@ def _stripped(text: str, start: int, end: int) -> tuple[int, int]:
     return start + len(inside) - len(inside.lstrip()), end - len(inside) + len(inside.rstrip())
 
 
-def groups_of(poses: Sequence[_Item], count: int) -> list[Sequence[_Item]]:
+def waypoint_groups(poses: Sequence[_Item], count: int) -> list[Sequence[_Item]]:
     """Group waypoints, or their names, by inserted move: one each, or two for arcs; see `PathMove`."""
     return [poses[first : first + count] for first in range(0, len(poses) - count + 1, count)]
 

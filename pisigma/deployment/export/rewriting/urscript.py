@@ -22,9 +22,9 @@ from pisigma.deployment.export.rewriting.scan import (
     Scan,
     ScannedProgram,
     argument_spans,
-    groups_of,
     mask_comments,
     numbers_in,
+    waypoint_groups,
 )
 from pisigma.robot.se3 import rotation_from_vector, transform
 
@@ -164,7 +164,7 @@ class _Reader:
         rest = [radius if index in named else argument for index, argument in enumerate(rest)]
         rest += [] if named else [radius]
         head, lines = self.text[start : spans[0][0]], []
-        for group in groups_of(poses, count):
+        for group in waypoint_groups(poses, count):
             targets = [
                 self.text[span[0] : operand[0]] + pose.write(T) + self.text[operand[1] : span[1]]
                 for span, operand, T in zip(spans, operands, group, strict=False)

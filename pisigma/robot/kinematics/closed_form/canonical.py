@@ -17,9 +17,9 @@ from pisigma.robot.kinematics.components import (
     IDENTITY,
     Frame,
     as_transform,
+    compose_row,
+    compose_xyzrpy,
     cosine_sine,
-    follow_row,
-    follow_xyzrpy,
     rotate_x,
 )
 from pisigma.robot.row import JointType
@@ -86,14 +86,14 @@ def canonical_rows(robot: Robot, types: Sequence[JointType], twists: Sequence[fl
         row[1] if joint.type == "prismatic" else row[0] for joint, row in zip(robot.joints, dh, strict=True)
     ]
     frame = rotate_x(IDENTITY, 0.0 if signs[-1] > 0 else math.pi)
-    frame = follow_row(frame, (0.0, *dh[-1][1:]))
+    frame = compose_row(frame, (0.0, *dh[-1][1:]))
     like = torch.zeros((), dtype=torch.float64)
     return CanonicalRows(
         T_base_first=as_transform(
-            _follow_fixed(robot, follow_xyzrpy(IDENTITY, robot.base.tolist()), 0, first), like
+            _follow_fixed(robot, compose_xyzrpy(IDENTITY, robot.base.tolist()), 0, first), like
         ),
         T_last_tool=as_transform(
-            follow_xyzrpy(_follow_fixed(robot, frame, last + 1, len(robot.rows)), robot.tool.tolist()), like
+            compose_xyzrpy(_follow_fixed(robot, frame, last + 1, len(robot.rows)), robot.tool.tolist()), like
         ),
         sign=torch.tensor(signs, dtype=torch.float64),
         direction=torch.from_numpy(robot.directions),
@@ -106,5 +106,5 @@ def canonical_rows(robot: Robot, types: Sequence[JointType], twists: Sequence[fl
 
 def _follow_fixed(robot: Robot, frame: Frame, start: int, stop: int) -> Frame:
     for parameters in robot.dh[start:stop].tolist():
-        frame = follow_row(frame, parameters)
+        frame = compose_row(frame, parameters)
     return frame

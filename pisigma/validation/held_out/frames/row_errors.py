@@ -67,7 +67,7 @@ def has_position(measurements: Measurements) -> Bool[Tensor, " rows"]:
     return torch.isfinite(measurements.position).all(-1)
 
 
-def places_remark(measurements: Measurements) -> tuple[str, ...]:
+def fitted_points_remark(measurements: Measurements) -> tuple[str, ...]:
     """Write a remark on errors of rows to which positions of sockets or anchors are fitted; empty if there are none."""
     rows = other_lengths(measurements).nonzero()[:, 0]
     groups = unknown_groups(measurements.select(rows))

@@ -20,7 +20,7 @@ from pisigma.deployment.export.registry import export_model
 from pisigma.files.errors import OutputError, RobotError
 from pisigma.model.folder.model_folder import load_model, save_model
 from pisigma.robot import Robot
-from pisigma.robot.chains import in_few_rows
+from pisigma.robot.chains import with_one_row_per_joint
 from pisigma.robot.kinematics.forward import forward_kinematics
 
 REQUEST = ExportRequest(Path("model"), Path("file"))
@@ -65,7 +65,7 @@ def test_the_robot_is_read_back(file, scale):
 @pytest.mark.parametrize("name", ["ur10", "kiro3", "fanuc_r2000"])
 def test_rows_are_rewritten_without_moving_the_tool(name):
     robot = everything_off(name)
-    few = in_few_rows(robot)
+    few = with_one_row_per_joint(robot)
     assert len(few.rows) == robot.dof
     assert far_apart(few, robot) < 1e-12
     assert few.limits.tolist() == robot.limits.tolist()

@@ -5,8 +5,8 @@ from testing.closeness import assert_close
 from testing.identified import off_by
 from testing.models import joints_around
 
-from pisigma.deployment.export.controllers.xacro import with_properties
-from pisigma.deployment.export.urdf import CALIBRATED_FRAME, CALIBRATED_TOOL, robot_into_urdf
+from pisigma.deployment.export.controllers.xacro import urdf_to_xacro
+from pisigma.deployment.export.urdf import CALIBRATED_FRAME, CALIBRATED_TOOL, update_urdf
 from pisigma.files.errors import RobotError
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
@@ -26,9 +26,9 @@ def urdf(tmp_path):
 def test_the_robot_is_read_back(urdf, tmp_path):
     nominal = Robot.load(urdf)
     calibrated = off_by(nominal)
-    urdf = robot_into_urdf(calibrated, nominal, urdf, comments=("said",))
+    urdf = update_urdf(calibrated, nominal, urdf, comments=("said",))
     overlay = tmp_path / "arm.urdf.xacro"
-    overlay.write_text(with_properties(urdf))
+    overlay.write_text(urdf_to_xacro(urdf))
     text = overlay.read_text()
     assert '<xacro:property name="theta_2_xyz" value="' in text
     assert 'xyz="${theta_2_xyz}"' in text
@@ -49,6 +49,6 @@ def test_the_robot_is_read_back(urdf, tmp_path):
 def test_anything_else_of_xacro_is_refused(before, after, urdf, tmp_path):
     nominal = Robot.load(urdf)
     overlay = tmp_path / "arm.xacro"
-    overlay.write_text(with_properties(robot_into_urdf(nominal, nominal, urdf)).replace(before, after))
+    overlay.write_text(urdf_to_xacro(update_urdf(nominal, nominal, urdf)).replace(before, after))
     with pytest.raises(RobotError, match="xacro"):
         Robot.load(overlay, tip=CALIBRATED_TOOL)
