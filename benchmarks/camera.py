@@ -39,7 +39,7 @@ from pisigma.robot.se3 import (
     transform_from_xyzrpy,
     xyzrpy_from_transform,
 )
-from pisigma.simulation.camera.simulated_images import ImageNoise, far_apart, simulate_images
+from pisigma.simulation.camera.simulated_images import ImageNoise, select_far_apart, simulate_images
 
 LENGTH, ANGLE = 1e-3, np.deg2rad(0.3)
 CAMERA = Camera("wrist", 1920, 1200, 1400.0, 1400.0, 960.0, 600.0)
@@ -96,7 +96,7 @@ class Cell:
     def with_images(count: int) -> "Cell":
         """Return the cell with a number of images."""
         nominal, rng = Robot.load("ur5"), np.random.default_rng(0)
-        q = far_apart(views(nominal, CANDIDATES * count, rng), count)
+        q = select_far_apart(views(nominal, CANDIDATES * count, rng), count)
         everywhere = rng.uniform(-np.pi, np.pi, (POSTURES, nominal.dof))
         return Cell(
             nominal, q, {"region": views(nominal, VIEWS, rng), "workspace": torch.from_numpy(everywhere)}

@@ -42,7 +42,7 @@ from pisigma.robot import Robot
 from pisigma.robot.kinematics.closed_form.registry import closed_form_solver
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.se3 import invert, transform_from_xyzrpy, xyzrpy_from_transform
-from pisigma.simulation.camera.simulated_images import far_apart, simulate_images
+from pisigma.simulation.camera.simulated_images import select_far_apart, simulate_images
 
 FIXED_CAMERA = replace(CAMERA, name="fixed", is_fixed=True)
 HAND = replace(BOARD, name="hand")
@@ -221,9 +221,9 @@ def at(rows: Measurements, q: Tensor) -> Measurements:
 def main(chosen: list[str], draws: int) -> None:
     """Print root mean squares over all draws."""
     nominal, rng = Robot.load("ur5"), np.random.default_rng(0)
-    q = far_apart(views(nominal, CANDIDATES * 50, rng), 50)
-    q_fixed = far_apart(fixed_views(nominal, CANDIDATES * 50, rng), 50)
-    q_gears = far_apart(views(nominal, CANDIDATES * GEAR_IMAGES, rng), GEAR_IMAGES)
+    q = select_far_apart(views(nominal, CANDIDATES * 50, rng), 50)
+    q_fixed = select_far_apart(fixed_views(nominal, CANDIDATES * 50, rng), 50)
+    q_gears = select_far_apart(views(nominal, CANDIDATES * GEAR_IMAGES, rng), GEAR_IMAGES)
     postures = torch.from_numpy(rng.uniform(-np.pi, np.pi, (POSTURES + 10, nominal.dof)))
     parts = {
         "mixed": lambda arm: mixed(arm, q, q_fixed, postures),

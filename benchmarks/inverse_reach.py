@@ -140,7 +140,7 @@ TASKS: tuple[tuple[str, Robot | str, tuple[str, ...] | None], ...] = (
 
 
 def report_tasks(rows: int) -> None:
-    """Print how many poses are reached in the axes that count, and the time per pose on one thread."""
+    """Print how many poses are reached in the constrained axes, and the time per pose on one thread."""
     for label, robot, ignored in TASKS:
         rng = np.random.default_rng(0)
         model = make_model(robot, 24, rng)

@@ -122,7 +122,7 @@ def session(arm: Arm, how: str) -> tuple[int, float]:
         )
     rule = MeasureSettings(limit_mm=LIMIT_MM, least_gain_mm=0.0, replan=how == "planned")
     measuring, rows = MeasuringSession(stored, rule), None
-    while not (state := measuring.state).finished:
+    while not (state := measuring.state).is_finished:
         assert state.next_pose is not None
         line = len(state.rows.line) + 2
         x, _ = arm.true.measure(state.next_pose.q[None], rng=np.random.default_rng(1000 * arm.seed + line))

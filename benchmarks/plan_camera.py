@@ -99,7 +99,7 @@ class Bench:
         rows = image_measurements(images, self.camera, self.board, False, noise.repeatability, "fixed")
         robot = GeometricCalibrator(self.arm.robot, prior=PRIOR).fit(rows).robot
         points, estimated = (forward_kinematics(one, judged)[:, :3, 3] for one in (true, robot))
-        predicted = rms_of(self.posterior["geometric"].given_poses(q).tool(judged))
+        predicted = rms_of(self.posterior["geometric"].after_measuring(q).tool(judged))
         return 1e3 * aligned_error(points, estimated), 1e3 * predicted
 
 

@@ -148,7 +148,7 @@ class Arm:
         """Return the result for measured poses."""
         result = fit_if_better(HybridCalibrator(self.nominal), self.rows(q), lambda what: None)
         assert isinstance(result, HybridResult)
-        both = posterior.given_poses(q), RobotPosterior.from_result(result, posterior.instrument)
+        both = posterior.after_measuring(q), RobotPosterior.from_result(result, posterior.instrument)
         return Figures(rms_mm(result, self.test), *(rms_of(one.tool(self.test.q)) * 1e3 for one in both))
 
 

@@ -88,7 +88,7 @@ def _take_in(
     exports: Sequence[Path] = (),
 ) -> None:
     """Add rows to a cell as a session; `exports` are the files that they were converted from."""
-    entry = cell.take_in(rows, accept_implausible, date)
+    entry = cell.add_session(rows, accept_implausible, date)
     cell.sessions.set_imported_aside(exports, entry)
     if as_json:
         print_json(

@@ -80,12 +80,12 @@ def _convert(
     """Write the robot of a controller's file; `like` names the nominal one."""
     from pisigma.deployment.export.controllers.reading import MAX_CHANGE, read_controller_file
     from pisigma.deployment.export.dh_table import dh_yaml
-    from pisigma.files.output_file import check_output, write_whole
+    from pisigma.files.output_file import check_output, write_atomically
 
     check_output(out, (".yaml", ".yml"), "a robot file", (read, Path(like)))
     reading = read_controller_file(read, nominal, MAX_CHANGE if max_change_mm is None else max_change_mm)
     robot, change = reading.robot, reading.change
-    write_whole(out, dh_yaml(robot, (robot.source, *reading.remarks)))
+    write_atomically(out, dh_yaml(robot, (robot.source, *reading.remarks)))
     if as_json:
         print_json(
             {

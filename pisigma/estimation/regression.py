@@ -121,7 +121,7 @@ class AbstractRegression(ABC):
         return posterior
 
 
-def root_of_sizes(posterior: Posterior, root: CovarianceRoot) -> Float64[Tensor, "unknowns groups"]:
+def prior_size_columns(posterior: Posterior, root: CovarianceRoot) -> Float64[Tensor, "unknowns groups"]:
     """Return the columns that the uncertainty of the prior sizes adds to a root of the covariance C of the unknowns.
 
     With `dx / d log s_g = 2 C Λ_g x` for the unknowns of group g and `var(log s_g) = 1 / (2 n_g)`, where n_g of

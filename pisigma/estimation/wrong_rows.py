@@ -42,7 +42,7 @@ class ExplainedRows(Generic[What]):
     deviation: Float64[Tensor, " values"]
 
 
-def with_wrong_rows(
+def mark_wrong_rows(
     explained: ExplainedRows[What], explain: Callable[[Mapping[int, float]], ExplainedRows[What]]
 ) -> ExplainedRows[What]:
     """Mark configurations as wrong as long as that raises the log evidence by more than its prior penalty.

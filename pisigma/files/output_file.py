@@ -62,13 +62,13 @@ def check_page(page: Path, inputs: Iterable[Input] = ()) -> None:
     check_output(page, (".html", ".htm"), "a page", inputs)
 
 
-def write_whole(path: Path, content: str | bytes) -> None:
+def write_atomically(path: Path, content: str | bytes) -> None:
     """Write a file next to `path` and rename it to `path` in one step; an existing file is replaced.
 
     Raises:
         OutputError: see `check_output`, or writing fails; nothing is left behind.
     """
-    with writing_whole(path) as file:
+    with open_atomically(path) as file:
         if isinstance(content, bytes):
             file.buffer.write(content)
         else:
@@ -76,7 +76,7 @@ def write_whole(path: Path, content: str | bytes) -> None:
 
 
 @contextmanager
-def writing_whole(path: Path) -> Iterator[TextIO]:
+def open_atomically(path: Path) -> Iterator[TextIO]:
     """Open a text file next to `path` for writing and rename it to `path` at the end; an existing file is replaced.
 
     Nothing is left behind if the block ends with an exception or an interruption. Scratch files of killed processes are
@@ -101,7 +101,7 @@ def writing_whole(path: Path) -> Iterator[TextIO]:
 
 
 def write_failure(path: str | os.PathLike[str], problem: OSError) -> OutputError:
-    """Return the error of an output that the operating system does not let us write."""
+    """Return the error of an output that the operating system refuses to write."""
     is_full = problem.errno in (errno.ENOSPC, errno.EDQUOT)
     return OutputError(
         f"the output cannot be written: {problem.strerror}",

@@ -173,7 +173,7 @@ class Jig:
             torch.where(along, coordinate, self.upper[self.block]),
         )
 
-    def on_face(
+    def is_on_face(
         self, face: Int64[Tensor, "*batch"], point: Float64[Tensor, "*batch 3"], margin: float = 0.0
     ) -> Bool[Tensor, "*batch"]:
         """Return whether points are on a face, away from its edges, and not covered by another block.
@@ -194,7 +194,7 @@ class Jig:
         )
         return inside & ~others.all(-1).any(-1)
 
-    def is_hit(
+    def intersects_line(
         self, start: Float64[Tensor, "*batch 3"], end: Float64[Tensor, "*batch 3"]
     ) -> Bool[Tensor, "*batch"]:
         """Return whether the straight line from `start` to `end` [m] intersects a block.

@@ -9,7 +9,7 @@ from pisigma.measurement.copies import copy_warnings
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot.coupling import dh_limits
 from pisigma.robot.description import Robot
-from pisigma.robot.kinematics.joint_limits import beyond_limits, grossly_beyond
+from pisigma.robot.kinematics.joint_limits import beyond_limits, far_beyond_limits
 from pisigma.robot.row import Row
 
 _MAX_NAMED = 5
@@ -45,7 +45,7 @@ class JointRange:
         farthest = int(beyond.argmax())
         named = ", ".join(rows.place(row) for row in self.rows[:_MAX_NAMED])
         more = f" and {len(self.rows) - _MAX_NAMED} more" if len(self.rows) > _MAX_NAMED else ""
-        gross = bool(grossly_beyond(self.q, axis).any())
+        gross = bool(far_beyond_limits(self.q, axis).any())
         meaning = (
             "This is too far for an inaccurate limit: the values belong to another joint or are in another unit."
             if gross

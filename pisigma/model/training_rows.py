@@ -1,4 +1,4 @@
-"""Training rows of a model, which are recognised in later data so that they count only once."""
+"""Training rows of a model, which are recognised in later data so that they are used only once."""
 
 from dataclasses import replace
 

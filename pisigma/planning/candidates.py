@@ -174,7 +174,7 @@ def _repeats(q: Float64[Tensor, "poses dof"]) -> Bool[Tensor, " poses"]:
     return torch.from_numpy(first[group.reshape(-1)] < np.arange(len(q)))
 
 
-def spread(
+def select_spread_poses(
     arm: ArmInSurroundings, q: Float64[Tensor, "poses dof"], count: int, others: Float64[Tensor, "others dof"]
 ) -> Int64[Tensor, " chosen"]:
     """Select poses spread over the workspace: each time the one farthest from all selected or given poses.

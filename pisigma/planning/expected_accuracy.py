@@ -180,13 +180,13 @@ class CameraProspects:
         q, sight = candidates.q[chosen], views.sight
 
         def rms(better: RobotPosterior) -> float:
-            return rms_of(better.given_poses(q).tool(task))
+            return rms_of(better.after_measuring(q).tool(task))
 
         def posterior_with(corner_noise: float, repeatability: Repeatability) -> RobotPosterior:
             better = replace(sight, corner_noise=corner_noise, repeatability=repeatability)
             return replace(posterior, instrument=replace(posterior.instrument, sight=better))
 
-        after = posterior.given_poses(q)
+        after = posterior.after_measuring(q)
         others = torch.ones(len(candidates.q), dtype=torch.bool)
         others[chosen] = False
         left = candidates.q[others]
@@ -197,7 +197,7 @@ class CameraProspects:
         )
         return CameraProspects(
             rms_of(after.tool(task)),
-            rms_of(after.given_poses(more).tool(task)) if len(more) else rms_of(after.tool(task)),
+            rms_of(after.after_measuring(more).tool(task)) if len(more) else rms_of(after.tool(task)),
             rms(posterior_with(EXACT_CORNERS, sight.repeatability)),
             rms(posterior_with(sight.corner_noise, EXACT_ROBOT)),
             float(views.margin_in_image(arm, q).min()),

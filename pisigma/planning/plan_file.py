@@ -13,7 +13,7 @@ from pydantic import Field
 from torch import Tensor
 
 from pisigma.files.errors import MeasurementError, Place, PlanningError
-from pisigma.files.output_file import write_whole
+from pisigma.files.output_file import write_atomically
 from pisigma.files.yaml_file import Section, read_yaml, yaml_text
 from pisigma.measurement.csv.columns import PLAN_COLUMNS
 from pisigma.measurement.csv.reading import read_joints
@@ -115,8 +115,8 @@ class StoredPlan:
         rows = zip(self._in_file_units(self.q), sets, self.candidate.tolist(), strict=True)
         for order, (joints, name, candidate) in zip(self.numbers, rows, strict=True):
             writer.writerow([*joints, name, order, candidate])
-        write_whole(path, text.getvalue())
-        write_whole(yaml_of(path), yaml_text(self._document(path)))
+        write_atomically(path, text.getvalue())
+        write_atomically(yaml_of(path), yaml_text(self._document(path)))
 
     def _in_file_units(self, q: Float64[Tensor, "poses dof"]) -> list[list[float]]:
         """Return the controller's values [deg or mm] with the digits that controllers take."""

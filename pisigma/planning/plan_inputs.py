@@ -72,7 +72,7 @@ def find_candidates(settings: PlanSettings, arm: ArmInSurroundings) -> Candidate
     return with_workspace(arm, candidates, draw_candidates(arm, WORKSPACE_POSES, settings.seed, workspace))
 
 
-def with_measured(settings: PlanSettings, arm: ArmInSurroundings) -> ArmInSurroundings:
+def allow_measured_poses(settings: PlanSettings, arm: ArmInSurroundings) -> ArmInSurroundings:
     """Return the arm such that candidates that were measured are free of self-collision.
 
     Raises:
@@ -80,7 +80,7 @@ def with_measured(settings: PlanSettings, arm: ArmInSurroundings) -> ArmInSurrou
     """
     if settings.candidates_from is None or not contains_measurements(settings.candidates_from):
         return arm
-    return arm.with_measured(read_joints(settings.candidates_from, arm.robot))
+    return arm.allow_measured_poses(read_joints(settings.candidates_from, arm.robot))
 
 
 def workspace_of(settings: PlanSettings) -> Workspace | None:

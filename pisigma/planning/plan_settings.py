@@ -68,7 +68,7 @@ FILES = ("candidates_from", "task", "measured")
 """Settings that are paths of files."""
 
 
-def box(stated: str) -> tuple[float, ...]:
+def parse_box(stated: str) -> tuple[float, ...]:
     """Return the lowest and the highest x, y, z [mm] from "X,Y,Z,X,Y,Z"."""
     try:
         numbers = tuple(map(float, stated.split(",")))
@@ -121,9 +121,9 @@ class PlanSettings:
     limit_mm: float | None = None
     candidates: Annotated[int, KEY] = 5000
     candidates_from: Annotated[str | None, Option(kind=Path, read=str, is_key=True)] = None
-    box_mm: Annotated[Box | None, Option("--box", kind=str, read=box, metavar="X,Y,Z,X,Y,Z", is_key=True)] = (
-        None
-    )
+    box_mm: Annotated[
+        Box | None, Option("--box", kind=str, read=parse_box, metavar="X,Y,Z,X,Y,Z", is_key=True)
+    ] = None
     task: Annotated[str | None, FILE] = None
     measured: Annotated[str | None, FILE] = None
     seed: Annotated[int, KEY] = 0

@@ -146,9 +146,9 @@ class RobotPosterior:
         except ImplausibleError:
             raise
         except IdentificationError:  # too few rows
-            return self.given_poses(rows.q)
+            return self.after_measuring(rows.q)
 
-    def given_poses(self, q: Float64[Tensor, "poses dof"]) -> "RobotPosterior":
+    def after_measuring(self, q: Float64[Tensor, "poses dof"]) -> "RobotPosterior":
         """Return the posterior given measured poses, which does not depend on the values: `C' = R (1 + B^T B)^-1 R^T`.
 
         Args:
@@ -173,7 +173,7 @@ class RobotPosterior:
         """Compute the derivative D of the target's position by standard normal numbers; its covariance is `D D^T`.
 
         The position is in the measuring frame; for distances, which do not determine where the robot is, it is in the
-        robot's base frame. For a camera, a rigid motion of all poses together does not count, because the pose of the
+        robot's base frame. For a camera, a rigid motion of all poses together is ignored, because the pose of the
         board's frame is known through the arm only.
         """
         columns = self.columns(q)[:, :3]

@@ -33,7 +33,7 @@ def acceptance_sentences(acceptance: Acceptance) -> tuple[str, ...]:
     if measured is not None and measured.fitted:
         several = len(measured.fitted) > 1
         lines.append(
-            f"The {' and the '.join(measured.fitted)} {'were' if several else 'was'} fitted to these rows, as "
+            f"The {' and the '.join(measured.fitted)} {'were' if several else 'was'} fitted to these rows, because "
             f"{'they were' if several else 'it was'} changed."
         )
     if measured is not None and measured.doubt:

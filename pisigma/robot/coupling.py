@@ -155,7 +155,7 @@ class Coupling:
         """Convert approach directions of joints to those of axes: +1 or -1 where the joints determine it, else 0."""
         return _sides(approach, np.sign(np.round(np.linalg.pinv(self.matrix), 12)))
 
-    def is_inside(self, q: Float[np.ndarray, "*batch dof"]) -> Bool[np.ndarray, "*batch"]:
+    def is_within_limits(self, q: Float[np.ndarray, "*batch dof"]) -> Bool[np.ndarray, "*batch"]:
         """Return whether DH values are within the stops and the controller's values within its limits; NaN is not."""
         values, (lower, upper) = self.to_controller(q), self.limits.T
         inside = ((values >= lower - LIMIT_TOLERANCE) & (values <= upper + LIMIT_TOLERANCE)).all(-1)
@@ -163,7 +163,7 @@ class Coupling:
             inside &= (q[..., joint] >= least - LIMIT_TOLERANCE) & (q[..., joint] <= most + LIMIT_TOLERANCE)
         return np.asarray(inside)
 
-    def wrapped_inside(
+    def wrapped_within_limits(
         self, q: Float64[np.ndarray, "rows dof"], near: Float64[np.ndarray, "#rows dof"] | None = None
     ) -> tuple[Float64[np.ndarray, "rows dof"], Bool[np.ndarray, " rows"]]:
         """Shift coupled joints by full turns so that the controller's values are within its limits.
@@ -180,7 +180,7 @@ class Coupling:
         turns = 2 * math.pi * self._turns()
         every = q[:, None] + turns
         least = np.abs(turns).sum(-1)[None] if near is None else np.abs(every - near[:, None]).sum(-1)
-        inside = self.is_inside(every)
+        inside = self.is_within_limits(every)
         best = np.where(inside, least, math.inf).argmin(1)
         reached: np.ndarray = inside[np.arange(len(q)), best]
         return np.where(reached[:, None], every[np.arange(len(q)), best], q), reached

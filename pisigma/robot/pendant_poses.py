@@ -71,7 +71,7 @@ def pendant_poses(
         values[index + 1, index] = ends[0] if abs(ends[0]) >= abs(ends[1]) else ends[1]
     inside = ((values >= lower) & (values <= upper)).all(1)
     if nominal.coupling is not None:
-        inside &= nominal.coupling.is_inside(nominal.coupling.to_dh(values))
+        inside &= nominal.coupling.is_within_limits(nominal.coupling.to_dh(values))
     moved = zip(
         (None, *nominal.axes), (0.0, *values[1:].diagonal()), nominal.to_dh(values), inside, strict=True
     )

@@ -149,7 +149,7 @@ class RobotDocument(Section):
         rows, coupling = rows_and_coupling([row.to_row() for row in self.rows], self.coupling)
         dh, base = np.array([row.to_si() for row in self.rows]), self.base.to_si()
         if self.convention == "modified":
-            dh, base = from_modified(dh, base)
+            dh, base = from_modified_dh(dh, base)
         return RobotFields(self.name, self.maker, self.source, rows, dh, base, self.tool.to_si(), coupling)
 
 
@@ -194,7 +194,7 @@ def read_robot(robot: str | os.PathLike[str], base: str | None, tip: str | None)
     )
 
 
-def from_modified(
+def from_modified_dh(
     dh: Float64[np.ndarray, "rows 5"], base: Float64[np.ndarray, " 6"]
 ) -> tuple[Float64[np.ndarray, "rows 5"], Float64[np.ndarray, " 6"]]:
     """Convert modified rows `RotX(alpha) · Trans(a, 0, 0) · RotZ(theta) · Trans(0, 0, d)` to standard rows exactly.

@@ -133,7 +133,7 @@ def _nearest(
     return torch.take_along_dim(solutions.q, distance.argmin(-1)[:, None, None], 1)[:, 0]
 
 
-class AbstractCommanded(Section):
+class AbstractCommandedJoints(Section):
     """Base of sections that measure at poses.
 
     Attributes:
@@ -145,7 +145,7 @@ class AbstractCommanded(Section):
     branch: BranchSection | None = None
 
     @model_validator(mode="after")
-    def _branch_for_poses(self) -> "AbstractCommanded":
+    def _branch_for_poses(self) -> "AbstractCommandedJoints":
         if isinstance(self.poses, JointsRandom) != (self.branch is None):
             raise ValueError(
                 "desired poses need a branch; add one"

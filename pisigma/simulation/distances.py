@@ -11,7 +11,7 @@ from pisigma.files.errors import RecipeError
 from pisigma.files.yaml_file import Count, Section, Seed
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot.se3 import transform
-from pisigma.simulation.commanded import AbstractCommanded, BranchSection, joints_for_poses
+from pisigma.simulation.commanded import AbstractCommandedJoints, BranchSection, joints_for_poses
 from pisigma.simulation.noise import SensorNoise, draw_noise, row_sigma
 from pisigma.simulation.poses import OrientationSection
 from pisigma.simulation.true_robot import TrueRobot
@@ -98,7 +98,7 @@ class AnchorSection(Section):
     known: bool = False
 
 
-class SimulatedDistances(AbstractCommanded):
+class SimulatedDistances(AbstractCommandedJoints):
     """Recipe section of distances from an anchor.
 
     Attributes:
@@ -134,7 +134,7 @@ class SimulatedDistances(AbstractCommanded):
         )
 
 
-class SimulatedPairs(AbstractCommanded):
+class SimulatedPairs(AbstractCommandedJoints):
     """Recipe section of distances between pairs of poses: the first and the second, and so on.
 
     Attributes:

@@ -11,14 +11,14 @@ from torch import Tensor
 from pisigma.files.yaml_file import Section
 from pisigma.measurement.dataset import Measurements, join
 from pisigma.simulation.camera.simulated_images import SimulatedImages
-from pisigma.simulation.commanded import AbstractCommanded
+from pisigma.simulation.commanded import AbstractCommandedJoints
 from pisigma.simulation.distances import SimulatedDistances, SimulatedPairs, SimulatedSockets
 from pisigma.simulation.noise import MeasurementNoise
 from pisigma.simulation.touching import SimulatedTouches
 from pisigma.simulation.true_robot import TrueRobot
 
 
-class SimulatedMeasurements(AbstractCommanded):
+class SimulatedMeasurements(AbstractCommandedJoints):
     """Recipe section of a tracker that measures the true robot.
 
     Attributes:

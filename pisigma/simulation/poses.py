@@ -114,7 +114,7 @@ class JointsRandom(Section):
         if robot.coupling is None or not robot.coupling.stops:
             return q
         many = torch.cat([q] + [sample() for _ in range(EXTRA_DRAWS)])
-        kept = many[torch.from_numpy(robot.coupling.is_inside(many.numpy()))]
+        kept = many[torch.from_numpy(robot.coupling.is_within_limits(many.numpy()))]
         if len(kept) < self.count:
             raise RecipeError(
                 option="joints_random",

@@ -255,11 +255,11 @@ class TouchCandidatesSection(Section):
         outward = jig.outward[sampled.face]
         lean = torch.arcsin((shaft * outward).sum(-1).clamp(-1, 1))
         clear = torch.rad2deg(lean) >= self.least_lean_deg
-        clear &= jig.on_face(sampled.face, point, self.margin_mm / 1e3)
+        clear &= jig.is_on_face(sampled.face, point, self.margin_mm / 1e3)
         for distance in (1e-6, self.travel_mm / 1e3):
             tip = point + distance * outward
-            clear &= ~jig.is_hit(tip, tip + self.shaft_mm / 1e3 * shaft)
-        return clear & ~jig.is_hit(point + 1e-6 * outward, point + self.travel_mm / 1e3 * outward)
+            clear &= ~jig.intersects_line(tip, tip + self.shaft_mm / 1e3 * shaft)
+        return clear & ~jig.intersects_line(point + 1e-6 * outward, point + self.travel_mm / 1e3 * outward)
 
     def _reachable(
         self, robot: Robot, jig: Jig, placement: JigPlacement, sampled: TouchCandidates

@@ -171,7 +171,7 @@ def _on_faces(
     on = torch.zeros(candidates.count, dtype=torch.bool)
     for number, placement in enumerate(placements):
         rows = candidates.placement == number
-        on[rows] = placement.load_jig().on_face(candidates.face[rows], tip[rows])
+        on[rows] = placement.load_jig().is_on_face(candidates.face[rows], tip[rows])
     return on
 
 

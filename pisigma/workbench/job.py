@@ -115,7 +115,7 @@ class Jobs:
             self.version += 1
 
     def stop(self, person: str, number: str) -> None:
-        """Stop the running step when it next reports progress; it leaves nothing half written.
+        """Stop the running step when it next reports progress; no incomplete files are left.
 
         Args:
             person: who stops it.

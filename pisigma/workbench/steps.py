@@ -64,7 +64,7 @@ def create(folder: Path, form: Form, files: list[Path]) -> Cell:
         raise RobotError(expected="a robot of the catalogue, or a file", option="robot")
     if robot == form.get("robot"):
         check_choice(RobotError, "robot", robot, catalogue())  # a page must not name paths
-    limit = number_of(form, "limit_mm") if form.get("limit_mm") else None
+    limit = form_number(form, "limit_mm") if form.get("limit_mm") else None
     return Cell.create(
         folder, robot, form.get("sensor") or "tracker", limit, form.get("base"), form.get("tip")
     )
@@ -145,7 +145,7 @@ def _in_cell(text: ResultText, cell: Cell) -> ResultText:
     return replace(text, verdict=replace(text.verdict, next_step=step))
 
 
-def proposal_of(files: list[Path], cell: Cell, form: Form) -> ImportProposal | None:
+def propose_columns(files: list[Path], cell: Cell, form: Form) -> ImportProposal | None:
     """Return the proposed meaning of the columns of uploaded files; None for a measurement file of pisigma.
 
     Args:
@@ -168,16 +168,16 @@ def proposal_of(files: list[Path], cell: Cell, form: Form) -> ImportProposal | N
     return propose_import(files, replace(settings, maps=[one for one in stated if one]))
 
 
-def take_in(files: list[Path], cell: Cell, form: Form) -> Outcome:
+def import_session(files: list[Path], cell: Cell, form: Form) -> Outcome:
     """Add uploaded rows to the cell as a session."""
     accept, day = form.get("accept_implausible") == "true", form.get("date", "").strip()
-    proposal = proposal_of(files, cell, form)
+    proposal = propose_columns(files, cell, form)
     rows: Path | Measurements = files[0]
     said: tuple[str, ...] = ()
     if proposal is not None:
         imported = import_rows(proposal)
         rows, said = imported.measurements, imported.sentences
-    entry = cell.take_in(rows, accept, day)
+    entry = cell.add_session(rows, accept, day)
     remarks = tuple(filter(None, (*said, entry.remark)))
     trust = (
         f"with caution ({counted(len(remarks), 'remark')})" if remarks else "yes: nothing contradicts them"
@@ -245,7 +245,7 @@ def export(cell: Cell, form: Form, files: Mapping[str, Path]) -> Outcome:
 def try_pose(cell: Cell, form: Form) -> tuple[Outcome, Solution]:
     """Compute the corrected joint values that reach a pose."""
     solver = load(cell.folder)
-    solution = solver(stated_pose([number_of(form, name) for name in POSE_COLUMNS]))
+    solution = solver(stated_pose([form_number(form, name) for name in POSE_COLUMNS]))
     failed = [one for one in statuses_of(solution) if one in FAILURES]
     refusal = f"{failed[0].name.lower()}. {failed[0].sentence}" if failed else ""
     return Outcome(solution_text(solution, solver), refusal), solution
@@ -266,7 +266,7 @@ def file_name(name: str) -> str:
     return name
 
 
-def number_of(form: Form, key: str) -> float:
+def form_number(form: Form, key: str) -> float:
     """Return a number of a form.
 
     Raises:

@@ -231,7 +231,7 @@ class Workbench:
 
         def propose() -> str:
             cell, files = Cell.open(self.folder), self._uploads.paths(form.get("files", "").split(","))
-            proposal = steps.proposal_of(files, cell, form)
+            proposal = steps.propose_columns(files, cell, form)
             return self._tabs.proposal(proposal, files, form.get("files", ""))
 
         return web.Response(text=await asyncio.to_thread(propose), content_type="text/html")
@@ -283,7 +283,7 @@ class Workbench:
     def import_rows(self, cell: Cell, form: Form, progress: Progress) -> Outcome:
         """Add uploaded rows as a session."""
         progress("reading the rows")
-        return steps.take_in(self._uploads.paths(form.get("files", "").split(",")), cell, form)
+        return steps.import_session(self._uploads.paths(form.get("files", "").split(",")), cell, form)
 
     def plan(self, cell: Cell, form: Form, progress: Progress) -> Outcome:
         """Plan poses, and show them."""

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from pisigma.files.model_files import model_hash
-from pisigma.files.output_file import check_page, write_whole
+from pisigma.files.output_file import check_page, write_atomically
 from pisigma.lifetime.comparison.model_pair import Displacement, ModelPair
 from pisigma.lifetime.comparison.parameter_differences import (
     ParameterDifference,
@@ -114,7 +114,7 @@ class ComparedModels:
         check_page(Path(page))
         says = self.sentences, self.warnings
         text = comparison_page(self.models, self.parameters, self.displacements, self.rows, says)
-        write_whole(Path(page), text)
+        write_atomically(Path(page), text)
 
     @property
     def _difference(self) -> Difference | None:

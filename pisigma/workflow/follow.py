@@ -81,7 +81,7 @@ def follow(session: MeasuringSession, file: GrowingFile, once: bool = False) -> 
                 return
             if work is None:
                 urgent = session.next_step()
-                ending = state.finished and urgent is None
+                ending = state.is_finished and urgent is None
                 step = urgent or session.idle_step()
                 work = None if step is None else pool.submit(step)
             time.sleep(PAUSE)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pisigma.files.errors import MeasurementError, Place
-from pisigma.files.output_file import check_output, write_whole
+from pisigma.files.output_file import check_output, write_atomically
 from pisigma.measurement.csv.reading import fields_of
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.foreign.accounting import FileAccount, FileLine, LeftOutRow, count_rows, sentences
@@ -109,7 +109,7 @@ class ImportedRows:
         """
         files = [mapping.file.source for mapping in self.proposal.mappings]
         check_output(Path(path), (".csv",), "a measurement file", files)
-        write_whole(Path(path), self.content.text())
+        write_atomically(Path(path), self.content.text())
 
     def to_json(self) -> dict[str, object]:
         """Return what was imported and left out as plain values."""

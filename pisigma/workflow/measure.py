@@ -14,18 +14,18 @@ from jaxtyping import Bool, Int64
 from torch import Tensor
 
 from pisigma.deployment.export.programs.planned import planned_program
-from pisigma.files.output_file import write_whole
+from pisigma.files.output_file import write_atomically
 from pisigma.files.progress import Progress
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.fields import UnusableRow
 from pisigma.planning.plan_file import StoredPlan, read_plan
-from pisigma.planning.plan_inputs import find_candidates, with_measured
+from pisigma.planning.plan_inputs import allow_measured_poses, find_candidates
 from pisigma.planning.session.row_alarms import NEAR_POSE, alarm_of_all_rows, joint_differences
 from pisigma.planning.session.session_accuracy import (
     SessionAccuracy,
-    cross_validated,
     expected_accuracy,
     session_accuracy,
+    with_cross_validation,
 )
 from pisigma.planning.session.session_rows import FurtherPoses, SessionRows, setup_sentence, stopping_advice
 from pisigma.planning.session.state import (
@@ -70,7 +70,7 @@ class MeasuringSession:
             plan: the poses, and what they were planned with.
             settings: see `MeasureSettings`.
         """
-        plan = replace(plan, arm=with_measured(plan.settings, plan.arm))
+        plan = replace(plan, arm=allow_measured_poses(plan.settings, plan.arm))
         self.plan, self.replanned = plan, False
         self._lock = threading.RLock()
         self._settings = settings
@@ -219,7 +219,7 @@ class MeasuringSession:
         """Cross-validate the calibration so far."""
         so_far = self._so_far
         assert so_far is not None
-        point = cross_validated(self.plan.arm.robot, so_far, progress)
+        point = with_cross_validation(self.plan.arm.robot, so_far, progress)
         with self._lock:
             self._reached[-1], self._validated = point, so_far
         return ()
@@ -295,7 +295,7 @@ class MeasuringSession:
             remaining = self.plan.select_poses(self._open)
         remaining.write(path)
         for program in programs if len(remaining.q) else ():
-            write_whole(program, planned_program(remaining, program))
+            write_atomically(program, planned_program(remaining, program))
 
     def _adopt(self, plan: StoredPlan) -> None:
         """Continue with another plan: known poses keep their numbers, and new ones get the next numbers."""
@@ -326,7 +326,7 @@ class MeasuringSession:
     @property
     def _counting(self) -> Bool[Tensor, " rows"]:
         """Mask of the rows that are used."""
-        return self._judged.rows_that_count
+        return self._judged.used_rows
 
     @property
     def _check(self) -> Bool[Tensor, " rows"]:

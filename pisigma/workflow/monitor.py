@@ -13,7 +13,7 @@ import torch
 
 from pisigma.files.errors import MeasurementError, ModelError, Place
 from pisigma.files.model_files import model_hash
-from pisigma.files.output_file import check_page, write_whole
+from pisigma.files.output_file import check_page, write_atomically
 from pisigma.files.progress import Progress
 from pisigma.lifetime.cell.history import HISTORY, History
 from pisigma.lifetime.cell.layout import cell_of_model, history_of_model
@@ -212,7 +212,7 @@ class Monitoring:
             self._marks(),
             None if self.forecast is None else self.forecast.limit_mm,
         )
-        write_whole(Path(page), content)
+        write_atomically(Path(page), content)
 
     def _marks(self) -> dict[str, list[tuple[datetime.date, str]]]:
         """Return the days of events of the cell for all charts, and of jumps for that of their joint."""

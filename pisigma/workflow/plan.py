@@ -16,14 +16,14 @@ from pisigma.deployment.export.programs.languages import LANGUAGES, check_progra
 from pisigma.deployment.export.programs.planned import planned_program
 from pisigma.files.conflicts import Input
 from pisigma.files.errors import MeasurementError, Place
-from pisigma.files.output_file import check_output, write_whole
+from pisigma.files.output_file import check_output, write_atomically
 from pisigma.files.progress import Progress
 from pisigma.measurement.joint_range import row_warnings
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import HasModel
 from pisigma.model.training_rows import known_rows, training_row_warnings
 from pisigma.planning.board_views import BoardViews
-from pisigma.planning.candidates import Candidates, spread
+from pisigma.planning.candidates import Candidates, select_spread_poses
 from pisigma.planning.expected_accuracy import (
     CameraProspects,
     ExpectedAccuracy,
@@ -32,7 +32,7 @@ from pisigma.planning.expected_accuracy import (
     remaining_errors,
 )
 from pisigma.planning.plan_file import StoredPlan, yaml_of
-from pisigma.planning.plan_inputs import find_candidates, read_planned_rows, views_of, with_measured
+from pisigma.planning.plan_inputs import allow_measured_poses, find_candidates, read_planned_rows, views_of
 from pisigma.planning.plan_settings import PlanSettings
 from pisigma.planning.pose_selection import select_poses
 from pisigma.planning.robot_posterior import RobotPosterior
@@ -148,7 +148,7 @@ class Plan:
         texts = [planned_program(self.stored, file) for file in files]
         self.stored.write(Path(path))
         for file, text in zip(files, texts, strict=True):
-            write_whole(file, text)
+            write_atomically(file, text)
 
 
 def check_files(
@@ -195,7 +195,7 @@ def plan(
     subject = subject if isinstance(subject, Subject) else Subject.load(subject)
     if surroundings is not None and not isinstance(surroundings, Surroundings):
         surroundings = read_surroundings(surroundings, subject.robot)
-    arm = with_measured(settings, subject.arm(surroundings))
+    arm = allow_measured_poses(settings, subject.arm(surroundings))
     progress("candidates")
     candidates = find_candidates(settings, arm)
     candidates.check_count(settings.count + settings.check)
@@ -212,7 +212,7 @@ def plan(
         candidates,
         points,
         problem.needed(chosen, points),
-        remaining_errors(posterior.given_poses(candidates.q[chosen]), task),
+        remaining_errors(posterior.after_measuring(candidates.q[chosen]), task),
         way.seconds,
         (
             *repeated,
@@ -278,7 +278,7 @@ class _Problem:
             progress(f"{count} of {len(free):,} candidates")
             chosen = free[select_poses(self.measured[free], self.tool, count, self.settings.criterion)]
             others = free[~torch.isin(free, chosen)]
-            check = others[spread(self.arm, q[others], self.settings.check, q[chosen])]
+            check = others[select_spread_poses(self.arm, q[others], self.settings.check, q[chosen])]
             use = order_of_use(count, len(check))
             poses = torch.cat([chosen, check])[use]
             progress("order of the poses")

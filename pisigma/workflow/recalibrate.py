@@ -45,7 +45,7 @@ from pisigma.robot.description import Robot
 from pisigma.validation.checks.check import MOVES, Move
 from pisigma.validation.checks.wrong_rows import FilteredRows, without_wrong_rows
 from pisigma.validation.gate import check_rows
-from pisigma.validation.held_out.calibration_validation import errors_under
+from pisigma.validation.held_out.calibration_validation import pose_errors_of
 from pisigma.validation.held_out.distillation_summary import ParentFigures
 from pisigma.validation.held_out.few_rows import fit_if_better
 from pisigma.validation.held_out.frames.fitted_frames import fitted_kinds
@@ -241,7 +241,7 @@ def _outliers(
     adaptation: Adaptation, rows: Measurements, wrong: Sequence[int]
 ) -> tuple[ContradictingRowFigures, ...]:
     """Return the rows that were left out as wrong, with their residuals under the others' calibration."""
-    errors = errors_under(adaptation, rows)
+    errors = pose_errors_of(adaptation, rows)
     sizes = {"residual_mm": (errors.position, 1e3), "residual_deg": (errors.rotation, math.degrees(1.0))}
     outliers = []
     for row in wrong:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from pisigma.files.conflicts import Input
-from pisigma.files.output_file import check_output, write_whole
+from pisigma.files.output_file import check_output, write_atomically
 from pisigma.files.progress import Progress
 from pisigma.lifetime.cell.acceptance import Acceptance
 from pisigma.measurement.camera.camera_files import CameraFiles
@@ -60,7 +60,7 @@ class Report:
         """Write the page and, if a folder is given, every figure as PNG and SVG.
 
         Args:
-            page: file of the page (.html); replaced whole or not at all.
+            page: file of the page (.html); replaced completely or not at all.
             figures: folder of the figures, created if missing.
 
         Returns:
@@ -70,7 +70,7 @@ class Report:
             OutputError: a file cannot be written.
         """
         check_report_outputs(page, figures)
-        write_whole(Path(page), render_page(self.content, self.figures, self.acceptance))
+        write_atomically(Path(page), render_page(self.content, self.figures, self.acceptance))
         return () if figures is None else tuple(write_figures(self.figures.all, Path(figures)))
 
 

@@ -49,7 +49,7 @@ class AbstractModelResult(ABC):
         accept_implausible: bool = False,
         overwrite: bool = False,
     ) -> CalibratedModel:
-        """Write the model folder with card and figures, whole or not at all.
+        """Write the model folder with card and figures, completely or not at all.
 
         Args:
             folder: folder to write.

@@ -121,7 +121,7 @@ def verification_text(verification: Verification, width: int, verbose: bool = Fa
 
 
 def session_text(state: SessionState, closing: Sequence[str] = ()) -> ResultText:
-    """Lay out a session: the accuracy so far, the rows that count, and whether to measure more.
+    """Lay out a session: the accuracy so far, the used rows, and whether to measure more.
 
     Args:
         state: state of the session.

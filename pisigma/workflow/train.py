@@ -24,8 +24,8 @@ from pisigma.network.sections import LevenbergMarquardtSection
 from pisigma.reporting.cards import CardTexts, write_training_card
 from pisigma.robot.description import Robot
 from pisigma.validation.held_out.calibration_summary import summarise
-from pisigma.validation.held_out.calibration_validation import errors_under, judge, learning_curve, validate
-from pisigma.validation.held_out.pose_statistics import Comparison, PoseErrors, compare_on
+from pisigma.validation.held_out.calibration_validation import judge, learning_curve, pose_errors_of, validate
+from pisigma.validation.held_out.pose_statistics import Comparison, PoseErrors, compare_with_nominal
 from pisigma.validation.held_out.training_summary import (
     ComparisonFigures,
     JointErrors,
@@ -153,7 +153,7 @@ def _train_geometric(
     rows, held_out = data.simulations[0]
     calibrator = recipe.calibration.calibrator(data.robot)
     result = calibrator.fit(rows)
-    errors = errors_under(result, held_out).figures
+    errors = pose_errors_of(result, held_out).figures
     summary = summarise(result).with_figures(
         command=_call(recipe),
         redundant_sets=tuple(tuple(members) for members in result.pairwise.sets),
@@ -223,7 +223,9 @@ def _train_inverse(
     validation = None if data.folds is None else cross_validate(recipe, data, progress, settings.jobs)
     test = None
     if data.test is not None:
-        test = ComparisonFigures.from_comparison(compare_on(run.model, data.test), rows=data.test.rows)
+        test = ComparisonFigures.from_comparison(
+            compare_with_nominal(run.model, data.test), rows=data.test.rows
+        )
     summary = summarise_training(run, recipe.paper, validation, test).with_figures(command=_call(recipe))
     model = replace(run.model, metrics=summary.to_json())
     return InverseTraining(model, recipe, run, summary)
@@ -340,7 +342,7 @@ def _compared_fold(
 ) -> Comparison:
     """Train without a fold, and compare the model with the nominal robot on that fold."""
     report_start()
-    return compare_on(train_networks(recipe, data).model, test)
+    return compare_with_nominal(train_networks(recipe, data).model, test)
 
 
 def _check_one_pose(measurements: Measurements) -> None:

@@ -13,7 +13,7 @@ from pisigma.files.errors import MeasurementError, ModelError, OutputError, Reci
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.folder.model_folder import load_model, save_model
 from pisigma.robot import Robot
-from pisigma.validation.held_out.pose_statistics import compare_on
+from pisigma.validation.held_out.pose_statistics import compare_with_nominal
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +66,7 @@ def test_poses_before_and_after(run, trained, held_out):
     for name in ("rms_mm", "mean_mm", "p95_mm", "max_mm", "rms_deg", "max_deg"):
         assert printed["corrected"][name] < printed["nominal"][name] / 10
     model = load_model(trained[0] / "model")
-    by_hand = compare_on(model, Measurements.read_csv(held_out, model.robot))
+    by_hand = compare_with_nominal(model, Measurements.read_csv(held_out, model.robot))
     for kind in ("nominal", "corrected"):
         assert printed[kind] == pytest.approx(getattr(by_hand, kind).figures.figures_by_name, rel=1e-12)
 
@@ -194,6 +194,8 @@ def test_rows_that_the_model_does_not_predict_are_left_out_of_both(run, held_out
     rows = Measurements.read_csv(held_out, model.robot)
     predicted = torch.isfinite(model.forward(rows.q)).flatten(1).all(-1)
     assert int((~predicted).sum()) == lost
-    kept = compare_on(replace(model, network=None), rows.select(predicted)).nominal.figures.figures_by_name
+    kept = compare_with_nominal(
+        replace(model, network=None), rows.select(predicted)
+    ).nominal.figures.figures_by_name
     assert printed["nominal"] == pytest.approx(kept, rel=1e-9)
     assert f"Warning: {lost} rows" in run("evaluate", tmp_path, held_out).stdout

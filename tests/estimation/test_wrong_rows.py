@@ -9,7 +9,7 @@ from testing.closeness import assert_close
 
 from pisigma.estimation.drift import DriftGroup, DriftSearch, LinearValues
 from pisigma.estimation.regression import SensorCount
-from pisigma.estimation.wrong_rows import ExplainedRows, with_wrong_rows
+from pisigma.estimation.wrong_rows import ExplainedRows, mark_wrong_rows
 
 NOISE, MOVED, CONFIGURATIONS = 1e-4, 4e-3, 12
 
@@ -34,7 +34,7 @@ def explained(off: float, seed: int = 0) -> ExplainedRows[DriftSearch]:
         search.estimate_sizes()
         return ExplainedRows(search, there, search.log_evidence, search.covariance, search.deviation)
 
-    return with_wrong_rows(explain({}), explain)
+    return mark_wrong_rows(explain({}), explain)
 
 
 @pytest.mark.parametrize("off", [0.005, 0.5])

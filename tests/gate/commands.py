@@ -18,7 +18,7 @@ from pisigma.robot import Robot
 from pisigma.workflow.calibrate import calibrate
 from pisigma.workflow.cell.advance import advance
 from pisigma.workflow.cell.cell import Cell
-from pisigma.workflow.cell.new_cell import NewCell, of_model
+from pisigma.workflow.cell.new_cell import NewCell, cell_from_model
 from pisigma.workflow.compare import compare
 from pisigma.workflow.evaluate import evaluate
 from pisigma.workflow.measure import MeasuringSession
@@ -100,7 +100,7 @@ def _measure(rows: Measurements, folder: Path) -> Answer:
 
 
 def _advance(rows: Measurements, folder: Path) -> Answer:
-    of_model(model_folder(folder), NewCell("")).write(folder / "cell")
+    cell_from_model(model_folder(folder), NewCell("")).write(folder / "cell")
     rows.write_csv(folder / "cell" / "sessions" / "s1.csv", Robot.load(ROBOT))
     try:
         step = advance(Cell.open(folder / "cell")).step

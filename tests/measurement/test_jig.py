@@ -50,21 +50,21 @@ def test_points_on_a_face_are_inside_its_edges_and_uncovered(tmp_path: Path):
     jig = load(tmp_path, STAIRS)
     riser = torch.full((5,), 2)
     on = points((50, 100, 85), (50, 100, 30), (50, 100, 55), (-1, 100, 85), (50, 250, 85))
-    assert jig.on_face(riser, on).tolist() == [True, False, True, False, True]
-    assert jig.on_face(riser, on, margin=0.01).tolist() == [True, False, False, False, True]
+    assert jig.is_on_face(riser, on).tolist() == [True, False, True, False, True]
+    assert jig.is_on_face(riser, on, margin=0.01).tolist() == [True, False, False, False, True]
     tread = torch.zeros(3, dtype=torch.int64)
     on = points((50, 50, 0), (50, 95, 0), (5, 50, 0))
-    assert jig.on_face(tread, on).all()
-    assert jig.on_face(tread, on, margin=0.01).tolist() == [True, False, False]
-    assert jig.on_face(tread[:0], on[:0]).tolist() == []
+    assert jig.is_on_face(tread, on).all()
+    assert jig.is_on_face(tread, on, margin=0.01).tolist() == [True, False, False]
+    assert jig.is_on_face(tread[:0], on[:0]).tolist() == []
 
 
 def test_lines_intersect_blocks(tmp_path: Path):
     jig = load(tmp_path, STAIRS)
     start = points((50, 50, 60), (50, 50, 51), (50, 50, 51), (50, 50, 51), (50, -10, 25), (50, 50, 50))
     end = points((50, 50, 500), (50, 500, 51), (50, -500, 51), (50, 99, 300), (50, 210, 25), (500, 50, 50))
-    assert jig.is_hit(start, end).tolist() == [False, True, False, False, True, False]
-    assert jig.is_hit(end, start).tolist() == [False, True, False, False, True, False]
+    assert jig.intersects_line(start, end).tolist() == [False, True, False, False, True, False]
+    assert jig.intersects_line(end, start).tolist() == [False, True, False, False, True, False]
 
 
 def test_the_jig_that_comes_with_the_package_steps_down_along_x_and_y():
@@ -74,7 +74,7 @@ def test_the_jig_that_comes_with_the_package_steps_down_along_x_and_y():
     assert sorted(jig.coordinate[jig.axis == 2].tolist()) == pytest.approx([0.12, 0.24, 0.36])
     assert "not published" in jig.source
     middles = torch.stack(jig.extent).mean(0)
-    uncovered = jig.on_face(torch.arange(15), middles)
+    uncovered = jig.is_on_face(torch.arange(15), middles)
     covered = {name for name, free in zip(jig.face_names, uncovered.tolist(), strict=True) if not free}
     assert covered == {"low/+z", "middle/+z"}  # their middles are under the next step, their rims are free
 

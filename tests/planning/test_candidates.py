@@ -8,7 +8,7 @@ from testing.closeness import assert_close
 from testing.refusals import refused
 
 from pisigma.files.errors import PlanningError
-from pisigma.planning.candidates import draw_candidates, read_candidates, spread
+from pisigma.planning.candidates import draw_candidates, read_candidates, select_spread_poses
 from pisigma.planning.surroundings.arm_in_surroundings import ArmInSurroundings
 from pisigma.planning.surroundings.surroundings import Surroundings
 from pisigma.robot import Robot
@@ -79,7 +79,7 @@ def test_a_prismatic_joint_needs_limits():
 
 def test_spread_poses_are_farther_apart_than_random_ones():
     q = draw_candidates(ArmInSurroundings.from_robot(ARM.nominal), 200, 0).q
-    chosen = spread(ARM, q[20:], 10, q[:20])
+    chosen = select_spread_poses(ARM, q[20:], 10, q[:20])
     position = forward_kinematics(ARM.robot, q)[:, :3, 3]
 
     def nearest(index: torch.Tensor) -> float:
@@ -87,7 +87,7 @@ def test_spread_poses_are_farther_apart_than_random_ones():
 
     assert len(chosen.unique()) == 10
     assert nearest(20 + chosen) > nearest(torch.arange(20, 30))
-    assert len(spread(ARM, q, 0, q[:3])) == 0
+    assert len(select_spread_poses(ARM, q, 0, q[:3])) == 0
 
 
 def test_joints_are_unwrapped_away_from_angles_that_are_rarely_free():

@@ -65,7 +65,7 @@ def test_condensed_rows_keep_the_variance_after_measuring(hybrid: bool) -> None:
     posterior, task = RobotPosterior.from_robot(Robot.load("ur5"), hybrid=hybrid), random_joints(50, 1)
     q, goal = random_joints(60, 0), condense_derivatives(posterior.tool(task))
     for count in (5, 20, 60):
-        left = rms_of(posterior.given_poses(q[:count]).tool(task)) ** 2
+        left = rms_of(posterior.after_measuring(q[:count]).tool(task)) ** 2
         assert_close(variance(posterior.sensitivities(q[:count]), goal), left, rtol=0.01)
 
 
@@ -81,7 +81,7 @@ def test_criterion_i_leaves_less_error_of_the_tool_than_criterion_d_and_random_p
             select_poses(posterior.sensitivities(q), posterior.tool(task), count, "D"),
             torch.arange(count),
         ]
-        left, *others = (rms_of(posterior.given_poses(q[rows]).tool(task)) for rows in chosen)
+        left, *others = (rms_of(posterior.after_measuring(q[rows]).tool(task)) for rows in chosen)
         assert left < 0.9 * min(others)
 
 
@@ -101,7 +101,7 @@ def test_the_curve_is_the_covariance_after_the_poses(posterior: RobotPosterior) 
     chosen = select_poses(posterior.sensitivities(q), posterior.tool(task), 20)
     points = accuracy_curve(posterior.sensitivities(q), posterior.tool(task), chosen, (10, 20))
     for point in points:
-        after = posterior.given_poses(q[chosen[: point.poses]])
+        after = posterior.after_measuring(q[chosen[: point.poses]])
         assert_close(point.rms, float(after.deviation(task).square().mean().sqrt()), rtol=1e-6)
         assert point.rms < point.p95 < 3 * point.rms
         assert point.rms < point.random_rms
@@ -120,7 +120,7 @@ def test_remaining_errors_are_attributed_to_groups(posterior: RobotPosterior) ->
     errors = remaining_errors(posterior, task)
     assert {"base", "tool", "joint offsets"} <= {error.name for error in errors}
     assert errors[0].name == "base"
-    hybrid = RobotPosterior.from_robot(Robot.load("ur5")).given_poses(random_joints(300, 7))
+    hybrid = RobotPosterior.from_robot(Robot.load("ur5")).after_measuring(random_joints(300, 7))
     assert any(error.name.startswith("correction of joint") for error in remaining_errors(hybrid, task))
 
 

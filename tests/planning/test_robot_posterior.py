@@ -50,12 +50,12 @@ def test_conditioning_agrees_with_a_normal_distribution(robot: Robot) -> None:
     A = posterior.columns(q)[:, :3].flatten(0, 1)
     C = posterior.uncertainty.root.square()
     expected = torch.linalg.inv(torch.linalg.inv(C) + A.t() @ A / posterior.instrument.sigma**2)
-    root = posterior.given_poses(q).uncertainty.root
+    root = posterior.after_measuring(q).uncertainty.root
     scale = expected.diagonal().sqrt()
     assert_close(root @ root.t() / scale / scale[:, None], expected / scale / scale[:, None], atol=1e-6)
     # What is measured first and what is measured second may be exchanged.
-    halves = posterior.given_poses(q[:8]).given_poses(q[8:]).deviation(task)
-    assert_close(halves, posterior.given_poses(q).deviation(task), rtol=1e-6)
+    halves = posterior.after_measuring(q[:8]).after_measuring(q[8:]).deviation(task)
+    assert_close(halves, posterior.after_measuring(q).deviation(task), rtol=1e-6)
 
 
 def test_few_rows_are_conditioned_on_without_a_fit(robot: Robot) -> None:
@@ -63,12 +63,12 @@ def test_few_rows_are_conditioned_on_without_a_fit(robot: Robot) -> None:
     rows = Measurements(q=q, position=forward_kinematics(robot, q)[:, :3, 3])
     task = random_joints(robot, 5, 4)
     assert_close(
-        posterior.updated_with(rows).deviation(task), posterior.given_poses(q).deviation(task), rtol=1e-9
+        posterior.updated_with(rows).deviation(task), posterior.after_measuring(q).deviation(task), rtol=1e-9
     )
 
 
 def test_surprise_is_chi_square_distributed_and_larger_for_wrong_rows(robot: Robot) -> None:
-    posterior = RobotPosterior.from_robot(robot, Instrument("pose", 1e-4, 2e-4)).given_poses(
+    posterior = RobotPosterior.from_robot(robot, Instrument("pose", 1e-4, 2e-4)).after_measuring(
         random_joints(robot, 60, 5)
     )
     q = random_joints(robot, 400, 6)
@@ -96,7 +96,7 @@ def test_rows_without_positions_are_refused(robot: Robot) -> None:
 def test_distances_do_not_determine_the_pose_of_the_base(robot: Robot) -> None:
     known = RobotPosterior.from_robot(robot, Instrument("distance", anchor=(1.5, -1.0, 0.3)), hybrid=False)
     q = torch.rand(40, robot.dof, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
-    after = known.given_poses(q).deviation(q)
+    after = known.after_measuring(q).deviation(q)
     assert bool((after < 0.5 * known.deviation(q)).all())
     assert float(after.max()) < 5e-3
 

@@ -80,11 +80,11 @@ def test_a_joint_has_an_approach_direction_if_all_its_axes_agree(sides):
 def test_full_turns_bring_controller_values_into_their_limits():
     robot = coupled_robot()
     q = robot.to_dh(drawn(robot))
-    turned, inside = robot.coupling.wrapped_inside(q + 2 * np.pi * np.array([0, 1, -1, 0, 0, 0]))
+    turned, inside = robot.coupling.wrapped_within_limits(q + 2 * np.pi * np.array([0, 1, -1, 0, 0, 0]))
     assert inside.all()
     assert_close(turned, q, atol=1e-12)
     beyond = robot.to_dh(np.deg2rad([[0, 0, 224.0, 0, 0, 0]]))
-    assert not robot.coupling.wrapped_inside(beyond)[1].any()
+    assert not robot.coupling.wrapped_within_limits(beyond)[1].any()
 
 
 def test_only_a_parallelogram_rotates_with_its_crank():

@@ -119,11 +119,11 @@ def test_candidates_can_be_touched():
     assert found.count == 240
     tip, shaft = found.T_jig_tool[:, :3, 3], -found.T_jig_tool[:, :3, 2]
     assert_close(tip[torch.arange(240), found.axis], found.coordinate, atol=1e-15)
-    assert bool(jig.on_face(found.face, tip, 0.0199).all())
+    assert bool(jig.is_on_face(found.face, tip, 0.0199).all())
     assert bool((shaft[:, 2] >= math.cos(math.radians(30)) - 1e-12).all())
     lean = (shaft * jig.outward[found.face]).sum(-1)
     assert bool((lean >= math.sin(math.radians(8)) - 1e-12).all())
-    assert not jig.is_hit(tip + 1e-6 * shaft, tip + 0.3 * shaft).any()
+    assert not jig.intersects_line(tip + 1e-6 * shaft, tip + 0.3 * shaft).any()
     Ts_jig_base = torch.stack([PLACEMENTS[number].T_jig_base for number in found.placement.tolist()])
     assert_close(Ts_jig_base @ forward_kinematics(robot, found.q), found.T_jig_tool, atol=1e-12)
     limits = torch.from_numpy(robot.limits)

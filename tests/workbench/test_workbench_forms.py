@@ -29,7 +29,7 @@ FILL = """(form, last) => { for (const one of form.elements) {
 def cell(tmp_path, blank_pictures):
     """A cell with a space in its path, a session and a plan."""
     made = Cell.create(tmp_path / "my cell", "ur10", limit_mm=0.5)
-    made.take_in(measured(20, 0), day=day(20))
+    made.add_session(measured(20, 0), day=day(20))
     made.plan(count=4, check=0, candidates=50)
     return made
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 from testing.simulated_arm import simulate
 
-from pisigma.validation.held_out.calibration_validation import errors_under
+from pisigma.validation.held_out.calibration_validation import pose_errors_of
 from pisigma.workflow.calibrate import calibrate
 from pisigma.workflow.settings.calibration import CalibrationSettings
 
@@ -17,7 +17,7 @@ def test_a_calibration_without_held_out_rows_predicts_its_error_at_other_poses(m
     predicted, fitted = calibration.summary.predicted_rms_mm, calibration.summary.calibrated
     assert predicted is not None
     assert fitted is not None
-    error = float(errors_under(calibration.result, others).position.square().mean().sqrt()) * 1e3
+    error = float(pose_errors_of(calibration.result, others).position.square().mean().sqrt()) * 1e3
     assert error / 1.7 < predicted < 1.7 * error
     assert predicted > 1.5 * fitted.models[model].rms_mm
 

@@ -18,7 +18,7 @@ def test_a_plan_holds_the_controllers_values_within_its_limits(tmp_path: Path) -
     robot = coupled_robot()
     arm = ArmInSurroundings.from_robot(robot)
     q = draw_candidates(arm, 20, seed=1).q
-    assert robot.coupling.is_inside(q.numpy()).all()
+    assert robot.coupling.is_within_limits(q.numpy()).all()
     count = len(q)
     way = (q[:1],) + (q[:0],) * (count - 1)
     check = torch.zeros(count, dtype=torch.bool)

@@ -36,7 +36,7 @@ def test_rows_are_checked_as_they_are_measured_until_the_plan_is_done(tmp_path, 
     assert waited[1]
     assert not waited[-1]
     assert seen == list(range(2, 11))
-    assert step.state.finished
+    assert step.state.is_finished
 
 
 def test_the_accuracy_is_computed_in_the_background(tmp_path, monkeypatch):

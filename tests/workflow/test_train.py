@@ -10,7 +10,7 @@ from testing.refusals import refused
 
 import pisigma
 from pisigma.files.errors import MeasurementError, RecipeError
-from pisigma.validation.held_out.pose_statistics import compare_on
+from pisigma.validation.held_out.pose_statistics import compare_with_nominal
 from pisigma.validation.held_out.training_summary import ComparisonFigures, summarise_training
 from pisigma.workflow.recipes.data import load_data, simulate
 from pisigma.workflow.recipes.reader import recipe_hash
@@ -122,7 +122,10 @@ def test_rows_of_the_test_set_do_not_change_the_model():
         ]
         run = train_networks(measured, load_data(measured, marked))
         summary = summarise_training(
-            run, {}, None, ComparisonFigures.from_comparison(compare_on(run.model, test), rows=test.rows)
+            run,
+            {},
+            None,
+            ComparisonFigures.from_comparison(compare_with_nominal(run.model, test), rows=test.rows),
         )
     states = [model.network.state_dict() for model in models]
     for name, values in states[0].items():

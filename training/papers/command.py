@@ -9,7 +9,7 @@ from jig_recipe import JIGS, read_jig_recipe
 from page import PAGE, page_text
 from pictures import draw_pictures
 from pisigma.files.errors import PisigmaError
-from pisigma.files.output_file import write_whole
+from pisigma.files.output_file import write_atomically
 from pisigma.robot.description import Robot
 from published import read_published
 from stored_results import read_results
@@ -70,7 +70,7 @@ def write_page(folder: Path) -> None:
     """
     text = page_text(folder)
     draw_pictures(folder, read_published(folder), read_results(folder))
-    write_whole(folder / PAGE, text)
+    write_atomically(folder / PAGE, text)
 
 
 def write_touches(folder: Path, out: Path) -> None:

@@ -14,7 +14,7 @@ from pisigma.files.errors import RecipeError, nearest_choice
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import Robot
 from pisigma.simulation.true_robot import TrueRobot
-from pisigma.validation.held_out.calibration_validation import errors_under
+from pisigma.validation.held_out.calibration_validation import pose_errors_of
 from pisigma.workflow.recipes.recipe import GeometricRecipe
 
 _DECIMALS = 6
@@ -49,7 +49,7 @@ def report_eliminations(
     compared = []
     for removed in (*cases, ()):
         found = calibrate_without(recipe, removed, rows)
-        errors = errors_under(found, held_out).figures.figures_by_name
+        errors = pose_errors_of(found, held_out).figures.figures_by_name
         compared.append(
             {
                 "removed": list(removed),

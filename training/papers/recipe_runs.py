@@ -9,7 +9,7 @@ from jig_recipe import JIGS
 from jig_run import run_jigs_recipe
 from markdown_text import command_of
 from pisigma.calibration.geometric.result import CalibrationResult
-from pisigma.files.output_file import write_whole
+from pisigma.files.output_file import write_atomically
 from pisigma.files.output_folder import check_folder
 from pisigma.measurement.dataset import Measurements
 from pisigma.workflow.recipes.data import simulate
@@ -45,7 +45,7 @@ def run_recipe(folder: Path, name: str, data: Path | None, out: Path | None) -> 
         training.save(out, name, command_of(name), overwrite=True)
         result = {"model": str(out), **figures_of(training), **extra_figures(folder, name, training)}
     (folder / RESULTS).mkdir(exist_ok=True)
-    write_whole(folder / RESULTS / f"{name}.json", result_text(result))
+    write_atomically(folder / RESULTS / f"{name}.json", result_text(result))
 
 
 def figures_of(training: Training) -> dict[str, Any]:

@@ -24,7 +24,7 @@ from pisigma.calibration.geometric.identifiability.sufficiency import (
     refuse_too_few,
     without_sensor_unknowns,
 )
-from pisigma.calibration.geometric.initial_guess.initial_guess import chosen_rows
+from pisigma.calibration.geometric.initial_guess.initial_guess import randomly_chosen_rows
 from pisigma.calibration.geometric.problem.information import information
 from pisigma.calibration.geometric.problem.least_squares import SHORTEST_STEP, Solution, levenberg_marquardt
 from pisigma.calibration.geometric.problem.noise import sensor_view_of
@@ -251,7 +251,7 @@ class GeometricCalibrator:
         """
         problem = setup.problem.with_active(active)
         if problem.rows > ROUGH_ROWS:
-            problem = problem.select(chosen_rows(problem.rows, ROUGH_ROWS).to(problem.q.device))
+            problem = problem.select(randomly_chosen_rows(problem.rows, ROUGH_ROWS).to(problem.q.device))
         steps = min(ROUGH_STEPS, self.maximum_iterations)
         rough = levenberg_marquardt(problem.without_prior(), setup.start, steps, close_enough=1.0)
         unknowns, here = setup.free_unknowns, rough.linearisation

@@ -8,7 +8,7 @@ from jaxtyping import Int64
 from torch import Tensor
 
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
-from pisigma.calibration.geometric.initial_guess.initial_guess import chosen_rows
+from pisigma.calibration.geometric.initial_guess.initial_guess import randomly_chosen_rows
 from pisigma.calibration.geometric.outliers import Outlier, outliers_of
 from pisigma.calibration.geometric.problem.noise import renumber, sensor_view_of
 from pisigma.calibration.geometric.problem.problem import CalibrationProblem
@@ -28,7 +28,7 @@ from pisigma.calibration.hybrid.refinement import (
     evaluate_in_chunks,
     linearise_rows,
     refine,
-    with_frames_of,
+    with_aligned_frames,
 )
 from pisigma.calibration.hybrid.regression import build_regression
 from pisigma.calibration.hybrid.result import HybridResult, LearnedPart
@@ -160,7 +160,7 @@ class HybridCalibrator:
         """Return the correction with the geometry fitted together with it, and its measured ranges."""
         noise = zip(solved.problem.sensors, refined.posterior.noise, strict=True)
         return LearnedPart(
-            geometry=with_frames_of(solved, refined),
+            geometry=with_aligned_frames(solved, refined),
             correction=refined.correction,
             coverage=JointCoverage.from_joints(self.geometric.robot, solved.problem.q),
             noise={sensor.name: sigma for sensor, sigma in noise if not sensor.certain},
@@ -184,7 +184,7 @@ class HybridCalibrator:
         problem, view = solved.problem, sensor_view_of(solved.solution.linearisation)
         noise, prior_scale = tuple(view.noise.tolist()), tuple(view.prior_scale.tolist())
         if problem.q.shape[0] > SEARCHED_ROWS:
-            chosen = chosen_rows(problem.q.shape[0], SEARCHED_ROWS).to(problem.q.device)
+            chosen = randomly_chosen_rows(problem.q.shape[0], SEARCHED_ROWS).to(problem.q.device)
             chosen = problem.with_partners(chosen)
             problem, group = problem.select(chosen), renumber(group[chosen])
         design, point = Design(problem, ()), solved.solution.linearisation.point

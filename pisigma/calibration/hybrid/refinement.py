@@ -133,7 +133,7 @@ def linearise_rows(
     return Rows.from_linearisation(design, x, values, robust_weights(problem, values, effective), group)
 
 
-def with_frames_of(solved: SolvedCalibration, refined: RefinedFit) -> IdentifiedGeometry:
+def with_aligned_frames(solved: SolvedCalibration, refined: RefinedFit) -> IdentifiedGeometry:
     """Return the geometry of the hybrid, with floating frames moved onto those of the geometric calibration.
 
     Residuals of sockets, and of distances from anchors at unknown points, do not change if the whole frame is moved.
@@ -155,13 +155,13 @@ def with_frames_of(solved: SolvedCalibration, refined: RefinedFit) -> Identified
     bases = setup.anchors.bases.clone()
     for frame in frames:
         here = torch.tensor([name == frame for name in rows.frame])
-        motion = nearest_motion(points[0][here].flatten(0, 1), points[1][here].flatten(0, 1))
+        motion = fit_rigid_motion(points[0][here].flatten(0, 1), points[1][here].flatten(0, 1))
         number = setup.problem.space.frames.index(frame)
         bases[number] = motion.to(bases) @ bases[number]
     return identified_geometry(replace(setup, anchors=replace(setup.anchors, bases=bases)), refined.point)
 
 
-def nearest_motion(
+def fit_rigid_motion(
     points: Float64[Tensor, "points 3"], onto: Float64[Tensor, "points 3"]
 ) -> Float64[Tensor, "4 4"]:
     """Compute the rigid motion T that minimises `Σ |T p - p'|²` (Kabsch 1976, Acta Crystallographica A32, 922-923)."""

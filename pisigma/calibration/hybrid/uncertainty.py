@@ -20,7 +20,7 @@ from pisigma.calibration.hybrid.noise import CalibrationNoise, stated_sigmas
 from pisigma.calibration.hybrid.sensor_values import joint_columns, weight_columns
 from pisigma.estimation.covariance_root import CovarianceRoot
 from pisigma.estimation.held_out import HeldOutErrors, held_out_scale
-from pisigma.estimation.regression import Posterior, root_of_sizes
+from pisigma.estimation.regression import Posterior, prior_size_columns
 from pisigma.joint_correction.feature import AbstractFeature
 from pisigma.measurement.conditions import JointState
 from pisigma.measurement.dataset import Measurements
@@ -149,7 +149,7 @@ def position_uncertainty(
     prior_scale = held_out_scale(missed)
     root = fit.covariance_root(posterior)
     change = geometry.coordinate_jacobian[:, design.problem.active.cpu()]
-    root = root.with_columns(root_of_sizes(posterior, root), prior_scale**0.5, change)
+    root = root.with_columns(prior_size_columns(posterior, root), prior_scale**0.5, change)
     value = {sensor.name: sigma for sensor, sigma in zip(rows.values, posterior.noise, strict=True)}
     noise = CalibrationNoise(value, stated_sigmas(design.problem.sensors))
     return PositionUncertainty(design.problem.space, geometry, design.features, root, prior_scale, noise)

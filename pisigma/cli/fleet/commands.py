@@ -102,7 +102,7 @@ def show_fleet(
         verbose: print all tables.
         as_json: print one JSON object.
     """
-    from pisigma.files.output_file import check_output, write_whole
+    from pisigma.files.output_file import check_output, write_atomically
     from pisigma.lifetime.fleet.status import FleetStatus
 
     if page is not None:
@@ -111,7 +111,7 @@ def show_fleet(
     if page is not None:
         from pisigma.reporting.page.lifetime import fleet_page
 
-        write_whole(page, fleet_page(seen, page.parent))
+        write_atomically(page, fleet_page(seen, page.parent))
     if as_json:
         print_json(seen.to_json())
     else:

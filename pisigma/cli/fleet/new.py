@@ -63,7 +63,7 @@ def new(
     from pisigma.files.model_files import is_model
     from pisigma.measurement.camera.camera_files import CameraFiles
     from pisigma.workflow.cell.cell import Cell
-    from pisigma.workflow.cell.new_cell import NewCell, of_model
+    from pisigma.workflow.cell.new_cell import NewCell, cell_from_model
     from pisigma.workflow.fleet.manifest import new_cells
 
     cameras = None
@@ -74,7 +74,7 @@ def new(
         return _print_cells(new_cells(source, out, cell), out, as_json)
     if bool(robot) is (source is not None):
         raise typer.BadParameter("expected either ROBOT or --from MODEL_FOLDER")
-    (cell if source is None else of_model(source, cell)).write(out)
+    (cell if source is None else cell_from_model(source, cell)).write(out)
     status = Cell.open(out).status()
     if as_json:
         print_json({"cell": str(out), **status.to_json()})

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pisigma.files.output_file import writing_whole
+from pisigma.files.output_file import open_atomically
 from pisigma.measurement.csv.poses import CHUNK_ROWS, PoseChunk, read_pose_chunks
 from pisigma.measurement.fields import UnusableRow
 from pisigma.model.inverse.corrected_ik import CorrectedIK
@@ -104,7 +104,7 @@ def write_joint_file(
     accuracy: bool = False,
     path: bool = False,
 ) -> PoseFileResult:
-    """Write one row per pose of a file, whole or not at all, however long the file is.
+    """Write one row per pose of a file, completely or not at all, however long the file is.
 
     A row contains the line of the pose, status, branch, corrected and nominal joint values, the residuals of the
     calibrated model, the domain measure and, with `accuracy`, the predicted standard deviation of the tool's position.
@@ -125,7 +125,7 @@ def write_joint_file(
         PoseError: there is no such branch.
     """
     outcome, begun = PoseFileResult(), time.monotonic()
-    with writing_whole(out) as file:
+    with open_atomically(out) as file:
         writer = csv.writer(file, lineterminator="\n")
         header = _header(solver, accuracy)
         writer.writerow(header)

@@ -77,13 +77,13 @@ def _verdict(detected: "DetectedCorners", out: Path, camera: Path, board: Path) 
 
 def _print_board(board: Path, sheet: Path, as_json: bool) -> None:
     """Write a board as a PDF."""
-    from pisigma.files.output_file import check_output, write_whole
+    from pisigma.files.output_file import check_output, write_atomically
     from pisigma.measurement.camera.board import Board
     from pisigma.reporting.board_sheet import board_pdf
 
     check_output(sheet, (".pdf",), "a board to print", [board])
     paper, content = board_pdf(Board.load(board))
-    write_whole(sheet, content)
+    write_atomically(sheet, content)
     if as_json:
         print_json({"file": str(sheet), "paper": paper})
     else:

@@ -109,7 +109,7 @@ def page(step: SessionStep | None, state: SessionState, title: str) -> "Renderab
 
 
 def _verdict(state: SessionState, row: int) -> str:
-    return "does not count" if state.rows.alarmed[row] else row_text(state, row)
+    return "not used" if state.rows.alarmed[row] else row_text(state, row)
 
 
 def _points(points: Sequence[AccuracyPoint]) -> list[tuple[str, ...]]:

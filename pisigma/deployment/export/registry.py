@@ -7,7 +7,7 @@ from pathlib import Path
 from pisigma.deployment.export.export_format import OPTIONS, Exported, ExportFormat, ExportRequest
 from pisigma.files.conflicts import check_conflicts
 from pisigma.files.errors import OutputError, Place, check_choice, nearest_choice
-from pisigma.files.output_file import check_output, write_whole
+from pisigma.files.output_file import check_output, write_atomically
 
 BUILT_IN = {
     "urdf": ("pisigma.deployment.export.urdf", "calibrated geometry"),
@@ -84,7 +84,7 @@ def export_format(name: str) -> ExportFormat:
 
 
 def export_model(name: str, request: ExportRequest) -> Exported:
-    """Write a model in a format, every file as a whole or not at all.
+    """Write a model in a format, every file completely or not at all.
 
     Args:
         name: name of the format.
@@ -112,7 +112,7 @@ def export_model(name: str, request: ExportRequest) -> Exported:
         check_conflicts(request.out, inputs)
     exported = form.write(request)
     if isinstance(exported.content, str | bytes):
-        write_whole(request.out, exported.content)
+        write_atomically(request.out, exported.content)
     else:
         _write_folder(request.out, exported.content)
     return exported
@@ -134,4 +134,4 @@ def _write_folder(folder: Path, files: Mapping[str, bytes]) -> None:
             remedy="choose another folder",
         ) from None
     for name, content in files.items():
-        write_whole(folder / name, content)
+        write_atomically(folder / name, content)

@@ -5,7 +5,7 @@ import socket
 import time
 from collections.abc import Callable
 
-from pisigma.deployment.serve.protocol import AbstractProtocol, BrokenStreamError, is_token
+from pisigma.deployment.serve.protocol import AbstractProtocol, BrokenStreamError, tokens_match
 
 CHUNK = 4096
 """[bytes] Read at a time, so that no client delays the others by sending a lot at once."""
@@ -146,7 +146,7 @@ class Connection:
             self._watch(answered > 0)
 
     def _admit(self, message: bytes, token: bytes) -> None:
-        admitted = is_token(self._protocol.token_of(message), token)
+        admitted = tokens_match(self._protocol.token_of(message), token)
         reply = self._protocol.admission_answer(admitted)
         if not admitted:
             raise BrokenStreamError(reply)

@@ -16,11 +16,11 @@ from typing import TYPE_CHECKING, Any
 from pisigma.deployment.serve.json_lines import JsonLines
 from pisigma.deployment.serve.metrics import Metrics
 from pisigma.deployment.serve.models import ModelStatus, ServedModel, ServedModels
-from pisigma.deployment.serve.protocol import is_token
+from pisigma.deployment.serve.protocol import tokens_match
 from pisigma.deployment.serve.settings import ServeSettings, is_local
 from pisigma.files.errors import OutputError, Place
 from pisigma.files.input_file import read_input
-from pisigma.files.output_file import write_whole
+from pisigma.files.output_file import write_atomically
 
 if TYPE_CHECKING:
     import asyncua
@@ -279,7 +279,7 @@ class _Admission:
 
         if username is not None and self._token is not None:
             secret = password.encode() if isinstance(password, str) else password
-            is_admitted = username == USER and is_token(secret, self._token)
+            is_admitted = username == USER and tokens_match(secret, self._token)
         else:
             is_admitted = self._is_open or (username is None and certificate in self._trusted)
         return User(role=UserRole.User, name=username or "") if is_admitted else None
@@ -335,7 +335,7 @@ def _make_own_certificate(folder: Path, uri: str) -> None:
     descriptor = os.open(folder / _KEY, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
     with os.fdopen(descriptor, "wb") as file:
         file.write(cert_gen.dump_private_key_as_pem(key))
-    write_whole(folder / _CERTIFICATE, certificate.public_bytes(Encoding.DER))
+    write_atomically(folder / _CERTIFICATE, certificate.public_bytes(Encoding.DER))
 
 
 def _free_port(host: str) -> int:

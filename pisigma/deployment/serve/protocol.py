@@ -52,6 +52,6 @@ class AbstractProtocol(ABC):
         """Return the answer to a token."""
 
 
-def is_token(given: bytes | None, wanted: bytes) -> bool:
+def tokens_match(given: bytes | None, wanted: bytes) -> bool:
     """Compare tokens in a time that does not depend on where they differ."""
     return given is not None and hmac.compare_digest(given, wanted)

@@ -16,7 +16,7 @@ CLIENT_TIMEOUT = 10.0
 """[s] A client that takes longer for the remainder of a message, its token, or to receive an answer is cut off."""
 
 
-def token_in(file: Path) -> str:
+def read_token(file: Path) -> str:
     """Read the token from a file."""
     return read_input(file, OutputError).decode(errors="replace").strip()
 
@@ -65,6 +65,6 @@ class ServeSettings:
     opcua: bool = False
     opcua_port: Annotated[int, Option(min=0, max=LAST_PORT)] = 4840
     opcua_certificates: Path | None = None
-    token: Annotated[str | None, Option("--token-file", kind=Path, read=token_in)] = None
+    token: Annotated[str | None, Option("--token-file", kind=Path, read=read_token)] = None
     client_timeout: Annotated[float, HIDDEN] = CLIENT_TIMEOUT
     polling: Annotated[float, Option("--poll-ms", unit="ms", min=0, max=100, is_key=True)] = POLL_DURATION

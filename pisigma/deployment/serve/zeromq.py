@@ -7,7 +7,7 @@ from pisigma.deployment.serve.connection import MAX_DRAIN_BYTES
 from pisigma.deployment.serve.json_lines import MAX_LINE_BYTES, JsonLines
 from pisigma.deployment.serve.metrics import Metrics
 from pisigma.deployment.serve.models import ServedModels
-from pisigma.deployment.serve.protocol import AbstractProtocol, BrokenStreamError, is_token
+from pisigma.deployment.serve.protocol import AbstractProtocol, BrokenStreamError, tokens_match
 from pisigma.files.errors import OutputError
 
 SILENCE_MS = 500
@@ -117,7 +117,7 @@ class ZeroMq:
         message = parts[-1] if parts else b""
         protocol: AbstractProtocol = self._binary if message.startswith(MAGIC) else self._json
         if len(parts) != (1 if self._token is None else 2) or (
-            self._token is not None and not is_token(parts[0], self._token)
+            self._token is not None and not tokens_match(parts[0], self._token)
         ):
             return protocol.admission_answer(False)
         if protocol is self._json:

@@ -70,7 +70,7 @@ _ELSE: dict[Situation, str] = {
 
 
 @dataclass(frozen=True)
-class Active:
+class ActiveExport:
     """An export that is active on a controller.
 
     Attributes:
@@ -116,14 +116,14 @@ class Controller:
         """Return the controller of a cell."""
         return Controller(history.controller(), history.exports())
 
-    def active(self, day: str = "9999", time: str = "") -> dict[Contents, Active]:
+    def active(self, day: str = "9999", time: str = "") -> dict[Contents, ActiveExport]:
         """Return the exports that were active after a day, by their contents.
 
         Args:
             day: the day (ISO 8601).
-            time: time (ISO 8601, UTC): a change of this day counts only if it was recorded until then.
+            time: time (ISO 8601, UTC): a change of this day is regarded only if it was recorded until then.
         """
-        exports, found = {one.sha256: one for one in self.exports}, dict[Contents, Active]()
+        exports, found = {one.sha256: one for one in self.exports}, dict[Contents, ActiveExport]()
         for one in self.changes:
             if one.day > day or (one.day == day and one.recorded > time):
                 break
@@ -131,10 +131,10 @@ class Controller:
                 found.clear()
             elif one.sha256 in exports:
                 export = exports[one.sha256]
-                found[export.contains] = Active(export, one.day)
+                found[export.contains] = ActiveExport(export, one.day)
         return found
 
-    def active_during(self, session: SessionEntry) -> dict[Contents, Active]:
+    def active_during(self, session: SessionEntry) -> dict[Contents, ActiveExport]:
         """Return the exports that were active during a session; of its day, those recorded before it was added."""
         return self.active(session.day, session.taken_in)
 
@@ -151,7 +151,7 @@ class Controller:
 
     def active_when_fitted(
         self, model: ModelEntry, sessions: tuple[SessionEntry, ...]
-    ) -> dict[Contents, Active]:
+    ) -> dict[Contents, ActiveExport]:
         """Return the exports that were active when the newest rows of a model were measured."""
         newest = [one for one in sessions if one.name == model.sessions.split(",")[-1]]
         return (
@@ -167,7 +167,7 @@ class Controller:
         command: str,
         model: ModelEntry | None,
         sessions: tuple[SessionEntry, ...],
-        at: dict[Contents, Active] | None = None,
+        at: dict[Contents, ActiveExport] | None = None,
     ) -> "Findings":
         """Apply `RULES` to a command.
 
@@ -243,12 +243,12 @@ def valid_sessions(
     return tuple(one for one in present if controller.matches_session(one))
 
 
-def _hash(active: dict[Contents, Active]) -> str:
+def _hash(active: dict[Contents, ActiveExport]) -> str:
     """Return a hash that identifies joint zeros; empty if none are active."""
     return active["joint_zeros"].export.sha256 if "joint_zeros" in active else ""
 
 
-def records(active: dict[Contents, Active]) -> list[dict[str, str]]:
+def records(active: dict[Contents, ActiveExport]) -> list[dict[str, str]]:
     """Return the active exports as plain values."""
     return [one.to_json() for one in active.values()]
 

@@ -131,7 +131,7 @@ class Database:
 
     @contextmanager
     def open(self) -> Iterator[sqlite3.Connection]:
-        """Open the file; one of an earlier version is upgraded first, as a whole or not at all.
+        """Open the file; one of an earlier version is upgraded first, completely or not at all.
 
         Raises:
             OutputError: the file is not a database, has a newer version, cannot be opened or upgraded, or is on the

@@ -211,7 +211,7 @@ def _facts(folder: Path, history: History) -> CellFacts:
         limit_mm=stated.limit_mm,
         today=datetime.date.today().isoformat(),
         not_taken_in=not_taken_in(folder / SESSIONS, sessions),
-        not_read=unimported_files(folder / SESSIONS, sessions),
+        not_read=foreign_files(folder / SESSIONS, sessions),
         plans_nothing=stated.plans_nothing(in_use),
         settings_sha256=stated.settings_hash(folder),
         changed_models=tuple(
@@ -250,7 +250,7 @@ def not_taken_in(folder: Path, sessions: Sequence[SessionEntry]) -> tuple[str, .
     return tuple(sorted(found, key=lambda name: (date_in_name(name), name)))
 
 
-def unimported_files(folder: Path, sessions: Sequence[SessionEntry]) -> tuple[str, ...]:
+def foreign_files(folder: Path, sessions: Sequence[SessionEntry]) -> tuple[str, ...]:
     """Return the names of the files in the folder of sessions that are not measurement files and were not imported."""
     names = {one.name for one in sessions}
     found = [path.name for path in folder.glob("[!.]*") if path.is_file() and path.suffix != ".csv"]

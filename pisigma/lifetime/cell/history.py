@@ -254,7 +254,7 @@ class History:
         return tuple(sorted(self.database.read(ControllerEntry), key=lambda one: (one.day, one.recorded)))
 
     @property
-    def before_in_use(self) -> str | None:
+    def model_after_undo(self) -> str | None:
         """The model that an undo puts into use, "" for none; None if there is nothing to undo."""
         states = [""]
         for one in self.uses():

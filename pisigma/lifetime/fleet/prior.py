@@ -45,7 +45,7 @@ class FleetPrior:
         model: mean robot, with the uncertainty of another robot of the fleet.
         population: mean and covariance of the errors between robots.
         names: names of the geometric parameters.
-        odd: indices of robots that are inconsistent with the others and did not count.
+        odd: indices of robots that are inconsistent with the others and were not used.
     """
 
     model: CalibratedModel

@@ -44,10 +44,10 @@ class FleetPriorSummary(AbstractSummary):
     """All figures of a fleet prior.
 
     Attributes:
-        robots: number of robots that count.
-        odd: ids of robots that are inconsistent with the others and do not count.
-        refused: reasons by id of robots whose files cannot be read and that do not count.
-        remarks: remarks on the rows of robots that count, one sentence each.
+        robots: number of robots that were used.
+        odd: ids of robots that are inconsistent with the others and were not used.
+        refused: reasons by id of robots whose files cannot be read.
+        remarks: remarks on the rows of the robots that were used, one sentence each.
         rows: number of rows of all robots.
         parameters: distributions of the geometric parameters.
         spectrum: standard deviations of the joint correction's weights.
@@ -66,8 +66,8 @@ class FleetPriorSummary(AbstractSummary):
     @property
     def warnings(self) -> tuple[str, ...]:
         """Warnings, one sentence each."""
-        odd = (f"Robot '{name}' is inconsistent with the others and did not count." for name in self.odd)
-        refused = (f"Robot '{name}' did not count: {reason}" for name, reason in self.refused.items())
+        odd = (f"Robot '{name}' is inconsistent with the others and was not used." for name in self.odd)
+        refused = (f"Robot '{name}' was not used: {reason}" for name, reason in self.refused.items())
         return (*odd, *refused, *self.remarks)
 
 

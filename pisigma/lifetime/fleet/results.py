@@ -83,7 +83,7 @@ def write_results(path: Path, cells: Sequence[CellFacts], parameters: Parameters
     rows = [row for facts in cells for row in _rows(facts, parameters)]
     content = io.BytesIO()
     parquet.write_table(pyarrow.Table.from_pylist(rows, schema), content)
-    write_whole(path, content.getvalue())
+    write_atomically(path, content.getvalue())
 
 
 def _rows(facts: CellFacts, parameters: Parameters) -> list[dict[str, object]]:

@@ -160,12 +160,12 @@ def limits_of(charts: int, one_sided: bool = False) -> Limits:
     sessions = 2 * charts * SESSIONS_PER_YEAR / FALSE_ALARMS_PER_YEAR
     sides = 1 if one_sided else 2
     return Limits(
-        ewma=_solved(lambda limit: ewma_sessions(limit, one_sided), sessions, 0.1, 3.0),
-        cusum=_solved(lambda limit: cusum_sessions(limit) / sides, sessions, 0.5, 20.0),
+        ewma=_solved(lambda limit: mean_sessions_to_ewma_alarm(limit, one_sided), sessions, 0.1, 3.0),
+        cusum=_solved(lambda limit: mean_sessions_to_cusum_alarm(limit) / sides, sessions, 0.5, 20.0),
     )
 
 
-def ewma_sessions(limit: float, one_sided: bool) -> float:
+def mean_sessions_to_ewma_alarm(limit: float, one_sided: bool) -> float:
     """Compute the mean number of sessions until the moving average passes its limit (one-sided) or either limit."""
     low = -4.0 * math.sqrt(WEIGHT / (2 - WEIGHT)) if one_sided else -limit
     edges = torch.linspace(low, limit, STATES + 1, dtype=torch.float64)
@@ -178,7 +178,7 @@ def ewma_sessions(limit: float, one_sided: bool) -> float:
     return float(mean[int(middle.abs().argmin())])
 
 
-def cusum_sessions(limit: float) -> float:
+def mean_sessions_to_cusum_alarm(limit: float) -> float:
     """Compute the mean number of sessions until a cumulative sum passes its limit."""
     b = 2 * ALLOWANCE * (limit + OVERSHOOT)
     return (math.exp(b) - b - 1) / (2 * ALLOWANCE**2)

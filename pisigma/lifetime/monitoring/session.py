@@ -13,7 +13,7 @@ from torch import Tensor
 from pisigma.calibration.hybrid.refinement import linearise_rows
 from pisigma.estimation.drift import Drift, DriftGroup, LinearValues, PosteriorUpdate
 from pisigma.estimation.hypotheses import Explanation, Motion, SessionEvidence
-from pisigma.estimation.wrong_rows import ExplainedRows, with_wrong_rows
+from pisigma.estimation.wrong_rows import ExplainedRows, mark_wrong_rows
 from pisigma.files.errors import IdentificationError
 from pisigma.lifetime.recalibration.adaptation import AdaptedArm, linear_values, usual_noise
 from pisigma.lifetime.recalibration.movement import HistoryMovement, Movement, movements_of_group
@@ -28,7 +28,7 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import held_out_groups
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.model_posterior import ModelPosterior
-from pisigma.validation.held_out.calibration_validation import errors_under
+from pisigma.validation.held_out.calibration_validation import pose_errors_of
 
 Verdict = Literal["unchanged", "moved", "unclear"]
 ZERO_PRIOR = 0.02
@@ -79,7 +79,7 @@ class Session:
         values: number of measured values.
         standing: names of bases and tools that were moved since the model was made.
         observable: whether the rows determine the zero of each joint.
-        outliers: places of rows that do not count because they contradict the others under any movement.
+        outliers: places of rows that are not used because they contradict the others under any movement.
         score_ratio: for images, whose poses have more noise than error: RMS of values over their standard deviations,
             divided by that expected after a recalibration; otherwise 1.
     """
@@ -286,7 +286,7 @@ def _explained(
         V = evidence.covariance([_sized(one) for one in solved.probable_movements], factor)
         return ExplainedRows(solved, there, explanation.log_evidence, V, factor * there.deviation(noise))
 
-    return with_wrong_rows(explain(values.wrong), explain).what
+    return mark_wrong_rows(explain(values.wrong), explain).what
 
 
 def _sized(motion: Motion) -> DriftGroup:
@@ -385,7 +385,7 @@ def is_frame(what: str) -> bool:
 
 def _rms(arm: AdaptedArm, rows: Measurements) -> tuple[float, float]:
     """Compute the RMS errors of lengths [m] and of angles [rad]; 0 where none was measured."""
-    errors = errors_under(arm, rows)
+    errors = pose_errors_of(arm, rows)
     return _root_mean_square(errors.position), _root_mean_square(errors.rotation)
 
 

@@ -8,14 +8,14 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.calibration.geometric.initial_guess.initial_guess import chosen_rows
+from pisigma.calibration.geometric.initial_guess.initial_guess import randomly_chosen_rows
 from pisigma.calibration.geometric.prediction import predicted_poses
 from pisigma.calibration.geometric.problem.setup import IdentifiedGeometry, identified_geometry
 from pisigma.calibration.hybrid.design import Rows
 from pisigma.calibration.hybrid.noise import CalibrationNoise, stated_sigmas
 from pisigma.calibration.hybrid.refinement import correction_from_weights, linearise_rows
 from pisigma.estimation.drift import Drift, DriftGroup, DriftSearch, LinearValues, PosteriorUpdate
-from pisigma.estimation.wrong_rows import ExplainedRows, with_wrong_rows
+from pisigma.estimation.wrong_rows import ExplainedRows, mark_wrong_rows
 from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.lifetime.recalibration.recalibration_problem import RecalibrationProblem
 from pisigma.measurement.dataset import Measurements
@@ -92,7 +92,7 @@ class Adaptation:
 
     @property
     def wrong_rows(self) -> list[int]:
-        """Rows that do not count: dropped by the loss as far off, or wrong by evidence."""
+        """Rows that are not used: dropped by the loss as far off, or wrong by evidence."""
         rows: list[int] = self.problem.setup.rows[self.problem.wrong_rows(self.values)].tolist()
         return rows
 
@@ -199,7 +199,7 @@ def _searched(
 ) -> DriftSearch:
     """Estimate sizes of the drift and wrong rows by evidence, from a selection of the values where there are many."""
     if len(values.y) > MAX_VALUES:
-        values = values.select(chosen_rows(len(values.y), MAX_VALUES).sort().values)
+        values = values.select(randomly_chosen_rows(len(values.y), MAX_VALUES).sort().values)
     A = values.X @ problem.root
 
     def explain(wrong: Mapping[int, float]) -> ExplainedRows[DriftSearch]:
@@ -208,4 +208,4 @@ def _searched(
         search.estimate_sizes()
         return ExplainedRows(search, there, search.log_evidence, search.covariance, search.deviation)
 
-    return with_wrong_rows(explain(values.wrong), explain).what
+    return mark_wrong_rows(explain(values.wrong), explain).what

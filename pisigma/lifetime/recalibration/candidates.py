@@ -19,7 +19,7 @@ from pisigma.measurement.groups import groups_to_keep_whole
 from pisigma.measurement.splits import k_folds
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.model_posterior import FLEET_PRIOR
-from pisigma.validation.held_out.calibration_validation import ErrorPredictor, errors_under
+from pisigma.validation.held_out.calibration_validation import ErrorPredictor, pose_errors_of
 from pisigma.validation.held_out.trained_calibrations import Calibrator, fit, judgeable_rows
 
 Kept = Literal["recalibrated", "old", "scratch"]
@@ -49,7 +49,7 @@ class CandidateChoice:
     Attributes:
         kept: "recalibrated", unless another candidate is better by more than 5 % and by more than chance.
         rms: RMS error of held-out rows under each candidate [m]; None if the rows are too few for it.
-        rows: number of held-out rows that count.
+        rows: number of held-out rows that were used.
         p95: 95 % quantile of the same errors [m].
         names: names of the candidates, at the start of a sentence.
     """
@@ -125,7 +125,7 @@ def choose_candidate(
         }
         for name, candidate in candidates.items():
             try:
-                errors[name][test] = errors_under(candidate(), rows.select(test)).position
+                errors[name][test] = pose_errors_of(candidate(), rows.select(test)).position
             except IdentificationError:  # too few rows to identify it
                 errors[name][test] = torch.inf
     return replace(_decided(errors), names=OF_FLEET if model.kind == FLEET_PRIOR else NAMES)

@@ -22,7 +22,7 @@ from pisigma.validation.held_out.frames.fitted_frames import FrameKind
 from pisigma.validation.held_out.model_comparison import ModelComparison
 from pisigma.validation.setup_faults.cause import join_words, length_text
 from pisigma.validation.setup_faults.explanations import PLAUSIBLE_SHARE
-from pisigma.validation.setup_faults.nominal_robot_faults import measured_rows, spread
+from pisigma.validation.setup_faults.nominal_robot_faults import evenly_spaced_rows, measured_rows
 from pisigma.validation.setup_faults.setup_faults import judged_values
 
 MAX_ROWS = 60
@@ -47,7 +47,9 @@ def judged_motion(
         posterior = ModelPosterior.from_model(model)
         some = judged_values(model, rows)
         if rows.position is not None:
-            some = replace(some.select(spread(measured_rows(rows), MAX_ROWS)), pair=None, distance=None)
+            some = replace(
+                some.select(evenly_spaced_rows(measured_rows(rows), MAX_ROWS)), pair=None, distance=None
+            )
         some = posterior.with_model_names(some)
         with torch.no_grad():
             session, _ = judge_session(model, posterior, some, frame_keys(some, fitted) if fitted else None)

@@ -78,7 +78,7 @@ class RecalibrationProblem:
         return groups_to_keep_whole(self.setup.measurements)
 
     def wrong_rows(self, values: LinearValues) -> Bool[Tensor, " rows"]:
-        """Return which rows do not count: dropped by the loss as far off, or of wrong configurations."""
+        """Return which rows are not used: dropped by the loss as far off, or of wrong configurations."""
         wrong = ~torch.isin(self.configuration, values.configuration)
         return wrong | torch.isin(self.configuration, torch.tensor([*values.wrong]))
 

@@ -3,7 +3,7 @@
 from collections.abc import Set
 from contextlib import suppress
 
-from pisigma.calibration.geometric.initial_guess.initial_guess import chosen_rows
+from pisigma.calibration.geometric.initial_guess.initial_guess import randomly_chosen_rows
 from pisigma.estimation.drift import LOG_PRIOR_PENALTY
 from pisigma.files.errors import IdentificationError
 from pisigma.lifetime.recalibration.adaptation import adapt
@@ -38,7 +38,7 @@ def relocated_frames(
         IdentificationError: see `recalibration_problem`.
     """
     if rows.rows > MAX_ROWS and rows.pair is None:
-        rows = rows.select(chosen_rows(rows.rows, MAX_ROWS).sort().values)
+        rows = rows.select(randomly_chosen_rows(rows.rows, MAX_ROWS).sort().values)
     bases, tools = (
         frozenset((kind, name) for name in dict.fromkeys(names) if name in frames)
         for kind, names, frames in _kinds(rows, posterior)

@@ -45,7 +45,7 @@ class RecalibrationSummary(AbstractSummary):
     Attributes:
         parent: model that was recalibrated; its `sha256` is that of its `model.yaml`.
         date: date of the recalibration, such as "2026-11-22".
-        rows: number of rows that count.
+        rows: number of rows that were used.
         outliers: rows that were left out.
         kept: candidate that was kept.
         verdict: sentence on which candidate was kept, with the errors of all.

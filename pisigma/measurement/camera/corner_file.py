@@ -124,10 +124,10 @@ def read_rows(
                 at=Place(rows[0].source),
                 remedy="add a file of corners, or omit camera and board",
             )
-    return with_one_noise(join(rows, without_duplicates))
+    return with_common_noise(join(rows, without_duplicates))
 
 
-def with_one_noise(rows: Measurements) -> Measurements:
+def with_common_noise(rows: Measurements) -> Measurements:
     """Return the rows with the same noise for all corners; their weights state how cameras differ."""
     noise = rows.readings.get(NOISE_COLUMN)
     if not isinstance(noise, torch.Tensor):

@@ -13,7 +13,7 @@ from pisigma.measurement.faults import Fault
 from pisigma.measurement.readings import READINGS, from_si, to_si
 from pisigma.measurement.rules import rows_where
 from pisigma.robot import Robot, Row
-from pisigma.robot.kinematics.joint_limits import grossly_beyond
+from pisigma.robot.kinematics.joint_limits import far_beyond_limits
 from pisigma.robot.row import MAX_MAGNITUDE
 
 QUATERNION_TOLERANCE = 1e-3
@@ -124,7 +124,7 @@ def _number(cell: str) -> float:
 
 
 def _check_joints(values: _Values, layout: Layout, robot: Robot | None, faults: Faults) -> None:
-    """Check that every joint value is given and possible for its joint; see `grossly_beyond`."""
+    """Check that every joint value is given and possible for its joint; see `far_beyond_limits`."""
     for number, quantity in enumerate(layout.joints):
         column, q = layout.column(quantity), values[:, layout.index[quantity]]
         empty = Fault("", column.name, "a joint value", "", "give the values of all joints in every row")
@@ -137,7 +137,7 @@ def _check_limits(
     q: Float64[np.ndarray, " rows"], column: Column, joint: Row, robot: str, faults: Faults
 ) -> None:
     """Check that a joint's values are not so far outside its limits that they belong to another unit or joint."""
-    outside = grossly_beyond(to_si(q, column.unit), joint)
+    outside = far_beyond_limits(to_si(q, column.unit), joint)
     lower, upper = from_si(np.array([joint.lower, joint.upper]), column.unit).tolist()
     limits = f"{lower:.6g} to {upper:.6g} {column.unit}"
     expected = f"a value near the limits {limits} of joint '{joint.name}' of robot '{robot}'"

@@ -12,7 +12,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from pisigma.files.errors import MeasurementError, Place
-from pisigma.files.output_file import write_whole
+from pisigma.files.output_file import write_atomically
 from pisigma.measurement.csv.columns import number_fields
 from pisigma.measurement.fields import KINDS, TEXTS, MeasuredFields
 from pisigma.measurement.readings import READINGS, Unit, from_si, reading_texts
@@ -46,7 +46,7 @@ def write_fields(data: MeasuredFields, path: str | os.PathLike[str], revolute: S
         ["" if number != number else number for number in values.tolist()] for values in numbers.values()
     ]
     writer.writerows(zip(*cells, *texts.values(), strict=True))
-    write_whole(Path(path), text.getvalue())
+    write_atomically(Path(path), text.getvalue())
 
 
 def _numbers(data: MeasuredFields, revolute: Sequence[bool]) -> dict[str, Float64[np.ndarray, " rows"]]:

@@ -137,7 +137,7 @@ def _check_names(
 ) -> list[str]:
     """Refuse joined rows whose points have different names in both files.
 
-    If no name is in both files, the numbers at their ends are compared, which may count from different starts.
+    If no name is in both files, the numbers at the ends of the names are compared; their first numbers may differ.
 
     Returns:
         Warnings of names that cannot be compared.

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from pisigma.files.errors import MeasurementError
-from pisigma.files.output_file import write_whole
+from pisigma.files.output_file import write_atomically
 from pisigma.files.yaml_file import Section, read_yaml, yaml_text
 from pisigma.measurement.foreign.mapping import FileMapping
 
@@ -85,4 +85,4 @@ def save_map(mappings: Sequence[FileMapping], path: str | os.PathLike[str]) -> N
         OutputError: the file cannot be written.
     """
     files = [{mapping.key(one): one.target.text for one in mapping.columns} for mapping in mappings]
-    write_whole(Path(path), yaml_text({"files": files}))
+    write_atomically(Path(path), yaml_text({"files": files}))

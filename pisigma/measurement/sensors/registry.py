@@ -102,7 +102,7 @@ def unknown_groups(measurements: Measurements) -> tuple[UnknownGroup, ...]:
     return tuple(group for group in groups if group is not None)
 
 
-def pairs_first(measurements: Measurements, rows: Int64[Tensor, " rows"]) -> Int64[Tensor, " rows"]:
+def sort_pairs_first(measurements: Measurements, rows: Int64[Tensor, " rows"]) -> Int64[Tensor, " rows"]:
     """Sort rows such that pairs come first, with their rows next to each other; the others keep their order."""
     if measurements.pair is None:
         return rows
@@ -131,7 +131,7 @@ def measured_errors(
     Raises:
         IdentificationError: the rows of an owner that was not calibrated do not determine its unknowns.
     """
-    rows = pairs_first(measurements, torch.arange(measurements.rows, device=T.device))
+    rows = sort_pairs_first(measurements, torch.arange(measurements.rows, device=T.device))
     data = replace(as_poses(measurements, unknowns or {}), sigma_position=None, sigma_rotation=None).select(
         rows
     )

@@ -83,7 +83,7 @@ class Upgrade:
 
 
 def upgrade_folder(folder: str | os.PathLike[str], check: Callable[[CalibratedModel, Path], None]) -> Upgrade:
-    """Convert a model folder of an earlier version to the format of this one, as a whole or not at all.
+    """Convert a model folder of an earlier version to the format of this one, completely or not at all.
 
     Tensors, figures and all other files stay as they are, except for the type of a covariance root, and so does the
     card except for statements that are no longer true; the file for the compiled kernels is written again.

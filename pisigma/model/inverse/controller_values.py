@@ -116,7 +116,7 @@ class ControllerValues:
         else:
             starts = np.broadcast_to(near, (*batch, axes)).reshape(-1, 1, axes)
         found = solve_from(
-            self._motion, rows, starts, lambda q: self.coupling.is_inside(self.coupling.to_dh(q))
+            self._motion, rows, starts, lambda q: self.coupling.is_within_limits(self.coupling.to_dh(q))
         )
         nominal = solve(partial(self._motion, nominal=True), rows, found.q)
         q, q_nominal = found.mask_unreached(found.q), nominal.mask_unreached(nominal.q)
@@ -131,7 +131,7 @@ class ControllerValues:
             np.full(batch, np.nan),
             owner,
         )
-        outside = found.reached & ~self.coupling.is_inside(self.coupling.to_dh(found.q))
+        outside = found.reached & ~self.coupling.is_within_limits(self.coupling.to_dh(found.q))
         beyond = int(Status.OUTSIDE_JOINT_LIMITS)
         solution = replace(solution, status=np.where(outside.reshape(batch), beyond, solution.status))
         return solution.map(T.new_tensor) if is_tensor(T) else solution
@@ -148,7 +148,7 @@ class ControllerValues:
         """Wrap DH values so that the controller's values are within its limits, and return which of them cannot be."""
         rows = q.reshape(-1, q.shape[-1])
         near_rows = None if near is None else np.broadcast_to(near, q.shape).reshape(rows.shape)
-        turned, inside = self.coupling.wrapped_inside(rows, near_rows)
+        turned, inside = self.coupling.wrapped_within_limits(rows, near_rows)
         return turned.reshape(q.shape), (~inside & np.isfinite(rows).all(-1)).reshape(q.shape[:-1])
 
     def _other_branches(self, T: Any, q: Any, outside: Any, near: Any, options: dict[str, Any]) -> None:
@@ -176,7 +176,7 @@ class ControllerValues:
         """Convert a solution to the controller's values, with the status according to the controller's limits."""
         status = np.asarray(as_array(solution.status))
         dh = np.asarray(as_array(solution.q))
-        beyond = ~self.coupling.is_inside(dh) & np.isfinite(dh).all(-1)
+        beyond = ~self.coupling.is_within_limits(dh) & np.isfinite(dh).all(-1)
         status = np.where(beyond, int(Status.OUTSIDE_JOINT_LIMITS), status)
         plain = int(status) if np.ndim(solution.status) == 0 and not is_tensor(solution.status) else status
         return replace(

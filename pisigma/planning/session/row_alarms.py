@@ -55,9 +55,7 @@ def stale_readings(rows: Measurements, start: int) -> Iterator[Alarm]:
         earlier = int(same.nonzero()[0])
         here, there = rows.line[row], rows.line[earlier]
         if float((rows.q[row] - rows.q[earlier]).abs().max()) < SAME_VALUE:
-            text = (
-                f"line {here}: joint values and readings equal those of line {there}; the row does not count."
-            )
+            text = f"line {here}: joint values and readings equal those of line {there}; the row is not used."
             yield Alarm(here, "duplicate", text, repeat=False)
         else:
             text = (
@@ -74,7 +72,7 @@ def other_joint_values(
     poses: Float64[Tensor, "poses dof"],
     names: Sequence[str],
 ) -> Iterator[Alarm]:
-    """Find rows from `start` on whose joint values differ from all planned poses; they count nevertheless."""
+    """Find rows from `start` on whose joint values differ from all planned poses; they are used nevertheless."""
     for row in range(start, rows.rows):
         off = joint_differences(robot, rows.q[row : row + 1], poses)[0].abs()
         pose = int(off.amax(1).argmin())

@@ -172,7 +172,7 @@ class RowModel:
         misfit = self.misfit
         # At least 1, the scale of the class: rows that happen to agree must not make the limits stricter.
         whole = ((CLASS_VALUES + misfit - torch.where(self.kept, square, 0.0)) / left).clamp(min=1.0)
-        # For rows that do not count, the scale is at least the one that leave-one-out errors of the kept rows show.
+        # For rows that are not used, the scale is at least the one that leave-one-out errors of the kept rows show.
         each = float((CLASS_VALUES + square.sum()) / (CLASS_VALUES + count.sum()))
         scale = torch.where(self.kept, whole, whole.clamp(min=each))
         for row in (~self.kept).nonzero()[:, 0]:
@@ -298,7 +298,7 @@ class RowJudgement:
 
     Attributes:
         counts: rows that others do not contradict.
-        model: model of the rows that count; None while they are too few to fit base and tool.
+        model: model of the used rows; None while they are too few to fit base and tool.
         errors: errors of all rows under this model; None likewise.
     """
 

@@ -19,7 +19,7 @@ from pisigma.planning.plan_file import StoredPlan
 from pisigma.planning.robot_posterior import RobotPosterior
 from pisigma.planning.session.state import AccuracyPoint
 from pisigma.robot.description import Robot
-from pisigma.validation.held_out.calibration_validation import errors_under, validate
+from pisigma.validation.held_out.calibration_validation import pose_errors_of, validate
 from pisigma.validation.held_out.few_rows import fit_if_better
 
 FOLDS = 5
@@ -64,7 +64,7 @@ def session_accuracy(
         return None
     checked = (math.nan, math.nan)
     if plan.model is not None:
-        posterior = before.given_poses(rows.q)
+        posterior = before.after_measuring(rows.q)
     else:
         try:
             posterior, checked = _calibrated(plan.arm.robot, before, rows, check, progress)
@@ -88,15 +88,15 @@ def _calibrated(
     assert isinstance(result, HybridResult)
     if result.learned is None and np.array_equal(result.geometric.robot.dh, robot.dh):
         # with too few rows the arm stays nominal, so the posterior of the fit does not contain its errors
-        posterior = before.given_poses(rows.q)
+        posterior = before.after_measuring(rows.q)
     else:
         posterior = RobotPosterior.from_result(result, before.instrument)
     if check is None:
         return posterior, (math.nan, math.nan)
-    return posterior, _rms_p95(errors_under(result, check).position)
+    return posterior, _rms_p95(pose_errors_of(result, check).position)
 
 
-def cross_validated(
+def with_cross_validation(
     robot: Robot, so_far: SessionAccuracy, progress: Progress = lambda what: None
 ) -> AccuracyPoint:
     """Return the accuracy with cross-validated errors, where the rows allow a cross-validation.

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
 from pisigma.calibration.geometric.prediction import predicted_poses
-from pisigma.measurement.camera.corner_file import with_one_noise
+from pisigma.measurement.camera.corner_file import with_common_noise
 from pisigma.measurement.dataset import Measurements, join
 from pisigma.measurement.fields import UnusableRow
 from pisigma.model.calibrated_model import CalibratedModel
@@ -73,7 +73,7 @@ class SessionRows:
         return (*self._fixed, *self._contradicted.values())
 
     @property
-    def rows_that_count(self) -> Bool[Tensor, " rows"]:
+    def used_rows(self) -> Bool[Tensor, " rows"]:
         """Rows that are usable and not contradicted by others."""
         counting = self.usable.clone()
         counting[self.usable] = self.judgement.counts
@@ -101,7 +101,7 @@ class SessionRows:
         changed: list[Alarm] = []
         if new is not None and new.rows:
             start = 0 if self.rows is None else self.rows.rows
-            self.rows = rows = new if self.rows is None else with_one_noise(join([self.rows, new]))
+            self.rows = rows = new if self.rows is None else with_common_noise(join([self.rows, new]))
             stale = list(stale_readings(rows, start))
             copies = {alarm.line for alarm in stale}
             usable = torch.tensor([line not in copies for line in rows.line[start:]])
@@ -236,7 +236,7 @@ class FurtherPoses:
         if not len(first) or not 0 < count <= len(new):
             return None
         if not bool(plan.check[first]):
-            posterior = posterior.given_poses(plan.q[first])
+            posterior = posterior.after_measuring(plan.q[first])
         seen, tool = posterior.sensitivities(self.q), posterior.tool(self.task)
         for _ in range(MAX_REPLACEMENTS):
             if count > len(new):

@@ -50,7 +50,7 @@ class RowsSoFar:
         position: predicted position of the target in the robot's base frame [m]; NaN while base and tool are unknown.
         error: measured - predicted position in the robot's base frame [m]; NaN where it cannot be judged.
         check: rows of the set "test", which test the calibration and are not calibrated with.
-        alarmed: rows that do not count.
+        alarmed: rows that are not used.
     """
 
     line: tuple[int, ...]
@@ -221,7 +221,7 @@ class SessionState:
         ]
 
     @property
-    def finished(self) -> bool:
+    def is_finished(self) -> bool:
         """Whether more poses would not help, or none remain."""
         return self.advice.action == "stop"
 

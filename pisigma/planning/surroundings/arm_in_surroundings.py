@@ -93,7 +93,7 @@ class ArmInSurroundings:
             surroundings.joints.limits(robot),
         )
 
-    def with_measured(self, q: Float64[Tensor, "poses dof"]) -> "ArmInSurroundings":
+    def allow_measured_poses(self, q: Float64[Tensor, "poses dof"]) -> "ArmInSurroundings":
         """Return the arm such that measured poses are free of self-collision, for any radii of the links.
 
         Args:
@@ -174,7 +174,7 @@ class ArmInSurroundings:
         values, (lower, upper) = self.robot.to_controller(q), self.limits.t()
         outside = (values < lower - LIMIT_TOLERANCE) | (values > upper + LIMIT_TOLERANCE)
         if self.robot.coupling is not None:
-            outside |= ~torch.from_numpy(self.robot.coupling.is_inside(q.numpy()))[:, None]
+            outside |= ~torch.from_numpy(self.robot.coupling.is_within_limits(q.numpy()))[:, None]
         faults = {"a joint is outside its limits or their margin": outside.any(-1)}
         faults |= {reason: gap < 0 for reason, gap in self._gaps(segments).items()}
         if self.surroundings.tracker is not None:

@@ -77,7 +77,7 @@ def verdict_of(
     Args:
         model: the model.
         accuracies: error figures, of which the first one counts.
-        joints: errors of joints, which count where no pose was judged.
+        joints: errors of joints, which are used if no pose was evaluated.
         rows: judged rows, or None.
         limit: contribution of measurement scatter.
         causes: diagnosed causes of the errors; the first one is then what limits the accuracy.

@@ -20,7 +20,7 @@ from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, NullLocato
 
 from pisigma.files.conflicts import Input, check_conflicts
 from pisigma.files.errors import OutputError, Place
-from pisigma.files.output_file import write_whole
+from pisigma.files.output_file import write_atomically
 from pisigma.reporting.calibration_figures import STYLES, show_correlations
 from pisigma.reporting.page.content import ReportContent
 from pisigma.reporting.page.drawn_values import csv_of
@@ -168,7 +168,7 @@ def write_figures(drawings: Sequence[Drawing], folder: Path) -> list[Path]:
             stem = folder / file_name(drawing.key)
             for suffix, content in (("png", drawing.png()), ("svg", drawing.svg()), ("csv", drawing.csv())):
                 written.append(Path(f"{stem}.{suffix}"))
-                write_whole(written[-1], content)
+                write_atomically(written[-1], content)
     except OSError as problem:
         raise OutputError(
             f"cannot be written to: {problem.strerror}",

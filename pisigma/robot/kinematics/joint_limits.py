@@ -43,7 +43,7 @@ def wrap_into_limits(
     moved, every = torch.where(inside, moved, q), inside.all(-1)
     if robot.coupling is None:
         return moved, every
-    turned, allowed = robot.coupling.wrapped_inside(
+    turned, allowed = robot.coupling.wrapped_within_limits(
         moved.detach().double().cpu().numpy().reshape(-1, robot.dof)
     )
     return torch.from_numpy(turned).to(q).reshape(q.shape), every & torch.from_numpy(allowed).to(
@@ -88,7 +88,7 @@ def beyond_limits(
     return outside
 
 
-def grossly_beyond(q: Float64[np.ndarray, " rows"], axis: Row) -> Bool[np.ndarray, " rows"]:
+def far_beyond_limits(q: Float64[np.ndarray, " rows"], axis: Row) -> Bool[np.ndarray, " rows"]:
     """Return which values cannot belong to an axis, even if its stated limits are inaccurate."""
     stroke = axis.upper - axis.lower
     return beyond_limits(q, axis, GROSS_SHARE * stroke if axis.type == "prismatic" else GROSS_ANGLE)

@@ -79,7 +79,7 @@ class RandomViews(Section):
             if len(reached):
                 chosen.append(reached[rng.integers(len(reached))])
             if len(chosen) == needed:
-                return far_apart(torch.stack(chosen), self.count)
+                return select_far_apart(torch.stack(chosen), self.count)
         raise RecipeError(
             option="poses",
             expected=f"at least {needed} of {MAX_ATTEMPTS * needed} random views of the board within reach of robot "
@@ -122,7 +122,7 @@ def _is_whole(camera: Camera, board: Board, T_camera_board: Float64[np.ndarray, 
     return bool(((pixels > 0) & (pixels < (camera.width, camera.height))).all())
 
 
-def far_apart(q: Float64[Tensor, "rows dof"], count: int) -> Float64[Tensor, "count dof"]:
+def select_far_apart(q: Float64[Tensor, "rows dof"], count: int) -> Float64[Tensor, "count dof"]:
     """Choose joint values [rad] by farthest-point sampling in sines and cosines, the first one first."""
     points = torch.cat([q.cos(), q.sin()], 1)
     chosen, distance = [0], (points - points[0]).norm(dim=1)
@@ -165,7 +165,7 @@ class BoardErrors(Section):
     bow_mm: float = 0.0
 
 
-class LateJoints(Section):
+class JointReadingDelay(Section):
     """Joint values of a moving arm that are read after the image was taken.
 
     Attributes:
@@ -202,7 +202,7 @@ class SimulatedImages(Section):
     noise: CornerNoise
     camera_errors: IntrinsicsSection = IntrinsicsSection()
     board_errors: BoardErrors = BoardErrors()
-    late_joints: LateJoints | None = None
+    late_joints: JointReadingDelay | None = None
 
     @property
     def frame(self) -> str:

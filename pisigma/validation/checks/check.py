@@ -20,9 +20,9 @@ from pisigma.model.accuracy import deviation_of_rows
 from pisigma.model.calibrated_model import CalibratedModel, poses_of_rows
 from pisigma.robot.description import Robot
 from pisigma.robot.frame_fits import LEVER_SHARE, MeasuredPoses
-from pisigma.validation.held_out.calibration_validation import CalibrationValidation, errors_under
+from pisigma.validation.held_out.calibration_validation import CalibrationValidation, pose_errors_of
 from pisigma.validation.held_out.diagnostic import Diagnostic
-from pisigma.validation.held_out.frames.fitted_frames import FrameKind, fit_frames, with_names_of
+from pisigma.validation.held_out.frames.fitted_frames import FrameKind, fit_frames, with_known_names
 from pisigma.validation.held_out.trained_calibrations import Result, geometric_result
 from pisigma.validation.held_out.validation_figures import ValidationFigures
 from pisigma.validation.setup_faults.setup_fault import SetupFault
@@ -83,7 +83,7 @@ class CheckedCalibration:
     @cached_property
     def figures(self) -> ValidationFigures | None:
         """Errors of the rows of the calibration under every result; None if no length was measured."""
-        errors = {name: errors_under(result, self.rows) for name, result in self.results.items()}
+        errors = {name: pose_errors_of(result, self.rows) for name, result in self.results.items()}
         if not any(bool(torch.isfinite(one.position).any()) for one in errors.values()):
             return None
         return ValidationFigures(rows=self.rows.rows, **{name: one.figures for name, one in errors.items()})
@@ -136,7 +136,7 @@ class RowsUnderModel:
             return None
         kinds = kinds_to_fit(model, rows, fitted)
         some = judged_values(model, rows)
-        T = poses_of_rows(model, with_names_of(model, some, kinds))
+        T = poses_of_rows(model, with_known_names(model, some, kinds))
         there = torch.isfinite(rows.position).all(-1) & torch.isfinite(T).flatten(1).all(-1)
         if int(there.sum()) < MIN_ROWS_OF_MODEL:
             return None
@@ -146,7 +146,7 @@ class RowsUnderModel:
     @cached_property
     def renamed_rows(self) -> Measurements:
         """The rows, with fitted frames and targets named as in the model."""
-        return with_names_of(self.model, self.rows, self.fitted)
+        return with_known_names(self.model, self.rows, self.fitted)
 
     @cached_property
     def poses_before_fit(self) -> Float64[Tensor, "rows 4 4"]:

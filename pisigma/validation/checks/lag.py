@@ -75,7 +75,7 @@ def find_lag(rows: OrderedRows, measurements: Measurements) -> Lag | None:
     left = r - X @ (covariance @ (X.T @ r))
     found = []
     for before, motion in zip((True, False), _motions(measurements), strict=True):
-        z = (rows.by_joints @ motion[rows.number][..., None]).reshape(len(r), -1)[:, 0]
+        z = (rows.joint_derivative @ motion[rows.number][..., None]).reshape(len(r), -1)[:, 0]
         free = z - X @ (covariance @ (X.T @ z))
         information = float(free @ free)
         if information <= 1e-12 * float(z @ z):

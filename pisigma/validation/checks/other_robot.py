@@ -11,7 +11,7 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import Robot
 from pisigma.robot.robot_file import catalogue
 from pisigma.validation.checks.check import CheckedCalibration, RowsUnderModel
-from pisigma.validation.held_out.calibration_validation import errors_under
+from pisigma.validation.held_out.calibration_validation import pose_errors_of
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.held_out.trained_calibrations import base_and_tool
 
@@ -77,4 +77,4 @@ def _rms_mm(checked: CheckedCalibration, other: Robot) -> float | None:
         fitted = base_and_tool(replace(checked.calibrator, robot=other)).fit(rows)
     except IdentificationError:
         return None
-    return errors_under(fitted, rows).figures.rms_mm
+    return pose_errors_of(fitted, rows).figures.rms_mm

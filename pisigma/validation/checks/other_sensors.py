@@ -15,7 +15,7 @@ from pisigma.model.calibrated_model import CalibratedModel, poses_of_rows
 from pisigma.robot.se3 import transform
 from pisigma.validation.checks.check import LARGE_SHARE, MIN_ROWS_OF_MODEL, Move, kinds_to_fit
 from pisigma.validation.held_out.diagnostic import Diagnostic
-from pisigma.validation.held_out.frames.fitted_frames import FrameKind, with_names_of
+from pisigma.validation.held_out.frames.fitted_frames import FrameKind, with_known_names
 from pisigma.validation.held_out.frames.row_errors import errors_of_rows
 from pisigma.validation.held_out.model_comparison import ModelComparison, ModelFigures
 from pisigma.validation.setup_faults.cause import Cause, length_text
@@ -83,7 +83,7 @@ def diagnose_lengths(
     moves = free | ({*may_move} - {"frame"})
     if ("base" in kinds or "frame" in may_move) and (rows.touch is not None or rows.anchor_place is not None):
         return (), ()
-    known, reach = with_names_of(model, rows, kinds), model.robot.reach
+    known, reach = with_known_names(model, rows, kinds), model.robot.reach
     with suppress(IdentificationError):
         errors = _errors(model, known)
         if (

@@ -37,7 +37,7 @@ def check_prior_ratio(checked: CheckedCalibration) -> Iterator[Diagnostic]:
     """
     unusual = [ratio for ratio in checked.geometric.prior_ratios if ratio.at_least > UNUSUAL]
     large = [ratio for ratio in unusual if ratio.at_least > IMPLAUSIBLE]
-    possible = class_of(checked, large)
+    possible = narrowest_class(checked, large)
     usual = _usual_class(checked)
     for ratio in unusual:
         believed = ratio not in large or (
@@ -53,7 +53,7 @@ def check_prior_ratio(checked: CheckedCalibration) -> Iterator[Diagnostic]:
         )
 
 
-def class_of(checked: CheckedCalibration, large: Sequence[PriorRatio]) -> RobotClass | None:
+def narrowest_class(checked: CheckedCalibration, large: Sequence[PriorRatio]) -> RobotClass | None:
     """Find the class of a robot with errors of these sizes: the stated one, or the narrowest that allows them.
 
     The search for the narrowest class starts with that of the maker.

@@ -103,7 +103,7 @@ def joint_rounding(result: CalibrationResult, measurements: Measurements) -> Rou
     rows = OrderedRows.from_result(result) if steps.any() else None
     if rows is None or len(rows.residual) < MIN_ROWS:
         return None
-    made = rows.by_joints * steps / math.sqrt(12)
+    made = rows.joint_derivative * steps / math.sqrt(12)
     left = rows.residual_after_fit * math.sqrt(
         rows.values / max(rows.values - rows.effective_parameters, 1.0)
     )

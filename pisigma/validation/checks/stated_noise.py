@@ -7,7 +7,7 @@ from dataclasses import replace
 from pisigma.calibration.geometric.problem.noise import sensor_view_of
 from pisigma.files.errors import IdentificationError
 from pisigma.validation.checks.check import CheckedCalibration
-from pisigma.validation.held_out.calibration_validation import errors_under
+from pisigma.validation.held_out.calibration_validation import pose_errors_of
 from pisigma.validation.held_out.diagnostic import Diagnostic
 
 DISAGREEING = 3.0
@@ -68,11 +68,11 @@ def _share_without(checked: CheckedCalibration) -> float:
     """Compute the RMS residual of a geometric calibration without the stated noise over that with it."""
     rows = replace(checked.rows, sigma_position=None, sigma_rotation=None)
     try:
-        without = errors_under(checked.calibrator.fit(rows), rows).position
+        without = pose_errors_of(checked.calibrator.fit(rows), rows).position
     except IdentificationError:
         return 1.0
     return float(
         (
-            without.square().nanmean() / errors_under(checked.geometric, rows).position.square().nanmean()
+            without.square().nanmean() / pose_errors_of(checked.geometric, rows).position.square().nanmean()
         ).sqrt()
     )

@@ -23,7 +23,7 @@ MAX_WRONG_SHARE = 0.1
 MIN_ROWS, MIN_ROWS_TO_FIT = 6, 10
 """Rows needed to call one wrong: in known frames, and with frames or tools fitted to the rows."""
 SUSPICIOUS, REFITS = 3.0, 12
-"""Error over the median error above which a row does not count in the fit of frames and tools; number of such fits."""
+"""Error over the median error above which a row is not used in the fit of frames and tools; number of such fits."""
 MAX_NAMED = 5
 """Rows that a sentence names."""
 

@@ -32,7 +32,7 @@ from pisigma.validation.held_out.trained_calibrations import (
     drop_missing_frames,
     fit_compared_calibrations,
     geometric_of,
-    held_out_of_folds,
+    held_out_distances,
     judgeable_rows,
     with_frames,
 )
@@ -220,7 +220,7 @@ def fold_tasks(
         of_repeat = progress
         if len(repeats) > 1:
             of_repeat = with_stage(progress, f"repeat {number} of {len(repeats)}", ", ")
-        held_out = held_out_of_folds(geometric_of(calibrator).socket_distances, measurements, splits)
+        held_out = held_out_distances(geometric_of(calibrator).socket_distances, measurements, splits)
         for fold, (split, without) in enumerate(zip(splits, held_out, strict=True), 1):
             name = f"fold {fold} of {len(splits)}"
             tasks.append(partial(_judged_fold, calibrator, measurements, name, split, without, of_repeat))
@@ -343,7 +343,7 @@ def _judge(
     """
     if calibrator is not None:
         results = {name: with_frames(calibrator, fitted, held_out) for name, fitted in results.items()}
-    errors = {name: errors_under(result, held_out) for name, result in results.items()}
+    errors = {name: pose_errors_of(result, held_out) for name, result in results.items()}
     hybrid = results.get("hybrid")
     spread = predicted_spread(hybrid, held_out) if isinstance(hybrid, HybridResult) else None
     poses = {name: result.predicted_poses(rows) for name, result in results.items() if distances}
@@ -359,7 +359,7 @@ class ErrorPredictor(Protocol):
         """Compute measured minus predicted values by sensor [m or rad]; see `CalibrationResult.errors_of`."""
 
 
-def errors_under(result: ErrorPredictor, measurements: Measurements) -> PoseErrors:
+def pose_errors_of(result: ErrorPredictor, measurements: Measurements) -> PoseErrors:
     """Compute the errors of rows of any sensor under a calibration.
 
     Returns:

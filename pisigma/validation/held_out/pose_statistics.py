@@ -183,7 +183,7 @@ class Comparison:
         return Comparison(nominal.mask_other_rows(both), corrected, int((~both).sum()))
 
 
-def compare_on(model: CalibratedModel, measurements: Measurements) -> Comparison:
+def compare_with_nominal(model: CalibratedModel, measurements: Measurements) -> Comparison:
     """Compare a model with and without its correction on measurements.
 
     Raises:

@@ -253,7 +253,7 @@ class DistanceErrors:
         )
 
 
-def held_out_of_folds(
+def held_out_distances(
     stated: Mapping[PairOfSockets, float], measurements: Measurements, splits: Sequence[TrainTest]
 ) -> tuple[dict[PairOfSockets, float], ...]:
     """Assign every stated distance to one fold, whose calibration does not use it.

@@ -68,14 +68,14 @@ def joint_gaps(model: CalibratedModel, rows: JudgedRows | None) -> tuple[JointGa
 
     Args:
         model: the model.
-        rows: judged rows, whose joint values count unless they belong to another file; None for those that the model
+        rows: judged rows, whose joint values are used unless they belong to another file; None for those that the model
             keeps.
     """
     q = model.starts if rows is None or rows.origin == "other" else rows.measurements.q
     if not len(q):
         return ()
     gaps = []
-    for j, (stretches, (low, high)) in enumerate(measured_stretches(model, q)):
+    for j, (stretches, (low, high)) in enumerate(measured_intervals(model, q)):
         revolute = bool(model.robot.revolute[j])
         share = sum(b - a for a, b in stretches) / (high - low) if high > low else 1.0
         if not math.isfinite(high - low) or share >= COVERED:
@@ -105,7 +105,7 @@ def outside_errors(rows: JudgedRows | None) -> OutsideErrors | None:
     return OutsideErrors(int((~rows.inside).sum()), rows.measurements.rows, rms[0], rms[1])
 
 
-def measured_stretches(
+def measured_intervals(
     model: CalibratedModel, q: Float64[Tensor, "rows dof"]
 ) -> list[tuple[list[Stretch], Stretch]]:
     """Return the measured stretches of every joint and its range [rad or m].

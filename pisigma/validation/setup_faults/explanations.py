@@ -69,7 +69,7 @@ _MIRROR = torch.diag(torch.tensor([1.0, -1.0, 1.0], dtype=torch.float64))
 _MIRRORED = "{} mirrored, as in a left-handed frame (an axis has the wrong sign, or two are swapped)"
 
 
-def largest_explained(here: Hypothesis, reach: float) -> float:
+def explanation_limit(here: Hypothesis, reach: float) -> float:
     """Return the largest error [m] that an explanation may leave, for a robot with a given reach [m]."""
     return min(COLLAPSED * here.error, PLAUSIBLE_SHARE * reach)
 

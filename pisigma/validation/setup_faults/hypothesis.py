@@ -139,7 +139,7 @@ class Hypothesis:
 
     @property
     def complexity(self) -> float:
-        """Complexity of the causes; frame and tool together count less than separately: a new setup changes both."""
+        """Complexity of the causes; frame and tool together add less than separately: a new setup changes both."""
         kinds = {cause.kind for cause in self.causes}
         return sum(cause.size for cause in self.causes) - (1 if {"frame", "tool"} <= kinds else 0)
 

@@ -220,7 +220,7 @@ def _zero_cause(joints: tuple[int, ...], offset: list[float], robot: Robot) -> C
         turns = robot.revolute[i]
         by = f"{math.degrees(offset[i]):.4g} deg" if turns else f"{offset[i] * 1e3:.4g} mm"
         clauses.append(f"joint {i + 1} has moved by {by}")
-        size += 1.25 if turns and is_quarter(offset[i]) else 1.5
+        size += 1.25 if turns and is_quarter_turn(offset[i]) else 1.5
     advice = "check the joint zeros"
     if joints == (0,):
         advice += (
@@ -231,7 +231,7 @@ def _zero_cause(joints: tuple[int, ...], offset: list[float], robot: Robot) -> C
     return Cause("joint_zero", " and ".join(clauses), advice, size, joints, max(map(abs, offset)))
 
 
-def is_quarter(angle: float) -> bool:
+def is_quarter_turn(angle: float) -> bool:
     """Return whether an angle [rad] is a multiple of 90 deg."""
     return abs(math.remainder(angle, QUARTER)) < 1e-12
 

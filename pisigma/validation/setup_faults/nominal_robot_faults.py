@@ -23,9 +23,9 @@ from pisigma.validation.setup_faults.cause import Cause, join_words
 from pisigma.validation.setup_faults.explanations import (
     AS_GOOD,
     choose_simplest,
+    explanation_limit,
     fault_hypotheses,
     frame_hypotheses,
-    largest_explained,
 )
 from pisigma.validation.setup_faults.hypothesis import (
     MARGIN,
@@ -80,7 +80,7 @@ def find_nominal_robot_faults(robot: Robot, measurements: Measurements) -> tuple
     rows = largest_group(measurements)
     if rows.rows < MIN_ROWS_NOMINAL:
         return ()
-    chosen = spread(torch.arange(MARGIN, rows.rows - MARGIN), MAX_ROWS_NOMINAL)
+    chosen = evenly_spaced_rows(torch.arange(MARGIN, rows.rows - MARGIN), MAX_ROWS_NOMINAL)
     some, arm = rows.select(chosen), PredictingArm(robot)
     measured = MeasuredPoses.from_tensors(some.position, some.rotation, LEVER_SHARE * robot.reach)
     raw = Hypothesis(some.q, arm.poses(some), measured)
@@ -91,7 +91,7 @@ def find_nominal_robot_faults(robot: Robot, measurements: Measurements) -> tuple
             return named
     if not here.error > usual:
         return ()
-    most = largest_explained(here, robot.reach)
+    most = explanation_limit(here, robot.reach)
     tried = [
         *fault_hypotheses(arm, some, raw, most),
         *_with_joints(arm, some, shifted_rows(robot, rows, chosen, measured), most),
@@ -142,7 +142,7 @@ def _error_with_zeros(robot: Robot, rows: Measurements, measured: MeasuredPoses)
 def _named_otherwise(robot: Robot, measurements: Measurements, usual: float) -> tuple[SetupFault, ...]:
     """Find better names for the targets of the most frequent frame if errors are larger than usual [m]."""
     rows = largest_group(measurements, by_target=False)
-    rows = rows.select(spread(torch.arange(rows.rows), MAX_ROWS))
+    rows = rows.select(evenly_spaced_rows(torch.arange(rows.rows), MAX_ROWS))
     number, lever = numbers_of_names(rows.target), LEVER_SHARE * robot.reach
     measured, T = (
         MeasuredPoses.from_tensors(rows.position, rows.rotation, lever),
@@ -151,7 +151,7 @@ def _named_otherwise(robot: Robot, measurements: Measurements, usual: float) -> 
     here = Hypothesis(rows.q, fit_targets(T, measured, number)[1], measured)
     if not here.error > usual:
         return ()
-    most = largest_explained(here, robot.reach)
+    most = explanation_limit(here, robot.reach)
     return tuple(
         fault_from_hypothesis(here, other, float("nan"))
         for other in choose_simplest(_labelled(rows, T, measured), most)
@@ -196,7 +196,7 @@ def are_unrelated(robot: Robot, measurements: Measurements) -> bool:
     rows = largest_group(measurements)
     if rows.rows < MIN_ROWS_NOMINAL:
         return False
-    rows = rows.select(spread(torch.arange(rows.rows), MAX_ROWS_NOMINAL))
+    rows = rows.select(evenly_spaced_rows(torch.arange(rows.rows), MAX_ROWS_NOMINAL))
     assert rows.position is not None
     spread_out = float((rows.position - rows.position.mean(0)).square().sum(1).mean().sqrt())
     return spread_out > usual_error(robot, rows.q) and fits_by_chance(
@@ -233,7 +233,7 @@ def largest_group(measurements: Measurements, by_target: bool = True) -> Measure
     return replace(group, pair=None, distance=None)
 
 
-def spread(rows: Int64[Tensor, " rows"], most: int) -> Int64[Tensor, " chosen"]:
+def evenly_spaced_rows(rows: Int64[Tensor, " rows"], most: int) -> Int64[Tensor, " chosen"]:
     """Choose at most `most` of the rows, evenly over them."""
     count = min(len(rows), most)
     return rows[torch.linspace(0, len(rows) - 1, count).round().long()]

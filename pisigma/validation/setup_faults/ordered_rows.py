@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from jaxtyping import Float64, Int64
 
-from pisigma.calibration.geometric.initial_guess.initial_guess import chosen_rows
+from pisigma.calibration.geometric.initial_guess.initial_guess import randomly_chosen_rows
 from pisigma.calibration.geometric.problem.noise import ALWAYS_GOOD, UNDETERMINED, renumber, sensor_view_of
 from pisigma.calibration.geometric.problem.problem import CalibrationProblem
 from pisigma.calibration.geometric.result import CalibrationResult
@@ -95,7 +95,7 @@ class OrderedRows:
         if not present:
             return None
         measured = torch.stack(present).any(0).nonzero()[:, 0].cpu()
-        some = measured[chosen_rows(len(measured), MAX_ROWS)]
+        some = measured[randomly_chosen_rows(len(measured), MAX_ROWS)]
         line = np.zeros(data.rows) if data.origin else np.array(data.line)  # several files follow one another
         some = some[np.lexsort((rows[some].numpy(), line[rows[some]]))]
         problem = replace(solved.problem, pairs=0).select(some)
@@ -132,7 +132,7 @@ class OrderedRows:
         )
         return shortened
 
-    def by_motion(
+    def motion_derivative(
         self, kind: Literal["frame", "target"]
     ) -> tuple[Int64[np.ndarray, " rows"], Float64[np.ndarray, "rows values motion"]]:
         """Return the frame or target of every row, and the derivative of its values by their shift and rotation.
@@ -148,7 +148,7 @@ class OrderedRows:
         return group, Z if kind == "frame" or self.residual.shape[1] > 3 else Z[:, :, :3]
 
     @cached_property
-    def by_joints(self) -> Float64[np.ndarray, "rows values dof"]:
+    def joint_derivative(self) -> Float64[np.ndarray, "rows values dof"]:
         """Derivative of the values by the joint values."""
         robot = self.problem.space.robot
         theta_or_d = 5 * np.array(robot.joint_rows) + ~np.array(robot.revolute)
@@ -160,7 +160,7 @@ class OrderedRows:
         """Derivative by the parameters of the calibration, and by the weights of a series of joint errors."""
         robot = self.problem.space.robot
         series = FourierSeries(robot, HARMONICS).columns(self.problem.state).cpu().numpy()
-        by_weights = self.by_joints[..., None] * series[:, None]
+        by_weights = self.joint_derivative[..., None] * series[:, None]
         by_weights = by_weights.reshape(*self.residual.shape, -1)
         return np.concatenate([self.derivative[:, :, self.problem.active.cpu().numpy()], by_weights], 2)
 

@@ -138,7 +138,7 @@ def _differences(
         ("frame", "frame"),
     )
     for differing, kind in kinds:
-        Z = rows.by_motion(kind)[1]
+        Z = rows.motion_derivative(kind)[1]
         yield differing, Z, np.zeros(Z.shape[2])
     active = len(rows.problem.active)
     yield "arm", rows.jacobian[:, :, :active], rows.precision[:active] / DIFFERENCE

@@ -202,12 +202,12 @@ class _Search:
             yield from (candidate.from_row(int(first)) for first in changes)
 
     def _rigid(self) -> Iterator[_Candidate]:
-        """Yield frames, targets (if there are several), and the tool with all targets."""
+        """Yield what may have moved rigidly: frames, single targets (if there are several), and the tool."""
         space = self.rows.problem.space
         tool: _Moved = "target" if len(space.targets) > 1 else "tool"
         kinds: tuple[tuple[_Moved, Literal["frame", "target"]], ...] = (("frame", "frame"), (tool, "target"))
         for moved, kind in kinds:
-            group, Z = self.rows.by_motion(kind)
+            group, Z = self.rows.motion_derivative(kind)
             for number in range(int(group.max()) + 1):
                 index = np.flatnonzero(group == number)
                 yield _Candidate(moved, number, index, Z[index], np.ones((len(index), 1)))

@@ -11,23 +11,23 @@ from pisigma.model.calibrated_model import CalibratedModel, poses_of_rows
 from pisigma.robot.frame_fits import LEVER_SHARE, MeasuredPoses
 from pisigma.validation.held_out.calibration_summary import has_orientation
 from pisigma.validation.held_out.diagnostic import Diagnostic
-from pisigma.validation.held_out.frames.fitted_frames import FrameKind, fit_frames, with_names_of
+from pisigma.validation.held_out.frames.fitted_frames import FrameKind, fit_frames, with_known_names
 from pisigma.validation.held_out.model_comparison import ModelFigures
 from pisigma.validation.setup_faults.explanations import (
     PLAUSIBLE_SHARE,
     PLAUSIBLE_TURN,
     choose_simplest,
+    explanation_limit,
     fault_hypotheses,
     frame_hypotheses,
-    largest_explained,
 )
 from pisigma.validation.setup_faults.hypothesis import Hypothesis, PredictingArm
 from pisigma.validation.setup_faults.joint_faults import NOTICED
 from pisigma.validation.setup_faults.nominal_robot_faults import (
     MAX_ROWS,
+    evenly_spaced_rows,
     find_nominal_robot_faults,
     measured_rows,
-    spread,
 )
 from pisigma.validation.setup_faults.setup_fault import SetupFault, fault_from_hypothesis
 
@@ -65,8 +65,8 @@ def find_setup_faults(
         Empty if the errors are below 0.02 mm, or if nothing explains them.
     """
     judged = judged_values(model, measurements)
-    some = judged.select(spread(measured_rows(judged), MAX_ROWS))
-    known = with_names_of(model, some, fitted)
+    some = judged.select(evenly_spaced_rows(measured_rows(judged), MAX_ROWS))
+    known = with_known_names(model, some, fitted)
     T = poses_of_rows(model, known)
     predicted = torch.isfinite(T).flatten(1).all(-1)
     if not bool(predicted.any()):
@@ -80,7 +80,7 @@ def find_setup_faults(
     if not here.error > NOTICED:
         return ()
     arm = PredictingArm(model.robot, model)
-    most = largest_explained(here, model.robot.reach)
+    most = explanation_limit(here, model.robot.reach)
     tried = (
         frame_hypotheses(arm, known, [here], most)
         if frames_only
@@ -93,7 +93,7 @@ def find_setup_faults(
         if not {cause.kind for cause in other.causes} <= free
     )
     if not faults and not frames_only:
-        faults = find_nominal_robot_faults(model.robot, with_names_of(model, judged, fitted))
+        faults = find_nominal_robot_faults(model.robot, with_known_names(model, judged, fitted))
     return faults
 
 

@@ -46,7 +46,7 @@ def uncertainty_budget(
         temperatures: mean temperature of every session [deg C], by its name; None where the rows do not state it.
         made_of: names of the sessions that the model was fitted to.
         expansion_per_k: coefficient of linear expansion of the arm [1/K]; None if it is not stated.
-        repeatability_mm: pose repeatability RP of the maker [mm], which counts where the scatter is not known; None if
+        repeatability_mm: pose repeatability RP of the maker [mm], which is used if the scatter is not known; None if
             it is not stated.
     """
     scatter = scatter_component(model)

@@ -155,7 +155,7 @@ def magnification_of(top: float, reach: float) -> int:
 
 
 def top_of_scale(rows: RowsSoFar) -> float:
-    """Return the error at the end of the colour scale: the 95 % quantile of the rows that count, rounded up [m]."""
+    """Return the error at the end of the colour scale: the 95 % quantile of the used rows, rounded up [m]."""
     errors = np.linalg.norm(rows.error, axis=1)[~rows.alarmed]
     errors = errors[np.isfinite(errors)]
     return round_up(float(np.quantile(errors, 0.95))) if errors.size else 1e-3

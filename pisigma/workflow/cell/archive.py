@@ -18,7 +18,7 @@ _CHUNK = 2**20
 
 
 def pack(cell: Cell, path: str | os.PathLike[str]) -> int:
-    """Write all files of a cell into a ZIP file, whole or not at all.
+    """Write all files of a cell into a ZIP file, completely or not at all.
 
     Args:
         cell: the cell; the files of its sessions must be unchanged.
@@ -66,7 +66,7 @@ def pack(cell: Cell, path: str | os.PathLike[str]) -> int:
 
 
 def unpack(path: str | os.PathLike[str], folder: str | os.PathLike[str]) -> Cell:
-    """Restore a cell from a ZIP file that `pack` wrote, whole or not at all.
+    """Restore a cell from a ZIP file that `pack` wrote, completely or not at all.
 
     Args:
         path: the ZIP file.

@@ -29,12 +29,12 @@ from pisigma.workflow.calibrate import Calibration
 from pisigma.workflow.cell.cell_file import CellFile
 from pisigma.workflow.cell.model_choice import (
     calibrate_rows,
-    check_of,
-    entry_of,
+    check_entry,
     errors_of,
-    found_events,
     is_better,
+    model_entry,
     put_into_use,
+    unrecorded_changes,
     with_warnings,
 )
 from pisigma.workflow.cell.new_cell import NewCell
@@ -173,11 +173,11 @@ class Cell:
         """The sessions of the cell."""
         return Sessions(self.folder, self.robot, self.cameras, self.history)
 
-    def take_in(
+    def add_session(
         self, file: str | os.PathLike[str] | Measurements, accept_implausible: bool = False, day: str = ""
     ) -> SessionEntry:
-        """Add a session of measured rows to the cell; see `Sessions.take_in`."""
-        return self.sessions.take_in(file, accept_implausible, day)
+        """Add a session of measured rows to the cell; see `Sessions.add_session`."""
+        return self.sessions.add_session(file, accept_implausible, day)
 
     def calibrate(
         self,
@@ -280,7 +280,7 @@ class Cell:
             )
             rows = replace(seen.rows, date=None)
             found = monitor(self.model_folder(entry.name), [rows], settings, progress)
-            self.history.add(check_of(found, entry, one, seen, self.file.settings_of_step("recalibrate")))
+            self.history.add(check_entry(found, entry, one, seen, self.file.settings_of_step("recalibrate")))
         assert found is not None  # there is a session
         return replace(found, warnings=(*warnings, *found.warnings))
 
@@ -338,7 +338,7 @@ class Cell:
         of = ("recalibrate", entry.name, chosen.name, result.summary.kept, remark)
         added: list[Entry] = [entry, Check(*of, p95, False, now(), rms)]
         if result.trusted:
-            events = found_events(result, chosen, seen.moved, self.sessions.valid_sessions())
+            events = unrecorded_changes(result, chosen, seen.moved, self.sessions.valid_sessions())
             added += [Use(entry.name, now(), remark), *events]
         self.history.add(*added)
         return result, entry
@@ -356,7 +356,7 @@ class Cell:
         Raises:
             ModelError: the cell has no model with this name, its folder was changed, or there is nothing to undo.
         """
-        name = self.history.before_in_use if model is None else self.history.model(model).name
+        name = self.history.model_after_undo if model is None else self.history.model(model).name
         if name is None:
             raise ModelError("no model was in use before", at=Place(self.folder), option="--undo")
         warnings = self.controller_warnings("use", self.history.model(name)) if name else ()

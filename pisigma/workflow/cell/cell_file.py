@@ -151,7 +151,7 @@ class CellFile:
 
     @staticmethod
     def write(folder: Path, text: str) -> "CellFile":
-        """Replace the file of a cell by a text if it is valid, whole or not at all.
+        """Replace the file of a cell by a text if it is valid, completely or not at all.
 
         Raises:
             PlanningError: the text is not a valid `cell.yaml`; the message names line and key.

@@ -16,7 +16,7 @@ from pisigma.model.folder.model_folder import load_model
 from pisigma.robot.description import Robot
 from pisigma.validation.report.accuracy import identified_scatter
 from pisigma.workflow.calibrate import Calibration, calibrate
-from pisigma.workflow.cell.sessions import ModelRows, Sessions, name_since, newest_day
+from pisigma.workflow.cell.sessions import ModelRows, Sessions, newest_day, setup_name
 from pisigma.workflow.evaluate import evaluate
 from pisigma.workflow.monitor import Monitoring
 from pisigma.workflow.recalibrate import Recalibration, recalibrate
@@ -68,7 +68,7 @@ def is_better(
     seen = [stored.rows_for(one, rows, newest.day) for one in (in_use, entry)]
     old = load_model(folder)
     judged = evaluate(
-        [replace(old, name="in use"), replace(with_names_of(without.model, entry, in_use), name="new")],
+        [replace(old, name="in use"), replace(with_setup_names_of(without.model, entry, in_use), name="new")],
         seen[0].rows,
         EvaluationSettings(
             fit_frame=any(one.fit_frame for one in seen), fit_tool=any(one.fit_tool for one in seen)
@@ -81,26 +81,26 @@ def is_better(
     return interval is not None and interval[1] < 0, figures
 
 
-def with_names_of(model: CalibratedModel, entry: ModelEntry, other: ModelEntry) -> CalibratedModel:
+def with_setup_names_of(model: CalibratedModel, entry: ModelEntry, other: ModelEntry) -> CalibratedModel:
     """Return a model whose newest frame and tool are renamed to those of another model."""
 
-    def renamed(values: Mapping[str, Value], day: str, other_day: str) -> dict[str, Value]:
-        newest = {name_since(name, other_day): value for name, value in _of_day(values, day).items()}
+    def with_day(values: Mapping[str, Value], day: str, other_day: str) -> dict[str, Value]:
+        newest = {setup_name(name, other_day): value for name, value in _of_day(values, day).items()}
         return newest | {name: value for name, value in values.items() if name not in newest}
 
     frame, tool = (entry.frame_day, other.frame_day), (entry.target_day, other.target_day)
     return replace(
         model,
-        bases=renamed(model.bases, *frame),
-        hybrid_bases=renamed(model.hybrid_bases, *frame),
-        tools=renamed(model.tools, *tool),
-        hybrid_tools=renamed(model.hybrid_tools, *tool),
+        bases=with_day(model.bases, *frame),
+        hybrid_bases=with_day(model.hybrid_bases, *frame),
+        tools=with_day(model.tools, *tool),
+        hybrid_tools=with_day(model.hybrid_tools, *tool),
     )
 
 
 def _of_day(values: Mapping[str, Value], day: str) -> dict[str, Value]:
     """Return the frames or tools that were set up on a day, by their names in files of rows."""
-    ending = name_since("", day)
+    ending = setup_name("", day)
     if not day:
         return {name: value for name, value in values.items() if " since " not in f" {name}"}
     return {
@@ -108,7 +108,7 @@ def _of_day(values: Mapping[str, Value], day: str) -> dict[str, Value]:
     }
 
 
-def check_of(
+def check_entry(
     found: Monitoring,
     entry: ModelEntry,
     session: SessionEntry,
@@ -141,7 +141,7 @@ def check_of(
     return replace(check, recalibrate=True, summary=f"{judged.sentence} {tried.gate.sentence}")
 
 
-def found_events(
+def unrecorded_changes(
     result: Recalibration, session: SessionEntry, recorded: Collection[str], valid: Sequence[SessionEntry]
 ) -> list[Event]:
     """Return the changes of instrument and tool that a recalibration found, and that nobody has recorded.

@@ -1,4 +1,4 @@
-"""Write the folder of a new cell, whole or not at all."""
+"""Write the folder of a new cell, completely or not at all."""
 
 import datetime
 import math
@@ -11,7 +11,7 @@ from typing import Any
 
 from pisigma.files.errors import ModelError, OutputError, PisigmaError, Place
 from pisigma.files.model_files import DESCRIPTION, model_hash
-from pisigma.files.output_file import write_whole
+from pisigma.files.output_file import write_atomically
 from pisigma.files.scratch import FOLDER, remove_stale_scratch, scratch_beside
 from pisigma.lifetime.cell.history import HISTORY, History, ModelEntry, Use, now
 from pisigma.lifetime.cell.layout import CELL_FILE, MODELS, PLANS, SESSIONS
@@ -96,7 +96,7 @@ class NewCell:
             shutil.copyfile(file, folder / SESSIONS / f"{name}.csv")
         if self.model is not None:
             self._add_model(self.model, folder)
-        write_whole(folder / CELL_FILE, cell_template(known, self.calibrate))
+        write_atomically(folder / CELL_FILE, cell_template(known, self.calibrate))
         try:
             CellFile.read(folder)
         except PisigmaError as problem:  # the file is not kept, so its place means nothing
@@ -138,7 +138,7 @@ class NewCell:
         return name
 
 
-def of_model(model: Path, cell: NewCell) -> NewCell:
+def cell_from_model(model: Path, cell: NewCell) -> NewCell:
     """Return a cell with a model folder and the robot of the model.
 
     Raises:

@@ -67,7 +67,7 @@ def save_new(folder: Path, save: Callable[[Path], object], taken: Collection[str
 
 
 def write_new(folder: Path, name: str, content: bytes, taken: Collection[str]) -> Path:
-    """Write a session under a new name, whole or not at all, even if other processes write to the folder.
+    """Write a session under a new name, completely or not at all, even if other processes write to the folder.
 
     Args:
         folder: folder of the sessions.

@@ -17,7 +17,7 @@ from pisigma.files.errors import AcceptanceError, MeasurementError, PisigmaError
 from pisigma.files.model_files import is_unchanged
 from pisigma.lifetime.cell.controller import Controller
 from pisigma.lifetime.cell.events import Event
-from pisigma.lifetime.cell.facts import facts_of, not_taken_in, sha256_of, unimported_files
+from pisigma.lifetime.cell.facts import facts_of, foreign_files, not_taken_in, sha256_of
 from pisigma.lifetime.cell.history import Check, History, ModelEntry, SessionEntry, now
 from pisigma.lifetime.cell.layout import MODELS, SESSIONS
 from pisigma.lifetime.cell.status import FOREIGN
@@ -89,7 +89,7 @@ class Sessions:
         """Return the file of a session."""
         return self.folder / f"{session.name}.csv"
 
-    def take_in(
+    def add_session(
         self, file: str | os.PathLike[str] | Measurements, accept_implausible: bool = False, day: str = ""
     ) -> SessionEntry:
         """Check the rows of a session and store them; they are never changed afterwards.
@@ -148,7 +148,7 @@ class Sessions:
         if not waiting:
             return False
         try:
-            self.take_in(self.folder / waiting[0])
+            self.add_session(self.folder / waiting[0])
         except PisigmaError as refusal:
             verdict = "refused" if is_measurement_file(self.folder / waiting[0]) else FOREIGN
             refused = Check("import", "", Path(waiting[0]).stem, verdict, str(refusal), None, False, now())
@@ -217,7 +217,7 @@ class Sessions:
         """
         sessions = {one.name: one for one in self.history.sessions()}
         known = tuple(sessions.values())
-        for file in (*not_taken_in(self.folder, known), *unimported_files(self.folder, known)):
+        for file in (*not_taken_in(self.folder, known), *foreign_files(self.folder, known)):
             name, day = file.removesuffix(".csv"), date_in_name(file) or datetime.date.today().isoformat()
             sessions[name] = SessionEntry(
                 name, sha256_of(self.folder / file), now(), day, 0, "", judged_by=""
@@ -354,12 +354,12 @@ def with_session(model: ModelEntry, session: SessionEntry) -> ModelEntry:
 
 def with_setup_names(rows: Measurements, frame_day: str, target_day: str) -> Measurements:
     """Return rows whose frame and target names state the day of their setup; "": the names of the file."""
-    frame = tuple(name_since(name, frame_day) for name in rows.frame)
-    target = tuple(name_since(name, target_day) for name in rows.target)
+    frame = tuple(setup_name(name, frame_day) for name in rows.frame)
+    target = tuple(setup_name(name, target_day) for name in rows.target)
     return replace(rows, frame=frame, target=target)
 
 
-def name_since(name: str, day: str) -> str:
+def setup_name(name: str, day: str) -> str:
     """Return the name of a frame or target that was set up on a day; day "" for the first one."""
     return f"{name} since {day}".lstrip() if day else name
 

@@ -15,7 +15,7 @@ from pisigma.measurement.camera.camera_files import CameraFiles
 from pisigma.measurement.csv.header import check_separators
 from pisigma.measurement.csv.table import read_table
 from pisigma.measurement.dates import EXPECTED_DATE, date_in_name, is_date
-from pisigma.workflow.cell.new_cell import NewCell, of_model
+from pisigma.workflow.cell.new_cell import NewCell, cell_from_model
 from pisigma.workflow.cell.new_files import write_new
 from pisigma.workflow.settings.calibration import CalibrationSettings
 
@@ -202,7 +202,7 @@ def _cell(rows: list[_Row], common: NewCell) -> NewCell:
         calibrate=NO_VALIDATION | settings,
         sessions=tuple(_sessions(rows)),
     )
-    return of_model(Path(model), cell) if model else cell
+    return cell_from_model(Path(model), cell) if model else cell
 
 
 def _sessions(rows: list[_Row]) -> Iterator[tuple[str, Path]]:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from pisigma.files.errors import MeasurementError, Place
-from pisigma.files.output_file import check_page, write_whole
+from pisigma.files.output_file import check_page, write_atomically
 from pisigma.measurement.camera.board import Board
 from pisigma.measurement.camera.camera import INTRINSICS
 from pisigma.measurement.camera.detection.detected_board import DetectedBoard
@@ -125,7 +125,7 @@ class CameraCalibration:
         Raises:
             OutputError: it cannot be written.
         """
-        write_whole(Path(path), self.calibration.camera.to_yaml())
+        write_atomically(Path(path), self.calibration.camera.to_yaml())
 
     def save_page(self, page: str | os.PathLike[str]) -> None:
         """Write intrinsics and images with the residuals of their corners as one HTML page.
@@ -138,7 +138,7 @@ class CameraCalibration:
         check_page(Path(page))
         title = f"Intrinsics of {self.calibration.camera.name}"
         says = self.sentences, self.warnings
-        write_whole(Path(page), images_page(title, self.detection, self.tables, says))
+        write_atomically(Path(page), images_page(title, self.detection, self.tables, says))
 
 
 def calibrate_camera(

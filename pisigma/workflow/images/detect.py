@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pisigma.files.errors import MeasurementError, Place
-from pisigma.files.output_file import check_page, write_whole
+from pisigma.files.output_file import check_page, write_atomically
 from pisigma.measurement.camera.board import Board
 from pisigma.measurement.camera.camera import Camera
 from pisigma.measurement.camera.detection.detected_boards import DetectedBoards, predict_boards
@@ -79,7 +79,7 @@ class DetectedCorners:
         """
         text = io.StringIO()
         csv.writer(text, lineterminator="\n").writerows(self.rows)
-        write_whole(Path(path), text.getvalue())
+        write_atomically(Path(path), text.getvalue())
 
     def save_page(self, page: str | os.PathLike[str]) -> None:
         """Write the images with the residuals of their corners as one HTML page.
@@ -91,7 +91,7 @@ class DetectedCorners:
 
         check_page(Path(page))
         says = self.sentences, self.warnings
-        write_whole(Path(page), images_page("Corners of a board", self.detection, self.tables, says))
+        write_atomically(Path(page), images_page("Corners of a board", self.detection, self.tables, says))
 
 
 def detect(

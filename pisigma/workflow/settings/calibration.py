@@ -18,7 +18,7 @@ MAX_REPEATS = 1000
 ModelKind = Literal["hybrid", "geometric"]
 
 
-def free_parameters(stated: str) -> str | tuple[str, ...]:
+def parse_free_parameters(stated: str) -> str | tuple[str, ...]:
     """Return the free parameters from "identifiable", "joint_offsets" or comma-separated names.
 
     Raises:
@@ -44,7 +44,7 @@ def parse_direction(stated: str) -> tuple[float, ...]:
     return numbers
 
 
-def socket_distances(stated: Iterable[str]) -> dict[tuple[str, str], float]:
+def parse_socket_distances(stated: Iterable[str]) -> dict[tuple[str, str], float]:
     """Return known distances between pairs of sockets [m] from "A,B,MM" [mm]."""
     distances: dict[tuple[str, str], float] = {}
     for one in stated:
@@ -78,7 +78,12 @@ def _socket_distance(stated: str) -> tuple[tuple[str, str], float]:
 SocketDistances = Annotated[
     Mapping[tuple[str, str], float],
     Option(
-        "--socket-distance", kind=list[str], read=socket_distances, unit="mm", metavar="A,B,MM", is_key=True
+        "--socket-distance",
+        kind=list[str],
+        read=parse_socket_distances,
+        unit="mm",
+        metavar="A,B,MM",
+        is_key=True,
     ),
 ]
 
@@ -127,7 +132,7 @@ class CalibrationSettings:
     train_rows: Annotated[int | None, KEY] = None
     free: Annotated[
         Literal["identifiable", "joint_offsets"] | tuple[str, ...],
-        Option(kind=str, read=free_parameters, is_key=True),
+        Option(kind=str, read=parse_free_parameters, is_key=True),
     ] = "identifiable"
     prior_length: Annotated[float, Option("--prior-mm", unit="mm", is_key=True)] = 1e-3
     prior_angle: Annotated[float, Option("--prior-mrad", unit="mrad", is_key=True)] = 1e-3

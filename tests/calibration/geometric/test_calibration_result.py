@@ -9,7 +9,7 @@ from testing.simulated_arm import BASE, TOOL, draw_joints, simulate
 
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.calibration.geometric.identifiability.observability import observability_of
-from pisigma.calibration.geometric.problem.setup import turning_axes
+from pisigma.calibration.geometric.problem.setup import rpy_axes
 from pisigma.calibration.geometric.result import CalibrationResult
 from pisigma.files.errors import IdentificationError
 from pisigma.measurement.dataset import Measurements
@@ -87,7 +87,7 @@ def test_turning_axes_are_the_derivative_of_the_rotation() -> None:
         step = torch.zeros(3, dtype=torch.float64)
         step[index] = 1e-6
         turn = rotation_vector(rotation_from_rpy(rpy + step) @ rotation_from_rpy(rpy - step).mT) / 2e-6
-        assert_close(turning_axes(rpy)[:, index], turn, atol=1e-9)
+        assert_close(rpy_axes(rpy)[:, index], turn, atol=1e-9)
 
 
 def test_unknown_frames_and_targets_are_refused(result: CalibrationResult) -> None:

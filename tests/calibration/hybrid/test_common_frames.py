@@ -11,7 +11,7 @@ from testing.hybrid import joints_in, true_robot
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.calibration.geometric.prediction import predicted_poses
 from pisigma.calibration.hybrid.calibrator import HybridCalibrator
-from pisigma.calibration.hybrid.refinement import nearest_motion, refine, with_frames_of
+from pisigma.calibration.hybrid.refinement import fit_rigid_motion, refine, with_aligned_frames
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import held_out_groups
 from pisigma.robot import Robot
@@ -27,12 +27,12 @@ def test_a_motion_is_found_again(turn, generator):
         torch.tensor([0.3, -2.0, 1.0], dtype=torch.float64),
     )
     onto = points @ T[:3, :3].mT + T[:3, 3]
-    assert_close(nearest_motion(points, onto), T, atol=1e-12)
+    assert_close(fit_rigid_motion(points, onto), T, atol=1e-12)
 
 
 def test_a_mirrored_cloud_gives_a_rotation_still(generator):
     points = torch.randn(30, 3, generator=generator, dtype=torch.float64)
-    T = nearest_motion(points, points * torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64))
+    T = fit_rigid_motion(points, points * torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64))
     assert_close(torch.linalg.det(T[:3, :3]), 1.0, atol=1e-12)
 
 
@@ -74,8 +74,8 @@ def test_a_moved_frame_moves_what_stands_in_it_with_its_uncertainty():
     turned = refined.point.clone()
     turned[solved.problem.space.index("base_roll")] += 0.3
     turned[solved.problem.space.index("base_x")] += 0.1
-    moved = with_frames_of(solved, replace(refined, point=turned))
-    like = with_frames_of(solved, refined)
+    moved = with_aligned_frames(solved, replace(refined, point=turned))
+    like = with_aligned_frames(solved, refined)
     assert_close(moved.bases[""], like.bases[""], atol=1e-9)
     assert moved.point is not None
     base = moved.setup.anchors.bases[0] @ transform_from_xyzrpy(

@@ -19,7 +19,7 @@ from pisigma.calibration.hybrid.search import FeatureFit
 from pisigma.calibration.hybrid.uncertainty import PositionUncertainty, position_uncertainty
 from pisigma.estimation.held_out import MAX_SCALE, HeldOutErrors, held_out_scale
 from pisigma.estimation.prior import GaussianPrior
-from pisigma.estimation.regression import MIN_EFFECTIVE, root_of_sizes
+from pisigma.estimation.regression import MIN_EFFECTIVE, prior_size_columns
 from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.joint_correction.gravity_torques import GravityTorques
 from pisigma.joint_correction.joint_correction import JointCorrection
@@ -60,7 +60,7 @@ def test_uncertain_sizes_add_what_the_unknowns_move_with_them() -> None:
         if told > MIN_EFFECTIVE:
             expected += slope[:, None] * slope / (2 * told)
     assert told_at_all == [True, True, False]
-    added = root_of_sizes(posterior, fit.covariance_root(posterior))
+    added = prior_size_columns(posterior, fit.covariance_root(posterior))
     assert_close(added @ added.t(), expected, atol=1e-7 * float(expected.abs().max()))
 
 
@@ -68,7 +68,7 @@ def test_sizes_of_unknowns_without_a_prior_add_nothing() -> None:
     fit, prior = small_problem()
     flat = replace(prior, base=torch.where(prior.group == 2, prior.base, 0.0))
     posterior = fit.solve(flat, (0.4,))
-    added = root_of_sizes(posterior, fit.covariance_root(posterior))
+    added = prior_size_columns(posterior, fit.covariance_root(posterior))
     assert_close(added, torch.zeros_like(added))
 
 
@@ -163,7 +163,7 @@ def test_deviation_is_that_of_drawn_calibrations(arm: LinearisedArm) -> None:
     """The covariance of positions at the training rows, as their columns give it, widened."""
     found, fitted, correction = uncertainty(arm)
     root = NormalEquations.from_rows(fitted.design, arm.rows).covariance_root(fitted.posterior)
-    root = torch.cat([root.as_matrix, root_of_sizes(fitted.posterior, root)], 1)
+    root = torch.cat([root.as_matrix, prior_size_columns(fitted.posterior, root)], 1)
     C = root @ root.t()
     values = arm.rows.values[0].select(torch.arange(10))
     X = fitted.design.columns(values, slice(None))

@@ -43,7 +43,7 @@ def test_what_the_robots_have_in_common_is_printed_and_kept(prior):
     assert "5 robots of the type rb5" in card
     assert "| a_2 | mm |" in card
     for name in ("bad", "bad_robot", "metres"):
-        assert f"Robot '{name}' did not count: " in card
+        assert f"Robot '{name}' was not used: " in card
     assert "`pisigma fleet prior cells " in card
 
 

@@ -91,11 +91,11 @@ def test_twelve_changes_of_the_model_in_use_are_undone_one_after_the_other(histo
     history.add(*(replace(MODEL, name=name) for name in names))
     history.add(*(replace(USE, model=name) for name in names), replace(USE, model=names[-1]))
     for name in [*reversed(names[:-1]), ""]:
-        assert history.before_in_use == name
+        assert history.model_after_undo == name
         history.add(replace(USE, model=name, undo=True))
-    assert history.in_use is history.before_in_use is None
+    assert history.in_use is history.model_after_undo is None
     history.add(USE)
-    assert history.before_in_use == ""
+    assert history.model_after_undo == ""
 
 
 def test_an_older_history_gets_the_tables_and_columns_that_it_lacks(history):

@@ -9,10 +9,10 @@ from pisigma.lifetime.monitoring.charts import (
     FALSE_ALARMS_PER_YEAR,
     SESSIONS_PER_YEAR,
     Chart,
-    cusum_sessions,
-    ewma_sessions,
     innovations,
     limits_of,
+    mean_sessions_to_cusum_alarm,
+    mean_sessions_to_ewma_alarm,
 )
 
 
@@ -25,8 +25,8 @@ def chart(scores, one_sided=False):
 
 def test_mean_run_lengths_are_those_of_the_literature():
     # Lucas and Saccucci 1990, table 3: weight 0.2, limit 3; Montgomery, Statistical Quality Control: k 0.5, h 5
-    assert_close(ewma_sessions(3 * math.sqrt(0.2 / 1.8), False), 559.9, rtol=0.01)
-    assert_close(cusum_sessions(5.0), 938.2, rtol=0.01)
+    assert_close(mean_sessions_to_ewma_alarm(3 * math.sqrt(0.2 / 1.8), False), 559.9, rtol=0.01)
+    assert_close(mean_sessions_to_cusum_alarm(5.0), 938.2, rtol=0.01)
 
 
 def test_the_rate_of_false_alarms_is_as_stated():

@@ -40,7 +40,7 @@ def test_poses_of_the_arm_are_reached_within_its_limits(ik, robot, q):
     assert (free.status != Status.UNREACHABLE).all()
     assert (free.status == Status.REACHED).mean() > 0.9
     assert_close(ik.forward(free.q), T, atol=1e-9)
-    inside = robot.coupling.is_inside(robot.to_dh(free.q))
+    inside = robot.coupling.is_within_limits(robot.to_dh(free.q))
     assert ((free.status == Status.OUTSIDE_JOINT_LIMITS) == ~inside).all()
     assert np.shape(ik.all_branches(T[:2]).q) == (2, 1, 4)
 

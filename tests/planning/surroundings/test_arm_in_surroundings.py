@@ -110,7 +110,7 @@ def test_a_measured_pose_is_free_of_self_collision():
     q = limits[:, 0] + (limits[:, 1] - limits[:, 0]) * draws
     touching = (~arm.faults(q).allowed).nonzero()[:, 0]
     measured = q[touching[:5]]
-    with_measured = arm.with_measured(measured)
+    allowed = arm.allow_measured_poses(measured)
     assert len(touching) > 10
-    assert with_measured.faults(measured).allowed.all()
-    assert with_measured.faults(q).allowed.sum() < len(q)
+    assert allowed.faults(measured).allowed.all()
+    assert allowed.faults(q).allowed.sum() < len(q)

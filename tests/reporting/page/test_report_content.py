@@ -22,7 +22,7 @@ from pisigma.validation.held_out.judged_rows import MAX_PREDICTED, predicted_at
 from pisigma.validation.held_out.validation_figures import ErrorFigures
 from pisigma.validation.report.accuracy import limit_of
 from pisigma.validation.report.corrections import correction_curves
-from pisigma.validation.report.joint_gaps import joint_gaps, measured_stretches
+from pisigma.validation.report.joint_gaps import joint_gaps, measured_intervals
 
 pytestmark = pytest.mark.usefixtures("without_type_checker")
 
@@ -256,7 +256,7 @@ def test_curves_are_the_correction_at_the_middle_row(hybrid):
 
 def test_measured_values_are_in_the_stretches_up_to_turns(hybrid):
     model = hybrid[1]
-    for j, (stretches, (low, high)) in enumerate(measured_stretches(model, model.starts)):
+    for j, (stretches, (low, high)) in enumerate(measured_intervals(model, model.starts)):
         assert all(low - math.pi - 1e-9 <= a < b <= high + math.pi + 1e-9 for a, b in stretches)
         turns = model.starts[:, j].numpy()[:, None] + 2 * math.pi * np.arange(-2, 3)
         inside = [(turns >= a - 1e-9) & (turns <= b + 1e-9) for a, b in stretches]

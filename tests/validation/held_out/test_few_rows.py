@@ -12,7 +12,7 @@ from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.calibration.hybrid.calibrator import HybridCalibrator
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot
-from pisigma.validation.held_out.calibration_validation import errors_under
+from pisigma.validation.held_out.calibration_validation import pose_errors_of
 from pisigma.validation.held_out.few_rows import fit_if_better
 from pisigma.validation.held_out.trained_calibrations import base_and_tool
 
@@ -30,7 +30,7 @@ def test_few_poses_are_at_most_a_little_worse_than_the_nominal_arm(shared_data):
         few, others = rows.select(chosen[:count]), rows.select(chosen[-200:])
         with no_type_checker():
             results = (fit_if_better(calibrator, few, nothing), base_and_tool(calibrator).fit(few))
-            fitted, nominal = (errors_under(result, others).figures.rms_mm for result in results)
+            fitted, nominal = (pose_errors_of(result, others).figures.rms_mm for result in results)
         ratios.append(fitted / nominal)
     assert max(ratios) <= 1.05
     assert np.median(ratios) < 0.9
@@ -52,5 +52,5 @@ def test_ten_positions_of_an_arm_with_clear_errors_are_fitted():
     calibrator = GeometricCalibrator(arm.nominal)
     with no_type_checker():
         results = (fit_if_better(calibrator, few, nothing), base_and_tool(calibrator).fit(few))
-        fitted, nominal = (errors_under(result, others).figures.rms_mm for result in results)
+        fitted, nominal = (pose_errors_of(result, others).figures.rms_mm for result in results)
     assert fitted < 0.2 * nominal

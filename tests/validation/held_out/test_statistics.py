@@ -18,7 +18,7 @@ from pisigma.validation.held_out.pose_statistics import (
     ErrorVectors,
     PoseErrors,
     axis_statistics,
-    compare_on,
+    compare_with_nominal,
     error_statistics,
 )
 from pisigma.validation.held_out.training_summary import JointErrorFigures
@@ -79,7 +79,7 @@ def test_pose_errors_need_positions():
 def test_a_model_explains_what_it_predicts():
     model = hand_made_model("kiro4")
     q = joints_around("kiro4", 10, seed=3)
-    found = compare_on(model, measured(model.forward(q), q))
+    found = compare_with_nominal(model, measured(model.forward(q), q))
     assert found.not_predicted == 0
     assert_close(found.corrected.position, 0.0, atol=1e-12)
     assert float(found.nominal.position.min()) > 1e-4

@@ -9,7 +9,7 @@ from testing.refusals import assert_fields, refused
 from pisigma.files.errors import FleetError, MeasurementError, ModelError
 from pisigma.model.folder.model_folder import save_model
 from pisigma.workflow.cell.cell import Cell
-from pisigma.workflow.cell.new_cell import NewCell, of_model
+from pisigma.workflow.cell.new_cell import NewCell, cell_from_model
 from pisigma.workflow.fleet.manifest import new_cells
 
 ANY = NewCell("")
@@ -155,17 +155,17 @@ def model(tmp_path_factory):
 
 
 def test_the_model_of_a_folder_goes_into_use(tmp_path, model):
-    of_model(model, ANY).write(tmp_path / "cell")
+    cell_from_model(model, ANY).write(tmp_path / "cell")
     cell = Cell.open(tmp_path / "cell")
     assert cell.history.in_use.name == "welder"
     assert cell.history.in_use.sha256 == hashlib.sha256((model / "model.yaml").read_bytes()).hexdigest()
     assert cell.robot.dh == pytest.approx(model_before().robot.dh)
     assert (cell.status().step.state, cell.history.in_use.made_of) == ("no_plan", ())
     rows_later(10, 11).write_csv(tmp_path / "new.csv", cell.robot)
-    cell.take_in(tmp_path / "new.csv")
+    cell.add_session(tmp_path / "new.csv")
     assert cell.status().step.state == "session_not_judged"
 
 
 def test_what_is_not_the_model_of_a_robot_is_refused(tmp_path):
     with refused(ModelError):
-        of_model(tmp_path, ANY)
+        cell_from_model(tmp_path, ANY)

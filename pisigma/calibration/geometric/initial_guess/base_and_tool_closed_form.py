@@ -130,7 +130,7 @@ def starts_from_positions(
     assumed = torch.cat([nominal_point[None], torch.zeros_like(nominal_point)[None], along, -along])
     for point in assumed.unbind():
         arm = p_flange + R_flange @ point
-        yield *base_by_points(arm, position), point
+        yield *fit_base_to_points(arm, position), point
 
 
 def start_from_products(
@@ -152,7 +152,7 @@ def start_from_products(
     return R_base, *_translations(R_base, R_flange, p_flange, position)
 
 
-def base_by_points(
+def fit_base_to_points(
     points: Float64[Tensor, "rows 3"],
     position: Float64[Tensor, "rows 3"],
     like: Float64[Tensor, "3 3"] | None = None,
@@ -189,7 +189,7 @@ def _mean_turn(R_base: Tensor, R_flange: Tensor, rotation: Tensor) -> Tensor:
 
 
 def _procrustes(points: Tensor, position: Tensor, like: Tensor | None = None) -> Tensor:
-    """Fit the rotation of the points to the positions, both relative to their means; see `base_by_points`."""
+    """Fit the rotation of the points to the positions, both relative to their means; see `fit_base_to_points`."""
     M = (position - position.mean(0)).mT @ (points - points.mean(0))
     return nearest_rotation(M if like is None else M + like * (UNDETERMINED * M.norm()).clamp(min=1e-12))
 

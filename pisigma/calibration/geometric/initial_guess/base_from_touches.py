@@ -25,7 +25,7 @@ MAX_RMS_SHARE = 0.05
 BASE_UNKNOWNS = 6
 
 
-def touched_base(
+def fit_base_to_touches(
     tip: Float64[Tensor, "touches 3"],
     axis: Int64[Tensor, " touches"],
     touch: Float64[Tensor, " touches"],

@@ -9,11 +9,11 @@ from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
 from pisigma.calibration.geometric.initial_guess.base_and_tool import guess_base_and_tool
-from pisigma.calibration.geometric.initial_guess.base_and_tool_closed_form import base_by_points
+from pisigma.calibration.geometric.initial_guess.base_and_tool_closed_form import fit_base_to_points
 from pisigma.calibration.geometric.initial_guess.base_from_touches import (
     check_touched_base,
     check_touched_frames,
-    touched_base,
+    fit_base_to_touches,
 )
 from pisigma.calibration.geometric.initial_guess.tool_from_distances import (
     base_from_anchors,
@@ -149,7 +149,9 @@ def _from_positions(
         robot = space.robot if name not in stated else space.robot.with_geometry(base=stated[name])
         part = measurements
         if len(rows) < measurements.rows or len(rows) > GUESS_ROWS:
-            part = measurements.select(rows[chosen_rows(len(rows), GUESS_ROWS)].to(measurements.q.device))
+            part = measurements.select(
+                rows[randomly_chosen_rows(len(rows), GUESS_ROWS)].to(measurements.q.device)
+            )
         if part.pair is not None:
             part = replace(part, pair=None, distance=None)
         find_base = free_base and name not in stated
@@ -174,11 +176,11 @@ def _base_by_tools(
     T = forward_kinematics(arm, measurements.q.cpu())
     tool = torch.from_numpy(np.stack([tools[name][:3] for name in measurements.target]))
     points = (T[:, :3, :3] @ tool[..., None])[..., 0] + T[:, :3, 3]
-    R_base, place = base_by_points(points, measurements.position.cpu())
+    R_base, place = fit_base_to_points(points, measurements.position.cpu())
     return torch.cat([place, rpy_from_rotation(R_base)]).numpy()
 
 
-def chosen_rows(rows: int, most: int) -> Int64[Tensor, " chosen"]:
+def randomly_chosen_rows(rows: int, most: int) -> Int64[Tensor, " chosen"]:
     """Return all rows, or at most `most` of them in a fixed random order."""
     if rows <= most:
         return torch.arange(rows)
@@ -235,7 +237,9 @@ def _from_touches(
     part = measurements.select(rows.nonzero()[:, 0].to(measurements.q.device))
     axis = numbers_of(part.touch_axis, ("x", "y", "z"), part.rows)
     assert part.touch is not None
-    base, rms = touched_base(tip[rows], axis, part.touch.cpu(), torch.from_numpy(space.robot.base.copy()))
+    base, rms = fit_base_to_touches(
+        tip[rows], axis, part.touch.cpu(), torch.from_numpy(space.robot.base.copy())
+    )
     check_touched_base(part, name, rms, space.robot.reach)
     guessed: np.ndarray = base.numpy()
     return guessed

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
-from pisigma.calibration.geometric.initial_guess.base_and_tool_closed_form import base_by_points
+from pisigma.calibration.geometric.initial_guess.base_and_tool_closed_form import fit_base_to_points
 from pisigma.calibration.geometric.problem.parameters import ParameterSpace
 from pisigma.files.errors import ImplausibleError, Place
 from pisigma.measurement.csv.columns import MISNAMED_UNITS
@@ -127,7 +127,7 @@ class _Distances:
     def is_doubtful(
         self, tool: Float64[Tensor, "*batch 3"], residual: Float64[Tensor, "*batch rows"]
     ) -> Bool[Tensor, "*batch"]:
-        """Say whether the median error is large relative to the motion of the tool."""
+        """Return whether the median error is large relative to the motion of the tool."""
         points = self.points(tool)
         motion = (points - points.mean(-2, keepdim=True)).norm(dim=-1).median(-1).values
         doubtful: Tensor = residual.abs().median(-1).values > DOUBTFUL * motion
@@ -235,7 +235,7 @@ def base_from_anchors(
             stated.append(place.cpu())
     if not seen:
         return nominal_base
-    R, p = base_by_points(
+    R, p = fit_base_to_points(
         torch.stack(seen), torch.stack(stated), rotation_from_rpy(tip.new_tensor(nominal_base[3:]))
     )
     return torch.cat([p, rpy_from_rotation(R)]).numpy()

@@ -116,7 +116,7 @@ def information(
                 sensor.residual(motion, unknowns, rows),
             )
             weight = torch.full_like(r[0], 1e3) if view is None else _row_weights(problem, view, k, rows)
-            if not problem.measured_everywhere[k]:
+            if not problem.measured_in_every_row[k]:
                 present = sensor.present[rows]
                 J, r, weight = J[..., present], r[:, present], weight[present]
             # Residual and weight are two more columns, so that R contains misfit and weighted means as well.

@@ -360,7 +360,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         return self.precision[self.active]
 
     @cached_property
-    def measured_everywhere(self) -> tuple[bool, ...]:
+    def measured_in_every_row(self) -> tuple[bool, ...]:
         """Per sensor, whether it has a value in every row."""
         return tuple(
             values == self.rows * sensor.components
@@ -371,7 +371,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         self, number: int, view: SensorView | None, motion: ToolMotion, unknowns: Unknowns, rows: slice
     ) -> SensorSums:
         """Compute the sums of one sensor in some rows, weighted by its noise, or equally if `view` is None."""
-        sensor, everywhere = self.sensors[number], self.measured_everywhere[number]
+        sensor, everywhere = self.sensors[number], self.measured_in_every_row[number]
         residual = sensor.residual(motion, unknowns, rows)
         if not everywhere:
             residual = torch.where(sensor.present[rows], residual, 0.0)

@@ -20,7 +20,7 @@ from pisigma.measurement.conditions import JointState, repeat_key
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.fields import KINDS
 from pisigma.measurement.readings import READINGS
-from pisigma.measurement.sensors.registry import build_sensors, pairs_first, unknown_groups
+from pisigma.measurement.sensors.registry import build_sensors, sort_pairs_first, unknown_groups
 from pisigma.measurement.sensors.sensor import SensorRows, numbers_of
 from pisigma.measurement.sensors.socket import PairOfSockets, SocketDistanceSensor
 from pisigma.robot.description import Robot
@@ -193,7 +193,7 @@ def usable_rows(measurements: Measurements) -> tuple[Tensor, Measurements]:
             at=Place(measurements.source),
             remedy="give positions or poses (columns x_mm, y_mm, z_mm), touches, sockets or distances",
         )
-    rows = pairs_first(measurements, usable.nonzero()[:, 0])
+    rows = sort_pairs_first(measurements, usable.nonzero()[:, 0])
     whole = len(rows) == len(usable) and measurements.pair is None
     chosen = measurements if whole else measurements.select(rows)
     q = chosen.q
@@ -352,13 +352,13 @@ def coordinate_change(
         change[first : first + 3, first : first + 3] = anchor[:3, :3]
         # Angular velocities agree in both coordinates up to the anchor; the axes convert them from and to rpy.
         # At a pitch of 90 deg roll and yaw have the same axis: the pseudo-inverse then returns the smallest changes.
-        back = torch.linalg.pinv(turning_axes(user_bases[k, 3:]), rtol=1e-9)
+        back = torch.linalg.pinv(rpy_axes(user_bases[k, 3:]), rtol=1e-9)
         turns = slice(first + 3, first + 6)
-        change[turns, turns] = back @ anchor[:3, :3] @ turning_axes(bases[k, 3:])
+        change[turns, turns] = back @ anchor[:3, :3] @ rpy_axes(bases[k, 3:])
     for k in range(len(tools)):
         first = space.indices_of("tool").start + 6 * k + 3
-        back = torch.linalg.pinv(turning_axes(user_tools[k, 3:]), rtol=1e-9)
-        change[first : first + 3, first : first + 3] = back @ turning_axes(tools[k, 3:])
+        back = torch.linalg.pinv(rpy_axes(user_tools[k, 3:]), rtol=1e-9)
+        change[first : first + 3, first : first + 3] = back @ rpy_axes(tools[k, 3:])
     for own in space.unknowns:
         # Shifts of points are in the axes of their frame's anchor too.
         if own.has_point:
@@ -380,7 +380,7 @@ def unknowns_in_frames(
     }
 
 
-def turning_axes(rpy: Float64[Tensor, " 3"]) -> Float64[Tensor, "3 3"]:
+def rpy_axes(rpy: Float64[Tensor, " 3"]) -> Float64[Tensor, "3 3"]:
     """Return the rotation axes of roll, pitch and yaw as columns, for `RotZ(roll) · RotY(pitch) · RotX(yaw)`."""
     roll, pitch, _ = rpy.tolist()
     (cr, cp), (sr, sp) = ((turn(roll), turn(pitch)) for turn in (math.cos, math.sin))

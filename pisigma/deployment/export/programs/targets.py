@@ -68,7 +68,7 @@ class Targets:
         """Pose of the tool of T relative to the last row of the robot description."""
         return transform_from_xyzrpy(torch.from_numpy(self.robot.tool.copy()))
 
-    def lines_with(self, *statuses: Status) -> tuple[int, ...]:
+    def lines_with_status(self, *statuses: Status) -> tuple[int, ...]:
         """Return the lines of the poses with the given statuses."""
         return tuple(line for line, status in zip(self.line, self.status, strict=True) if status in statuses)
 
@@ -87,7 +87,7 @@ class Targets:
     @property
     def domain_warning(self) -> str | None:
         """Sentence on targets outside the domain; None without such targets."""
-        lines = self.lines_with(Status.OUTSIDE_DOMAIN)
+        lines = self.lines_with_status(Status.OUTSIDE_DOMAIN)
         if not lines:
             return None
         named = ", ".join(map(str, lines[:_LISTED])) + (", ..." if len(lines) > _LISTED else "")

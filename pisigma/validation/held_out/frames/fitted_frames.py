@@ -42,7 +42,9 @@ def fitted_kinds(fit_frame: bool, fit_tool: bool) -> tuple[FrameKind, ...]:
     return tuple(kind for kind, fitted in kinds if fitted)
 
 
-def with_names_of(model: CalibratedModel, rows: Measurements, fitted: Collection[FrameKind]) -> Measurements:
+def with_known_names(
+    model: CalibratedModel, rows: Measurements, fitted: Collection[FrameKind]
+) -> Measurements:
     """Replace the names of fitted frames and targets by some name of the model, because their poses do not matter."""
     if "base" in fitted:
         rows = replace(rows, frame=(next(iter(model.bases), ""),) * rows.rows)
@@ -93,7 +95,7 @@ def errors_in_fitted_frames(
             positions to fit to, or the model lacks a frame or target that is not fitted.
         IdentificationError: an anchor has too few rows to determine its position.
     """
-    T = poses_of_rows(model, with_names_of(model, measurements, fitted))
+    T = poses_of_rows(model, with_known_names(model, measurements, fitted))
     if not fitted:
         return errors_of_rows(T, measurements)
     if measurements.position is None:
