@@ -21,7 +21,7 @@ from typer.testing import CliRunner
 pytest.importorskip("viser", reason="the extra view is not installed")
 
 from pisigma.cli.main import app
-from pisigma.files.errors import PlanningError, fault_of_machine
+from pisigma.files.errors import PlanningError, system_fault
 from pisigma.lifetime.cell.layout import CELL_FILE
 from pisigma.workbench.job import BusyError, Jobs, Outcome
 from pisigma.workbench.tabs import TABS

@@ -165,7 +165,7 @@ def _print_run(result: "FleetRun") -> None:
 
 
 def _print_status(seen: "FleetStatus", page: Path | None, verbose: bool) -> None:
-    """Print how many cells are in each state, the worst, and what is to be done."""
+    """Print how many cells are in each state, the largest error, and what to do."""
     from pisigma.lifetime.cell.step import ATTENTION
     from pisigma.reporting.fleet_tables import ERRORS_NOTE, cell_table, fleet_verdict, state_table
 

@@ -109,7 +109,7 @@ class CellFacts:
 
     @property
     def unmeasured_plan(self) -> str:
-        """What the newest plan contains, if no session was added after it was made; else ""."""
+        """Contents of the newest plan, if no session was added after it was made; else ""."""
         planned = [one for one in self.checks if one.command == "plan"]
         newest = max((one.taken_in for one in self.sessions), default="")
         return planned[-1].summary if planned and planned[-1].checked > newest else ""
@@ -128,7 +128,7 @@ class CellFacts:
         checks = [one for one in self.checks if one.model == model and one.command in commands]
         return [one for one in checks if one.session not in aside]
 
-    def errors_of(self, model: str, *commands: str) -> list[Check]:
+    def trusted_checks_of(self, model: str, *commands: str) -> list[Check]:
         """Return those of `checks_of` whose rows are trusted, so that their errors are those of the model."""
         return [one for one in self.checks_of(model, *commands) if one.verdict not in NOT_TRUSTED]
 

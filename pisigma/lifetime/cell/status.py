@@ -54,7 +54,7 @@ class CellStatus:
     def last_error(self) -> Check | None:
         """The last check that found an RMS error of the model in use or, if there is none, of the newest model."""
         model = self.facts.in_use or (self.facts.models[-1] if self.facts.models else None)
-        checks = [] if model is None else self.facts.errors_of(model.name, *COMPUTED)
+        checks = [] if model is None else self.facts.trusted_checks_of(model.name, *COMPUTED)
         known = [one for one in checks if one.rms_mm is not None]
         return known[-1] if known else None
 
@@ -75,7 +75,7 @@ class CellStatus:
                     "day": one.day,
                     "rows": one.rows,
                     "set_aside": one.set_aside or None,
-                    "controller": records(facts.controller.during(one)),
+                    "controller": records(facts.controller.active_during(one)),
                 }
                 for one in facts.sessions
             ],
@@ -268,7 +268,7 @@ def _other_joint_zeros(facts: CellFacts, model: ModelEntry) -> Step | None:
     state: State = "other_joint_zeros"
     if facts.controller.fits(model, facts.sessions):
         return None
-    why = f"model '{model.name}' needs other joint zeros than those that are active on the controller"
+    why = f"model '{model.name}' needs joint zeros other than those that are active on the controller"
     if fitting := [one.name for one in facts.unchanged_models if facts.controller.fits(one, facts.sessions)]:
         return Step(state, f"{why}; model '{fitting[-1]}' needs these", facts.command("use", fitting[-1]))
     if not (new := facts.new_sessions(model)):

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from pisigma.files.output_file import write_whole
+from pisigma.files.output_file import write_atomically
 from pisigma.lifetime.cell.facts import CellFacts
 
 RESULTS = "results.parquet"

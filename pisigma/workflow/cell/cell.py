@@ -205,7 +205,7 @@ class Cell:
             MeasurementError: there are no valid sessions.
         """
         sessions, started, events = self.sessions.valid_sessions(), now(), self.history.events()
-        warnings, stated = self.on_controller("calibrate", None), settings_hash(self.folder)
+        warnings, stated = self.controller_warnings("calibrate", None), settings_hash(self.folder)
         settings: CalibrationSettings = self.file.settings_of_step("calibrate", **changed)
         result = calibrate_rows(
             self.robot, self.sessions.rows_of(sessions, events), settings, prior, progress
@@ -221,7 +221,7 @@ class Cell:
             better, remark = is_better(self.sessions, in_use, sessions, settings, progress)
         path = self._saved(result, accept_implausible)
         p95, rms = errors_of(result)
-        entry = entry_of(events, started, path, sessions, remark, result)
+        entry = model_entry(events, started, path, sessions, remark, result)
         verdict = "accepted_implausible" if doubt else "trusted"
         check = Check("calibrate", entry.name, "", verdict, doubt, p95, False, started, rms, stated)
         self.history.add(entry, check, *([Use(entry.name, now(), remark)] if better else []))
@@ -334,7 +334,7 @@ class Cell:
             return result, None
         path = self._saved(result, accept_implausible)
         remark, (p95, rms) = result.summary.verdict, errors_of(result)
-        entry = entry_of((), started, path, [chosen], remark, result, parent)
+        entry = model_entry((), started, path, [chosen], remark, result, parent)
         of = ("recalibrate", entry.name, chosen.name, result.summary.kept, remark)
         added: list[Entry] = [entry, Check(*of, p95, False, now(), rms)]
         if result.trusted:

@@ -195,7 +195,7 @@ def errors_of(result: Calibration | Recalibration) -> tuple[float | None, float 
     return None, None if fitted is None else list(fitted.models.values())[-1].rms_mm
 
 
-def entry_of(
+def model_entry(
     events: Sequence[Event],
     made: str,
     path: Path,

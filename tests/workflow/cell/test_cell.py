@@ -165,8 +165,8 @@ def test_a_changed_model_is_named_and_not_used(year, file):
 
 def test_an_event_that_is_recorded_during_a_calibration_asks_for_another(tmp_path):
     cell = Cell.create(tmp_path / "cell", "ur10")
-    cell.take_in(measured(14, 1), day="2026-01-10")
-    cell.take_in(measured(8, 2), day="2026-01-12")
+    cell.add_session(measured(14, 1), day="2026-01-10")
+    cell.add_session(measured(8, 2), day="2026-01-12")
 
     def record(_):
         if not cell.history.events():
