@@ -165,6 +165,9 @@ def test_what_was_dragged_is_written_and_can_be_undone(browser_with_link, bench,
     digest = seen(browser_with_link)
     refused = ended(browser_with_link, bench, "cell", seen=digest, **fields)
     assert refused.field == "surroundings.tracker.x_mm"
+    margin = {"surroundings.joints.margin_deg": "1000"}  # leaves no range of the joints
+    assert ended(browser_with_link, bench, "cell", seen=digest, **margin).refusal
+    assert cell.file.path.read_text() == text
     fields |= {"surroundings.tracker.x_mm": "3000", "surroundings.tracker.y_mm": "-10"}
     assert ended(browser_with_link, bench, "cell", seen=digest, **fields).refusal == ""
     turn = json.loads(browser_with_link.ask("/drag", "POST", '{"on": "true"}').body)["turn"]

@@ -19,6 +19,7 @@ from pisigma.lifetime.cell.facts import CellFacts
 from pisigma.lifetime.cell.layout import CELL_FILE
 from pisigma.lifetime.cell.status import VERIFICATION_POSES, plans_check
 from pisigma.planning.plan_settings import PlanSettings
+from pisigma.planning.surroundings.arm_in_surroundings import ArmInSurroundings
 from pisigma.planning.surroundings.surroundings import Surroundings
 from pisigma.robot.description import Robot
 from pisigma.robot.robot_file import robot_file
@@ -154,15 +155,16 @@ class CellFile:
         """Replace the file of a cell by a text if it is valid, completely or not at all.
 
         Raises:
-            PlanningError: the text is not a valid `cell.yaml`; the message names line and key.
-            RobotError: the robot cannot be loaded.
+            PlanningError: the text is not a valid `cell.yaml`, in which case the message names line and key; or the
+                robot cannot be loaded, or does not fit the surroundings.
         """
         path = folder / CELL_FILE
         with scratch_beside(path, FILE) as scratch:
             scratch.write_text(text, encoding="utf-8", newline="\n")
             try:
                 read = CellFile._checked(scratch)
-                Robot.load(read.robot, read.document.base, read.document.tip)
+                robot = Robot.load(read.robot, read.document.base, read.document.tip)
+                ArmInSurroundings.from_robot(robot, read.document.surroundings)
             except PisigmaError as problem:
                 refusal = PlanningError(str(problem).replace(str(scratch), str(path)))
                 refusal.file, refusal.line, refusal.column = str(path), problem.line, problem.column
