@@ -1,7 +1,6 @@
 """`pisigma import`: exports of instruments and controllers as a measurement file."""
 
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -15,8 +14,7 @@ from pisigma.cli.settings_options import StatedSettings, takes_settings
 from pisigma.workflow.settings.importing import ImportSettings
 
 if TYPE_CHECKING:
-    from pisigma.measurement.dataset import Measurements
-    from pisigma.workflow.cell.cell import Cell
+    from pisigma.workflow.cell.incoming_rows import IncomingRows
     from pisigma.workflow.import_rows import ImportProposal
 
 Files = Annotated[list[Path], typer.Argument(help="Exports (tables as text, in any encoding).")]
@@ -47,9 +45,9 @@ def import_(
     confirmation. Without a terminal, exits with status 2 unless --yes or a complete --map is given.
     """
     from pisigma.files.output_file import check_output
-    from pisigma.measurement.csv.reading import is_measurement_file
     from pisigma.workflow import import_rows as workflow
     from pisigma.workflow.cell.cell import Cell
+    from pisigma.workflow.cell.incoming_rows import IncomingRows
 
     if (cell is None) is (out is None):
         raise typer.BadParameter("expected either --out FILE or --cell CELL", param_hint="'--out'")
@@ -59,37 +57,30 @@ def import_(
         check_output(save_map, (".yaml", ".yml"), "a mapping", [*files, *([] if out is None else [out])])
     chosen = settings.build() if cell is None else settings_at(cell, "import", settings)
     if cell is not None:
-        opened = Cell.open(cell)
-        if len(files) == 1 and is_measurement_file(files[0]):
-            return _take_in(opened, files[0], date, accept_implausible, as_json)
+        incoming = IncomingRows(tuple(files), Cell.open(cell), chosen)
+        if not incoming.is_ready:
+            _confirm(incoming.proposal, yes, as_json)
+            if save_map is not None:
+                incoming.proposal.save_map(save_map)
+        return _take_in(incoming, date, accept_implausible, as_json)
     proposal = workflow.propose_import(files, chosen)
     _confirm(proposal, yes, as_json)
     rows = workflow.import_rows(proposal)
-    if out is not None:
-        rows.save(out)
+    assert out is not None  # there is no cell
+    rows.save(out)
     if save_map is not None:
         proposal.save_map(save_map)
-    if cell is not None:
-        if not as_json:
-            print_lines(rows.sentences)
-        return _take_in(opened, rows.measurements, date, accept_implausible, as_json, files)
     if as_json:
         print_json({"file": str(out)} | rows.to_json())
         return
     print_lines([*rows.sentences, f"{rows.rows} measurements written to {out}."])
 
 
-def _take_in(
-    cell: "Cell",
-    rows: "Path | Measurements",
-    date: str,
-    accept_implausible: bool,
-    as_json: bool,
-    exports: Sequence[Path] = (),
-) -> None:
-    """Add rows to a cell as a session; `exports` are the files that they were converted from."""
-    entry = cell.add_session(rows, accept_implausible, date)
-    cell.sessions.set_imported_aside(exports, entry)
+def _take_in(incoming: "IncomingRows", date: str, accept_implausible: bool, as_json: bool) -> None:
+    """Add rows to a cell as a session."""
+    if not as_json and incoming.imported is not None:
+        print_lines(incoming.imported.sentences)
+    entry, cell = incoming.add(accept_implausible, date), incoming.cell
     if as_json:
         print_json(
             {
@@ -100,7 +91,7 @@ def _take_in(
             }
         )
         return
-    remark = [f"Warning: {entry.remark}"] if entry.remark else []
+    remark = [f"Remark: {entry.remark}"] if entry.remark else []
     print_lines([f"{entry.rows} rows added as session '{entry.name}'.", *remark])
     print_next(cell.status())
 

@@ -238,7 +238,13 @@ class OutputError(PisigmaError, ValueError):
 
 
 class AcceptanceError(PisigmaError, ValueError):
-    """A model exceeds the limits that were set for it, or must not be trusted."""
+    """A model exceeds the limits that were set for it, or rows or a model must not be trusted.
+
+    Attributes:
+        findings: what the checks of rows found (`pisigma.validation.held_out.diagnostic.Diagnostic`).
+    """
+
+    findings: tuple[Any, ...] = ()
 
 
 class TrainingError(PisigmaError, RuntimeError):

@@ -2,6 +2,7 @@
 
 import math
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, get_args
@@ -138,6 +139,16 @@ class Robot:
     def limits(self) -> Float64[np.ndarray, " dof 2"]:
         """Lower and upper limit of every joint [rad or m]; of a coupled joint the range that the axes allow."""
         return np.array([[joint.lower, joint.upper] for joint in self.joints])
+
+    @property
+    def without_limits(self) -> "Robot":
+        """The robot without joint limits, which values of swapped columns or of other units exceed."""
+
+        def unlimited(rows: Sequence[Row]) -> tuple[Row, ...]:
+            return tuple(replace(row, lower=-np.inf, upper=np.inf) for row in rows)
+
+        coupling = self.coupling and replace(self.coupling, axes=unlimited(self.coupling.axes))
+        return replace(self, rows=unlimited(self.rows), coupling=coupling)
 
     @property
     def directions(self) -> Float64[np.ndarray, " dof"]:

@@ -4,7 +4,7 @@ from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
-from pisigma.files.errors import IdentificationError
+from pisigma.files.errors import IdentificationError, Place
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.model_posterior import FLEET_PRIOR
@@ -13,6 +13,7 @@ from pisigma.validation.checks.check import Move, RowsUnderModel
 from pisigma.validation.checks.other_robot import other_robot_diagnostics
 from pisigma.validation.checks.other_sensors import diagnose_lengths
 from pisigma.validation.checks.registry import ROW_CHECKS, diagnostics_of_rows
+from pisigma.validation.checks.row_order import new_setup_refusal
 from pisigma.validation.checks.setup_fault import check_position_size, joint_columns, setup_diagnostics
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.held_out.frames.fitted_frames import FrameKind
@@ -130,6 +131,18 @@ def _as_calibrated(rows: Measurements, robot: Robot) -> tuple[Diagnostic, ...]:
         found = diagnostics_of_rows(GeometricCalibrator(robot), rows)
         return tuple(one for one in found if not _is_unmodelled(one))
     except IdentificationError as refusal:  # no calibration error explains the rows
+        if moved := new_setup_refusal(robot, rows):
+            return (
+                Diagnostic(
+                    kind="row_order",
+                    severity="implausible",
+                    sentence=str(moved),
+                    rows=(str(Place(rows.source, moved.line)),),
+                    cause="frame",
+                    values={} if moved.line is None else {"first_line": moved.line},
+                    remedy=moved.remedy,
+                ),
+            )
         sentence = str(refusal).removeprefix(f"{rows.source}: ")
         return (Diagnostic(kind="implausible_errors", severity="implausible", sentence=sentence),)
 

@@ -2,13 +2,13 @@
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from pisigma.files.errors import MeasurementError, Place
 from pisigma.files.output_file import check_output, write_atomically
 from pisigma.measurement.csv.reading import fields_of
-from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.dataset import Measurements, with_new_frames
 from pisigma.measurement.foreign.accounting import FileAccount, FileLine, LeftOutRow, count_rows, sentences
 from pisigma.measurement.foreign.conversion import (
     ConvertedRows,
@@ -178,7 +178,7 @@ def import_rows(
     proposal = files if isinstance(files, ImportProposal) else propose_import(files, settings)
     converted = [(mapping, convert_rows(mapping)) for mapping in proposal.mappings]
     rows, joined = _joined(converted, proposal.settings)
-    content = measurement_table(rows)
+    content = _in_new_frames(measurement_table(rows), proposal.settings.new_frame_at)
     exports = [mapping.file for mapping in proposal.mappings]
     left_out = [*(row for file in exports for row in file.skipped), *content.left_out]
     used: list[FileLine] = list(content.places)
@@ -192,6 +192,31 @@ def import_rows(
         count_rows([place for file in exports for place in file.row_places], used, left_out),
         (*warnings, *(() if joined is None else joined.warnings)),
     )
+
+
+def _in_new_frames(content: MeasurementTable, lines: Sequence[int]) -> MeasurementTable:
+    """Write the names of new frames, which start at some lines, to the column `frame`.
+
+    Raises:
+        MeasurementError: the rows are of several files, or see `with_new_frames`.
+    """
+    if not lines:
+        return content
+    if len(files := dict.fromkeys(file for file, _ in content.places)) > 1:
+        raise MeasurementError(
+            option="new_frame_at",
+            expected="rows of one file",
+            value=", ".join(files),
+            remedy="import one by one",
+        )
+    table, frames = (
+        content.table,
+        with_new_frames(Measurements.from_fields(fields_of(content.table)), lines).frame,
+    )
+    kept = [index for index, name in enumerate(table.header) if name != "frame"]
+    records = [[*(row[one] for one in kept), frame] for row, frame in zip(table.records, frames, strict=True)]
+    header = (*(table.header[one] for one in kept), "frame")
+    return replace(content, table=replace(table, header=header, records=records))
 
 
 def _joined(

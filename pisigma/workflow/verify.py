@@ -3,7 +3,7 @@
 import os
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -19,7 +19,6 @@ from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import HasModel, ModelSource, loaded_model
 from pisigma.model.stated_conditions import condition_warnings
 from pisigma.model.training_rows import training_row_warnings
-from pisigma.robot.row import Row
 from pisigma.validation.checks.other_sensors import distance_diagnostics
 from pisigma.validation.checks.wrong_rows import without_wrong_rows
 from pisigma.validation.gate import check_rows
@@ -144,14 +143,7 @@ def read_for_verification(
     Raises:
         MeasurementError: the file cannot be used, or its column `set` leaves no row for tests.
     """
-    rows, coupling = _without_limits(model.robot.rows), model.robot.coupling
-    if coupling is not None:
-        coupling = replace(coupling, axes=_without_limits(coupling.axes))
-    return test_rows(read_rows(path, replace(model.robot, rows=rows, coupling=coupling), cameras))
-
-
-def _without_limits(rows: Sequence[Row]) -> tuple[Row, ...]:
-    return tuple(replace(row, lower=-np.inf, upper=np.inf) for row in rows)
+    return test_rows(read_rows(path, model.robot.without_limits, cameras))
 
 
 def verify(

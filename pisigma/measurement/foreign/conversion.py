@@ -217,7 +217,10 @@ def _numbers(file: ExportFile, column: MappedColumn) -> tuple[str, ...]:
                 at=Place(file.source, line, column.heading),
                 remedy="correct it, leave it empty if nothing was measured, or remove the row",
             )
-        numbers.append(to_file_unit(number, column.target.unit) if number else "")
+        converted = to_file_unit(number, column.target.unit) if number else ""
+        if converted and column.target.is_reversed:
+            converted = converted[1:] if converted.startswith("-") else f"-{converted}"
+        numbers.append(converted)
     return tuple(numbers)
 
 

@@ -157,13 +157,13 @@ def _take_stated(proposal: Proposal, name: str, text: str) -> None:
         indices = [int(name) - 1]
     for index in indices:
         target, written = parse_target(text, name), _written_unit(proposal, index)
-        if target.unit and written and target.unit != written:
+        if target.unit and written and target.unit != written and not target.overrides:
             raise MeasurementError(
                 option="--map",
                 expected=f"{written}, as the file states",
                 value=target.unit,
                 at=Place(file.source, file.header_line, name),
-                remedy=f"map it to {Target(target.quantity, written).text}",
+                remedy=f"map it to {Target(target.quantity, written).text}, or to {text}! if the file is wrong",
             )
         if target.missing_unit_kind and fits_unit(target.quantity, written):
             target = replace(target, unit=written)

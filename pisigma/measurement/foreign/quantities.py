@@ -10,7 +10,9 @@ from pisigma.measurement.foreign.rotations import ROTATIONS
 from pisigma.measurement.foreign.units import UNITS, UnitKind
 
 LEFT_OUT = "-"
-"""Target of a column that a mapping omits."""
+"""Target of a column that a mapping omits; before a target it reverses the sign: "-q4_deg"."""
+ALTHOUGH = "!"
+"""After a target in a mapping: the column is in this unit although its heading states another one ("x_in!")."""
 KEYS = ("point", "time")
 """Quantities by which rows of two files are joined; they are not in measurement files."""
 
@@ -46,16 +48,21 @@ class Target:
     Attributes:
         quantity: quantity such as "q1", "x", "kuka_a" or "point"; `LEFT_OUT` if the column is left out.
         unit: symbol of the unit of the cells; "" if it has none or is unknown.
+        is_reversed: whether the cells have the opposite sign.
+        overrides: whether the unit applies although the file states another one.
     """
 
     quantity: str
     unit: str = ""
+    is_reversed: bool = False
+    overrides: bool = False
 
     @property
     def text(self) -> str:
         """The text for `--map`."""
         named = measurement_column(self.quantity, self.unit)
-        return named or "_".join(filter(None, (self.quantity, self.unit)))
+        named = named or "_".join(filter(None, (self.quantity, self.unit)))
+        return f"{LEFT_OUT * self.is_reversed}{named}{ALTHOUGH * self.overrides}"
 
     @property
     def missing_unit_kind(self) -> UnitKind | None:
@@ -113,7 +120,7 @@ def measurement_column(quantity: str, unit: str) -> str:
 
 
 def parse_target(text: str, heading: str) -> Target:
-    """Parse the target of a column in a mapping, such as "q1_deg", "x_in", "ur_rx_rad", "point", or "-".
+    """Parse the target of a column in a mapping, such as "q1_deg", "-q1_deg", "x_in", "x_in!", "point", or "-".
 
     Args:
         text: the target.
@@ -124,13 +131,14 @@ def parse_target(text: str, heading: str) -> Target:
     """
     if text in ("", LEFT_OUT):
         return Target(LEFT_OUT)
-    column = find_column(text)
-    if column is not None:
-        return Target(column.quantity, column.unit)
-    for quantity, _, unit in ((text, "", ""), text.rpartition("_")):
-        is_quantity = quantity in _quantities() or is_joint(quantity)
-        if is_quantity and (not unit or unit in UNITS) and fits_unit(quantity, unit):
-            return Target(quantity, unit)
+    name, is_reversed = text.removeprefix(LEFT_OUT).removesuffix(ALTHOUGH), text.startswith(LEFT_OUT)
+    column = find_column(name)
+    known = () if column is None else ((column.quantity, "", column.unit),)
+    for quantity, _, unit in (*known, (name, "", ""), name.rpartition("_")):
+        is_quantity = bool(known) or quantity in _quantities() or is_joint(quantity)
+        has_sign = unit_kind(quantity) in ("angle", "length") or not is_reversed
+        if is_quantity and has_sign and (not unit or unit in UNITS) and fits_unit(quantity, unit):
+            return Target(quantity, unit, is_reversed, text.endswith(ALTHOUGH))
     choices = {"q1_deg", "x_mm", "y_mm", "z_mm", "time_s", LEFT_OUT, *_quantities()}
     raise MeasurementError(
         f"unknown target '{text}' of the column '{heading}'",

@@ -160,20 +160,21 @@ def joint_causes(maps: JointMaps, number: int, robot: Robot) -> tuple[Cause, ...
     if int((matrix != 0).sum()) > robot.dof:
         return (_coupling_cause(matrix.tolist(), robot),)
     causes = []
+    columns = tuple(int(math.copysign(one + 1, sign)) for one, sign in zip(order, factor, strict=True))
     moved = tuple(i for i, column in enumerate(order) if column != i)
     advice = "check the order of the joint columns"
     if len(moved) == 2:
         clause = f"the columns of {joints_text(moved)} are swapped"
-        causes.append(Cause("joint_order", clause, advice, 1.0, moved))
+        causes.append(Cause("joint_order", clause, advice, 1.0, moved, columns=columns))
     elif moved:
         columns = ", ".join(f"q{column + 1}" for column in order)
         clause = f"the joint columns are in another order (joints 1 to {robot.dof} are in {columns})"
-        causes.append(Cause("joint_order", clause, advice, 2.0, moved))
+        causes.append(Cause("joint_order", clause, advice, 2.0, moved, columns=columns))
     if negative := tuple(i for i, value in enumerate(factor) if value < 0):
         signs = "the sign of {} is reversed" if len(negative) == 1 else "the signs of {} are reversed"
         clause = signs.format(joints_text(negative))
         advice = "check the directions of the joints"
-        causes.append(Cause("joint_sign", clause, advice, float(len(negative)), negative))
+        causes.append(Cause("joint_sign", clause, advice, float(len(negative)), negative, columns=columns))
     causes.extend(_unit_causes(factor, robot))
     if zeros := tuple(i for i, value in enumerate(offset) if value):
         causes.append(_zero_cause(zeros, offset, robot))

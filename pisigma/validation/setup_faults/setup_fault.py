@@ -27,6 +27,7 @@ class SetupFault:
         moved: largest motion of a joint zero [rad or m]; infinite for faults of other kinds.
         joints: indices of the joints concerned, from 0.
         amounts: amount of every cause, see `Cause.amount`.
+        columns: columns with the values of every joint, see `Cause.columns`.
     """
 
     kinds: tuple[str, ...]
@@ -40,6 +41,7 @@ class SetupFault:
     moved: float = math.inf
     joints: tuple[int, ...] = ()
     amounts: tuple[float, ...] = ()
+    columns: tuple[int, ...] = ()
 
     @property
     def explains_orientation(self) -> bool:
@@ -81,7 +83,10 @@ class SetupFault:
         """The numbers of the sentence; joints count from 1; see `Diagnostic.values`."""
         figures = {"before_mm": self.before * 1e3, "after_mm": self.after * 1e3}
         finite = {name: value for name, value in figures.items() if np.isfinite(value)}
-        return {**finite, "joints": tuple(joint + 1 for joint in self.joints)}
+        if len(self.amounts) == 1 and self.kinds[0].endswith("_unit"):
+            finite["ratio"] = self.amounts[0]
+        columns = {"columns": self.columns} if self.columns else {}
+        return {**finite, "joints": tuple(joint + 1 for joint in self.joints), **columns}
 
     def to_json(self) -> dict[str, object]:
         """Return kinds, sentence and errors in mm and, if measured, in deg."""
@@ -98,18 +103,22 @@ class SetupFault:
 
 def combine_alternatives(faults: Sequence[SetupFault]) -> SetupFault:
     """Combine faults that explain the errors about equally well, the best first, into one with alternatives."""
+    if len(faults) == 1:
+        return faults[0]
     clauses = dict.fromkeys(fault.clause for fault in faults)
     advice = dict.fromkeys(fault.advice for fault in faults)
-    return replace(
-        faults[0], clause=", or ".join(clauses), advice="; ".join(advice), moved=max(f.moved for f in faults)
-    )
+    moved = max(fault.moved for fault in faults)
+    clause, advised = ", or ".join(clauses), "; ".join(advice)
+    return replace(faults[0], clause=clause, advice=advised, moved=moved, amounts=(), columns=())
 
 
 def fault_of_cause(cause: Cause, before: float, after: float) -> SetupFault:
     """Make the fault of a single cause, with the RMS position errors before and after its correction [m]."""
     nan = math.nan
     return SetupFault(
-        (cause.kind,), cause.clause, cause.advice, before, after, nan, nan, nan, joints=cause.joints
+        *((cause.kind,), cause.clause, cause.advice, before, after, nan, nan, nan),
+        joints=cause.joints,
+        columns=cause.columns,
     )
 
 
@@ -128,4 +137,5 @@ def fault_from_hypothesis(here: Hypothesis, other: Hypothesis, after_nominal: fl
         moved=max(cause.moved for cause in other.causes),
         joints=tuple(joint for cause in other.causes for joint in cause.joints),
         amounts=tuple(cause.amount for cause in other.causes),
+        columns=next((cause.columns for cause in other.causes if cause.columns), ()),
     )

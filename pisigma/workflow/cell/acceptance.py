@@ -13,7 +13,7 @@ from pisigma.validation.iso9283.repeats import repeated_poses
 from pisigma.validation.uncertainty.components import uncertainty_budget
 from pisigma.validation.uncertainty.instrument import Instrument
 from pisigma.workflow.cell.cell import Cell
-from pisigma.workflow.cell.sessions import ModelRows
+from pisigma.workflow.cell.setup_names import ModelRows
 from pisigma.workflow.evaluate import evaluate
 
 JUDGED = frozenset(("position", "rotation", "pose", "corner"))

@@ -39,7 +39,8 @@ from pisigma.workflow.cell.model_choice import (
 )
 from pisigma.workflow.cell.new_cell import NewCell
 from pisigma.workflow.cell.new_files import free_path, save_new
-from pisigma.workflow.cell.sessions import ModelRows, Sessions
+from pisigma.workflow.cell.sessions import Sessions
+from pisigma.workflow.cell.setup_names import ModelRows
 from pisigma.workflow.evaluate import Evaluation, evaluate
 from pisigma.workflow.monitor import Monitoring, monitor
 from pisigma.workflow.plan import Plan, plan

@@ -16,7 +16,8 @@ from pisigma.model.folder.model_folder import load_model
 from pisigma.robot.description import Robot
 from pisigma.validation.report.accuracy import identified_scatter
 from pisigma.workflow.calibrate import Calibration, calibrate
-from pisigma.workflow.cell.sessions import ModelRows, Sessions, newest_day, setup_name
+from pisigma.workflow.cell.sessions import Sessions
+from pisigma.workflow.cell.setup_names import ModelRows, newest_day, setup_name
 from pisigma.workflow.evaluate import evaluate
 from pisigma.workflow.monitor import Monitoring
 from pisigma.workflow.recalibrate import Recalibration, recalibrate

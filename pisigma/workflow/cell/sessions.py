@@ -5,9 +5,8 @@ import hashlib
 import os
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import torch
 from jaxtyping import Bool
@@ -31,43 +30,12 @@ from pisigma.measurement.groups import groups_of_equal_joints
 from pisigma.model.folder.model_folder import load_model
 from pisigma.model.training_rows import known_rows
 from pisigma.robot.description import Robot
-from pisigma.validation.gate import check_rows
+from pisigma.validation.gate import RowVerdict, check_rows
+from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.workflow.cell.new_files import write_new
+from pisigma.workflow.cell.setup_names import ModelRows, newest_day, with_setup_names
 from pisigma.workflow.recalibrate import may_move
 from pisigma.workflow.settings.recalibration import RecalibrationSettings
-
-
-@dataclass(frozen=True, eq=False)
-class ModelRows:
-    """Rows with the names of a model's frame and target.
-
-    Attributes:
-        rows: the rows, with the names of the newest frame and target of the model.
-        moved: "base" or "tool" or both, if events since the model record that they were changed.
-    """
-
-    rows: Measurements
-    moved: tuple[str, ...]
-
-    def settings_to_fit(self, settings: Any) -> Any:
-        """Return settings that also fit a changed frame and tool; cameras are removed, because the rows are read."""
-        fit_frame, fit_tool = settings.fit_frame or self.fit_frame, settings.fit_tool or self.fit_tool
-        return replace(settings, cameras=None, fit_frame=fit_frame, fit_tool=fit_tool)
-
-    def settings_to_recalibrate(self, settings: RecalibrationSettings) -> RecalibrationSettings:
-        """Return settings with what was moved, unless they state it; cameras are removed, because rows are read."""
-        moved = (self.moved or None) if settings.moved is None else settings.moved
-        return replace(settings, cameras=None, moved=moved)
-
-    @property
-    def fit_frame(self) -> bool:
-        """Whether the instrument was set up again."""
-        return "base" in self.moved
-
-    @property
-    def fit_tool(self) -> bool:
-        """Whether the tool was changed."""
-        return "tool" in self.moved
 
 
 class Sessions:
@@ -90,7 +58,11 @@ class Sessions:
         return self.folder / f"{session.name}.csv"
 
     def add_session(
-        self, file: str | os.PathLike[str] | Measurements, accept_implausible: bool = False, day: str = ""
+        self,
+        file: str | os.PathLike[str] | Measurements,
+        accept_implausible: bool = False,
+        day: str = "",
+        remark: str = "",
     ) -> SessionEntry:
         """Check the rows of a session and store them; they are never changed afterwards.
 
@@ -101,6 +73,7 @@ class Sessions:
             accept_implausible: add them even if the check finds that they must not be trusted.
             day: day on which they were measured (ISO 8601). "": from the column `date`, else from the name of the
                 file, else today.
+            remark: how the rows were imported, which the entry records before the findings.
 
         Returns:
             The entry of the session.
@@ -109,18 +82,8 @@ class Sessions:
             MeasurementError: the rows cannot be read, or the cell already contains some of them.
             AcceptanceError: the rows must not be trusted.
         """
-        rows = read_rows(file, self.robot, self.cameras)
-        if day and any(rows.date or ()) and day != _day_of(rows):
-            raise MeasurementError(
-                expected=f"the first day of the rows, {_day_of(rows)}",
-                value=day,
-                option="--date",
-                remedy="omit it",
-            )
-        day = day or _day_of(rows)
-        if not is_date(day):
-            raise MeasurementError(expected=EXPECTED_DATE, value=day, option="--date")
-        entry, fitted = self._judged(rows, day, accept_implausible)
+        rows = self._read(file)
+        entry, fitted = self._judged(rows, _checked_day(rows, day), accept_implausible, remark)
         inside: Path | None = None
         if isinstance(file, Measurements):
             with tempfile.TemporaryDirectory() as scratch:
@@ -129,7 +92,9 @@ class Sessions:
         else:
             content = Path(file).read_bytes()
             inside = Path(file) if Path(file).parent.resolve() == self.folder.resolve() else None
-        path = inside or write_new(self.folder, day, content, {one.name for one in self.history.sessions()})
+        path = inside or write_new(
+            self.folder, entry.day, content, {one.name for one in self.history.sessions()}
+        )
         entry = replace(entry, name=path.stem, sha256=hashlib.sha256(content).hexdigest())
         models = [] if fitted is None else [with_session(fitted, entry)]
         if not self.history.add_session(entry, *models):  # another process was faster
@@ -158,10 +123,42 @@ class Sessions:
             raise
         return True
 
-    def _judged(
-        self, rows: Measurements, day: str, accept_implausible: bool
-    ) -> tuple[SessionEntry, ModelEntry | None]:
-        """Check rows; return the entry of their session without name and hash, and the model fitted to them."""
+    def check(
+        self, file: str | os.PathLike[str] | Measurements, day: str = ""
+    ) -> tuple[Measurements, RowVerdict]:
+        """Read and check rows as `add_session` does, without storing them.
+
+        Returns:
+            The rows and what was found.
+
+        Raises:
+            MeasurementError: see `add_session`.
+        """
+        rows = self._read(file)
+        return rows, self._verdict(rows, _checked_day(rows, day))[0]
+
+    def _read(self, file: str | os.PathLike[str] | Measurements) -> Measurements:
+        """Read rows; if values exceed the limits of their joints, name the setup fault that explains it.
+
+        Raises:
+            MeasurementError: the rows cannot be read.
+            AcceptanceError: a setup fault explains why.
+        """
+        try:
+            return read_rows(file, self.robot, self.cameras)
+        except MeasurementError as refusal:
+            try:
+                rows = read_rows(file, self.robot.without_limits, self.cameras)
+            except MeasurementError:
+                raise refusal from None
+            if faults := check_rows(rows, self.robot).implausible:
+                raise _untrusted(rows, faults) from refusal
+            raise
+
+    def _verdict(
+        self, rows: Measurements, day: str
+    ) -> tuple[RowVerdict, tuple[str, ...], ModelEntry | None, bool]:
+        """Check rows; return the findings, warnings, the model that they were compared with, and if it is of them."""
         known = [one for one in self.history.sessions() if not one.set_aside]
         again = torch.zeros(rows.rows, dtype=torch.bool)
         for one in known:
@@ -185,12 +182,15 @@ class Sessions:
             fitted = bool(training.all())
             if not fitted:
                 _check_new(rows, training)
+        return verdict, found, model, fitted
+
+    def _judged(
+        self, rows: Measurements, day: str, accept_implausible: bool, remark: str
+    ) -> tuple[SessionEntry, ModelEntry | None]:
+        """Check rows; return the entry of their session without name and hash, and the model fitted to them."""
+        verdict, found, model, fitted = self._verdict(rows, day)
         if verdict.implausible and not accept_implausible:
-            raise AcceptanceError(
-                f"the rows must not be trusted: {verdict.implausible[0].sentence.rstrip('.')}",
-                at=Place(rows.source),
-                remedy="correct the file, or import it with --accept-implausible",
-            )
+            raise _untrusted(rows, verdict.implausible)
         temperature = None if rows.temperature is None else float(rows.temperature.nanmean())
         entry = SessionEntry(
             name="",
@@ -201,7 +201,7 @@ class Sessions:
             sensor=",".join(sorted(rows.kinds)),
             temperature_c=temperature,
             judged_by="robot" if model is None else model.name,
-            remark=" ".join((*found, *(one.sentence for one in verdict.diagnostics))),
+            remark=" ".join(filter(None, (remark, *found, *(one.sentence for one in verdict.diagnostics)))),
             poses=int(groups_of_equal_joints(rows.q).max()) + 1,
         )
         return entry, model if fitted else None
@@ -352,21 +352,33 @@ def with_session(model: ModelEntry, session: SessionEntry) -> ModelEntry:
     return replace(model, sessions=",".join((*model.made_of, session.name)), day=day)
 
 
-def with_setup_names(rows: Measurements, frame_day: str, target_day: str) -> Measurements:
-    """Return rows whose frame and target names state the day of their setup; "": the names of the file."""
-    frame = tuple(setup_name(name, frame_day) for name in rows.frame)
-    target = tuple(setup_name(name, target_day) for name in rows.target)
-    return replace(rows, frame=frame, target=target)
+def _untrusted(rows: Measurements, findings: Sequence[Diagnostic]) -> AcceptanceError:
+    """Return the refusal of rows because of what was found."""
+    refusal = AcceptanceError(
+        f"the rows must not be trusted: {findings[0].sentence.rstrip('.')}",
+        at=Place(rows.source),
+        remedy="correct the file, or import it with --accept-implausible",
+    )
+    refusal.findings = tuple(findings)
+    return refusal
 
 
-def setup_name(name: str, day: str) -> str:
-    """Return the name of a frame or target that was set up on a day; day "" for the first one."""
-    return f"{name} since {day}".lstrip() if day else name
+def _checked_day(rows: Measurements, day: str) -> str:
+    """Return the day of rows: the stated one, or that of `_day_of`.
 
-
-def newest_day(events: Sequence[Event], kind: str, day: str) -> str:
-    """Return the day of the newest event of a kind until a day; "" if there is none."""
-    return max((one.day for one in events if one.kind == kind and one.day <= day), default="")
+    Raises:
+        MeasurementError: the stated day is not a date, or contradicts the rows.
+    """
+    if day and any(rows.date or ()) and day != _day_of(rows):
+        raise MeasurementError(
+            expected=f"the first day of the rows, {_day_of(rows)}",
+            value=day,
+            option="--date",
+            remedy="omit it",
+        )
+    if not is_date(day := day or _day_of(rows)):
+        raise MeasurementError(expected=EXPECTED_DATE, value=day, option="--date")
+    return day
 
 
 def _check_new(rows: Measurements, known: Bool[Tensor, " rows"]) -> None:

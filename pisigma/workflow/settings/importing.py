@@ -38,7 +38,8 @@ class ImportSettings:
         maps: meaning of the columns, such as A1=q1_deg,X=x_mm,note=-, or a file written by --save-map. Columns are
             named by heading or by number (from 1). Meanings are a column of measurement files (q1_deg), its quantity in
             another unit (x_in) or in the unit stated in the file (x), a value of a rotation (ur_rx_rad), point, time,
-            or - for a column to skip. If several mappings are given, each file uses the one that fits it.
+            or - for a column to skip. A - before a meaning reverses the sign (-q4_deg), a ! after it overrules the unit
+            stated in the file (x_in!). If several mappings are given, each file uses the one that fits it.
         units: units of the columns for which the file states none, such as mm,deg or m,rad.
         rotation: maker whose rotation convention applies, such as kuka or ur, or none to skip rotations. None: from the
             headings.
@@ -46,6 +47,7 @@ class ImportSettings:
         join: how to join joint values of one file with measurements of another: by point, order or time. None:
             the files are concatenated.
         within: maximum difference between joined time stamps [s].
+        new_frame_at: first line measured after the instrument was moved. From there, rows are in a new frame.
 
     Raises:
         MeasurementError: `join` is not a valid choice.
@@ -59,6 +61,7 @@ class ImportSettings:
     ] = None
     join: Annotated["JoinBy | None", Option(kind=str)] = None
     within: Annotated[float, Option(kind=str, read=parse_seconds, default="0.2s")] = 0.2
+    new_frame_at: Annotated[tuple[int, ...], Option(metavar="LINE", is_key=True)] = ()
 
     def __post_init__(self) -> None:
         """Check `join`."""
