@@ -1,6 +1,7 @@
 """The robot of a cell in three dimensions: the newest plan, rows with their errors, and a pose that was tried."""
 
 import threading
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -9,7 +10,7 @@ from jaxtyping import Float64
 from pisigma.files.errors import PisigmaError, RobotError
 from pisigma.lifetime.cell.layout import PLANS, newest_plan
 from pisigma.planning.plan_inputs import sight_of
-from pisigma.planning.session.state import SessionState
+from pisigma.planning.session.state import RowsSoFar, SessionState
 from pisigma.planning.surroundings.arm_in_surroundings import ArmInSurroundings
 from pisigma.workbench.viewing.body import AbstractBody, CapsuleBody, MeshBody
 from pisigma.workbench.viewing.scene import SessionScene
@@ -38,7 +39,8 @@ class CellScene:
             server: viser.
         """
         self._server, self._lock = server, threading.Lock()
-        self._state: SessionState | None = None
+        self._rows: RowsSoFar | None = None
+        self._marked: list[int] = []
         self._scene: SessionScene | None = None
         self._turn = 0
         self._before: dict[str, str] | None = None
@@ -74,7 +76,7 @@ class CellScene:
             view.fov = FIELD
             sight = None if camera is None else sight_of(camera)
             self._scene = SessionScene(self._server.scene, arm, _body(cell, arm), sight, is_movable)
-            self._reach, self._state = arm.robot.reach, None
+            self._reach, self._rows = arm.robot.reach, None
             self._turn += 1
             self._before = self._places() if is_movable else None
             if planned is None:
@@ -105,17 +107,39 @@ class CellScene:
 
     def show_state(self, state: SessionState) -> None:
         """Show the rows of a session with their errors."""
-        top = top_of_scale(state.rows)
         with self._lock, self._server.atomic():
-            if self._scene is None:
-                return
-            self._state = state
-            self._slider.value = magnification_of(top, self._reach)  # type: ignore[misc]  # a decorated setter
-            self._scene.show_robot(state)
-            if state.base is not None:
-                self._scene.show_sensor(state.base)
-            self._scene.show_rows(state.rows, top, self._slider.value)
+            if self._scene is not None:
+                self._scene.show_robot(state)
+                if state.base is not None:
+                    self._scene.show_sensor(state.base)
+        self.show_rows(state.rows)
+
+    def show_rows(self, rows: RowsSoFar) -> None:
+        """Show rows, with their errors if they have been compared with each other."""
+        with self._lock, self._server.atomic():
+            self._rows, self._marked = rows, []
+            times = magnification_of(top_of_scale(rows), self._reach)
+            self._slider.value = times  # type: ignore[misc]  # a decorated setter
+            self._draw_rows()
         self._server.flush()
+
+    def mark_lines(self, lines: list[int]) -> None:
+        """Mark the rows of some lines in red with their numbers, and look at the first one."""
+        with self._lock, self._server.atomic():
+            self._marked = lines
+            if (place := self._draw_rows()) is not None:
+                for client in self._server.get_clients().values():
+                    client.camera.look_at = place
+        self._server.flush()
+
+    def _draw_rows(self) -> Float64[np.ndarray, " 3"] | None:
+        """Draw the rows with the magnification of the slider; return the position of the first one that is marked."""
+        if self._scene is None or self._rows is None:
+            return None
+        rows = replace(self._rows, alarmed=self._rows.alarmed | np.isin(self._rows.line, self._marked))
+        position = self._scene.show_rows(rows, top_of_scale(rows), float(self._slider.value))
+        marked = np.flatnonzero(np.isin(rows.line, self._marked))
+        return position[marked[0]] if marked.size else None
 
     def show_pose(self, q: Float64[np.ndarray, " dof"]) -> None:
         """Show the arm at joint values that were tried [rad or m]."""
@@ -126,12 +150,10 @@ class CellScene:
 
     def _magnify(self, event: "viser.GuiEvent[Any]") -> None:
         """Draw the errors with the magnification of the slider, once a person has moved it."""
-        if event.client is None:  # set by `show_state`, which has the lock
+        if event.client is None:  # set by `show_rows`, which has the lock
             return
         with self._lock, self._server.atomic():
-            if self._scene is not None and self._state is not None:
-                rows = self._state.rows
-                self._scene.show_rows(rows, top_of_scale(rows), self._slider.value)
+            self._draw_rows()
 
 
 def _body(cell: Cell, arm: ArmInSurroundings) -> AbstractBody:

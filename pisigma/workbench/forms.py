@@ -23,6 +23,7 @@ FIRST = {
     "verify": (),
     "monitor": (),
     "recalibrate": (),
+    "import": ("unit", "join"),
 }
 """Settings that are shown at once; the others are behind "all settings"."""
 NEW_CELL = {"sensor": "--sensor", "limit_mm": "--limit-mm"}

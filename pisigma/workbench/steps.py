@@ -1,6 +1,7 @@
 """Steps of a page: each calls the function of the cell that its command calls, and lays out its result."""
 
-from collections.abc import Mapping
+import contextlib
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,8 +20,6 @@ from pisigma.files.errors import (
 )
 from pisigma.files.progress import Progress
 from pisigma.lifetime.cell.layout import EXPORTS, newest_plan
-from pisigma.measurement.csv.reading import is_measurement_file
-from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.growing_file import GrowingFile
 from pisigma.model.inverse.solution import Solution
 from pisigma.planning.session.growing_images import growing_file
@@ -31,13 +30,15 @@ from pisigma.reporting.solution_text import FAILURES, solution_text, statuses_of
 from pisigma.reporting.verdict import Verdict, counted, uncapitalised
 from pisigma.robot.robot_file import catalogue
 from pisigma.workbench.forms import changed_cell, changed_settings, digest_of
-from pisigma.workbench.job import Outcome
+from pisigma.workbench.job import Outcome, StoppedError
+from pisigma.workbench.tabs import download_of
 from pisigma.workflow.calibrate import Calibration
 from pisigma.workflow.cell.cell import Cell
 from pisigma.workflow.cell.cell_file import CellFile
-from pisigma.workflow.cell.exports import export_from_cell
+from pisigma.workflow.cell.exports import NONE, export_from_cell, set_controller
+from pisigma.workflow.cell.incoming_rows import IncomingRows
 from pisigma.workflow.cell.new_files import output_path
-from pisigma.workflow.import_rows import ImportProposal, import_rows, propose_import
+from pisigma.workflow.follow import follow, remaining_poses_file
 from pisigma.workflow.load import load, stated_pose
 from pisigma.workflow.measure import MeasuringSession
 from pisigma.workflow.result_texts import (
@@ -145,44 +146,41 @@ def _in_cell(text: ResultText, cell: Cell) -> ResultText:
     return replace(text, verdict=replace(text.verdict, next_step=step))
 
 
-def propose_columns(files: list[Path], cell: Cell, form: Form) -> ImportProposal | None:
-    """Return the proposed meaning of the columns of uploaded files; None for a measurement file of pisigma.
+def incoming_rows(files: list[Path], cell: Cell, form: Form) -> IncomingRows:
+    """Return uploaded files as they are read into the cell.
 
     Args:
         files: uploaded files.
         cell: the cell, which states the settings of the import.
         form: what a person changed: "column 0 3" is the meaning of the fourth column of the first file.
     """
-    if len(files) == 1 and is_measurement_file(files[0]):
-        return None
-    settings: ImportSettings = cell.file.settings_of_step("import", **changed_settings("import", form))
-    first = propose_import(files, settings)
-    stated = []
-    for number, mapping in enumerate(first.mappings):
-        entered = {
-            mapping.key(one): form.get(f"column {number} {one.index}", "").strip() for one in mapping.columns
-        }
-        stated.append({key: meaning for key, meaning in entered.items() if meaning})
-    if not any(stated):
+    changed = changed_settings("import", form)
+    if lines := form.get("new_frame_at", "").split():
+        changed["new_frame_at"] = lines
+    settings: ImportSettings = cell.file.settings_of_step("import", **changed)
+    first = IncomingRows(tuple(files), cell, settings)
+    if not any(key.startswith("column ") and value.strip() for key, value in form.items()):
         return first
-    return propose_import(files, replace(settings, maps=[one for one in stated if one]))
+    maps = [
+        {
+            mapping.key(one): stated
+            for one in mapping.columns
+            if (stated := form.get(f"column {number} {one.index}", "").strip())
+        }
+        for number, mapping in enumerate(first.proposal.mappings)
+    ]
+    return replace(first, settings=replace(settings, maps=tuple(filter(None, maps))))
 
 
-def import_session(files: list[Path], cell: Cell, form: Form) -> Outcome:
+def import_session(incoming: IncomingRows, form: Form) -> Outcome:
     """Add uploaded rows to the cell as a session."""
-    accept, day = form.get("accept_implausible") == "true", form.get("date", "").strip()
-    proposal = propose_columns(files, cell, form)
-    rows: Path | Measurements = files[0]
-    said: tuple[str, ...] = ()
-    if proposal is not None:
-        imported = import_rows(proposal)
-        rows, said = imported.measurements, imported.sentences
-    entry = cell.add_session(rows, accept, day)
+    said = () if incoming.imported is None else incoming.imported.sentences
+    entry = incoming.add(form.get("accept_implausible") == "true", form.get("date", "").strip())
     remarks = tuple(filter(None, (*said, entry.remark)))
     trust = (
         f"with caution ({counted(len(remarks), 'remark')})" if remarks else "yes: nothing contradicts them"
     )
-    step = uncapitalised(cell.status().step.reason)
+    step = uncapitalised(incoming.cell.status().step.reason)
     verdict = Verdict(
         f"{counted(entry.rows, 'row')} were added as session '{entry.name}'.", trust, step, "Rows"
     )
@@ -202,10 +200,27 @@ def check_rows(cell: Cell, form: Form, progress: Progress) -> tuple[Outcome, Ses
     growth = growing.read(final=True)
     session.add(growth.rows, growth.left_out)
     session.update(progress)
-    state = session.state
-    alarms = sentences("alarms", [one.sentence for one in state.alarms])
+    return _session_outcome(session.state, f"Session {name}"), session.state
+
+
+def follow_file(cell: Cell, path: Path, show: Callable[[SessionState], None], progress: Progress) -> Outcome:
+    """Follow a growing file with the newest plan as `measure` does, until it ends or a person stops it."""
+    plan = newest_plan(cell.folder)
+    session = MeasuringSession.read(plan, cell.file.settings_of_step("measure"))
+    growing = growing_file(path, session.plan.arm.robot, session.plan.settings)
+    rest, waiting = remaining_poses_file(plan, path, None), f"waiting for rows in {path.name}"
+    with contextlib.suppress(StoppedError):
+        for step in follow(session, growing, tick=lambda: progress(waiting)):
+            show(step.state)
+            if step.replanned:
+                session.write_remaining(rest, [])
+    return _session_outcome(session.state, path.name)
+
+
+def _session_outcome(state: SessionState, subject: str) -> Outcome:
     text = session_text(state)
-    return Outcome(replace(text, blocks=(alarms, *text.blocks)), subject=f"Session {name}"), state
+    warnings = (*(one.sentence for one in state.alarms), *text.warnings)
+    return Outcome(replace(text, warnings=warnings), subject=subject)
 
 
 def export(cell: Cell, form: Form, files: Mapping[str, Path]) -> Outcome:
@@ -249,6 +264,33 @@ def try_pose(cell: Cell, form: Form) -> tuple[Outcome, Solution]:
     failed = [one for one in statuses_of(solution) if one in FAILURES]
     refusal = f"{failed[0].name.lower()}. {failed[0].sentence}" if failed else ""
     return Outcome(solution_text(solution, solver), refusal), solution
+
+
+def record(cell: Cell, form: Form, progress: Progress) -> Outcome:
+    """Record an event."""
+    cell.history.record(
+        form.get("kind", ""), form.get("date", ""), form.get("note", ""), form.get("person", "")
+    )
+    return Outcome()
+
+
+def set_active_export(cell: Cell, form: Form, progress: Progress) -> Outcome:
+    """Record which export is active on the controller."""
+    name = form.get("export", "")
+    file = str(download_of(cell, "export", (name,))) if name else NONE
+    set_controller(cell, file, form.get("date", ""), form.get("note", ""))
+    return Outcome()
+
+
+def use(cell: Cell, form: Form, progress: Progress) -> Outcome:
+    """Put a model into use."""
+    return Outcome(refusal=" ".join(cell.use(form.get("model") or None, form.get("reason", ""))))
+
+
+def set_aside(cell: Cell, form: Form, progress: Progress) -> Outcome:
+    """Set a session aside."""
+    cell.sessions.set_aside(form.get("session", ""), form.get("set_aside", ""))
+    return Outcome()
 
 
 def file_name(name: str) -> str:

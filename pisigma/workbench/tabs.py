@@ -1,5 +1,6 @@
 """Contents of the tabs of a page, read from the cell."""
 
+import re
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,13 +14,16 @@ from pisigma.files.templates import template_environment
 from pisigma.lifetime.cell.events import EventKind
 from pisigma.lifetime.cell.layout import CELL_FILE, EXPORTS, MODELS, PLANS
 from pisigma.lifetime.cell.status import CellStatus
-from pisigma.planning.plan_file import yaml_of
+from pisigma.measurement.csv.columns import POSITION
+from pisigma.planning.plan_file import joint_columns, yaml_of
+from pisigma.planning.session.state import SessionState
 from pisigma.reporting.result_text import merge_alike_warnings
 from pisigma.robot.robot_file import catalogue
+from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.workbench.forms import digest_of, form_of, form_of_cell, form_of_command, form_of_new_cell
 from pisigma.workbench.job import Jobs
 from pisigma.workflow.cell.cell import Cell
-from pisigma.workflow.import_rows import ImportProposal
+from pisigma.workflow.cell.incoming_rows import IncomingRows, Repair
 
 TABS = {
     "status": "Status",
@@ -42,6 +46,10 @@ TAB_OF = {
 FORMATS = tuple(name for name in BUILT_IN if name not in ("staubli", "xacro", "library", "ur-calibration"))
 """Formats that need no file of the controller."""
 FIGURES = (".png", ".svg")
+FIRST_ROWS, MAX_ROWS, MAX_LINES = 8, 40, 2000
+"""First rows of an upload that are shown, and largest numbers of rows with findings, and of lines in a sentence."""
+LINES = re.compile(r"\blines? ((?:\d{1,9}(?:, | to | and )?)+)")
+RANGES = re.compile(r"(\d+)(?: to (\d+))?")
 
 
 @dataclass(frozen=True)
@@ -62,13 +70,23 @@ class TimelineEntry:
 
 
 class Tabs:
-    """Renders the page and its tabs."""
+    """Renders the page and its tabs.
 
-    def __init__(self, jobs: Jobs) -> None:
-        self._jobs = jobs
+    Attributes:
+        live: state of the session that is being followed; None if none is.
+    """
+
+    def __init__(self, jobs: Jobs, growing: Path | None = None) -> None:
+        self._jobs, self._growing = jobs, growing
+        self.live: SessionState | None = None
         self._environment = template_environment(
             "pisigma.workbench",
-            {"together": merge_alike_warnings, "tab_of": lambda step: TAB_OF.get(step, step)},
+            {
+                "together": merge_alike_warnings,
+                "lines": lines_in,
+                "name": lambda path: Path(path).name,
+                "tab_of": lambda step: TAB_OF.get(step, step),
+            },
         )
 
     def page(self, folder: Path, cell: Cell | None) -> str:
@@ -102,30 +120,74 @@ class Tabs:
             "outcomes": self._jobs.outcomes,
             "folder": shlex.quote(str(cell.folder)),
             "forms": lambda step: form_of(step, cell.file),
+            "growing": self._growing,
+            "live": self.live and self.live.to_json(),
             "words": form_of_command(status.step.command) if status.step.command else None,
         }
         return self._environment.get_template(f"{name}.html.j2").render(
             context | _more(name, cell, status, texts)
         )
 
-    def proposal(self, proposal: ImportProposal | None, files: Sequence[Path], numbers: str) -> str:
+    def proposal(self, incoming: IncomingRows, numbers: str) -> str:
         """Render the proposed meaning of the columns of uploaded files.
 
         Args:
-            proposal: the proposal; None for a measurement file of pisigma.
-            files: the files.
+            incoming: the files.
             numbers: their numbers, with commas.
         """
-        tables = [
-            (
-                len(mapping.file.records),
-                [(one, mapping.key(one), mapping.first_cell(one)) for one in mapping.columns],
+        names = [one.name for one in incoming.files]
+        return self._environment.get_template("proposal.html.j2").render(
+            mappings=() if incoming.is_ready else incoming.proposal.mappings,
+            forms=form_of("import", incoming.cell.file),
+            files=names,
+            words=shlex.join(names),
+            numbers=numbers,
+        )
+
+    def findings(self, incoming: IncomingRows, found: Sequence[Diagnostic], problem: str = "") -> str:
+        """Render what the check of uploaded rows found next to the rows, with what corrects it.
+
+        Args:
+            incoming: the files.
+            found: the findings.
+            problem: why the rows cannot be read; "" if they can.
+        """
+        repairs = {one.sentence: incoming.repair(one) for one in found if one.severity == "implausible"}
+        fields = {
+            sentence: repaired_fields(incoming, repair) for sentence, repair in repairs.items() if repair
+        }
+        lines = {line for one in found for line in lines_in(" ".join(one.rows))}
+        tables = []
+        for mapping in () if problem else incoming.proposal.mappings:
+            rows = sorted(
+                zip(mapping.file.lines, mapping.file.records, strict=True),
+                key=lambda row: row[0] not in lines,
             )
-            for mapping in (() if proposal is None else proposal.mappings)
-        ]
-        template = self._environment.get_template("proposal.html.j2")
-        names = [one.name for one in files]
-        return template.render(tables=tables, files=names, words=shlex.join(names), numbers=numbers)
+            tables.append((mapping, rows[: FIRST_ROWS + min(len(lines), MAX_ROWS)]))
+        template = self._environment.get_template("findings.html.j2")
+        return template.render(
+            found=found, repairs=repairs, fields=fields, problem=problem, tables=tables, lines=lines
+        )
+
+
+def repaired_fields(incoming: IncomingRows, repair: Repair) -> dict[str, str]:
+    """Return what a repair enters in the form of the proposal."""
+    fields = {
+        f"column {number} {one.index}": stated[mapping.key(one)]
+        for stated in repair.settings.maps
+        for number, mapping in enumerate(incoming.proposal.mappings)
+        for one in mapping.columns
+        if mapping.key(one) in stated
+    }
+    return fields | {"new_frame_at": " ".join(map(str, repair.settings.new_frame_at))}
+
+
+def lines_in(text: str) -> list[int]:
+    """Return the lines of rows that a sentence names, such as "line 12" or "lines 3, 7 to 9"."""
+    found: list[int] = []
+    for first, last in RANGES.findall(" ".join(LINES.findall(text))):
+        found += range(int(first), int(last or first) + 1)
+    return found[:MAX_LINES]
 
 
 def _more(name: str, cell: Cell, status: CellStatus, texts: Mapping[str, str]) -> dict[str, Any]:
@@ -140,6 +202,8 @@ def _more(name: str, cell: Cell, status: CellStatus, texts: Mapping[str, str]) -
         case "plan":
             plans = sorted((cell.folder / PLANS).glob("*.csv"), reverse=True)
             return {"plans": [(one.name, yaml_of(one).name) for one in plans]}
+        case "measure":
+            return {"columns": [*joint_columns(cell.robot), *(f"{one}_mm" for one in POSITION)]}
         case "calibrate":
             return {"figures": figures(cell, status)}
         case "deliver":

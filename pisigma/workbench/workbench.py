@@ -1,37 +1,33 @@
 """The server of a cell's page: answers requests with tabs, starts steps, and shows their results."""
 
 import asyncio
-import functools
-import json
 import math
 import os
 import threading
 import time
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Callable, Mapping
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 from aiohttp import web
 from aiohttp.typedefs import Handler
 
-from pisigma.files.errors import (
-    PisigmaError,
-    system_fault,
-)
+from pisigma.files.errors import PisigmaError, PlanningError
 from pisigma.files.progress import Progress
 from pisigma.lifetime.cell.status import CellStatus
-from pisigma.robot.urdf_file import read_urdf
+from pisigma.planning.session.state import SessionState
 from pisigma.workbench import steps
 from pisigma.workbench.cell_scene import CellScene
-from pisigma.workbench.job import BusyError, Jobs, Outcome
+from pisigma.workbench.job import Jobs, Outcome
+from pisigma.workbench.server.answers import answers, form_of, person_of
 from pisigma.workbench.server.front_server import FrontServer
 from pisigma.workbench.server.viser_server import ViserBackend
 from pisigma.workbench.tabs import TABS, Tabs, download_of
+from pisigma.workbench.uploaded_rows import UploadedRows
 from pisigma.workbench.uploads import Uploads
 from pisigma.workflow.cell.cell import Cell
-from pisigma.workflow.cell.exports import NONE, set_controller
 
 Form = Mapping[str, str]
 STATUS_AGE = 5.0
@@ -44,65 +40,42 @@ STATIC = {
 """Type, package and folder of the files of the page."""
 NO_CELL = {"state": "no_cell", "reason": "the folder has no cell yet", "command": "pisigma new"}
 """Next step of a folder without a cell."""
-MAX_PERSON, MAX_COMMAND = 60, 2000
-"""Longest name of a person, and longest command line that is shown."""
+MAX_COMMAND = 2000
+"""Longest command line that is shown."""
 
 
-def answers(function: Callable[["Workbench", web.Request], Awaitable[web.StreamResponse]]) -> Any:
-    """Answer a refused input with its message, and a request during a step with the person who started it."""
-
-    @functools.wraps(function)
-    async def answer(self: "Workbench", request: web.Request) -> web.StreamResponse:
-        try:
-            return await function(self, request)
-        except PisigmaError as problem:
-            fields = {
-                "error": self._uploads.without_folder(str(problem)),
-                "field": problem.option or str(problem.column or ""),
-            }
-            return web.json_response(fields, status=422)
-        except (OSError, MemoryError) as problem:
-            if not (fault := system_fault(problem)):
-                raise
-            return web.json_response({"error": self._uploads.without_folder(fault), "field": ""}, status=422)
-        except BusyError:
-            job = self.jobs.running
-            who = "somebody" if job is None else f"{job.person}: {job.step}"
-            return web.json_response(
-                {"error": f"another step is running ({who}); wait for its end."}, status=409
-            )
-
-    return answer
-
-
-class Workbench:
+class Workbench(UploadedRows):
     """Page of a cell until it is closed: `with Workbench(folder) as bench: print(bench.url)`.
 
     Attributes:
         folder: folder of the cell.
         jobs: the step that runs, and the last outcomes.
         url: link to the page, with its token.
+        growing: file to which an instrument writes rows; None for none.
     """
 
-    def __init__(self, folder: Path, host: str = "127.0.0.1", port: int = 8080) -> None:
+    def __init__(
+        self, folder: Path, host: str = "127.0.0.1", port: int = 8080, growing: Path | None = None
+    ) -> None:
         """Start serving.
 
         Args:
             folder: folder of the cell; if it does not exist or is empty, the page creates the cell.
             host: address to listen on; at 127.0.0.1 only this machine can open the page.
             port: port to listen on; if it is taken, the next free one.
+            growing: file to which an instrument writes rows; None for none.
 
         Raises:
             ImportError: viser or aiohttp is not installed.
             OutputError: the host is not an address of this machine.
             PlanningError: the folder is not a cell, and not empty.
         """
-        self.folder, self._has_cell = folder, False
+        self.folder, self._has_cell, self.growing = folder, False, growing
         cell = self._cell()
         self._status = None if cell is None else cell.status(), time.monotonic()
         self._reading, self._texts = threading.Lock(), dict[str, str]()
         self.jobs, self._uploads = Jobs(), Uploads()
-        self._tabs = Tabs(self.jobs)
+        self._tabs = Tabs(self.jobs, growing)
         self._behind = ViserBackend("pisigma")
         try:
             self._scene = CellScene(self._behind.server)
@@ -135,6 +108,8 @@ class Workbench:
             ("GET", "/download/{kind}/{tail:.+}"): self._download,
             ("POST", "/upload"): self._upload,
             ("POST", "/propose"): self._propose,
+            ("POST", "/check"): self._check,
+            ("POST", "/show"): self._show,
             ("POST", "/step/{name}"): self._step,
             ("POST", "/stop"): self._stop,
             ("POST", "/drag"): self._drag,
@@ -207,43 +182,23 @@ class Workbench:
         path = await asyncio.to_thread(lambda: download_of(Cell.open(self.folder), kind, names))
         shown = "inline" if path.suffix in (".png", ".svg") else "attachment"
         response = web.FileResponse(path)
-        response.headers["Content-Disposition"] = f"{shown}; filename*=UTF-8''{_quoted(path.name)}"
+        response.headers["Content-Disposition"] = f"{shown}; filename*=UTF-8''{quote(path.name)}"
         return response
 
     @answers
-    async def _upload(self, request: web.Request) -> web.StreamResponse:
-        content = await request.read()
-        number = await asyncio.to_thread(self._uploads.add, request.query.get("name", ""), content)
-        (path,) = self._uploads.paths([number])
-        is_urdf = "links" in request.query and path.suffix.lower() in (".urdf", ".xacro")
-        links = await asyncio.to_thread(lambda: [*read_urdf(path)[0].link_map]) if is_urdf else []
-        return web.json_response({"file": number, "links": links})
-
-    @answers
     async def _drag(self, request: web.Request) -> web.StreamResponse:
-        is_on = "on" in await _form(request)
+        is_on = "on" in await form_of(request)
         turn = await asyncio.to_thread(lambda: self._scene.show_cell(Cell.open(self.folder), is_on))
         return web.json_response({"turn": turn})
 
     @answers
-    async def _propose(self, request: web.Request) -> web.StreamResponse:
-        form = await _form(request)
-
-        def propose() -> str:
-            cell, files = Cell.open(self.folder), self._uploads.paths(form.get("files", "").split(","))
-            proposal = steps.propose_columns(files, cell, form)
-            return self._tabs.proposal(proposal, files, form.get("files", ""))
-
-        return web.Response(text=await asyncio.to_thread(propose), content_type="text/html")
-
-    @answers
     async def _stop(self, request: web.Request) -> web.StreamResponse:
-        self.jobs.stop(_person(request), (await _form(request)).get("ended", ""))
+        self.jobs.stop(person_of(request), (await form_of(request)).get("ended", ""))
         return web.json_response({})
 
     @answers
     async def _step(self, request: web.Request) -> web.StreamResponse:
-        name, form = request.match_info["name"], await _form(request)
+        name, form = request.match_info["name"], await form_of(request)
         if name not in (*STEPS, "new"):
             raise web.HTTPNotFound
 
@@ -259,7 +214,7 @@ class Workbench:
                 with self._reading:  # a reading that began before the end of the step is out of date
                     self._status = self._status[0], -math.inf
 
-        self.jobs.start(name, _person(request), form.pop("command", "")[:MAX_COMMAND], run)
+        self.jobs.start(name, person_of(request), form.pop("command", "")[:MAX_COMMAND], run)
         return web.json_response({"started": name})
 
     def _cell(self) -> Cell | None:
@@ -283,7 +238,7 @@ class Workbench:
     def import_rows(self, cell: Cell, form: Form, progress: Progress) -> Outcome:
         """Add uploaded rows as a session."""
         progress("reading the rows")
-        return steps.import_session(self._uploads.paths(form.get("files", "").split(",")), cell, form)
+        return steps.import_session(self._incoming(cell, form), form)
 
     def plan(self, cell: Cell, form: Form, progress: Progress) -> Outcome:
         """Plan poses, and show them."""
@@ -296,6 +251,21 @@ class Workbench:
         found, state = steps.check_rows(cell, form, progress)
         self._scene.show_state(state)
         return found
+
+    def follow(self, cell: Cell, form: Form, progress: Progress) -> Outcome:
+        """Follow the growing file until a person stops it, and show every row."""
+
+        def show(state: SessionState) -> None:
+            self._scene.show_state(state)
+            self._tabs.live = state
+            self.jobs.version += 1
+
+        if self.growing is None:
+            raise PlanningError("no file is followed", remedy="open the page with --rows FILE")
+        try:
+            return steps.follow_file(cell, self.growing, show, progress)
+        finally:
+            self._tabs.live = None
 
     def export(self, cell: Cell, form: Form, progress: Progress) -> Outcome:
         """Export the model in use."""
@@ -321,35 +291,12 @@ class Workbench:
         self._scene.show_cell(Cell.open(cell.folder))
         return Outcome()
 
-    def record(self, cell: Cell, form: Form, progress: Progress) -> Outcome:
-        """Record an event."""
-        cell.history.record(
-            form.get("kind", ""), form.get("date", ""), form.get("note", ""), form.get("person", "")
-        )
-        return Outcome()
-
-    def set_controller(self, cell: Cell, form: Form, progress: Progress) -> Outcome:
-        """Record which export is active on the controller."""
-        name = form.get("export", "")
-        file = str(download_of(cell, "export", (name,))) if name else NONE
-        set_controller(cell, file, form.get("date", ""), form.get("note", ""))
-        return Outcome()
-
-    def use(self, cell: Cell, form: Form, progress: Progress) -> Outcome:
-        """Put a model into use."""
-        warnings = cell.use(form.get("model") or None, form.get("reason", ""))
-        return Outcome(refusal=" ".join(warnings))
-
-    def set_aside(self, cell: Cell, form: Form, progress: Progress) -> Outcome:
-        """Set a session aside."""
-        cell.sessions.set_aside(form.get("session", ""), form.get("set_aside", ""))
-        return Outcome()
-
 
 STEPS: dict[str, Callable[[Workbench, Cell, Form, Progress], Outcome]] = {
     "plan": Workbench.plan,
     "import": Workbench.import_rows,
     "measure": Workbench.measure,
+    "follow": Workbench.follow,
     "calibrate": lambda _, *given: steps.calibrate(*given),
     "verify": lambda _, *given: steps.verify(*given),
     "monitor": lambda _, *given: steps.monitor(*given),
@@ -357,36 +304,9 @@ STEPS: dict[str, Callable[[Workbench, Cell, Form, Progress], Outcome]] = {
     "export": Workbench.export,
     "ik": Workbench.try_pose,
     "cell": Workbench.write_cell,
-    "event": Workbench.record,
-    "controller": Workbench.set_controller,
-    "use": Workbench.use,
-    "session": Workbench.set_aside,
+    "event": lambda _, *given: steps.record(*given),
+    "controller": lambda _, *given: steps.set_active_export(*given),
+    "use": lambda _, *given: steps.use(*given),
+    "session": lambda _, *given: steps.set_aside(*given),
 }
 """Steps by the names of their commands."""
-
-
-async def _form(request: web.Request) -> dict[str, str]:
-    """Return the fields of a form.
-
-    Raises:
-        HTTPBadRequest: the body is not a JSON object of texts.
-    """
-    try:
-        values = await request.json()
-        json.dumps(values, ensure_ascii=False).encode()  # lone surrogates cannot be encoded
-    except ValueError:
-        raise web.HTTPBadRequest from None
-    if not isinstance(values, dict) or not all(isinstance(one, str) for one in values.values()):
-        raise web.HTTPBadRequest
-    return values
-
-
-def _person(request: web.Request) -> str:
-    """Return the name that a person entered, or the address of the browser."""
-    return request.query.get("person", "").strip()[:MAX_PERSON] or f"somebody at {request.remote}"
-
-
-def _quoted(name: str) -> str:
-    from urllib.parse import quote
-
-    return quote(name)

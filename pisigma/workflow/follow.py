@@ -1,7 +1,7 @@
 """Follow a growing file of measurements: rows are checked at once, and the accuracy is updated in the background."""
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -39,13 +39,16 @@ class SessionStep:
     replanned: bool = False
 
 
-def follow(session: MeasuringSession, file: GrowingFile, once: bool = False) -> Iterator[SessionStep]:
+def follow(
+    session: MeasuringSession, file: GrowingFile, once: bool = False, tick: Callable[[], None] = lambda: None
+) -> Iterator[SessionStep]:
     """Check the rows of a growing file until the session ends.
 
     Args:
         session: the session.
         file: the growing file.
         once: whether to check only the rows that exist, and end.
+        tick: called before every read of the file; an exception that it raises ends the session.
 
     Yields:
         A step at the start and whenever there are new rows, a new accuracy, or a file to wait for.
@@ -64,6 +67,7 @@ def follow(session: MeasuringSession, file: GrowingFile, once: bool = False) -> 
     yield SessionStep(FileGrowth(), (), state)
     with ThreadPoolExecutor(1) as pool:
         while True:
+            tick()
             growth = file.read()
             alarms = session.add(growth.rows, growth.left_out)
             worked = work is not None and work.done()

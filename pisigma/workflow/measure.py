@@ -355,10 +355,7 @@ class MeasuringSession:
         """Return all rows with their errors."""
         rows = self._rows
         if rows is None:
-            nothing = np.zeros((0, 3))
-            return RowsSoFar(
-                (), np.zeros((0, self.plan.arm.robot.dof)), nothing, nothing, *np.zeros((2, 0), dtype=bool)
-            )
+            return RowsSoFar.unjudged((), np.zeros((0, self.plan.arm.robot.dof)))
         flags = self._check.numpy(), (~self._counting).numpy()
         return RowsSoFar(rows.line, rows.q.numpy(), *self._judged.errors(), *flags)
 

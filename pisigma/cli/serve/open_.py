@@ -35,6 +35,10 @@ class PageAddress:
 def open_(
     cell: CellFolder,
     address: PageAddress,
+    rows: Annotated[
+        Path | None,
+        typer.Option("--rows", help="Measurements (CSV) that grow row by row, to follow on the page."),
+    ] = None,
     no_browser: Annotated[bool, typer.Option("--no-browser", help="Print the link only.")] = False,
     as_json: AsJson = False,
 ) -> None:
@@ -47,7 +51,7 @@ def open_(
     ended = threading.Event()
     for name in (signal.SIGTERM, signal.SIGINT):
         signal.signal(name, lambda *_: ended.set())
-    with Workbench(cell, address.host, address.port) as bench:
+    with Workbench(cell, address.host, address.port, rows) as bench:
         if as_json:
             print_json({"url": bench.url})
         else:

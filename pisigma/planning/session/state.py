@@ -60,6 +60,12 @@ class RowsSoFar:
     check: Bool[np.ndarray, " rows"]
     alarmed: Bool[np.ndarray, " rows"]
 
+    @staticmethod
+    def unjudged(line: tuple[int, ...], q: Float64[np.ndarray, "rows dof"]) -> "RowsSoFar":
+        """Return rows that have not been compared with each other."""
+        unknown, no = np.full((len(line), 3), math.nan), np.zeros(len(line), dtype=bool)
+        return RowsSoFar(line, q, unknown, unknown, no, no)
+
 
 @dataclass(frozen=True, eq=False)
 class NextPose:

@@ -167,8 +167,8 @@ def joint_causes(maps: JointMaps, number: int, robot: Robot) -> tuple[Cause, ...
         clause = f"the columns of {joints_text(moved)} are swapped"
         causes.append(Cause("joint_order", clause, advice, 1.0, moved, columns=columns))
     elif moved:
-        columns = ", ".join(f"q{column + 1}" for column in order)
-        clause = f"the joint columns are in another order (joints 1 to {robot.dof} are in {columns})"
+        logged = ", ".join(f"q{column + 1}" for column in order)
+        clause = f"the joint columns are in another order (joints 1 to {robot.dof} are in {logged})"
         causes.append(Cause("joint_order", clause, advice, 2.0, moved, columns=columns))
     if negative := tuple(i for i, value in enumerate(factor) if value < 0):
         signs = "the sign of {} is reversed" if len(negative) == 1 else "the signs of {} are reversed"

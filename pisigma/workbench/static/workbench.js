@@ -118,6 +118,7 @@ function say(form) {  // the command line that does the same
     const value = one.type === "file" ? one.files[0]?.name || "" : one.value;
     if (one.dataset.word !== undefined && value) line += ` ${quoted(value)}`;
     else if (!option || one.value === "" || (one.type === "checkbox" && !one.checked)) continue;
+    else if (one.dataset.kind === "list") line += one.value.trim().split(/\s+/).map(word => ` ${option}${quoted(word)}`).join("");
     else if (/[=/]$/.test(option)) line += ` ${option}${quoted(one.value)}`;
     else if (one.dataset.kind === "flag") line += one.value === "true" ? ` ${option}` : ` --no-${option.slice(2)}`;
     else if (one.dataset.kind === "switch") line += ` ${option}`;
@@ -187,22 +188,24 @@ async function start(form) {
   } catch (problem) { fault(form, problem); }
 }
 
-async function propose(form) {
-  const where = document.getElementById("proposal"), shown = document.getElementById("upload-fault");
+async function uploaded(files) {
+  const numbers = [];
+  document.getElementById("proposal").textContent = "";
+  for (const file of files) numbers.push((await upload(file)).file);
+  if (numbers.length) await propose({ files: numbers.join(",") });
+}
+
+async function propose(fields) {  // how the columns are read at once, then what the check of the rows finds
+  const where = document.getElementById("proposal"), shown = document.getElementById("upload-fault"), body = JSON.stringify(fields);
   shown.hidden = true;
   try {
-    let fields = form ? values(form) : {};
-    if (!form) {
-      const numbers = [];
-      for (const file of document.getElementById("files").files) numbers.push((await upload(file)).file);
-      if (!numbers.length) return;
-      fields = { files: numbers.join(",") };
-    }
-    where.innerHTML = await (await ask("propose", JSON.stringify(fields))).text();
-    if (form) copy(form, where.querySelector("form"));
-    proposal = where.firstElementChild;
-    where.querySelectorAll("form").forEach(say);
+    where.innerHTML = await (await ask("propose", body)).text();
+    const form = proposal = where.querySelector("form");
+    for (const one of form.elements) if (one.name in fields && one.type !== "hidden") { if (one.type === "checkbox") one.checked = true; else one.value = fields[one.name]; }
+    say(form);
     lock();
+    const found = await (await ask("check", body)).text();
+    if (form.isConnected) form.querySelector("#findings").innerHTML = found;
   } catch (problem) { shown.textContent = problem.message; shown.hidden = false; }
 }
 
@@ -239,10 +242,14 @@ document.querySelector("nav").addEventListener("keydown", event => {
 document.getElementById("stop").addEventListener("click", () => steps("stop", { ended: String(ended) }).then(poll));
 content.addEventListener("submit", event => { event.preventDefault(); start(event.target); });
 content.addEventListener("input", event => { if (event.target.form) say(event.target.form); });
-content.addEventListener("change", event => { if (event.target.id === "files") propose(); else if (event.target.matches("[data-links], [data-step=new] [name=robot]")) offer(event.target); else if (event.target.form) say(event.target.form); });
+content.addEventListener("change", event => { if (event.target.id === "files") uploaded(event.target.files); else if (event.target.matches("[data-links], [data-step=new] [name=robot]")) offer(event.target); else if (event.target.form) say(event.target.form); });
 content.addEventListener("click", event => {
   const one = event.target;
-  if (one.dataset.again !== undefined) propose(one.form);
+  if (one.dataset.again !== undefined) propose(values(one.form));
+  if (one.dataset.repair !== undefined) propose({ ...values(one.form), ...JSON.parse(one.dataset.repair) });
+  if (one.dataset.show !== undefined) ask("show", JSON.stringify({ text: one.dataset.show }));
+  if (one.dataset.typed !== undefined) uploaded([new File([document.getElementById("typed").value], "typed.csv")]);
+  if (one.dataset.growing !== undefined) propose({ files: "growing" });
   if (one.dataset.clear !== undefined) { for (const field of one.closest("fieldset").elements) field.value = ""; }
   if (one.dataset.discard !== undefined) { kept[tab].forms = {}; show(tab); if (dragging) steps("drag", {}); }
   if (one.dataset.drag !== undefined) steps("drag", { on: "true" }).then(async answer => { dragging = (await answer.json()).turn; poll(); }, problem => fault(one.form, problem));

@@ -42,6 +42,8 @@ SHEET, PRINT = (245, 245, 245), (20, 20, 20)
 """Colours of a board's sheet and corners."""
 CORNER_DOT = 0.25
 """Diameter of a corner's dot, as a share of the distance of two corners."""
+MAX_LABELS = 50
+"""Wrong rows that are labelled with their line."""
 FLOOR, TRACKER_HEAD, CONE, BEAM, HANDLE = 5.0, 0.05, 0.2, 0.003, 0.3
 """Shares of the robot's reach: edge of the floor, radius of the tracker, length of the cone, width of the beam, size of
 the arrows by which objects are dragged."""
@@ -119,17 +121,20 @@ class SessionScene:
         elif self._arm.surroundings.tracker is None:
             self._label("/sensor/label", "frame of the sensor", np.zeros(3))
 
-    def show_rows(self, rows: RowsSoFar, top: float, magnification: float) -> None:
+    def show_rows(self, rows: RowsSoFar, top: float, magnification: float) -> Float64[np.ndarray, "rows 3"]:
         """Draw every row as a point in the colour of its error, with the error as an arrow.
 
         Args:
             rows: rows; those that cannot be judged yet are drawn at the tool of the nominal robot.
             top: error at the end of the colour scale [m].
             magnification: ratio of the lengths of the arrows to those of the errors.
+
+        Returns:
+            The positions at which they are drawn [m].
         """
         self._begin("/rows")
         if not rows.line:
-            return
+            return rows.position
         nominal = self._poses(rows.q)[:, :3, 3]
         position = np.where(np.isfinite(rows.position), rows.position, nominal)
         colors = error_colors(np.linalg.norm(rows.error, axis=1), top)
@@ -138,9 +143,10 @@ class SessionScene:
             self._dots("/rows/measured", position[~rows.check], colors[~rows.check])
         if rows.check.any():
             self._dots("/rows/check", position[rows.check], colors[rows.check], shape="diamond")
-        for row in np.flatnonzero(rows.alarmed):
+        for row in np.flatnonzero(rows.alarmed)[:MAX_LABELS]:
             self._label(f"/rows/alarm_{row}", f"line {rows.line[row]}", position[row])
         self._arrows(position, rows, colors, magnification)
+        return position
 
     def _arrows(
         self,

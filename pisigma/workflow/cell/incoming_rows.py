@@ -10,6 +10,7 @@ import numpy as np
 
 from pisigma.files.errors import AcceptanceError, MeasurementError, Place
 from pisigma.lifetime.cell.history import SessionEntry
+from pisigma.measurement.camera.corner_file import read_rows
 from pisigma.measurement.csv.columns import POSITION
 from pisigma.measurement.csv.reading import is_measurement_file
 from pisigma.measurement.dataset import Measurements
@@ -102,24 +103,29 @@ class IncomingRows:
         """
         return None if self.is_ready else import_rows(self.proposal)
 
+    @cached_property
+    def unchecked(self) -> Measurements:
+        """The rows, which need not be possible for the robot.
+
+        Raises:
+            MeasurementError: the files cannot be read, or see `import_rows`.
+        """
+        return read_rows(self._rows, self.cell.robot.without_limits, self.cell.cameras)
+
     @property
     def _rows(self) -> Path | Measurements:
         return self.files[0] if self.imported is None else self.imported.measurements
 
-    def check(self, day: str = "") -> tuple[Measurements | None, tuple[Diagnostic, ...]]:
-        """Check the rows as `add` does.
-
-        Returns:
-            The rows, None if they cannot be read because of what was found, and the findings.
+    def check(self, day: str = "") -> tuple[Diagnostic, ...]:
+        """Check the rows as `add` does, and return what was found.
 
         Raises:
             MeasurementError: see `Sessions.add_session`.
         """
         try:
-            rows, verdict = self.cell.sessions.check(self._rows, day)
+            return self.cell.sessions.check(self._rows, day).diagnostics
         except AcceptanceError as refusal:
-            return None, refusal.findings
-        return rows, verdict.diagnostics
+            return refusal.findings
 
     def add(self, accept_implausible: bool = False, day: str = "") -> SessionEntry:
         """Add the rows to the cell as a session; see `Sessions.add_session`.

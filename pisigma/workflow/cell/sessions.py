@@ -123,19 +123,14 @@ class Sessions:
             raise
         return True
 
-    def check(
-        self, file: str | os.PathLike[str] | Measurements, day: str = ""
-    ) -> tuple[Measurements, RowVerdict]:
+    def check(self, file: str | os.PathLike[str] | Measurements, day: str = "") -> RowVerdict:
         """Read and check rows as `add_session` does, without storing them.
-
-        Returns:
-            The rows and what was found.
 
         Raises:
             MeasurementError: see `add_session`.
         """
         rows = self._read(file)
-        return rows, self._verdict(rows, _checked_day(rows, day))[0]
+        return self._verdict(rows, _checked_day(rows, day))[0]
 
     def _read(self, file: str | os.PathLike[str] | Measurements) -> Measurements:
         """Read rows; if values exceed the limits of their joints, name the setup fault that explains it.

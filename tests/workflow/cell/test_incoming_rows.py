@@ -64,7 +64,7 @@ def test_a_mistake_is_named_and_the_settings_that_correct_it(cell, tmp_path, mis
     file = written(tmp_path / "rows.csv", rows, (*NAMES, *headings.split()))
     with no_type_checker():
         incoming = IncomingRows((file,), cell, ImportSettings(units="mm" if headings == "X Y Z" else ""))
-        (finding, *_) = incoming.check()[1]
+        (finding, *_) = incoming.check()
         assert finding.severity == "implausible"
         ((name, value),) = named.items()
         assert finding.values[name] == (pytest.approx(value) if name == "ratio" else value)

@@ -1,0 +1,98 @@
+"""Requests for uploaded rows: how they are read, what the check finds, and which of them the scene marks."""
+
+import asyncio
+import contextlib
+from collections.abc import Mapping
+from pathlib import Path
+
+from aiohttp import web
+
+from pisigma.files.errors import PisigmaError
+from pisigma.planning.session.state import RowsSoFar
+from pisigma.robot.urdf_file import read_urdf
+from pisigma.workbench import steps
+from pisigma.workbench.cell_scene import CellScene
+from pisigma.workbench.server.answers import answers, form_of
+from pisigma.workbench.tabs import Tabs, lines_in
+from pisigma.workbench.uploads import Uploads
+from pisigma.workflow.cell.cell import Cell
+from pisigma.workflow.cell.incoming_rows import IncomingRows
+
+GROWING = "growing"
+"""What a form names the growing file instead of the number of an upload."""
+
+
+class UploadedRows:
+    """Answers the requests for uploaded rows of a page.
+
+    Attributes:
+        folder: folder of the cell.
+        growing: file to which an instrument writes rows; None for none.
+    """
+
+    folder: Path
+    growing: Path | None
+    _uploads: Uploads
+    _tabs: Tabs
+    _scene: CellScene
+
+    @answers
+    async def _upload(self, request: web.Request) -> web.StreamResponse:
+        content = await request.read()
+        number = await asyncio.to_thread(self._uploads.add, request.query.get("name", ""), content)
+        (path,) = self._uploads.paths([number])
+        is_urdf = "links" in request.query and path.suffix.lower() in (".urdf", ".xacro")
+        links = await asyncio.to_thread(lambda: [*read_urdf(path)[0].link_map]) if is_urdf else []
+        return web.json_response({"file": number, "links": links})
+
+    @answers
+    async def _propose(self, request: web.Request) -> web.StreamResponse:
+        form = await form_of(request)
+
+        def propose() -> str:
+            incoming = self._incoming(Cell.open(self.folder), form)
+            text = self._tabs.proposal(incoming, form.get("files", ""))
+            with contextlib.suppress(PisigmaError):  # the check says what is wrong
+                rows = incoming.unchecked
+                self._scene.show_rows(RowsSoFar.unjudged(rows.line, rows.q.numpy()))
+            return text
+
+        return web.Response(text=await asyncio.to_thread(propose), content_type="text/html")
+
+    @answers
+    async def _check(self, request: web.Request) -> web.StreamResponse:
+        form = await form_of(request)
+
+        def check() -> str:
+            incoming = self._incoming(Cell.open(self.folder), form)
+            try:
+                found = incoming.check(form.get("date", "").strip())
+            except PisigmaError as problem:
+                return self._uploads.without_folder(self._tabs.findings(incoming, (), str(problem)))
+            self._scene.mark_lines(lines_in(" ".join(row for one in found for row in one.rows)))
+            return self._uploads.without_folder(self._tabs.findings(incoming, found))
+
+        return web.Response(text=await asyncio.to_thread(check), content_type="text/html")
+
+    @answers
+    async def _show(self, request: web.Request) -> web.StreamResponse:
+        """Mark the rows that a sentence names in the scene: those of a session that it names, else those shown."""
+        text = (await form_of(request)).get("text", "")
+
+        def show() -> None:
+            cell = Cell.open(self.folder)
+            for session in cell.history.sessions():
+                if f"{session.name}.csv" in text:
+                    rows = cell.sessions.as_measured(session)
+                    self._scene.show_rows(RowsSoFar.unjudged(rows.line, rows.q.numpy()))
+                    break
+            self._scene.mark_lines(lines_in(text))
+
+        await asyncio.to_thread(show)
+        return web.json_response({})
+
+    def _incoming(self, cell: Cell, form: Mapping[str, str]) -> IncomingRows:
+        """Return the uploaded files of a form, or the growing file."""
+        numbers = form.get("files", "").split(",")
+        files = [self.growing] if numbers == [GROWING] and self.growing else self._uploads.paths(numbers)
+        return steps.incoming_rows(files, cell, form)
