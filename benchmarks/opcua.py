@@ -25,7 +25,7 @@ import pisigma
 
 PAUSE = 1.0
 """[s] Time between the end of a server and the start of the next."""
-PATIENCE = 60.0
+MAX_WAIT = 60.0
 """[s] After this time without an answer a client counts as one that did not go on."""
 
 
@@ -40,8 +40,8 @@ def begin(model: Path, port: int) -> tuple["subprocess.Popen[str]", int]:
 class Load:
     """Clients that share the calls, and what they counted."""
 
-    def __init__(self, port: int, poses: np.ndarray, near: np.ndarray, wanted: np.ndarray) -> None:
-        self.port, self.poses, self.near, self.wanted = port, poses, near, wanted
+    def __init__(self, port: int, poses: np.ndarray, near: np.ndarray, expected: np.ndarray) -> None:
+        self.port, self.poses, self.near, self.expected = port, poses, near, expected
         self.times: list[float] = []
         self.wrong = self.repeated = self.lost = 0
 
@@ -55,8 +55,8 @@ class Load:
         q, reached, *_ = await owner.call_method(method, *values)
         self.wrong += (
             not reached
-            or len(q) != len(self.wanted[index])
-            or not np.abs(q - self.wanted[index]).max() < 1e-9
+            or len(q) != len(self.expected[index])
+            or not np.abs(q - self.expected[index]).max() < 1e-9
         )
 
     async def run(self, calls: int, number: int) -> None:
@@ -72,7 +72,7 @@ class Load:
                         break
                     except (ua.UaError, ConnectionError, TimeoutError):
                         self.repeated += 1
-                        if time.perf_counter() - begun > PATIENCE:
+                        if time.perf_counter() - begun > MAX_WAIT:
                             self.lost += 1
                             return
                         await asyncio.sleep(0.1)
@@ -82,10 +82,10 @@ class Load:
 async def measure(options: argparse.Namespace) -> dict[str, Any]:
     """Run all clients while the server is ended twice, and return what was counted."""
     ik = pisigma.load(options.model)
-    poses, near, wanted = poses_of(ik)
+    poses, near, expected = poses_of(ik)
     per_unit = np.where(ik.revolute, 180 / np.pi, 1e3)
     server, port = begin(options.model, 0)
-    load = Load(port, poses, near * per_unit, wanted * per_unit)
+    load = Load(port, poses, near * per_unit, expected * per_unit)
     clients = [
         asyncio.create_task(load.run(options.calls // options.clients, number))
         for number in range(options.clients)

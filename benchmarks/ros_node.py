@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 PACKAGE = Path(__file__).parents[1] / "integrations" / "ros2" / "pisigma_ros"
-LONGEST = 2.0
+MAX_WAIT = 2.0
 """[s] An answer that takes longer counts as lost."""
 
 
@@ -35,9 +35,9 @@ def empty_node() -> None:
     publisher = node.create_publisher(JointState, "~/corrected_joints", 100)
     names, stored = [f"joint_{number}" for number in range(1, 7)], [0.0] * 6
 
-    def answer(wanted: Any) -> None:
+    def answer(desired: Any) -> None:
         message = JointState(name=names, position=stored)
-        message.header.stamp, message.header.frame_id = wanted.header.stamp, "base_link"
+        message.header.stamp, message.header.frame_id = desired.header.stamp, "base_link"
         publisher.publish(message)
 
     node.create_subscription(PoseStamped, "~/desired_pose", answer, 100)
@@ -76,7 +76,7 @@ class Client:
         self.got.clear()
         begun = time.perf_counter()
         self.publisher.publish(message)
-        while not self.got and time.perf_counter() - begun < LONGEST:
+        while not self.got and time.perf_counter() - begun < MAX_WAIT:
             rclpy.spin_once(self.node, timeout_sec=0.1)
         self.times.append(time.perf_counter() - begun)
         if len(self.got) != 1 or self.got[0].header.stamp.sec != number:
@@ -103,7 +103,7 @@ def client(file: Path) -> None:
         for one in nodes:
             q = one.ask(work["frame"], work["poses"][index], number)
             if one is nodes[0] and q:
-                wrong += max(abs(a - b) for a, b in zip(q, work["wanted"][index], strict=True)) > 1e-9
+                wrong += max(abs(a - b) for a, b in zip(q, work["expected"][index], strict=True)) > 1e-9
     medians = [sorted(one.times)[len(one.times) // 2] * 1e6 for one in nodes]
     print(
         json.dumps(
@@ -138,7 +138,7 @@ def work_of(model: Path, requests: int) -> dict[str, Any]:
         "requests": requests,
         "frame": "base_link",
         "poses": poses[reached].tolist(),
-        "wanted": np.asarray(solutions.q)[reached].tolist(),
+        "expected": np.asarray(solutions.q)[reached].tolist(),
     }
 
 

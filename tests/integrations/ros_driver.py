@@ -1,4 +1,4 @@
-"""Drives the ROS 2 node from a process of its own, in the environment of the ROS wheels.
+"""Drives the ROS 2 node from a second process, in the environment of the ROS wheels.
 
 It reads lines of JSON, `[name, arguments]`, calls the method of `Driver` with this name, and prints what it returns
 as a line of JSON.
@@ -18,8 +18,8 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-LONGEST = 20.0
-"""[s] Longest wait for anything; only for what must not come is it waited shorter."""
+MAX_WAIT = 20.0
+"""[s] Longest wait for a message or an answer."""
 
 
 class Driver(Node):
@@ -38,7 +38,7 @@ class Driver(Node):
         self.change = self.create_client(ChangeState, "/corrected_ik/change_state")
         self.get = self.create_client(GetState, "/corrected_ik/get_state")
 
-    def until(self, found, longest=LONGEST):
+    def until(self, found, longest=MAX_WAIT):
         end = time.monotonic() + longest
         while not found() and time.monotonic() < end:
             rclpy.spin_once(self, timeout_sec=0.05)
@@ -51,7 +51,7 @@ class Driver(Node):
         self.until(lambda: self.urdf)
         return self.urdf[-1].data if self.urdf else None
 
-    def pose(self, frame, values, stamp, longest=LONGEST):
+    def pose(self, frame, values, stamp, longest=MAX_WAIT):
         """Return the answer to x, y, z and a quaternion: stamp, frame, names and positions."""
         self.joints.clear()
         self.poses.publish(_stamped(frame, values, stamp))
@@ -91,7 +91,7 @@ class Driver(Node):
         message = PoseStamped()
         message.pose.position.x, message.pose.position.y, message.pose.position.z = reading
         self.until(lambda: self.tracker.get_subscription_count() and self.states.get_subscription_count())
-        end, done = time.monotonic() + LONGEST, [False, ""]
+        end, done = time.monotonic() + MAX_WAIT, [False, ""]
         while not done[0] and time.monotonic() < end:
             for _ in range(10):
                 self.states.publish(JointState(name=names, position=positions))
@@ -119,9 +119,9 @@ class Driver(Node):
         return self._call(self.get, GetState.Request()).current_state.label
 
     def _call(self, client, request):
-        client.wait_for_service(LONGEST)
+        client.wait_for_service(MAX_WAIT)
         future = client.call_async(request)
-        rclpy.spin_until_future_complete(self, future, timeout_sec=LONGEST)
+        rclpy.spin_until_future_complete(self, future, timeout_sec=MAX_WAIT)
         return future.result()
 
 

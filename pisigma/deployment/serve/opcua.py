@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 NAMESPACE = "urn:pisigma:server"
 USER = "pisigma"
 """Name of the user whose password is the token of the server."""
-LOOK_INTERVAL = 0.5
+POLL_INTERVAL = 0.5
 """[s] Time between two looks at which models are served."""
 STATUS_INTERVAL = 10.0
 """[s] Time after which age and state of a model are determined again."""
@@ -42,9 +42,9 @@ _TEXTS = ("Name", "Sha256", "Day", "State", "Reason", "Joints", "Units")
 class OpcUa:
     """An OPC UA server in a separate thread.
 
-    Only programs on this machine may connect without a user. If other machines can reach the server, every client needs
-    the user `USER`, with the token as password, or a certificate in the folder `trusted`, and the connection is signed
-    and encrypted.
+    Without a token, only programs on this machine can connect, and they need no user. With a token, every client needs
+    the user `USER`, whose password is the token, or a certificate in the folder `trusted`. If other machines can reach
+    the server, all connections are signed and encrypted.
 
     Attributes:
         port: port of the server.
@@ -93,7 +93,8 @@ class OpcUa:
 
     def stop(self) -> None:
         """End the connections, from any thread."""
-        self._loop.call_soon_threadsafe(self._stopping.set)
+        if self.is_running:
+            self._loop.call_soon_threadsafe(self._stopping.set)
 
     async def _serve(self, started: "Future[asyncio.AbstractEventLoop]") -> None:
         self._stopping = asyncio.Event()
@@ -109,7 +110,7 @@ class OpcUa:
         started.set_result(asyncio.get_running_loop())
         while not self._stopping.is_set():
             with contextlib.suppress(asyncio.TimeoutError):
-                await asyncio.wait_for(self._stopping.wait(), LOOK_INTERVAL)
+                await asyncio.wait_for(self._stopping.wait(), POLL_INTERVAL)
             await self._look(server, index, robots)
         listener = server.bserver and server.bserver._server
         if listener is not None:
@@ -123,7 +124,7 @@ class OpcUa:
         folder = self._settings.opcua_certificates
         trusted: frozenset[bytes] = frozenset() if folder is None else _trusted_certificates(folder)
         token = None if self._settings.token is None else self._settings.token.encode()
-        server = Server(user_manager=_Admission(self._is_local, token, trusted))
+        server = Server(user_manager=_Admission(self._is_local and token is None, token, trusted))
         await server.init()
         host = self._settings.host
         server.set_endpoint(f"opc.tcp://{f'[{host}]' if ':' in host else host}:{self.port}")

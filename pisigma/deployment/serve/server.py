@@ -53,12 +53,18 @@ class Server:
         self._selector = selectors.DefaultSelector()
         self._connections: set[Connection] = set()
         self._listeners: list[socket.socket] = []
+        self.zmq: ZeroMq | None = None
+        self.opcua: OpcUa | None = None
         try:
             self.json_port = self._listen(settings.json_port, JsonLines(models, self.metrics))
             self.binary_port = self._listen(settings.binary_port, BinaryFrames(models, self.metrics))
-            self.zmq = None if settings.zmq_port is None else self._zmq(settings.zmq_port)
-            self.opcua = OpcUa(models, self.metrics, settings) if settings.opcua else None
+            if settings.zmq_port is not None:
+                self.zmq = self._zmq(settings.zmq_port)
+            if settings.opcua:
+                self.opcua = OpcUa(models, self.metrics, settings)
         except (OutputError, ImportError):
+            if self.zmq is not None:
+                self.zmq.stop()
             self._listen_no_more()
             self._selector.close()
             raise

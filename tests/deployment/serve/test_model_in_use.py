@@ -1,6 +1,7 @@
 """A server of a cell takes over the model in use between two requests, with all protocols."""
 
 import json
+from xml.etree import ElementTree
 
 import pytest
 from testing.cell_models import FIRST, SECOND, cell_of_two_models, put_into_use
@@ -43,6 +44,26 @@ def test_every_protocol_names_the_model_that_answers(cell):
             assert frames.sha256 == hashes[name]
             socket.send(json.dumps({"pose": POSE, "model": name}).encode())
             assert json.loads(socket.recv())["model"] == name
+
+
+def test_a_client_learns_the_state_of_the_model_and_its_urdf(cell):
+    models = ServedModels(cell=cell.folder)
+    protocol = JsonLines(models, Metrics())
+
+    def ask(question):
+        return json.loads(protocol.answer_message(json.dumps({"ask": question}).encode())())
+
+    status, step = ask("status"), cell.status().step
+    assert (status["model"], status["day"], status["state"]) == (FIRST, "2026-01-10", step.state)
+    assert status["sha256"] == ask("urdf")["sha256"] == model_hash(cell.folder / "models" / FIRST)
+    assert ElementTree.fromstring(ask("urdf")["urdf"]).get("name") == FIRST
+    put_into_use(cell, SECOND)
+    assert ask("status")["state"] == "not_in_use"
+    models.reload()
+    assert ask("status")["state"] == cell.status().step.state
+    with (cell.folder / "models" / SECOND / "model.yaml").open("a") as file:
+        file.write("# edited\n")
+    assert "error" in ask("urdf")
 
 
 def test_a_path_that_was_begun_is_answered_by_one_model(cell):

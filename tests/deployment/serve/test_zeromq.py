@@ -77,14 +77,17 @@ def test_every_message_needs_the_token(asking, repository):
             assert ask(*parts)["error"].startswith("token: ")
 
 
-def test_without_pyzmq_the_extra_is_named(monkeypatch, repository):
-    monkeypatch.setitem(sys.modules, "zmq", None)
+@pytest.mark.parametrize(
+    ("module", "extra", "options"), [("zmq", "serve", {"zmq_port": 0}), ("asyncua", "opcua", {"opcua": True})]
+)
+def test_a_missing_extra_is_named(monkeypatch, repository, module, extra, options):
+    monkeypatch.setitem(sys.modules, module, None)
     with (
         pytest.raises(ImportError) as caught,
-        running(repository / "models" / "kiro4", settings=ServeSettings(zmq_port=0)),
+        running(repository / "models" / "kiro4", settings=ServeSettings(**options)),
     ):
         pass
-    assert 'pip install "pisigma[serve]"' in str(missing_extra(caught.value))
+    assert f'pip install "pisigma[{extra}]"' in str(missing_extra(caught.value))
 
 
 @pytest.fixture

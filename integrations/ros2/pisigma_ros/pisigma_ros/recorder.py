@@ -30,9 +30,9 @@ PARAMETERS = {
     "still_tracker": (1e-4, "Largest range of a coordinate of the tracker within the window [m]."),
     "automatic": (False, "Whether a row is recorded whenever the arm stops at another pose."),
 }
-LEAST = 3
-"""Least number of messages of each topic within a window."""
-MOVED = 10.0
+MIN_SAMPLES = 3
+"""Minimum number of messages of each topic within a window."""
+MIN_MOTION = 10.0
 """The arm is at another pose if a joint differs by this multiple of `still_joints`."""
 
 
@@ -58,7 +58,7 @@ class Samples:
         """
         begin = time.monotonic() - self._window
         rows = [values for arrived, values in self._values if arrived >= begin]
-        if len(rows) < LEAST:
+        if len(rows) < MIN_SAMPLES:
             return None
         columns = list(zip(*rows, strict=True))
         if any(max(column) - min(column) > largest for column in columns[:checked]):
@@ -87,9 +87,9 @@ class Recorder(Node):
         self._file, self._rows, self._last = None, 0, None
         self._arm, self._tracker = Samples(self._value("window")), Samples(self._value("window"))
         overriding = {"qos_overriding_options": QoSOverridingOptions.with_default_policies()}
-        quick = qos_profile_sensor_data
-        self.create_subscription(JointState, "joint_states", self._on_joints, quick, **overriding)
-        self.create_subscription(PoseStamped, "tracker", self._on_tracker, quick, **overriding)
+        qos = qos_profile_sensor_data
+        self.create_subscription(JointState, "joint_states", self._on_joints, qos, **overriding)
+        self.create_subscription(PoseStamped, "tracker", self._on_tracker, qos, **overriding)
         self.create_service(Trigger, "~/take", self._take)
         self.create_service(Trigger, "~/finish", self._finish)
         if self._value("automatic"):
@@ -133,7 +133,7 @@ class Recorder(Node):
         if q is not None and (
             self._last is None
             or max(abs(a - b) for a, b in zip(q, self._last, strict=True))
-            > MOVED * self._value("still_joints")
+            > MIN_MOTION * self._value("still_joints")
         ):
             self._write(q, reading)
             self.get_logger().info(f"Row {self._rows} recorded")

@@ -5,7 +5,7 @@ from xml.etree import ElementTree
 
 from pisigma_ros.pisigma_client import FrameClient, JsonClient
 
-SLOW = 60.0
+URDF_TIMEOUT = 60.0
 """[s] Longest wait for the first URDF of a model, which the server has to make."""
 FRAMES, TIPS = ("calibrated_frame", "base_link"), ("calibrated_tool", "tool0")
 """Links of a calibrated URDF that are the frame of the model's poses and its tool; the first one that it has."""
@@ -23,12 +23,15 @@ class Server:
 
     def __init__(self, host, port, json_port, token=None, model=0, timeout=0.5):
         """Connect, and ask for the model and its URDF; an OSError or RuntimeError says that this is not possible."""
-        self._address, self._json_address = (port, host, token, timeout), (json_port, host, token, SLOW)
+        self._address, self._json_address = (
+            (port, host, token, timeout),
+            (json_port, host, token, URDF_TIMEOUT),
+        )
         self._model, self._lines = model, None
         self._frames = FrameClient(*self._address)
         self.problem, self.status, self.joints, self.urdf = "", {}, [], ""
         self._ask()
-        self._ending = threading.Event()
+        self._ended = threading.Event()
 
     def solve(self, *arguments):
         """See `FrameClient.solve`; after a failure, the next request opens a new connection."""
@@ -47,7 +50,7 @@ class Server:
 
     def close(self):
         """End the connections and the thread."""
-        self._ending.set()
+        self._ended.set()
         for client in (self._frames, self._lines):
             if client is not None:
                 client.close()
@@ -61,7 +64,7 @@ class Server:
         return tuple(next((name for name in names if name in links), "") for names in (FRAMES, TIPS))
 
     def _follow(self, period):
-        while not self._ending.wait(period):
+        while not self._ended.wait(period):
             try:
                 self._ask()
                 self.problem = ""
