@@ -1,8 +1,8 @@
 """Time and memory of a fleet of simulated robots, with processes and with Ray, and recovery from killed runs.
 
 Run `OMP_NUM_THREADS=1 python benchmarks/fleet.py [PART ...]` with the simulator of arms (`sim.py`) in
-`PISIGMA_SIMULATED`. Every robot is a kr10 with individual errors, measured at 100 poses. The part `before` compares
-cells with the manifest of a checkout of an earlier version (`--before FOLDER`), alternately.
+`PISIGMA_SIMULATED`. Every robot is a kr10 with individual errors, measured at `--poses` poses. The part `before`
+compares cells with the manifest of a checkout of an earlier version (`--before FOLDER`), alternately.
 """
 
 import argparse
@@ -23,22 +23,22 @@ from pyarrow import parquet
 SIMULATED = Path(os.environ.get("PISIGMA_SIMULATED", "../shared/simulated"))
 
 
-def write_fleet(folder: Path, robots: int) -> None:
+def write_fleet(folder: Path, robots: int, poses: int, model: str) -> None:
     """Simulate measurements of the robots, with the manifest `fleet.csv`."""
     sys.path.insert(0, str(SIMULATED))
     import sim  # type: ignore[import-not-found]
 
     os.chdir(folder)
     sim.write_urdf("kr10")
-    lines = ["id,robot,data,date"]
+    lines = ["id,robot,data,date,options"]
     for number in range(robots):
         true, rng = sim.True_("kr10", seed=number), np.random.default_rng(number)
-        q = true.sample(100, 1000 + number)
+        q = true.sample(poses, 1000 + number)
         position, _ = true.measure(q, noise=3e-5, rng=rng, rep=2e-5)
         header = ",".join([*(f"q{k + 1}_rad" for k in range(q.shape[1])), "x_mm", "y_mm", "z_mm"])
         rows = np.column_stack([q, position * 1e3])
         np.savetxt(f"r{number:04d}.csv", rows, "%.9f", ",", header=header, comments="")
-        lines.append(f"r{number:04d},kr10.urdf,r{number:04d}.csv,2026-10-01")
+        lines.append(f"r{number:04d},kr10.urdf,r{number:04d}.csv,2026-10-01,model={model}")
     Path("fleet.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
     new = [sys.executable, "-m", "pisigma", "new", "--from", "fleet.csv", "--out", "cells"]
     subprocess.run(new, check=True, stdout=subprocess.DEVNULL)
@@ -156,12 +156,14 @@ def main() -> None:
     parser.add_argument("--before", type=Path, help="checkout of an earlier version with manifests")
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--robots", type=int, default=200)
+    parser.add_argument("--poses", type=int, default=100, help="per robot")
+    parser.add_argument("--model", default="hybrid", choices=("hybrid", "geometric"))
     parser.add_argument("--kills", type=int, default=20)
     wanted = parser.parse_args()
     parts = wanted.parts or ["engines", "kills"]
     earlier = wanted.before and wanted.before.resolve()
     with TemporaryDirectory() as folder:
-        write_fleet(Path(folder), wanted.robots)
+        write_fleet(Path(folder), wanted.robots, wanted.poses, wanted.model)
         if "engines" in parts:
             engines(wanted.robots)
         if "kills" in parts:

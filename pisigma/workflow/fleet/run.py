@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pisigma.files.engines.engine import AbstractEngine
 from pisigma.files.engines.processes import ProcessEngine
@@ -25,13 +25,10 @@ from pisigma.lifetime.fleet.results import (
     write_results,
 )
 from pisigma.lifetime.fleet.status import FleetStatus
-from pisigma.measurement.sensors.sensor import SHOWN_UNITS
-from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.model.folder.model_folder import load_model
-from pisigma.model.model_posterior import check_fleet_prior
-from pisigma.workflow.cell.advance import advance
-from pisigma.workflow.cell.cell import Cell
 from pisigma.workflow.settings.fleet import FleetSettings
+
+if TYPE_CHECKING:
+    from pisigma.model.calibrated_model import CalibratedModel
 
 CELLS_PER_CHUNK = 4
 """Cells that a worker processes at once, which takes some seconds."""
@@ -100,6 +97,9 @@ def run_fleet(
         import_module(extra)  # before the work, and before anything is written
     cells = cells_in(folder)
     if settings.prior is not None:
+        from pisigma.model.folder.model_folder import load_model
+        from pisigma.model.model_posterior import check_fleet_prior
+
         check_fleet_prior(load_model(settings.prior))
     before = FleetStatus.read(folder)
     reasons = dict(before.unreadable) | {
@@ -135,6 +135,11 @@ def run_fleet(
 
 def _advance(folder: Path, prior: Path | None) -> tuple[str, dict[str, list[ParameterValue]]]:
     """Advance a cell; return why it needs attention, "" if it does not, and the parameters of its models."""
+    from pisigma.workflow.cell.advance import (
+        advance,  # torch takes seconds, and most calls have nothing to do
+    )
+    from pisigma.workflow.cell.cell import Cell
+
     reason = ""
     try:
         step = advance(Cell.open(folder), prior).step
@@ -153,10 +158,14 @@ def _parameters(facts: CellFacts, known: Iterable[str] = ()) -> dict[str, list[P
     """Return the estimated parameters of the models of a cell, except known ones, by the SHA-256 of the models."""
     new = {one.sha256: Path(facts.folder) / MODELS / one.name for one in facts.models}
     there = {sha256: folder for sha256, folder in new.items() if sha256 not in known and folder.is_dir()}
+    if not there:
+        return {}
+    from pisigma.model.folder.model_folder import load_model
+
     return {sha256: parameters_of(load_model(folder)) for sha256, folder in there.items()}
 
 
-def parameters_of(model: CalibratedModel) -> list[ParameterValue]:
+def parameters_of(model: "CalibratedModel") -> list[ParameterValue]:
     """Return the geometric parameters of a calibration, or those of which a recalibrated model has a posterior."""
     estimated = model.metrics.get("parameters")
     if estimated is not None:
@@ -165,6 +174,8 @@ def parameters_of(model: CalibratedModel) -> list[ParameterValue]:
         return [ParameterValue(*row) for row in rows if row[-1] is not None]
     if (posterior := model.uncertainty) is None:
         return []
+    from pisigma.measurement.sensors.sensor import SHOWN_UNITS
+
     space, values = posterior.space, posterior.geometry.robot.dh.ravel()
     changes, deviations = values - space.robot.dh.ravel(), posterior.root[: space.arm_size].norm(dim=1)
     parameters = []
