@@ -149,17 +149,20 @@ def iso_table(repeats: Sequence[RepeatedPose]) -> Table:
     """Return pose accuracy and repeatability of the poses that were measured more than once [mm]."""
     accuracies = [one.accuracy * 1e3 for one in repeats if one.accuracy is not None]
     repeatabilities = [one.repeatability * 1e3 for one in repeats if one.repeatability is not None]
-    names = (
+    names: tuple[tuple[str, list[float], int], ...] = (
         ("pose accuracy AP", accuracies, 2),
         (f"pose repeatability RP, {MIN_CYCLES} cycles or more", repeatabilities, MIN_CYCLES),
+        ("path accuracy AT and path repeatability RT", [], 2),  # the sessions of a cell contain no paths
     )
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for name, values, fewest in names:
         cycles = sorted({one.rows for one in repeats if one.rows >= fewest})
         if values:
             counts = f"{cycles[0]} to {cycles[-1]}" if len(cycles) > 1 else f"{cycles[0]}"
             mean = sum(values) / len(values)
             rows.append((name, str(len(values)), counts, figure_text(mean), figure_text(max(values))))
+        else:
+            rows.append((name, "0", "", NOT_STATED, NOT_STATED))
     return Table(("ISO 9283:1998", "poses", "cycles", "mean [mm]", "largest [mm]"), tuple(rows))
 
 

@@ -28,6 +28,10 @@ def test_errors_that_the_budget_does_not_explain_end_with_3(run, tmp_path):
     assert len(found["budget"]["components"]) == 3
     text = page.read_text(encoding="utf-8")
     assert 'id="acceptance"' in text
+    assert all(
+        name in text.partition("By ISO 9283")[2]
+        for name in ("accuracy AP", "repeatability RP", "accuracy AT")
+    )
     assert "Ada &lt;i&gt;" in text
     assert "<b>7</b>" not in text
     screen = run("report", cell, "--out", page)

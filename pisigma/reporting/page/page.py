@@ -83,7 +83,7 @@ def _acceptance(acceptance: Acceptance) -> dict[str, Any]:
         "statements": statement_table(acceptance),
         "budget": budget_table(acceptance),
         "comparison": comparison_table(acceptance),
-        "iso": iso_table(acceptance.repeats) if acceptance.repeats else None,
+        "iso": iso_table(acceptance.repeats),
     }
 
 
