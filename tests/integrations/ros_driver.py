@@ -12,7 +12,9 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from lifecycle_msgs.srv import ChangeState, GetState
+from rcl_interfaces.srv import SetParameters
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
@@ -117,6 +119,12 @@ class Driver(Node):
         request.transition.label = name
         self._call(self.change, request)
         return self._call(self.get, GetState.Request()).current_state.label
+
+    def parameter(self, name, value):
+        """Set a parameter of the node, and return whether it was accepted."""
+        request = SetParameters.Request(parameters=[Parameter(name, value=value).to_parameter_msg()])
+        client = self.create_client(SetParameters, "/corrected_ik/set_parameters")
+        return self._call(client, request).results[0].successful
 
     def _call(self, client, request):
         client.wait_for_service(MAX_WAIT)

@@ -91,12 +91,14 @@ def test_poses_are_answered_with_corrected_joints(repository):
     far, skew = [9.0, *pose[1:]], [*pose[:3], 2.0, 2.0, 2.0, 2.0]
     with (
         running(model) as server,
-        node(repository, server, joint_states_max_age=60.0),
+        node(repository, server),
         driver(repository) as ask,
     ):
         joints = ElementTree.fromstring(ask("connect")).iterfind("joint")
         assert [one.get("name") for one in joints if one.get("type") != "fixed"] == JOINTS
         assert ask("pose", "base_link", pose, 1) == [[1, "base_link", JOINTS, []]]  # no joint_states yet
+        assert ask("parameter", "joint_states_max_age", 60.0) is True
+        assert ask("parameter", "port", 1) is False
         ask("near", JOINTS[::-1], near[::-1].tolist())
         ((stamp, frame, names, q),) = ask("pose", "base_link", pose, 2)
         assert (stamp, frame, names) == (2, "base_link", JOINTS)
@@ -119,8 +121,16 @@ def test_poses_are_answered_with_corrected_joints(repository):
         assert np.isfinite(float(values["p50_us"]))
         assert ask("transition", "deactivate") == "inactive"
         assert ask("pose", "base_link", pose, 9, 0.3) == []
-        assert ask("transition", "activate") == "active"
+        for transition, state in (
+            ("cleanup", "unconfigured"),
+            ("configure", "inactive"),
+            ("activate", "active"),
+        ):
+            assert ask("transition", transition) == state
+        ask("connect")
+        ask("near", JOINTS, near.tolist())
+        assert ask("pose", "base_link", pose, 9) == [[9, "base_link", JOINTS, q]]
         server.stop()
         ask("near", JOINTS, near.tolist())
         assert ask("pose", "base_link", pose, 10) == [[10, "base_link", JOINTS, []]]
-        assert ask("report", int(values["requests"]) + 1)[0] == 2
+        assert ask("report", 2)[0] == 2

@@ -7,7 +7,7 @@ from dataclasses import replace
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseStamped
-from rcl_interfaces.msg import ParameterDescriptor
+from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
 from rclpy.executors import ExternalShutdownException
 from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
@@ -45,6 +45,8 @@ PARAMETERS = {
     "diagnostics_period": (1.0, "Time between two diagnostics [s]."),
     "autostart": (True, "Whether to configure and activate the node when it starts."),
 }
+DYNAMIC = ("accept_outside_domain", "joint_states_max_age")
+"""Parameters that may be changed at any time; the others are read when the node is configured."""
 CALM_STATES = ("up_to_date", "not_in_cell")
 """States of a cell that need no attention."""
 
@@ -57,13 +59,21 @@ class CorrectedIk(LifecycleNode):
         for name, (value, meaning) in PARAMETERS.items():
             self.declare_parameter(name, value, ParameterDescriptor(description=meaning))
         self._server, self._made, self._is_active = None, [], False
-        self.add_post_set_parameters_callback(lambda changed: self._read())
+        self.add_on_set_parameters_callback(self._on_parameters)
 
-    def _read(self):
-        """Read the parameters that may be changed at any time."""
-        self._max_age = self._value("joint_states_max_age")
+    def _on_parameters(self, changed):
+        """Take over parameters that may be changed at any time; refuse the others while the node is configured."""
+        values = {one.name: one.value for one in changed}
+        fixed = sorted(values.keys() & PARAMETERS.keys() - set(DYNAMIC))
+        if self._server is not None and fixed:
+            return SetParametersResult(
+                successful=False, reason=f"{fixed[0]} is read when the node is configured: clean it up first"
+            )
         if self._server is not None:
-            self._arm = replace(self._arm, accept_outside_domain=self._value("accept_outside_domain"))
+            accepts = values.get("accept_outside_domain", self._arm.accept_outside_domain)
+            self._arm = replace(self._arm, accept_outside_domain=accepts)
+            self._max_age = values.get("joint_states_max_age", self._max_age)
+        return SetParametersResult(successful=True)
 
     def on_configure(self, state):
         """Connect to the server, and create topics and services."""
@@ -84,10 +94,11 @@ class CorrectedIk(LifecycleNode):
         if not all(frames):
             self.get_logger().error("A URDF cannot describe the model: set base_frame and tip_link")
             self._server.close()
+            self._server = None
             return TransitionCallbackReturn.FAILURE
         joints = tuple(filter(None, self._value("joints"))) or tuple(self._server.joints)
-        self._arm = Arm(joints, *frames, self._value("model"))
-        self._read()
+        self._arm = Arm(joints, *frames, self._value("model"), self._value("accept_outside_domain"))
+        self._max_age = self._value("joint_states_max_age")
         self._joint_states, self._counts, self._durations = None, Counter(), deque(maxlen=1024)
         self._shown = None
         self._create()
