@@ -1,75 +1,118 @@
-"""Poses of the tool of a URDF file in MuJoCo, pinocchio and Drake.
+"""Poses and Jacobians of the tool of URDF and MJCF files in MuJoCo, pinocchio, Drake and the Robotics Toolbox.
 
-`python urdf_peers.py PEER FILE BASE TOOL < joint_values.json` reads joint values [[q_1, ...], ...] [rad or m] and
-prints the poses of the link TOOL in the link BASE as JSON. It does not import pisigma, so the peers can be
-installed in a separate environment:
-`pip install mujoco pin drake==1.51.1` (the last Drake for Python 3.11).
+`python urdf_peers.py PEER < requests.json` reads `[{"file": ..., "base": ..., "tool": ..., "q": [[q_1, ...], ...]}]`
+with joint values [rad or m], and prints for every file the poses of the link, body or site `tool` in `base`, and the
+geometric Jacobians of its origin in the axes of `base` (first of the position, then of the rotation), as JSON. It does
+not import pisigma, so the peers can be installed in a separate environment:
+`pip install mujoco pin roboticstoolbox-python drake==1.51.1` (the last Drake for Python 3.11).
 """
 
 import json
 import sys
+from collections.abc import Iterator
 
 import numpy as np
 
+Motion = tuple[np.ndarray, np.ndarray]
+"""Pose (4, 4) and Jacobian (6, joints)."""
 
-def mujoco_poses(path: str, q: np.ndarray, *links: str) -> list[np.ndarray]:
-    """Return poses by MuJoCo, which compiles the unmodified file."""
+
+def _in_base(T_base: np.ndarray, T_tool: np.ndarray, J: np.ndarray) -> Motion:
+    """Express a pose and a Jacobian in the axes of the world in those of a base that does not move."""
+    R = T_base[:3, :3].T
+    return np.linalg.inv(T_base) @ T_tool, np.concatenate([R @ J[:3], R @ J[3:]])
+
+
+def mujoco_motions(path: str, q: np.ndarray, *names: str) -> Iterator[Motion]:
+    """Yield motions by MuJoCo, which compiles the unmodified file."""
     import mujoco
 
     spec = mujoco.MjSpec.from_file(path)
     spec.compiler.fusestatic = False
     model = spec.compile()
-    data, poses = mujoco.MjData(model), []
-    base, tool = (mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name) for name in links)
+    data = mujoco.MjData(model)
+
+    def frame(name: str) -> tuple[np.ndarray, np.ndarray]:
+        """Return the pose of a body or site, and the columns of its motion."""
+        T, J = np.eye(4), np.zeros((2, 3, model.nv))
+        if (site := mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, name)) >= 0:
+            T[:3, :3], T[:3, 3] = data.site_xmat[site].reshape(3, 3), data.site_xpos[site]
+            mujoco.mj_jacSite(model, data, J[0], J[1], site)
+        elif (body := mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name)) >= 0:
+            T[:3, :3], T[:3, 3] = data.xmat[body].reshape(3, 3), data.xpos[body]
+            mujoco.mj_jacBody(model, data, J[0], J[1], body)
+        return T, J.reshape(6, -1)  # the root of a URDF is the world itself
+
     for values in q:
-        data.qpos[:] = values
+        data.qpos[: len(values)] = values
         mujoco.mj_kinematics(model, data)
-        frames = []
-        for body in (base, tool):
-            T = np.eye(4)
-            if body >= 0:  # the root of a URDF is the world itself
-                T[:3, :3], T[:3, 3] = data.xmat[body].reshape(3, 3), data.xpos[body]
-            frames.append(T)
-        poses.append(np.linalg.inv(frames[0]) @ frames[1])
-    return poses
+        mujoco.mj_comPos(model, data)
+        T, J = frame(names[1])
+        yield _in_base(frame(names[0])[0], T, J[:, : len(values)])
 
 
-def pinocchio_poses(path: str, q: np.ndarray, *links: str) -> list[np.ndarray]:
-    """Return poses by pinocchio, whose continuous joints take cosine and sine."""
+def pinocchio_motions(path: str, q: np.ndarray, *names: str) -> Iterator[Motion]:
+    """Yield motions by pinocchio, whose continuous joints take cosine and sine."""
     import pinocchio
 
     model = pinocchio.buildModelFromUrdf(path)
-    data, poses = model.createData(), []
-    base, tool = (model.getFrameId(name) for name in links)
+    data = model.createData()
+    base, tool = (model.getFrameId(name) for name in names)
     for values in q:
         stated: list[float] = []
         for joint, value in zip(model.joints[1:], values, strict=True):
             stated += [value] if joint.nq == 1 else [np.cos(value), np.sin(value)]
-        pinocchio.framesForwardKinematics(model, data, np.array(stated))
-        poses.append((data.oMf[base].inverse() * data.oMf[tool]).homogeneous)
-    return poses
+        pinocchio.computeJointJacobians(model, data, np.array(stated))
+        pinocchio.updateFramePlacements(model, data)
+        J = pinocchio.getFrameJacobian(model, data, tool, pinocchio.ReferenceFrame.LOCAL_WORLD_ALIGNED)
+        yield _in_base(data.oMf[base].homogeneous, data.oMf[tool].homogeneous, J)
 
 
-def drake_poses(path: str, q: np.ndarray, *links: str) -> list[np.ndarray]:
-    """Return poses by Drake, with the base welded to the world."""
+def drake_motions(path: str, q: np.ndarray, *names: str) -> Iterator[Motion]:
+    """Yield motions by Drake, with the base welded to the world."""
     from pydrake.multibody.parsing import Parser
     from pydrake.multibody.plant import MultibodyPlant
+    from pydrake.multibody.tree import JacobianWrtVariable
 
     plant = MultibodyPlant(time_step=0.0)
     Parser(plant).AddModels(path)
-    base, tool = (plant.GetFrameByName(name) for name in links)
-    plant.WeldFrames(plant.world_frame(), base)
+    base, tool = (plant.GetFrameByName(name) for name in names)
+    world = plant.world_frame()
+    if base.body().index() not in [body.index() for body in plant.GetBodiesWeldedTo(plant.world_body())]:
+        plant.WeldFrames(world, base)
     plant.Finalize()
-    context, poses = plant.CreateDefaultContext(), []
+    context = plant.CreateDefaultContext()
     for values in q:
         plant.SetPositions(context, values)
-        poses.append(tool.CalcPose(context, base).GetAsMatrix4())
-    return poses
+        kind = JacobianWrtVariable.kQDot
+        J = plant.CalcJacobianSpatialVelocity(context, kind, tool, np.zeros(3), base, base)
+        yield tool.CalcPose(context, base).GetAsMatrix4(), np.concatenate([J[3:], J[:3]])
 
 
-PEERS = {"mujoco": mujoco_poses, "pinocchio": pinocchio_poses, "drake": drake_poses}
+def toolbox_motions(path: str, q: np.ndarray, *names: str) -> Iterator[Motion]:
+    """Yield motions by the Robotics Toolbox for Python."""
+    import roboticstoolbox
+
+    robot = roboticstoolbox.Robot.URDF(path)
+    for values in q:
+        T, J = (
+            robot.fkine(values, end=names[1], start=names[0]).A,
+            robot.jacob0(values, end=names[1], start=names[0]),
+        )
+        yield T, J
+
+
+PEERS = {
+    "mujoco": mujoco_motions,
+    "pinocchio": pinocchio_motions,
+    "drake": drake_motions,
+    "toolbox": toolbox_motions,
+}
 
 if __name__ == "__main__":
-    peer, file, *links = sys.argv[1:]
-    values = np.array(json.load(sys.stdin))
-    print(json.dumps([np.asarray(pose).tolist() for pose in PEERS[peer](file, values, *links)]))
+    answers = []
+    for one in json.load(sys.stdin):
+        motions = PEERS[sys.argv[1]](one["file"], np.array(one["q"]), one["base"], one["tool"])
+        poses, jacobians = zip(*motions, strict=True)
+        answers.append({"poses": np.stack(poses).tolist(), "jacobians": np.stack(jacobians).tolist()})
+    print(json.dumps(answers))

@@ -16,6 +16,7 @@ _NAMES = {
     "calibration.geometric.result": "CalibrationResult",
     "model.inverse.corrected_ik": "CorrectedIK",
     "model.inverse.solution": "Solution",
+    "deployment.export.urdf": "to_pinocchio",
     "joint_correction.registry": "register_feature",
     "robot.kernels.array_kinematics": "forward_kinematics joint_jacobian",
     "robot.kinematics.status": "Status",

@@ -2,6 +2,7 @@ from pisigma.calibration.geometric.calibrator import GeometricCalibrator as Geom
 from pisigma.calibration.geometric.result import CalibrationResult as CalibrationResult
 from pisigma.calibration.hybrid.calibrator import HybridCalibrator as HybridCalibrator
 from pisigma.calibration.hybrid.result import HybridResult as HybridResult
+from pisigma.deployment.export.urdf import to_pinocchio as to_pinocchio
 from pisigma.files.errors import PisigmaError as PisigmaError
 from pisigma.joint_correction.registry import register_feature as register_feature
 from pisigma.measurement.dataset import Measurements as Measurements

@@ -266,9 +266,10 @@ EXTRAS = {
     "pyzmq": "serve",
     "asyncua": "opcua",
     "opencv-python-headless": "camera",
+    "pin": "bench",
 }
 """The extra that installs each optional package."""
-_PACKAGES = {"cv2": "opencv-python-headless"}
+_PACKAGES = {"cv2": "opencv-python-headless", "pinocchio": "pin"}
 """Packages whose module has another name, by that name."""
 
 

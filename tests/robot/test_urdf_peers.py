@@ -1,54 +1,114 @@
-"""URDF files that pisigma writes, loaded by MuJoCo, pinocchio and Drake."""
+"""URDF and MJCF files of every robot, loaded by MuJoCo, pinocchio, Drake and the Robotics Toolbox for Python."""
 
 import json
 import os
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from testing.aged import model_before
 from testing.closeness import assert_close
+from testing.outside_arm import ARMS, SIMULATOR
 
+import pisigma
+from pisigma.deployment.export.mjcf import update_mjcf, urdf_to_mjcf
 from pisigma.deployment.export.urdf import CALIBRATED_FRAME, CALIBRATED_TOOL, update_urdf
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.robot.kinematics.jacobian import joint_jacobian
 from pisigma.robot.writing import BASE_LINK, TOOL_LINK, robot_to_urdf
 
-MODULES = {"mujoco": "mujoco", "pinocchio": "pinocchio", "drake": "pydrake"}
+MODULES = {"mujoco": "mujoco", "pinocchio": "pinocchio", "drake": "pydrake", "toolbox": "roboticstoolbox"}
+KINDS = {
+    "mujoco": ("urdf", "urdf of a drawing", "mjcf", "mjcf of a drawing"),
+    "pinocchio": ("urdf", "urdf of a drawing"),
+    "drake": ("urdf", "urdf of a drawing", "mjcf"),
+    "toolbox": ("urdf", "urdf of a drawing"),
+}
+"""Kinds of files by what reads them; Drake's parser of MJCF leaves out sites."""
+POSES = 10
 
 
-@pytest.mark.parametrize("in_template", [False, True], ids=["a new file", "the file that it was loaded from"])
+def drawings(folder: Path, repository: Path) -> dict[str, Path]:
+    """Draw the catalogue as many files are: links without masses, joints without effort and velocity."""
+    made = {}
+    for name in sorted(path.stem for path in (repository / "pisigma" / "robot" / "catalogue").glob("*.yaml")):
+        text = re.sub(r"(?s)<inertial>.*?</inertial>", "", robot_to_urdf(Robot.load(name)))
+        made[name] = folder / f"{name}.urdf"
+        made[name].write_text(text.replace('effort="1000" velocity="10"', 'effort="0" velocity="0"'))
+    return made | {name: SIMULATOR.parent / f"{name}.urdf" for name in ARMS if SIMULATOR.exists()}
+
+
+def calibrated(nominal: Robot, random: np.random.Generator) -> Robot:
+    dh = nominal.dh + random.normal(0, 1e-3, nominal.dh.shape)
+    return nominal.with_geometry(dh, random.normal(0, 0.5, 6), random.normal(0, 0.2, 6))
+
+
+@pytest.fixture(scope="module")
+def robots(tmp_path_factory, repository):
+    """Calibrated robots, their files by kind, and joint values."""
+    folder, random, made = tmp_path_factory.mktemp("peers"), np.random.default_rng(2), []
+    for name, drawing in drawings(folder, repository).items():
+        nominal = Robot.load(drawing)
+        robot = calibrated(nominal, random)
+        in_drawing = update_urdf(robot, nominal, drawing)
+        path = folder / f"{name}_drawing.xml"
+        path.write_text(urdf_to_mjcf(update_urdf(nominal, nominal, drawing))[0])
+        texts = {
+            "urdf": robot_to_urdf(robot),
+            "urdf of a drawing": in_drawing,
+            "mjcf": urdf_to_mjcf(in_drawing)[0],
+            "mjcf of a drawing": update_mjcf(robot, nominal, path),
+        }
+        files = {}
+        for kind, text in texts.items():
+            files[kind] = folder / f"{name} {kind}{'.xml' if kind.startswith('mjcf') else '.urdf'}"
+            files[kind].write_text(text)
+        low, high = np.clip(robot.limits, -3.0, 3.0).T
+        made.append((robot, files, random.uniform(low, high, (POSES, robot.dof))))
+    return made
+
+
 @pytest.mark.parametrize("peer", MODULES)
-@pytest.mark.parametrize("name", ["ur5e", "panda", "kiro3", "fanuc_r2000"])
-def test_peers_compute_the_same_tool_pose(peer, name, in_template, tmp_path, repository):
+def test_peers_compute_the_same_poses_and_jacobians(peer, repository, request):
     """They run in the interpreter of PISIGMA_PEERS, so that they need not be compatible with pisigma's packages."""
     python = os.environ.get("PISIGMA_PEERS", sys.executable)
     if subprocess.run([python, "-c", f"import {MODULES[peer]}"], capture_output=True, check=False).returncode:
         pytest.skip(f"{peer} is not installed for {python}; name a Python that has it in PISIGMA_PEERS")
-    nominal, file, random = Robot.load(name), tmp_path / "arm.urdf", np.random.default_rng(2)
-    if in_template:  # as many files are: links without masses, joints without effort and velocity
-        text = re.sub(r"(?s)<inertial>.*?</inertial>", "", robot_to_urdf(nominal))
-        file.write_text(text.replace('effort="1000" velocity="10"', 'effort="0" velocity="0"'))
-        nominal = Robot.load(file)
-    robot = nominal.with_geometry(
-        nominal.dh + random.normal(0, 1e-3, nominal.dh.shape),
-        random.normal(0, 0.5, 6),
-        random.normal(0, 0.2, 6),
-    )
-    low, high = np.clip(robot.limits, -3.0, 3.0).T
-    q = random.uniform(low, high, (100, robot.dof))
-    links = (CALIBRATED_FRAME, CALIBRATED_TOOL) if in_template else (BASE_LINK, TOOL_LINK)
-    file.write_text(update_urdf(robot, nominal, file) if in_template else robot_to_urdf(robot))
+    requests, expected = [], []
+    for robot, files, q in request.getfixturevalue("robots"):
+        T, J = joint_jacobian(robot, torch.from_numpy(q))
+        for kind in KINDS[peer]:
+            base, tool = (BASE_LINK, TOOL_LINK) if kind == "urdf" else (CALIBRATED_FRAME, CALIBRATED_TOOL)
+            requests.append({"file": str(files[kind]), "base": base, "tool": tool, "q": q.tolist()})
+            expected.append((T, J))
     script = Path(repository) / "benchmarks" / "urdf_peers.py"
     run = subprocess.run(
-        [python, str(script), peer, str(file), *links],
-        input=json.dumps(q.tolist()),
-        capture_output=True,
-        text=True,
-        check=False,
+        [python, str(script), peer], input=json.dumps(requests), capture_output=True, text=True, check=False
     )
     assert run.returncode == 0, run.stderr
-    assert_close(np.array(json.loads(run.stdout)), forward_kinematics(robot, torch.from_numpy(q)), atol=1e-9)
+    for answer, (T, J) in zip(json.loads(run.stdout), expected, strict=True):
+        assert_close(np.array(answer["poses"]), T, atol=1e-9)
+        assert_close(np.array(answer["jacobians"]), J, atol=1e-9)
+
+
+@pytest.mark.parametrize("in_drawing", [False, True])
+def test_a_model_in_pinocchio(in_drawing, tmp_path):
+    pinocchio = pytest.importorskip("pinocchio", reason="pinocchio is not installed (pip install pin)")
+    model, names = model_before(), (BASE_LINK, TOOL_LINK)
+    if in_drawing:
+        drawing = tmp_path / "arm.urdf"
+        drawing.write_text(robot_to_urdf(model.robot))
+        nominal, names = Robot.load(drawing), (CALIBRATED_FRAME, CALIBRATED_TOOL)
+        model = replace(model, robot=nominal, calibrated=calibrated(nominal, np.random.default_rng(0)))
+    made = pisigma.to_pinocchio(model)
+    data, q = made.createData(), torch.from_numpy(np.random.default_rng(1).uniform(-1, 1, (5, 6)))
+    base, tool = (made.getFrameId(name) for name in names)
+    for values, T in zip(q.numpy(), forward_kinematics(model.calibrated, q), strict=True):
+        pinocchio.framesForwardKinematics(made, data, values)
+        assert_close((data.oMf[base].inverse() * data.oMf[tool]).homogeneous, T, atol=1e-9)

@@ -11,6 +11,7 @@ from pisigma.files.output_file import check_output, write_atomically
 
 BUILT_IN = {
     "urdf": ("pisigma.deployment.export.urdf", "calibrated geometry"),
+    "mjcf": ("pisigma.deployment.export.mjcf", "the same as MJCF for MuJoCo"),
     "dh": ("pisigma.deployment.export.dh_table", "its DH + Hayati table with base and tool"),
     "offsets": (
         "pisigma.deployment.export.joint_offsets",

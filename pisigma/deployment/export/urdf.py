@@ -2,14 +2,17 @@
 
 import os
 import re
-from typing import Any
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pisigma.deployment.export.export_format import Exported, ExportFormat, ExportRequest, model_facts
 from pisigma.deployment.export.geometry import check_geometry, chosen_geometry
-from pisigma.files.errors import OutputError, Place, RobotError
+from pisigma.files.errors import OutputError, Place, RobotError, missing_extra
 from pisigma.files.model_files import DRAWING
+from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.robot.description import Robot
 from pisigma.robot.robot_fields import RobotFields
 from pisigma.robot.urdf_chain import Chain, origin_of, read_chain
@@ -28,6 +31,9 @@ from pisigma.robot.writing import (
     unused_name,
 )
 
+if TYPE_CHECKING:
+    from pisigma.model.inverse.corrected_ik import CorrectedIK
+
 _SOURCE = re.compile(re.escape(URDF_SOURCE) + r".+, from link '(?P<base>.*)' to link '(?P<tip>.*)'")
 CALIBRATED_FRAME = "calibrated_frame"
 CALIBRATED_TOOL = "calibrated_tool"
@@ -39,7 +45,8 @@ SAME = 1e-9
 """[m or rad] Largest difference of rows that count as those of the file."""
 
 
-def _check(request: ExportRequest) -> None:
+def check_tip(request: ExportRequest) -> None:
+    """Check that a tip is given only together with the file that it is a link of."""
     if request.tip is not None and request.like is None:
         raise OutputError(
             "names a link of the file given with --like",
@@ -47,6 +54,10 @@ def _check(request: ExportRequest) -> None:
             value=request.tip,
             remedy="give both options or none",
         )
+
+
+def _check(request: ExportRequest) -> None:
+    check_tip(request)
     check_geometry(request)
 
 
@@ -80,6 +91,35 @@ def updated_urdf_text(
         return None
     base, tip = source.group("base", "tip") if source else (None, None)
     return update_urdf(robot, nominal, like, request.tip or tip, comments, base)
+
+
+def to_pinocchio(model: "CalibratedModel | CorrectedIK") -> Any:
+    """Return the identified geometry as a `pinocchio.Model`, without the joint correction of a hybrid.
+
+    The pose of a model is that of its frame `calibrated_tool` in `calibrated_frame` if the robot was loaded from a URDF
+    file, whose masses, inertias and limits are kept, and of `tool0` in `base_link` otherwise; the joints are those of
+    the robot, in order. Pinocchio takes cosine and sine of joints without limits. See `update_urdf`.
+
+    Args:
+        model: the result of `pisigma.load` or of a calibration.
+
+    Raises:
+        MissingExtraError: pinocchio is not installed.
+        OutputError: URDF cannot express the robot.
+    """
+    try:
+        import pinocchio
+    except ImportError as problem:
+        raise missing_extra(problem) or problem from None
+    calibrated = model if isinstance(model, CalibratedModel) else model.model
+    chosen = chosen_geometry(calibrated, None)
+    with TemporaryDirectory() as folder:
+        if calibrated.robot.urdf:
+            Path(folder, DRAWING).write_bytes(calibrated.robot.urdf)
+        request = ExportRequest(Path(folder), Path(folder))
+        text = updated_urdf_text(request, chosen.robot, calibrated.robot, ())
+    text = text or robot_to_urdf(chosen.robot)
+    return pinocchio.buildModelFromXML(text, mimic="<mimic" in text)
 
 
 def _warnings(request: ExportRequest, nominal: Robot, text: str) -> tuple[str, ...]:

@@ -38,6 +38,7 @@ TEXT = """\
   <joint name="flange" type="fixed"><origin xyz="0 0.1 0"/><parent link="c"/><child link="tool0"/></joint>
   <joint name="eye" type="fixed"><origin xyz="0 0.2 0"/><parent link="a"/><child link="camera"/></joint>
   <gazebo reference="base"><mu1>0.2</mu1></gazebo>
+  <ros2_control name="arm" type="system"><joint name="one"><command_interface name="position"/></joint></ros2_control>
 </robot>
 """
 
@@ -71,15 +72,18 @@ def test_only_origins_change(path, tmp_path):
     assert_close(peer_poses(out, "calibrated_tool", q), forward_kinematics(robot, q), atol=1e-10)
     assert [joint.name for joint in again.joints] == ["one", "two", "three"]
     before, after = etree.fromstring(TEXT), etree.fromstring(out.read_text())
-    for tag in ("visual", "limit", "axis", "parent", "child", "gazebo"):
+    for tag in ("visual", "limit", "axis", "parent", "child", "gazebo", "ros2_control"):
         old = [etree.tostring(e, with_tail=False) for e in before.iter(tag)]
         new = [etree.tostring(e, with_tail=False) for e in after.iter(tag)]
         assert [b"".join(text.split()) for text in new[: len(old)]] == [
             b"".join(text.split()) for text in old
         ]
+    # An SRDF names links and joints, which are all still there.
+    for tag in ("link", "joint"):
+        assert {e.get("name") for e in before.iter(tag)} <= {e.get("name") for e in after.iter(tag)}
     moved = {
         joint.get("name")
-        for joint in before.iter("joint")
+        for joint in before.findall("joint")
         if etree.tostring(
             joint.find("origin") if joint.find("origin") is not None else joint, with_tail=False
         )
