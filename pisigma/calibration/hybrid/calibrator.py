@@ -81,7 +81,7 @@ class HybridCalibrator:
         features: names of the features to try, see `joint_correction.registry.FEATURES`.
         harmonics: numbers of harmonics of the Fourier series, tried in this order.
         products: whether to try product units, which need two joints; without them the correction is additive.
-        gravity: direction of gravity in the frame of the robot's base; None for the axis of the base with the highest
+        gravity: direction of gravity in the frame of the robot's base; None for the direction with the highest
             evidence.
     """
 

@@ -182,7 +182,7 @@ class HybridSection(Section):
         features: features of the unit of order 1 to try.
         harmonics: harmonics of the Fourier series to try, in this order.
         products: whether to try product units.
-        gravity: direction of gravity in the robot's base frame; null to choose the axis by evidence.
+        gravity: direction of gravity in the robot's base frame; null to find it by the evidence of the data.
     """
 
     features: tuple[str, ...] = HybridCalibrator.features

@@ -72,6 +72,14 @@ def test_the_axis_of_gravity_is_found(falling, turned, direction):
     assert gravity_of(robot, result) == pytest.approx(direction, abs=1e-9)
 
 
+def test_an_inclined_direction_is_found_within_five_degrees():
+    robot, falling = Robot.load("ur5"), np.array([0.6, 0.4, -math.sqrt(0.48)])
+    result = fit(robot, measured(robot, tuple(falling), 60, seed=0))
+    found = gravity_of(robot, result)
+    assert found is not None
+    assert np.degrees(np.arccos(falling @ found)) < 5
+
+
 def test_a_robot_on_a_wall_is_as_accurate_as_one_on_the_floor():
     robot = Robot.load("ur5")
     rows, others = (measured(robot, (1.0, 0.0, 0.0), 100, seed) for seed in (0, 1))
