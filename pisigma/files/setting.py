@@ -63,12 +63,12 @@ def as_texts(stated: Iterable[object]) -> tuple[str, ...]:
     return tuple(map(str, stated))
 
 
-def names(stated: str) -> tuple[str, ...]:
+def split_names(stated: str) -> tuple[str, ...]:
     """Split names that are separated by commas."""
     return tuple(name.strip() for name in stated.split(",")) if stated else ()
 
 
-NAMES = Option(kind=str, read=names)
+NAMES = Option(kind=str, read=split_names)
 """For settings that are several names."""
 
 

@@ -48,25 +48,25 @@ def checked_values(
     """
     from pydantic import TypeAdapter, ValidationError
 
-    def refused(key: str, value: Any, expected: str, **texts: str) -> SettingError:
+    def setting_error(key: str, value: Any, expected: str, **texts: str) -> SettingError:
         at = place_of(key)
         return SettingError(expected=expected, value=value, at=at, option="" if at else key, **texts)
 
     for key, value in stated.items():
         if key not in known:
             problem, remedy = f"unknown key '{key}'", nearest_choice(key, known)
-            raise refused(key, key, f"one of {', '.join(known)}", problem=problem, remedy=remedy)
+            raise setting_error(key, key, f"one of {', '.join(known)}", problem=problem, remedy=remedy)
         kind = known[key].kind
         single = _listed(value, kind)
         several = single if isinstance(single, list | tuple) else (single,)
         if kind is not bool and any(isinstance(one, bool) for one in several):  # pydantic reads true as 1
-            raise refused(key, single, _type_text(kind))
+            raise setting_error(key, single, _type_text(kind))
         try:
             converted = TypeAdapter(kind).validate_python(single)
         except ValidationError:
-            raise refused(key, single, _type_text(kind)) from None
+            raise setting_error(key, single, _type_text(kind)) from None
         if missed := _missed_bounds(known[key], converted):
-            raise refused(key, single, missed)
+            raise setting_error(key, single, missed)
         yield key, converted
 
 

@@ -70,7 +70,9 @@ def _learned(summary: CalibrationSummary) -> Iterator[Block]:
     if summary.hybrid is not None:
         yield sentences("joint correction", tables.learned_lines(summary.hybrid))
         yield table_block("joint corrections that were tried", *tables.trial_table(summary.hybrid), "trials")
-    if summary.judged is not None and (coverage := tables.coverage_line(summary.judged)):
+    if summary.validation_errors is not None and (
+        coverage := tables.coverage_line(summary.validation_errors)
+    ):
         yield sentences("predicted intervals", [coverage])
     if summary.learning_curve is not None:
         what = "errors of held-out rows by number of training rows"

@@ -67,7 +67,10 @@ def calibration_verdict(summary: CalibrationSummary, folder: Path | None, warnin
 
 
 def _accuracy(summary: CalibrationSummary) -> str:
-    figures, implausible = summary.judged, any(one.severity == "implausible" for one in summary.diagnostics)
+    figures, implausible = (
+        summary.validation_errors,
+        any(one.severity == "implausible" for one in summary.diagnostics),
+    )
     if figures is None and summary.predicted_rms_mm is not None and not implausible:
         return (
             f"{rounded(summary.predicted_rms_mm, 0)} mm RMS at other poses, because the calibration's own uncertainty "
@@ -88,7 +91,7 @@ def _trust(summary: CalibrationSummary, warnings: int) -> str:
     implausible = [one for one in summary.diagnostics if one.severity == "implausible"]
     if implausible:
         return f"no: {implausible[0].sentence}"
-    judged = summary.judged
+    judged = summary.validation_errors
     if judged is None:
         return "not known: no row was held out, so nothing judged the calibration."
     share = judged.coverage
@@ -110,7 +113,7 @@ def _next_step(summary: CalibrationSummary, folder: Path | None, warnings: int) 
     if folder is None or any(one.severity == "implausible" for one in summary.diagnostics):
         unwritten = "; no model was written" if folder is None else ""
         return f"correct what is named above and calibrate again{unwritten}."
-    if summary.judged is None:
+    if summary.validation_errors is None:
         return "measure more poses and calibrate again, or start from the prior of a fleet (--prior)."
     first = "follow the warnings, then verify" if warnings else "verify"
     return f"{first} with other poses: `pisigma verify {folder} ROWS.csv`."
@@ -118,7 +121,7 @@ def _next_step(summary: CalibrationSummary, folder: Path | None, warnings: int) 
 
 def scale_matters(summary: CalibrationSummary, odds: float = LIKELY_SCALE) -> bool:
     """Return whether a wrong scale of the sensor has at least these odds and causes an error that matters."""
-    scale, judged = summary.scale, summary.judged
+    scale, judged = summary.scale, summary.validation_errors
     if scale is None or judged is None or scale.odds < odds:
         return False
     *_, best = judged.models.values()

@@ -130,12 +130,12 @@ class Workbench(UploadedRows):
                 self.jobs.version += found != before
             return found
 
-    @answers
+    @with_error_answers
     async def _page(self, request: web.Request) -> web.StreamResponse:
         text = await asyncio.to_thread(lambda: self._tabs.page(self.folder, self._cell()))
         return web.Response(text=text, content_type="text/html")
 
-    @answers
+    @with_error_answers
     async def _tab(self, request: web.Request) -> web.StreamResponse:
         name = request.match_info["name"]
 
@@ -149,7 +149,7 @@ class Workbench(UploadedRows):
         text = await asyncio.to_thread(tab)
         return web.Response(text=text, content_type="text/html")
 
-    @answers
+    @with_error_answers
     async def _state(self, request: web.Request) -> web.StreamResponse:
         status, job = await asyncio.to_thread(self.status), self.jobs.running
         running = job and {
@@ -176,7 +176,7 @@ class Workbench(UploadedRows):
         text = resources.files(package).joinpath(folder, name).read_text(encoding="utf-8")
         return web.Response(text=text, content_type=kind)
 
-    @answers
+    @with_error_answers
     async def _download(self, request: web.Request) -> web.StreamResponse:
         kind, names = request.match_info["kind"], tuple(request.match_info["tail"].split("/"))
         path = await asyncio.to_thread(lambda: download_of(Cell.open(self.folder), kind, names))
@@ -196,7 +196,7 @@ class Workbench(UploadedRows):
         self.jobs.stop(person_of(request), (await form_of(request)).get("ended", ""))
         return web.json_response({})
 
-    @answers
+    @with_error_answers
     async def _step(self, request: web.Request) -> web.StreamResponse:
         name, form = request.match_info["name"], await form_of(request)
         if name not in (*STEPS, "new"):

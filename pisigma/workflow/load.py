@@ -42,18 +42,18 @@ class CellIK(CorrectedIK):
         self._loaded = load_folder(folder)
 
     @property
-    def present(self) -> CorrectedIK:
+    def current(self) -> CorrectedIK:
         """Corrected inverse kinematics of the model in use.
 
         Raises:
             ModelError: the model must not be used with what is active on the controller.
         """
-        self._in_use.findings.accepted(self._in_use.cell)
+        self._in_use.findings.checked_warnings(self._in_use.cell)
         return self._loaded
 
     def __call__(self, *arguments: Any, **options: Any) -> Solution:
         """See `CorrectedIK.__call__`."""
-        return self.present(*arguments, **options)
+        return self.current(*arguments, **options)
 
     @property
     def warnings(self) -> tuple[str, ...]:  # type: ignore[override]
@@ -62,8 +62,8 @@ class CellIK(CorrectedIK):
 
     def __getattribute__(self, name: str) -> Any:
         """Return the attributes that this class does not have from the model in use."""
-        of_self = name in ("present", "warnings", "_in_use", "_load", "_loaded") or name.startswith("__")
-        return object.__getattribute__(self, name) if of_self else getattr(self.present, name)
+        of_self = name in ("current", "warnings", "_in_use", "_load", "_loaded") or name.startswith("__")
+        return object.__getattribute__(self, name) if of_self else getattr(self.current, name)
 
 
 def load(folder: str | os.PathLike[str], pin: bool = False) -> CorrectedIK:

@@ -211,7 +211,7 @@ def plan(
         stored,
         candidates,
         points,
-        problem.needed(chosen, points),
+        problem.poses_needed(chosen, points),
         remaining_errors(posterior.after_measuring(candidates.q[chosen]), task),
         way.seconds,
         (
@@ -302,7 +302,9 @@ class _Problem:
         first, count = 0 if self.has_measurements else STEP, len(chosen)
         return self._curve(chosen, [*range(first, count, STEP), count])
 
-    def needed(self, chosen: Int64[Tensor, " chosen"], points: Sequence[ExpectedAccuracy]) -> int | None:
+    def poses_needed(
+        self, chosen: Int64[Tensor, " chosen"], points: Sequence[ExpectedAccuracy]
+    ) -> int | None:
         """Return the smallest number of the chosen poses with which the limit is expected to be reached."""
         limit = (self.settings.limit_mm or 0.0) / 1e3  # without a limit, 0 m, which is never reached
         reached = next((index for index, point in enumerate(points) if point.p95 <= limit), None)

@@ -16,7 +16,7 @@ from pisigma.model.folder.model_folder import save_model
 from pisigma.planning.plan_settings import PlanSettings
 from pisigma.robot import Robot
 from pisigma.workflow.calibrate import calibrate
-from pisigma.workflow.cell.advance import advance
+from pisigma.workflow.cell.advance import advance_cell
 from pisigma.workflow.cell.cell import Cell
 from pisigma.workflow.cell.new_cell import NewCell, cell_from_model
 from pisigma.workflow.compare import compare
@@ -103,7 +103,7 @@ def _advance(rows: Measurements, folder: Path) -> Answer:
     cell_from_model(model_folder(folder), NewCell("")).write(folder / "cell")
     rows.write_csv(folder / "cell" / "sessions" / "s1.csv", Robot.load(ROBOT))
     try:
-        step = advance(Cell.open(folder / "cell")).step
+        step = advance_cell(Cell.open(folder / "cell")).step
     except AcceptanceError as refusal:
         return Answer(3, str(refusal))
     return _of(step.state not in ATTENTION, step.reason)

@@ -5,7 +5,7 @@ from testing.models import no_type_checker
 
 from pisigma.files.errors import PisigmaError
 from pisigma.lifetime.cell.layout import cells_in
-from pisigma.workflow.cell.advance import advance
+from pisigma.workflow.cell.advance import advance_cell
 from pisigma.workflow.cell.cell import Cell
 
 
@@ -14,7 +14,7 @@ def test_every_bad_file_is_named_with_its_reason(tmp_path):
     with no_type_checker():
         for folder in cells_in(tmp_path / "cells"):
             try:
-                advance(Cell.open(folder))
+                advance_cell(Cell.open(folder))
             except PisigmaError as problem:
                 refused[folder.name] = str(problem)
     assert not faults_of(refused)

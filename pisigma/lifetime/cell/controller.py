@@ -214,7 +214,7 @@ class Findings:
     refusal: str
     warnings: tuple[str, ...]
 
-    def accepted(self, cell: Path) -> tuple[str, ...]:
+    def checked_warnings(self, cell: Path) -> tuple[str, ...]:
         """Return the warnings.
 
         Raises:
@@ -277,7 +277,7 @@ def model_in_use_warnings(path: Path, command: str) -> tuple[str, ...]:
     if not is_cell(path):
         return ()
     history = History(path / HISTORY)
-    return findings(history, command, history.in_use).accepted(path)
+    return findings(history, command, history.in_use).checked_warnings(path)
 
 
 def record_controller(history: History, sha256: str, day: str, note: str) -> ControllerEntry:

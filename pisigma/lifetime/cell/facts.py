@@ -49,7 +49,7 @@ class CellFacts:
         today: day (ISO 8601).
         not_taken_in: names of the files in `sessions/` that are not in the history yet, by their dates.
         not_read: names of the files in `sessions/` that are not measurement files and were not imported.
-        plans_nothing: why no poses can be planned; "" if they can.
+        no_plan_reason: why no poses can be planned; "" if they can.
         settings_sha256: SHA-256 of the present settings of a calibration; see `Check`.
         changed_models: those of the model in use and the newest one that were changed or removed after they were made.
         incomplete: how many poses of the newest plan have been measured, if they are too few; else "".
@@ -68,7 +68,7 @@ class CellFacts:
     today: str
     not_taken_in: tuple[str, ...] = ()
     not_read: tuple[str, ...] = ()
-    plans_nothing: str = ""
+    no_plan_reason: str = ""
     settings_sha256: str = ""
     changed_models: tuple[str, ...] = ()
     incomplete: str = ""
@@ -158,7 +158,7 @@ class _Stated(BaseModel):
         hashes = [sha256_of(folder / name) for name in names]
         return hashlib.sha256(json.dumps([stated, hashes], sort_keys=True, default=str).encode()).hexdigest()
 
-    def plans_nothing(self, model: ModelEntry | None) -> str:
+    def no_plan_reason(self, model: ModelEntry | None) -> str:
         """Return why no poses can be planned; "" if they can.
 
         Args:
@@ -210,9 +210,9 @@ def _facts(folder: Path, history: History) -> CellFacts:
         in_use=in_use,
         limit_mm=stated.limit_mm,
         today=datetime.date.today().isoformat(),
-        not_taken_in=not_taken_in(folder / SESSIONS, sessions),
+        not_taken_in=unrecorded_files(folder / SESSIONS, sessions),
         not_read=foreign_files(folder / SESSIONS, sessions),
-        plans_nothing=stated.plans_nothing(in_use),
+        no_plan_reason=stated.no_plan_reason(in_use),
         settings_sha256=stated.settings_hash(folder),
         changed_models=tuple(
             name for name, sha256 in checked.items() if not is_unchanged(folder / MODELS / name, sha256)
@@ -243,7 +243,7 @@ def sha256_of(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
 
 
-def not_taken_in(folder: Path, sessions: Sequence[SessionEntry]) -> tuple[str, ...]:
+def unrecorded_files(folder: Path, sessions: Sequence[SessionEntry]) -> tuple[str, ...]:
     """Return the names of the files in the folder of sessions that are not in the history yet, by their dates."""
     names = {one.name for one in sessions}
     found = [path.name for path in folder.glob("*.csv") if path.stem not in names]

@@ -49,7 +49,7 @@ class ModelInUse:
         self._seen: tuple[int, int, int] | None = None  # the first look reads the history again
         self.folder = model_folder(cell)
         self.findings = self._find()
-        self.findings.accepted(cell)
+        self.findings.checked_warnings(cell)
         load(self.folder)
 
     def check(self, always: bool = False) -> None:

@@ -110,8 +110,8 @@ def next_step(facts: CellFacts) -> Step:
         return step
     if facts.unmeasured_plan:
         return _to_measure(facts, facts.unmeasured_plan)
-    if facts.plans_nothing:
-        reason = f"{step.reason}; {facts.plans_nothing}, so measure poses that you choose and import them"
+    if facts.no_plan_reason:
+        reason = f"{step.reason}; {facts.no_plan_reason}, so measure poses that you choose and import them"
         return replace(step, reason=reason, command=facts.import_command())
     return step
 

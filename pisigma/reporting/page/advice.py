@@ -94,7 +94,7 @@ def _more_rows(model: CalibratedModel, summary: CalibrationSummary, limit: Accur
 
 
 def _trust(summary: CalibrationSummary) -> tuple[str, ...]:
-    coverage = None if summary.judged is None else summary.judged.coverage
+    coverage = None if summary.validation_errors is None else summary.validation_errors.coverage
     return () if coverage is None or abs(coverage - 0.95) < COVERAGE_TOLERANCE else say("trust", coverage)
 
 

@@ -299,7 +299,7 @@ def _learned(summary: CalibrationSummary | None) -> tuple[str, ...]:
     if summary is None:
         return ()
     lines = learned_lines(summary.hybrid) if summary.hybrid is not None else []
-    coverage = "" if summary.judged is None else coverage_line(summary.judged)
+    coverage = "" if summary.validation_errors is None else coverage_line(summary.validation_errors)
     return (*lines, *([coverage] if coverage else []))
 
 

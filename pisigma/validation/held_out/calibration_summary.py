@@ -261,7 +261,7 @@ class CalibrationSummary(AbstractSummary):
     paper: dict[str, JsonValue] | None = None
 
     @property
-    def judged(self) -> ValidationFigures | None:
+    def validation_errors(self) -> ValidationFigures | None:
         """Errors of held-out rows: of the cross-validation, else of simulated rows, else of the test set."""
         return self.cross_validation or self.held_out or self.test
 

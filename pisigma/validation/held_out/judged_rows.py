@@ -152,7 +152,7 @@ def rows_of_folder(model: CalibratedModel, held_out: HeldOutRows) -> JudgedRows:
     return replace(judged, repeats=_repeats(model))
 
 
-def place_of(model: CalibratedModel, q: Float64[Tensor, "rows dof"]) -> Float64[Tensor, "rows 3"]:
+def tool_positions(model: CalibratedModel, q: Float64[Tensor, "rows dof"]) -> Float64[Tensor, "rows 3"]:
     """Compute the position of the tool in the robot's base frame [m]."""
     T = model.forward(q)
     T = torch.where(torch.isfinite(T), T, forward_kinematics(model.robot, q))
@@ -187,7 +187,7 @@ def _judged(
     return JudgedRows(
         origin=origins[0],
         measurements=replace(rows, source=rows.file_names),
-        place=place_of(model, rows.q),
+        place=tool_positions(model, rows.q),
         models=models,
         residual=residual,
         residual_origin=origins[1],

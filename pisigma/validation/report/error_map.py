@@ -12,7 +12,7 @@ from torch import Tensor
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.robot.kinematics.forward import forward_kinematics
-from pisigma.validation.held_out.judged_rows import JudgedRows, is_inside_range, place_of, predicted_at
+from pisigma.validation.held_out.judged_rows import JudgedRows, is_inside_range, predicted_at, tool_positions
 
 MAX_POINTS = 20_000
 """Points of a map; of more rows the largest errors and an even selection of the others are shown."""
@@ -145,7 +145,7 @@ def _map(
 ) -> ErrorMap:
     factor = [math.degrees(1.0) if revolute else 1e3 for revolute in model.robot.revolute]
     return ErrorMap(
-        place_of(model, points.q).numpy() * 1e3,
+        tool_positions(model, points.q).numpy() * 1e3,
         tuple(layers),
         number.numpy(),
         points.q.numpy() * factor,

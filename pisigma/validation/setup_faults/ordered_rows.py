@@ -54,7 +54,7 @@ class OrderedRows:
     noise: Float64[np.ndarray, " values"]
 
     @cached_property
-    def content(self) -> bytes:
+    def content_hash(self) -> bytes:
         """SHA-256 of everything that a search depends on, which identifies its last result.
 
         The same rows are calibrated with when they are added to a cell, and again for its model.
@@ -77,11 +77,11 @@ class OrderedRows:
 
     def __eq__(self, other: object) -> bool:
         """Whether a search in both has the same result."""
-        return isinstance(other, OrderedRows) and self.content == other.content
+        return isinstance(other, OrderedRows) and self.content_hash == other.content_hash
 
     def __hash__(self) -> int:
         """Return the hash of the content."""
-        return hash(self.content)
+        return hash(self.content_hash)
 
     @staticmethod
     def from_result(result: CalibrationResult | HybridResult) -> "OrderedRows | None":

@@ -10,7 +10,7 @@ from pisigma.lifetime.cell.status import CellStatus, next_step, status_of
 from pisigma.workflow.cell.cell import Cell
 
 
-def advance(cell: Cell, prior: Path | None = None, progress: Progress = lambda what: None) -> CellStatus:
+def advance_cell(cell: Cell, prior: Path | None = None, progress: Progress = lambda what: None) -> CellStatus:
     """Calibrate, verify, monitor and recalibrate a cell as its status says, for every new session in turn.
 
     New files in `sessions/` are added one by one in the order of their dates, each after all steps that the earlier

@@ -370,7 +370,7 @@ class Cell:
 
     def controller_warnings(self, command: str, model: ModelEntry | None) -> tuple[str, ...]:
         """Return warnings because of what is active on the controller; raise a ModelError if a rule refuses it."""
-        return findings(self.history, command, model).accepted(self.folder)
+        return findings(self.history, command, model).checked_warnings(self.folder)
 
     def _saved(self, result: Calibration | Recalibration, accept_implausible: bool) -> Path:
         """Save a model under a name that no model of the cell has had; return its folder."""

@@ -176,7 +176,7 @@ def calibrate_rows(
     """
     if prior is None:
         result = calibrate(robot, rows, replace(settings, cameras=None), progress)
-        return replace(result, figures=result.summary.judged is not None)
+        return replace(result, figures=result.summary.validation_errors is not None)
     settings.check_unused()
     return recalibrate(prior, rows, RecalibrationSettings(), progress, robot)
 
@@ -189,7 +189,7 @@ def errors_of(result: Calibration | Recalibration) -> tuple[float | None, float 
     if isinstance(result, Recalibration):
         p95 = result.gate.p95.get(result.gate.kept)
         return None if p95 is None else p95 * 1e3, result.summary.cross_validation[result.summary.kept].rms_mm
-    judged, fitted = result.summary.judged, result.summary.calibrated
+    judged, fitted = result.summary.validation_errors, result.summary.calibrated
     if judged is not None:
         errors = list(judged.models.values())[-1]
         return errors.p95_mm, errors.rms_mm

@@ -16,7 +16,7 @@ from pisigma.files.errors import AcceptanceError, MeasurementError, PisigmaError
 from pisigma.files.model_files import is_unchanged
 from pisigma.lifetime.cell.controller import Controller
 from pisigma.lifetime.cell.events import Event
-from pisigma.lifetime.cell.facts import facts_of, foreign_files, not_taken_in, sha256_of
+from pisigma.lifetime.cell.facts import facts_of, foreign_files, sha256_of, unrecorded_files
 from pisigma.lifetime.cell.history import Check, History, ModelEntry, SessionEntry, now
 from pisigma.lifetime.cell.layout import MODELS, SESSIONS
 from pisigma.lifetime.cell.status import FOREIGN
@@ -109,7 +109,7 @@ class Sessions:
         Raises:
             PisigmaError: the rows cannot be used; the history records the reason.
         """
-        waiting = not_taken_in(self.folder, self.history.sessions())
+        waiting = unrecorded_files(self.folder, self.history.sessions())
         if not waiting:
             return False
         try:
@@ -162,7 +162,9 @@ class Sessions:
         _check_new(rows, again)
         model, fitted, controller = self.history.in_use, False, Controller.from_history(self.history)
         at = controller.active(day, now())
-        found = controller.findings("import", model, self.history.sessions(), at).accepted(self.folder.parent)
+        found = controller.findings("import", model, self.history.sessions(), at).checked_warnings(
+            self.folder.parent
+        )
         if model is None or found or not is_unchanged(self._folder_of(model), model.sha256):
             model, verdict = (
                 None,
@@ -212,7 +214,7 @@ class Sessions:
         """
         sessions = {one.name: one for one in self.history.sessions()}
         known = tuple(sessions.values())
-        for file in (*not_taken_in(self.folder, known), *foreign_files(self.folder, known)):
+        for file in (*unrecorded_files(self.folder, known), *foreign_files(self.folder, known)):
             name, day = file.removesuffix(".csv"), date_in_name(file) or datetime.date.today().isoformat()
             sessions[name] = SessionEntry(
                 name, sha256_of(self.folder / file), now(), day, 0, "", judged_by=""

@@ -77,7 +77,7 @@ def run_fleet(
 ) -> FleetRun:
     """Advance all cells in a folder: calibrate, verify, monitor and recalibrate as the status of each requires.
 
-    See `pisigma.workflow.cell.advance.advance`. A cell with bad rows is reported and does not stop the others. The
+    See `pisigma.workflow.cell.advance.advance_cell`. A cell with bad rows is reported and does not stop the others. The
     contents of a cell are always complete, so a later call continues after an interruption; a cell whose status names
     no step is not opened.
 
@@ -142,7 +142,7 @@ def _advance(folder: Path, prior: Path | None) -> tuple[str, dict[str, list[Para
 
     reason = ""
     try:
-        step = advance(Cell.open(folder), prior).step
+        step = advance_cell(Cell.open(folder), prior).step
         reason = step.reason if step.state in ATTENTION else ""
     except Exception as problem:  # one cell must not stop the others; a later call tries it again
         known = isinstance(problem, PisigmaError | OSError | MemoryError)

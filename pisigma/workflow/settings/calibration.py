@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated, Literal, get_args
 
 from pisigma.files.errors import IdentificationError, MeasurementError, check_choice
-from pisigma.files.setting import KEY, NAMES, Option, names
+from pisigma.files.setting import KEY, NAMES, Option, split_names
 from pisigma.measurement.camera.camera_files import CameraFiles
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ def parse_free_parameters(stated: str) -> str | tuple[str, ...]:
         raise IdentificationError(
             expected="identifiable, joint_offsets or names of parameters", value=stated, option="free"
         )
-    return stated if stated in ("identifiable", "joint_offsets") else names(stated)
+    return stated if stated in ("identifiable", "joint_offsets") else split_names(stated)
 
 
 def parse_direction(stated: str) -> tuple[float, ...]:

@@ -5,7 +5,7 @@ from operator import not_
 from typing import Annotated
 
 from pisigma.files.errors import IdentificationError, MeasurementError
-from pisigma.files.setting import Option, names
+from pisigma.files.setting import Option, split_names
 from pisigma.measurement.camera.camera_files import CameraFiles
 from pisigma.measurement.dates import EXPECTED_DATE, is_date
 from pisigma.workflow.settings.recalibration import Moved, RecalibrationSettings
@@ -29,7 +29,7 @@ class MonitorSettings:
         MeasurementError: a date is not valid.
     """
 
-    dates: Annotated[tuple[str, ...], Option(kind=str, read=names, metavar="DAY,...")] = ()
+    dates: Annotated[tuple[str, ...], Option(kind=str, read=split_names, metavar="DAY,...")] = ()
     moved: Moved = None
     limit_mm: float | None = None
     history: Annotated[bool, Option("--no-history", kind=bool, read=not_)] = True

@@ -125,7 +125,7 @@ def test_every_state_is_a_case():
 
 @pytest.mark.parametrize("state", ["no_plan", "verification_due", "outside_limit"])
 def test_poses_are_measured_without_a_plan_where_none_can_be_made(state):
-    step = next_step(replace(CASES[state][0], plans_nothing="no board"))
+    step = next_step(replace(CASES[state][0], no_plan_reason="no board"))
     assert step.state == state
     assert step.command.split()[:2] == ["pisigma", "import"]
 

@@ -6,7 +6,7 @@ from testing.models import no_type_checker
 from testing.refusals import refused
 
 from pisigma.files.errors import MeasurementError
-from pisigma.workflow.cell.advance import advance
+from pisigma.workflow.cell.advance import advance_cell
 from pisigma.workflow.cell.cell import Cell
 
 
@@ -20,7 +20,7 @@ def cell(tmp_path_factory, blank_pictures):
         measured(rows, ago, zero=zero).write_csv(folder / "sessions" / f"{day(ago)}.csv", ROBOT)
     assert made.status().step.state == "not_taken_in"
     with no_type_checker():
-        status = advance(Cell.open(folder))
+        status = advance_cell(Cell.open(folder))
     assert status.step.state == "up_to_date"
     return Cell.open(folder)
 
@@ -38,7 +38,7 @@ def test_sessions_are_compared_in_the_order_of_their_dates(cell):
 
 def test_nothing_is_done_again(cell):
     before = cell.history.checks()
-    assert advance(cell).step.state == "up_to_date"
+    assert advance_cell(cell).step.state == "up_to_date"
     assert cell.history.checks() == before
 
 
@@ -47,7 +47,7 @@ def test_a_file_that_cannot_be_used_is_named_until_it_is_corrected(cell):
     path.write_text("q1_deg\nx\n")
     for _ in range(2):
         with refused(MeasurementError, file=path.name):
-            advance(cell)
+            advance_cell(cell)
     assert cell.status().step.state == "file_refused"
     assert [one.session for one in cell.history.checks() if one.command == "import"] == [day(0)]
     path.unlink()

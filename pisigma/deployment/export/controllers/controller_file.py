@@ -21,7 +21,7 @@ _NUMBER = r"-?\d+(?:\.\d+)?(?:e[-+]?\d+)?"
 
 
 @dataclass(frozen=True)
-class FileText:
+class FileContent:
     """Data from which the text of a file is written.
 
     Attributes:
@@ -110,7 +110,7 @@ class ControllerFile:
     suffixes: tuple[str, ...]
     source: str
     relies: tuple[str, ...]
-    text: Callable[[FileText], str]
+    text: Callable[[FileContent], str]
     read: Callable[[str, str, Robot], Robot] | None
     check: Callable[[Robot], None]
     convention: Callable[[Robot], Convention] = Convention
@@ -144,7 +144,7 @@ class ControllerFile:
         whole = len(parameters) == nominal.dh.size
         start = model.calibrated if whole and model.calibrated is not None else nominal
         fit = approximate_model(model, start, parameters)
-        draft, held = FileText(fit.robot, nominal, request), fit.robot
+        draft, held = FileContent(fit.robot, nominal, request), fit.robot
         if self.read is not None:
             held = self.read(self.text(draft), str(request.out), nominal)
         lost, of_nominal = fit.deviation_of(held), fit.deviation_of(nominal)

@@ -8,7 +8,7 @@ from jaxtyping import Float64, Int64
 from pisigma.deployment.export.approximation import joint_offsets
 from pisigma.deployment.export.controllers.controller_file import (
     ControllerFile,
-    FileText,
+    FileContent,
     untested_on_controller,
 )
 from pisigma.deployment.export.controllers.offset_table import read_offsets
@@ -51,7 +51,7 @@ def _unit(robot: Robot) -> Float64[np.ndarray, " axes"]:
     return np.where([axis.type == "revolute" for axis in robot.axes], 2 * np.pi, 1e-3)
 
 
-def write_counts(content: FileText) -> str:
+def write_counts(content: FileContent) -> str:
     """Write one line per joint with its counts and the offset of the rounded counts, then base and tool."""
     nominal, robot, request = content.nominal, content.robot, content.request
     per_turn = _numbers(request.counts_per_turn, "counts-per-turn", nominal)

@@ -6,7 +6,7 @@ import numpy as np
 
 from pisigma.deployment.export.controllers.controller_file import (
     ControllerFile,
-    FileText,
+    FileContent,
     check_plain_joints,
     frame_sentences,
     untested_on_controller,
@@ -24,7 +24,7 @@ ATTRIBUTES = ("theta", "d", "a", "b", "alpha", "beta")
 _FACTORS = np.array([np.pi / 180 if name in ("theta", "alpha", "beta") else 1e-3 for name in DH_COLUMNS])
 
 
-def write_arm(content: FileText) -> str:
+def write_arm(content: FileContent) -> str:
     """Write the element `dhOffset`, inside the controller's file if one is given."""
     from lxml import etree
 

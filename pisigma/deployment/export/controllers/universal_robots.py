@@ -7,7 +7,7 @@ import numpy as np
 
 from pisigma.deployment.export.controllers.controller_file import (
     ControllerFile,
-    FileText,
+    FileContent,
     frame_sentences,
     untested_on_controller,
     with_frames,
@@ -61,7 +61,7 @@ def without_beta(origins: list[Frame], own: Robot) -> Robot:
     return plain.with_geometry(dh=dh)
 
 
-def write_calibration(content: FileText) -> str:
+def write_calibration(content: FileContent) -> str:
     """Write `calibration.conf`, keeping the other lines of the controller's file if one is given."""
     own = controller_geometry(content.nominal)
     robot = without_beta(*own.origins(content.robot))

@@ -5,7 +5,7 @@ from pydantic import Field
 
 from pisigma.deployment.export.controllers.controller_file import (
     ControllerFile,
-    FileText,
+    FileContent,
     frame_sentences,
     untested_on_controller,
     with_frames,
@@ -82,7 +82,7 @@ ORDER = "Rotations are RotZ(yaw) RotY(pitch) RotX(roll), as URDF reads them."
 """Sentence by which files of pisigma are recognised."""
 
 
-def write_kinematics(content: FileText) -> str:
+def write_kinematics(content: FileContent) -> str:
     """Write the file; the frame after the last joint is part of the tool in the comments."""
     origins, own = controller_geometry(content.nominal).origins(content.robot)
     links: dict[str, object] = {

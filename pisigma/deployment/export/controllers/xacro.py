@@ -2,7 +2,7 @@
 
 import re
 
-from pisigma.deployment.export.controllers.controller_file import ControllerFile, FileText
+from pisigma.deployment.export.controllers.controller_file import ControllerFile, FileContent
 from pisigma.deployment.export.urdf import updated_urdf_text
 from pisigma.files.errors import OutputError
 from pisigma.robot.urdf_file import XACRO
@@ -28,7 +28,7 @@ def urdf_to_xacro(urdf: str) -> str:
     return f'<?xml version="1.0"?>\n{etree.tostring(top, encoding="unicode")}\n'
 
 
-def write_xacro(content: FileText) -> str:
+def write_xacro(content: FileContent) -> str:
     """Write the xacro file from the URDF file that the nominal robot was loaded from.
 
     Raises:

@@ -105,7 +105,7 @@ class _Reader:
             index = re.match(r"P\[(\d+)", name)
             match = self.positions.get(index[1]) if index else None
             if match is not None and re.search(r"\bJ1\s*=", match["body"]):
-                self.scan.joints(line.start())
+                self.scan.add_joint_move(line.start())
                 continue
             pose: Pose | str = COMPUTED
             frame: Frame | str = ""
@@ -125,7 +125,7 @@ class _Reader:
                     line.start(), "arcs of A have no waypoints, only their poses are corrected"
                 )
             cut = partial(self._waypoints, line, move, match, len(names)) if cuttable and match else None
-            self.scan.move(line.start(), pose, frame, tool, cut, circular)
+            self.scan.add_move(line.start(), pose, frame, tool, cut, circular)
 
     def _stated(self, kind: str, index: str, position: int) -> Frame | str:
         """Return a stated frame or tool, unless the program, or a routine that it has called, may set it."""

@@ -97,11 +97,11 @@ def scan_krl_data(text: str, stated: FrameFile) -> ScannedProgram:
         literal, data = _AGGREGATE.match(visible, match.end()), frames.get(match[1].upper())
         if data is None or literal is None or data[4].upper() != "BASE":
             reason = f"no FDAT F{match[1]} with IPO_FRAME #BASE states the frame and the tool of the point"
-            scan.move(match.start(), reason, IDENTITY, IDENTITY)
+            scan.add_move(match.start(), reason, IDENTITY, IDENTITY)
             continue
         tool = IDENTITY if data[2] == "0" else stated.tool(f"TOOL_DATA[{data[2]}]")
         frame = IDENTITY if data[3] == "0" else stated.frame(f"BASE_DATA[{data[3]}]")
-        scan.move(match.start(), _target_pose(literal, in_use), frame, tool)
+        scan.add_move(match.start(), _target_pose(literal, in_use), frame, tool)
     return scan.program()
 
 
@@ -169,7 +169,7 @@ class _Reader:
         operands = []
         for begin, _ in spans[: 2 if kind.endswith("CIRC") else 1]:
             if _AXES.match(self.text, begin):
-                self.scan.joints(match.start())
+                self.scan.add_joint_move(match.start())
                 continue
             pose = self._target(begin) if not match["relative"] else COMPUTED
             operands.append(begin)
@@ -179,7 +179,7 @@ class _Reader:
                     self.scan.leave_unchanged(match.start(), STATED_ARC)
                 else:
                     cut = partial(self._waypoints, match, operands)
-            self.scan.move(match.start(), pose, *self._frames(match["target"]), cut, circular)
+            self.scan.add_move(match.start(), pose, *self._frames(match["target"]), cut, circular)
 
     def _frames(self, target: str) -> tuple[Frame | str, Frame | str]:
         """Return frame and tool of a move, which it may state itself after WITH."""

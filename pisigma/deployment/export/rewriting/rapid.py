@@ -123,7 +123,7 @@ class _Reader:
             if match["flow"]:
                 self.scan.mark_unknown_start()
             elif match["move"].upper() == "MOVEABSJ":
-                self.scan.joints(match.start())
+                self.scan.add_joint_move(match.start())
             else:
                 self._move(match)
         return self.scan.program(self.names)
@@ -160,7 +160,7 @@ class _Reader:
         kind = re.match(r"Move([JLC])", match["move"], re.IGNORECASE)
         count = 2 if kind and kind[1].upper() == "C" else 1
         if kind is None or len(spans) < count + 3:
-            self.scan.move(match.start(), "this kind of move is not understood", IDENTITY, IDENTITY)
+            self.scan.add_move(match.start(), "this kind of move is not understood", IDENTITY, IDENTITY)
             return
         frame, tool = self._frames(self.text[slice(*spans[count + 2])])
         if displaced := _DISPLACED.search(self.text):
@@ -181,7 +181,7 @@ class _Reader:
                     )
                 else:
                     cut = partial(self._waypoints, match, spans, count, pose)
-            self.scan.move(match.start(), pose, frame, tool, cut, circular)
+            self.scan.add_move(match.start(), pose, frame, tool, cut, circular)
 
     def _target(self, expression: str, span: tuple[int, int]) -> Pose | str:
         if literal := _TARGET.match(self.text, span[0]):

@@ -179,7 +179,7 @@ class Scan:
         """Record that the next statement may be reached from elsewhere, so the start of the next move is unknown."""
         self._last_two = (None, None)
 
-    def joints(self, position: int) -> None:
+    def add_joint_move(self, position: int) -> None:
         """Record a move to joint values, which is not changed."""
         self._joint_lines.append(self.line_number(position))
         self._last_two = (None, None)
@@ -188,7 +188,7 @@ class Scan:
         """Record that a pose is used in a way that is not understood, so it is not changed."""
         self._unclear.add(pose.span)
 
-    def move(
+    def add_move(
         self,
         position: int,
         pose: Pose | str,

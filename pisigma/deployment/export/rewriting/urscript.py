@@ -100,14 +100,16 @@ class _Reader:
         operands = []
         for span in spans[: 2 if circular else 1]:
             if self.text[span[0]] == "[":
-                self.scan.joints(call.start())
+                self.scan.add_joint_move(call.start())
                 continue
             pose, frame, operand = self._target(span)
             operands.append(operand)
             cut = None
             if call["name"] in ("movel", "movep") or len(operands) == 2:
                 cut = self._cut(call, spans, operands, pose)
-            self.scan.move(call.start(), pose, frame, self.frames[_TOOL], cut, circular=len(operands) == 2)
+            self.scan.add_move(
+                call.start(), pose, frame, self.frames[_TOOL], cut, circular=len(operands) == 2
+            )
 
     def _cut(
         self, call: re.Match[str], spans: Sequence[_Span], operands: Sequence[_Span], pose: Pose | str

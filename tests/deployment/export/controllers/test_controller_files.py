@@ -12,7 +12,7 @@ from testing.models import joints_around
 from testing.refusals import refused
 
 from pisigma.deployment.export.controllers import counts, staubli, universal_robots, ur_ros
-from pisigma.deployment.export.controllers.controller_file import FileText, untested_on_controller
+from pisigma.deployment.export.controllers.controller_file import FileContent, untested_on_controller
 from pisigma.deployment.export.controllers.reading import read_controller_file
 from pisigma.deployment.export.controllers.ur_models import controller_geometry
 from pisigma.deployment.export.export_format import ExportRequest
@@ -57,7 +57,7 @@ def far_apart(one: Robot, other: Robot) -> float:
 def test_the_robot_is_read_back(file, scale):
     """The maker's rows have no beta: a tilt of nearly parallel axes makes d large without moving the tool."""
     robot, nominal = everything_off(scale=scale), Robot.load("ur10")
-    text = file.text(FileText(robot, nominal, REQUEST, ("said: a -- b",)))
+    text = file.text(FileContent(robot, nominal, REQUEST, ("said: a -- b",)))
     assert far_apart(file.read(text, "file", nominal), robot) <= 1e-9
     assert "said: a" in text
 
@@ -272,6 +272,6 @@ def test_offsets_of_reversed_joints_are_in_the_controllers_direction():
     )
     dh = flipped.dh.copy()
     dh[:, 0] += 0.01
-    text = counts.write_counts(FileText(flipped.with_geometry(dh), flipped, request))
+    text = counts.write_counts(FileContent(flipped.with_geometry(dh), flipped, request))
     assert text.splitlines()[1].startswith("joint,theta_1,-0.57")
     assert_close(counts.read_offsets(text, "counts.csv", flipped).dh, dh, atol=1e-8)

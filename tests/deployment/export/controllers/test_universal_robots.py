@@ -21,7 +21,7 @@ from testing.published_arms import (
 from testing.refusals import refused
 
 from pisigma.deployment.export.controllers import universal_robots, ur_ros
-from pisigma.deployment.export.controllers.controller_file import FileText
+from pisigma.deployment.export.controllers.controller_file import FileContent
 from pisigma.deployment.export.controllers.reading import read_controller_file
 from pisigma.deployment.export.controllers.ur_models import controller_geometry
 from pisigma.deployment.export.export_format import ExportRequest
@@ -95,7 +95,7 @@ def test_published_calibrations_agree_with_the_makers_formula(case, tmp_path):
     wanted = makers_formula(q, *with_deltas(name, deltas))
     assert_close(forward_kinematics(reading.robot, torch.from_numpy(q)), wanted, atol=1e-9)
     assert 0.5 < reading.change.mean_mm < 5
-    text = universal_robots.FILE.text(FileText(reading.robot, reading.robot, REQUEST))
+    text = universal_robots.FILE.text(FileContent(reading.robot, reading.robot, REQUEST))
     assert_close(makers_formula(q, *with_deltas(name, deltas_of(text))), wanted, atol=1e-9)
 
 
@@ -103,7 +103,7 @@ def test_published_calibrations_agree_with_the_makers_formula(case, tmp_path):
 def test_written_files_agree_with_the_makers_formula(name):
     """With the base and tool of the file, without fitting a frame."""
     robot, nominal = everything_off(name), Robot.load(name)
-    text = universal_robots.FILE.text(FileText(robot, nominal, REQUEST))
+    text = universal_robots.FILE.text(FileContent(robot, nominal, REQUEST))
     q = joint_values()
     number = r"(-?[\d.]+(?:e-?\d+)?)"
     frames = []
@@ -127,7 +127,7 @@ def test_described_arms_agree_with_the_maker_in_its_frames(name, file):
     d, a, calib = NOMINAL[name]
     q = joint_values()
     wanted = makers_formula(q, np.zeros(6), d, a, ALPHA)
-    text = file.text(FileText(described, described, REQUEST))
+    text = file.text(FileContent(described, described, REQUEST))
     assert_close(
         forward_kinematics(file.read(text, "file", described), torch.from_numpy(q)),
         forward_kinematics(described, torch.from_numpy(q)),
@@ -160,7 +160,7 @@ def test_a_calibrated_robot_is_written_against_the_makers_nominal_one():
     """A robot read from a file is written with all of its differences from the nominal robot."""
     name, deltas = CALIBRATIONS["ur5 179"]
     read = universal_robots.read_calibration(conf(deltas), "file", Robot.load(name))
-    again = universal_robots.FILE.text(FileText(read, read, REQUEST))
+    again = universal_robots.FILE.text(FileContent(read, read, REQUEST))
     q = joint_values(100)
     assert_close(
         makers_formula(q, *with_deltas(name, deltas_of(again))),
@@ -179,7 +179,7 @@ def test_the_hash_equals_that_of_the_driver():
     links = {link: dict(zip(keys, values, strict=True)) for link, values in DRIVERS_UR5.items()}
     stated = yaml_text({"kinematics": {**links, "hash": DRIVERS_UR5_HASH}})
     read = ur_ros.read_kinematics(stated, "file", robot)
-    written = ur_ros.FILE.text(FileText(read, robot, REQUEST))
+    written = ur_ros.FILE.text(FileContent(read, robot, REQUEST))
     assert DRIVERS_UR5_HASH in written
     assert_close(
         forward_kinematics(
