@@ -12,7 +12,7 @@ from pisigma.planning.session.state import RowsSoFar
 from pisigma.robot.urdf_file import read_urdf
 from pisigma.workbench import steps
 from pisigma.workbench.cell_scene import CellScene
-from pisigma.workbench.server.answers import answers, form_of
+from pisigma.workbench.server.answers import form_of, with_error_answers
 from pisigma.workbench.tabs import Tabs, lines_in
 from pisigma.workbench.uploads import Uploads
 from pisigma.workflow.cell.cell import Cell
@@ -36,7 +36,7 @@ class UploadedRows:
     _tabs: Tabs
     _scene: CellScene
 
-    @answers
+    @with_error_answers
     async def _upload(self, request: web.Request) -> web.StreamResponse:
         content = await request.read()
         number = await asyncio.to_thread(self._uploads.add, request.query.get("name", ""), content)
@@ -45,7 +45,7 @@ class UploadedRows:
         links = await asyncio.to_thread(lambda: [*read_urdf(path)[0].link_map]) if is_urdf else []
         return web.json_response({"file": number, "links": links})
 
-    @answers
+    @with_error_answers
     async def _propose(self, request: web.Request) -> web.StreamResponse:
         form = await form_of(request)
 
@@ -59,7 +59,7 @@ class UploadedRows:
 
         return web.Response(text=await asyncio.to_thread(propose), content_type="text/html")
 
-    @answers
+    @with_error_answers
     async def _check(self, request: web.Request) -> web.StreamResponse:
         form = await form_of(request)
 
@@ -74,7 +74,7 @@ class UploadedRows:
 
         return web.Response(text=await asyncio.to_thread(check), content_type="text/html")
 
-    @answers
+    @with_error_answers
     async def _show(self, request: web.Request) -> web.StreamResponse:
         """Mark the rows that a sentence names in the scene: those of a session that it names, else those shown."""
         text = (await form_of(request)).get("text", "")

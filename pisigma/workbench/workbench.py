@@ -21,7 +21,7 @@ from pisigma.planning.session.state import SessionState
 from pisigma.workbench import steps
 from pisigma.workbench.cell_scene import CellScene
 from pisigma.workbench.job import Jobs, Outcome
-from pisigma.workbench.server.answers import answers, form_of, person_of
+from pisigma.workbench.server.answers import form_of, person_of, with_error_answers
 from pisigma.workbench.server.front_server import FrontServer
 from pisigma.workbench.server.viser_server import ViserBackend
 from pisigma.workbench.tabs import TABS, Tabs, download_of
@@ -185,13 +185,13 @@ class Workbench(UploadedRows):
         response.headers["Content-Disposition"] = f"{shown}; filename*=UTF-8''{quote(path.name)}"
         return response
 
-    @answers
+    @with_error_answers
     async def _drag(self, request: web.Request) -> web.StreamResponse:
         is_on = "on" in await form_of(request)
         turn = await asyncio.to_thread(lambda: self._scene.show_cell(Cell.open(self.folder), is_on))
         return web.json_response({"turn": turn})
 
-    @answers
+    @with_error_answers
     async def _stop(self, request: web.Request) -> web.StreamResponse:
         self.jobs.stop(person_of(request), (await form_of(request)).get("ended", ""))
         return web.json_response({})

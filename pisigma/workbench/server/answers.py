@@ -14,7 +14,7 @@ MAX_PERSON = 60
 """Longest name of a person."""
 
 
-def answers(function: Callable[[Any, web.Request], Awaitable[web.StreamResponse]]) -> Any:
+def with_error_answers(function: Callable[[Any, web.Request], Awaitable[web.StreamResponse]]) -> Any:
     """Answer a refused input with its message, and a request during a step with the person who started it."""
 
     @functools.wraps(function)
