@@ -136,7 +136,7 @@ def run_fleet(
 def _advance(folder: Path, prior: Path | None) -> tuple[str, dict[str, list[ParameterValue]]]:
     """Advance a cell; return why it needs attention, "" if it does not, and the parameters of its models."""
     from pisigma.workflow.cell.advance import (
-        advance,  # torch takes seconds, and most calls have nothing to do
+        advance_cell,  # torch takes seconds, and most calls have nothing to do
     )
     from pisigma.workflow.cell.cell import Cell
 
