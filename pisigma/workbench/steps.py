@@ -187,6 +187,16 @@ def import_session(incoming: IncomingRows, form: Form) -> Outcome:
     return Outcome(ResultText(verdict, remarks))
 
 
+def take_back(cell: Cell, form: Form, progress: Progress) -> Outcome:
+    """Add a session that was set aside again, as the import of its file does."""
+    progress("reading the rows")
+    known = {one.name: one for one in cell.history.sessions() if one.set_aside and one.rows}
+    name = form.get("session", "")
+    check_choice(MeasurementError, "session", name, tuple(known))
+    incoming = incoming_rows([cell.sessions.path(known[name])], cell, {})
+    return import_session(incoming, {**form, "date": known[name].day})
+
+
 def check_rows(cell: Cell, form: Form, progress: Progress) -> tuple[Outcome, SessionState]:
     """Judge the rows of a session against the newest plan, as `measure --once --set replan=false` does."""
     session = MeasuringSession.read(

@@ -8,6 +8,7 @@ import shutil
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from urllib.parse import quote
 
 import numpy as np
@@ -217,6 +218,17 @@ def test_an_empty_folder_becomes_a_cell_once(tmp_path):
         assert "data-step" in second.ask("/tab/plan").body.decode()
     with pytest.raises(PlanningError):
         Workbench(tmp_path, port=0)
+
+
+def test_a_session_that_was_set_aside_is_taken_back(browser_with_link, bench, cell):
+    (before,) = (one for one in cell.history.sessions() if one.set_aside)
+    for name in ("", "../cell", day(20), HOSTILE):
+        assert ended(browser_with_link, bench, "take_back", session=name).refusal
+    assert ended(browser_with_link, bench, "take_back", session=before.name).refusal == ""
+    sessions = {one.name: one for one in cell.history.sessions()}
+    taken_in = sessions[before.name].taken_in
+    assert sessions[before.name] == replace(before, set_aside="", taken_in=taken_in)
+    assert ended(browser_with_link, bench, "session", session=before.name, set_aside=HOSTILE).refusal == ""
 
 
 def test_a_cell_file_that_breaks_during_a_step_is_named_as_the_fault(

@@ -27,9 +27,11 @@ FILL = """(form, last) => { for (const one of form.elements) {
 
 @pytest.fixture
 def cell(tmp_path, blank_pictures):
-    """A cell with a space in its path, a session and a plan."""
+    """A cell with a space in its path, a session, one that was set aside, and a plan."""
     made = Cell.create(tmp_path / "my cell", "ur10", limit_mm=0.5)
-    made.add_session(measured(20, 0), day=day(20))
+    for number, ago in enumerate((20, 10)):
+        made.add_session(measured(20, number), day=day(ago))
+    made.sessions.set_aside(day(10), "loose reflector")
     made.plan(count=4, check=0, candidates=50)
     return made
 
@@ -43,7 +45,7 @@ def bench(cell):
 def test_every_command_that_a_form_shows_can_be_read(browser, bench, tmp_path, cell):
     commands = typer.main.get_command(app).commands
     (tmp_path / "a b; c.csv").write_text("P,A1,A2,A3,A4,A5,A6,X,Y,Z\n1,1,2,3,4,5,6,1000,20,30\n")
-    shown = {}
+    shown, every = {}, []
     with opened(browser, bench.url) as page:
         for tab in TABS:
             show(page, tab)
@@ -55,7 +57,8 @@ def test_every_command_that_a_form_shows_can_be_read(browser, bench, tmp_path, c
                     program, step, *words = shlex.split(line)
                     assert program == "pisigma"
                     commands[step].make_context(step, [*words])
-                    shown[step, last] = words
+                    shown.setdefault((step, last), words)
+                    every.append([step, *words])
     assert {step for step, _ in shown} >= {
         "plan",
         "calibrate",
@@ -65,6 +68,16 @@ def test_every_command_that_a_form_shows_can_be_read(browser, bench, tmp_path, c
         "measure",
         "export",
     }
+    set_aside = f"{cell.folder}/sessions/{day(10)}.csv"
+    assert [
+        "import",
+        "--accept-implausible",
+        set_aside,
+        "--cell",
+        str(cell.folder),
+        "--date",
+        day(10),
+    ] in every
     assert "fit_frame=false" in shown["verify", True]
     assert "fit_frame=true" in shown["verify", False]
     assert shown["measure", True][-1] == f"{cell.folder}/sessions/{day(20)}.csv"

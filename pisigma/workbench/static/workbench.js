@@ -125,11 +125,13 @@ function say(form) {  // the command line that does the same
     else line += ` ${option} ${quoted(value)}`;
   }
   if (form.elements.export?.value === "") line += " --export none";
+  const folder = quoted(document.body.dataset.folder), day = form.elements.session?.selectedOptions?.[0]?.dataset.day;
+  if (day) line += ` ${quoted(`${document.body.dataset.folder}/sessions/${form.elements.session.value}.csv`)} --cell ${folder} --date ${day}`;
   if (form.dataset.rows !== undefined) line += ` --rows ${quoted(`${document.body.dataset.folder}/sessions/${form.elements.session.value}.csv`)}`;
   if (form.dataset.pose !== undefined) line += " --pose " + [...form.querySelectorAll("input")].map(one => one.value || "0").join(" ");
   const stated = [...form.elements].filter(one => one.dataset.key && one.value.trim());
   if (stated.length) line += ` --map ${quoted(stated.map(one => `${one.dataset.key}=${one.value.trim()}`).join(","))}`;
-  if (form.dataset.proposal !== undefined) line += ` --cell ${quoted(document.body.dataset.folder)} --yes`;
+  if (form.dataset.proposal !== undefined) line += ` --cell ${folder} --yes`;
   const isOne = new Set(stated.map(one => one.dataset.file)).size < 2;
   code.textContent = isOne ? line : "";  // a command has one --map for all files
 }
