@@ -12,6 +12,7 @@ from testing.closeness import assert_close
 from testing.models import joints_around
 from testing.urdf import peer_poses
 
+from pisigma.deployment.export.mjcf import urdf_to_mjcf
 from pisigma.files.errors import ModelError, OutputError, RobotError
 from pisigma.files.output_folder import staged_folder
 from pisigma.measurement.dataset import Measurements
@@ -63,6 +64,23 @@ def test_urdf(run, geometric, tmp_path):
     assert_close(peer_poses(out, "tool0", q), expected, atol=1e-10)
     assert [joint.name for joint in again.joints] == [joint.name for joint in calibrated.joints]
     assert_close(again.limits, calibrated.limits, atol=0)
+
+
+def test_mjcf_as_a_new_file_and_into_a_drawing(run, geometric, tmp_path):
+    drawn, out = tmp_path / "drawn.xml", tmp_path / "robot.xml"
+    printed = run("export", geometric, "--format", "mjcf", "--out", drawn)
+    assert printed.exit_code == 0
+    assert NOT_TOLD not in drawn.read_text()
+    nominal = tmp_path / "nominal.xml"
+    text = urdf_to_mjcf(robot_to_urdf(Robot.load("ur10")))[0]
+    nominal.write_text(text.replace("<asset/>", '<asset><mesh file="arm.obj"/></asset>'))
+    printed = run("export", geometric, "--format", "mjcf", "--like", nominal, "--out", out, "--json")
+    assert printed.exit_code == 0
+    assert json.loads(printed.stdout)["geometry"] == "geometric"
+    assert 'site name="calibrated_tool"' in out.read_text()
+    assert "(tracker, arm)" in out.read_text()
+    assert "arm.obj" in out.read_text()
+    assert "arm.obj" in printed.stderr
 
 
 def test_urdf_in_calibrated_and_out_again(run, tmp_path):

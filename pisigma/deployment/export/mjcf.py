@@ -3,6 +3,7 @@
 import itertools
 import math
 import os
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -12,7 +13,13 @@ from jaxtyping import Float64
 
 from pisigma.deployment.export.export_format import Exported, ExportFormat, ExportRequest, model_facts
 from pisigma.deployment.export.geometry import check_geometry, chosen_geometry
-from pisigma.deployment.export.urdf import CALIBRATED_FRAME, CALIBRATED_TOOL, check_tip, updated_urdf_text
+from pisigma.deployment.export.urdf import (
+    CALIBRATED_FRAME,
+    CALIBRATED_TOOL,
+    check_tip,
+    missing_meshes,
+    updated_urdf_text,
+)
 from pisigma.files.errors import Place, RobotError
 from pisigma.robot.description import Robot
 from pisigma.robot.mjcf_file import MjcfDrawing, numbers
@@ -48,6 +55,9 @@ def _write(request: ExportRequest) -> Exported:
                 f"{len(left_out)} meshes, such as {left_out[0]}, are not in the file, because MuJoCo reads only "
                 f"{', '.join(MESHES)}."
             )
+    directory = re.search(r'<compiler\s[^>]*meshdir="([^"]*)"', text)
+    folder = request.out.parent / (directory.group(1) if directory else "")
+    warnings += missing_meshes(re.findall(r'<mesh\s[^>]*file="([^"]+)"', text), folder)
     return Exported(text, facts, chosen.comments, warnings=tuple(warnings))
 
 

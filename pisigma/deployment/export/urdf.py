@@ -2,6 +2,7 @@
 
 import os
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
@@ -129,13 +130,17 @@ def _warnings(request: ExportRequest, nominal: Robot, text: str) -> tuple[str, .
             "The model was made by a version that did not store the URDF file of the robot: use --like FILE to keep "
             "its links, meshes, masses and limits; this file has placeholders.",
         )
-    meshes = re.findall(r'<mesh\s[^>]*filename="([^":]+)"', text)
-    lost = [name for name in meshes if not (request.out.parent / name).is_file()]
-    if not lost:
+    return missing_meshes(re.findall(r'<mesh\s[^>]*filename="([^":]+)"', text), request.out.parent)
+
+
+def missing_meshes(names: Sequence[str], folder: Path) -> tuple[str, ...]:
+    """Return a warning if files of meshes do not exist in a folder."""
+    missing = [name for name in names if not (folder / name).is_file()]
+    if not missing:
         return ()
     return (
-        f"{len(lost)} meshes that the file names by relative paths, such as {lost[0]}, do not exist; write the file to "
-        "the folder of the meshes, otherwise simulators that read meshes reject it.",
+        f"{len(missing)} meshes that the file names by relative paths, such as {missing[0]}, do not exist; write the "
+        "file to the folder of the meshes, otherwise simulators that read meshes reject it.",
     )
 
 
