@@ -5,6 +5,7 @@ import contextlib
 import functools
 import json
 import logging
+import math
 import os
 import socket
 import threading
@@ -146,7 +147,8 @@ class OpcUa:
         """Add objects of new models, and update the variables of all."""
         for number in range(len(self._models)):
             if number == len(robots):
-                robots.append(await _Robot.add(server, index, number, functools.partial(self._call, number)))
+                call, dof = functools.partial(self._call, number), len(self._models[number].ik.joints)
+                robots.append(await _Robot.add(server, index, f"Model{number}", call, dof))
             await robots[number].update(self._models[number])
 
     async def _call(self, number: int, parent: Any, *arguments: Any) -> Any:
@@ -161,13 +163,16 @@ class OpcUa:
             )
             return ua.StatusCode(code)
         pose, near = (argument.Value for argument in arguments)
-        near_key = "near_deg" if self._models[number].joints_key == "q_deg" else "near"
-        request = {"model": number, "pose": pose} | ({near_key: near} if near else {})
+        model = self._models[number]
+        none = [math.nan] * len(model.ik.joints)
+        request = {"model": number, "pose": pose}
+        if near and str(near) != str(none):
+            request["near_deg" if model.joints_key == "q_deg" else "near"] = near
         reply = self._json.answer_message(json.dumps(request).encode())
         answer = json.loads(reply if isinstance(reply, bytes) else await asyncio.to_thread(reply))
         status = answer.get("status", "refused")
         values = {
-            ua.VariantType.Double: answer.get("q_deg") or answer.get("q") or [],
+            ua.VariantType.Double: answer.get("q_deg") or answer.get("q") or none,
             ua.VariantType.Boolean: status == "reached",
         }
         texts = status, answer.get("error") or answer.get("sentence") or "", answer.get("model", "")
@@ -184,11 +189,10 @@ class _Robot:
         self._variables, self._sha256, self._next = variables, "", 0.0
 
     @staticmethod
-    async def add(server: "asyncua.Server", index: int, number: int, call: Any) -> "_Robot":
-        """Add the object of a model to the address space; its NodeIds depend on its index only."""
+    async def add(server: "asyncua.Server", index: int, name: str, call: Any, dof: int) -> "_Robot":
+        """Add the object of a model with `dof` joints to the address space; its NodeIds begin with its name."""
         from asyncua import ua
 
-        name = f"Model{number}"
         owner = await server.nodes.objects.add_object(ua.NodeId(name, index), ua.QualifiedName(name, index))
         variables = {
             key: await owner.add_variable(
@@ -204,11 +208,11 @@ class _Robot:
                 "Pose", ua.ObjectIds.Double, "x, y, z [mm], roll, pitch, yaw [deg] of the tool in the base", 6
             ),
             _argument(
-                "Near", ua.ObjectIds.Double, "joint values to stay near to [deg or mm]; empty for none", 0
+                "Near", ua.ObjectIds.Double, "joint values to stay near to [deg or mm]; NaN for none", dof
             ),
         ]
         outputs = [
-            _argument("Joints", ua.ObjectIds.Double, "joint values [deg or mm]; empty if there are none", 0),
+            _argument("Joints", ua.ObjectIds.Double, "joint values [deg or mm]; NaN if there are none", dof),
             _argument("Reached", ua.ObjectIds.Boolean, "whether the robot may be moved to them"),
             _argument("Status", ua.ObjectIds.String, "status of the solution, or refused"),
             _argument("Sentence", ua.ObjectIds.String, "what the status means, or why it is refused"),
@@ -249,7 +253,7 @@ class _Robot:
 
 
 def _argument(name: str, kind: int, meaning: str, length: int | None = None) -> "asyncua.ua.Argument":
-    """Describe an argument: an array of a length, 0 for any; None for a single value."""
+    """Describe an argument: an array of a length; None for a single value."""
     from asyncua import ua
 
     return ua.Argument(

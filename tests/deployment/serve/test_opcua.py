@@ -1,6 +1,7 @@
 """OPC UA: calls, variables and admission, driven by the client of asyncua."""
 
 import asyncio
+import math
 from dataclasses import replace
 
 import pytest
@@ -47,13 +48,23 @@ def _client(server, **options):
 
 
 async def _check_calls(robot, lines):
-    for near in ([], [5.0] * 6):
+    for near in ([], [math.nan] * 6, [5.0] * 6):
         q, *others = await robot.joints(POSE, near)
-        assert_close(q, lines.ask(pose=POSE, **({"near_deg": near} if near else {}))["q_deg"], atol=0)
+        stated = {"near_deg": near} if near == [5.0] * 6 else {}
+        assert_close(q, lines.ask(pose=POSE, **stated)["q_deg"], atol=0)
         assert others == [True, "reached", "", FIRST]
-    for pose, near in ((POSE[:3], []), ([*POSE[:5], float("nan")], []), (POSE, [1.0] * 5)):
-        assert (await robot.joints(pose, near))[:3] == [[], False, "refused"]
-    assert (await robot.joints([9e4, *POSE[1:]], []))[:3] == [[], False, "unreachable"]
+    mixed = [math.nan, *[1.0] * 5]
+    for pose, near, status in (
+        (POSE[:3], [], "refused"),
+        ([*POSE[:5], math.nan], [], "refused"),
+        (POSE, [1.0] * 5, "refused"),
+        (POSE, mixed, "refused"),
+        ([9e4, *POSE[1:]], [], "unreachable"),
+    ):
+        q, *others = await robot.joints(pose, near)
+        assert others[:2] == [False, status]
+        assert len(q) == 6
+        assert all(map(math.isnan, q))
     for arguments in ((POSE,), (POSE, [], [])):
         with pytest.raises(asyncua.ua.UaStatusCodeError):
             await robot.joints(*arguments)
