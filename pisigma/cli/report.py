@@ -9,17 +9,14 @@ from pisigma.cli.arguments import AsJson, ModelOrCell
 from pisigma.cli.cell import cell_at, output_in_cell
 from pisigma.cli.output import print_json
 from pisigma.cli.progress import progress_of
-from pisigma.cli.screen import print_screen
+from pisigma.cli.screen import print_result
 from pisigma.cli.settings_options import takes_settings
 from pisigma.files.errors import AcceptanceError
 from pisigma.measurement.camera.camera_files import CameraFiles
-from pisigma.reporting.result_text import sentences, table_block
-from pisigma.reporting.verdict import Verdict, uncapitalised
 
 if TYPE_CHECKING:
     from pisigma.lifetime.cell.acceptance import Acceptance
     from pisigma.workflow.cell.cell import Cell
-    from pisigma.workflow.report import Report
 
 
 @takes_settings
@@ -47,6 +44,7 @@ def report(
     """
     from pisigma.lifetime.cell.layout import REPORTS, model_folder
     from pisigma.workflow import report as workflow
+    from pisigma.workflow.result_texts import report_doubt, report_text
 
     cell, model = cell_at(model), model_folder(model)
     if out is None:
@@ -61,13 +59,9 @@ def report(
         print_json({"report": str(out), "figures": [str(path) for path in written]} | result.to_json())
     else:
         also = f", {len(written)} figures to {figures}" if written else ""
-        _print(result, [f"Report written to {out}{also}."])
-    if result.acceptance is not None and result.acceptance.contradicted:
-        from pisigma.reporting.acceptance_tables import contradiction
-
-        raise AcceptanceError(contradiction(result.acceptance))
-    if result.diagnostics:
-        raise AcceptanceError(" ".join(one.sentence for one in result.diagnostics))
+        print_result(report_text(result, [f"Report written to {out}{also}."]), verbose=False)
+    if doubt := report_doubt(result):
+        raise AcceptanceError(doubt)
 
 
 def _acceptance(cell: "Cell | None") -> "Acceptance | None":
@@ -77,31 +71,3 @@ def _acceptance(cell: "Cell | None") -> "Acceptance | None":
     from pisigma.workflow.cell.acceptance import acceptance_of
 
     return acceptance_of(cell)
-
-
-def _print(result: "Report", closing: list[str]) -> None:
-    """Print the verdict of the page, and what it advises to measure."""
-    from pisigma.reporting.acceptance_tables import acceptance_sentences, budget_table, contradiction
-
-    content, wrong = result.content, result.diagnostics
-    trust = "yes: these rows were held out."
-    accepted = result.acceptance
-    if wrong:
-        trust = f"no: {wrong[0].sentence}"
-    elif accepted is not None and accepted.contradicted:
-        trust = f"no: {uncapitalised(contradiction(accepted))}"
-    elif not content.verdict.held_out:
-        trust = "with caution: no held-out rows were judged."
-    first, *others = content.advice or ("read the page.",)
-    verdict = Verdict(result.verdict, trust, uncapitalised(first))
-    blocks = [sentences("further advice", (f"- {one}" for one in others), "  ")]
-    if accepted is not None:
-        columns, rows = budget_table(accepted)
-        lacking = ", ".join(dict.fromkeys(line.partition(":")[0] for line in accepted.not_stated))
-        blocks += [
-            sentences(
-                "acceptance", (*acceptance_sentences(accepted), f"Not stated: {lacking}; see the page."), "  "
-            ),
-            table_block("Uncertainty budget of one coordinate", columns[:-1], [row[:-1] for row in rows]),
-        ]
-    print_screen(verdict, [one.sentence for one in wrong[1:]], blocks, closing=closing)

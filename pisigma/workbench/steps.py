@@ -1,6 +1,8 @@
 """Steps of a page: each calls the function of the cell that its command calls, and lays out its result."""
 
 import contextlib
+import itertools
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -19,13 +21,13 @@ from pisigma.files.errors import (
     check_choice,
 )
 from pisigma.files.progress import Progress
-from pisigma.lifetime.cell.layout import EXPORTS, newest_plan
+from pisigma.lifetime.cell.layout import EXPORTS, REPORTS, newest_plan
 from pisigma.measurement.growing_file import GrowingFile
 from pisigma.model.inverse.solution import Solution
 from pisigma.planning.session.growing_images import growing_file
 from pisigma.planning.session.state import SessionState
 from pisigma.reporting.calibration_text import calibration_text
-from pisigma.reporting.result_text import ResultText, sentences
+from pisigma.reporting.result_text import ResultText, sentences, table_block
 from pisigma.reporting.solution_text import FAILURES, solution_text, statuses_of
 from pisigma.reporting.verdict import Verdict, counted, uncapitalised
 from pisigma.robot.robot_file import catalogue
@@ -33,6 +35,7 @@ from pisigma.workbench.forms import changed_cell, changed_settings, digest_of
 from pisigma.workbench.job import Outcome, StoppedError
 from pisigma.workbench.tabs import download_of
 from pisigma.workflow.calibrate import Calibration
+from pisigma.workflow.cell.acceptance import acceptance_of
 from pisigma.workflow.cell.cell import Cell
 from pisigma.workflow.cell.cell_file import CellFile
 from pisigma.workflow.cell.exports import NONE, export_from_cell, set_controller
@@ -41,10 +44,13 @@ from pisigma.workflow.cell.new_files import output_path
 from pisigma.workflow.follow import follow, remaining_poses_file
 from pisigma.workflow.load import load, stated_pose
 from pisigma.workflow.measure import MeasuringSession
+from pisigma.workflow.report import report
 from pisigma.workflow.result_texts import (
     monitoring_text,
     plan_text,
     recalibration_text,
+    report_doubt,
+    report_text,
     session_text,
     verification_text,
 )
@@ -259,12 +265,37 @@ def export(cell: Cell, form: Form, files: Mapping[str, Path]) -> Outcome:
     verdict = Verdict(
         f"{what} written to {out.name}{exported.details}.", "", "test every program at low speed.", "File"
     )
+    left: Any = exported.facts.get("left_alone", [])
+    alone, changed = [(str(one["line"]), str(one["reason"])) for one in left], side_by_side(exported.shown)
     blocks = (
         sentences("remarks", exported.remarks),
-        sentences("what was changed", exported.shown.splitlines()),
+        table_block("What was changed", ("line", "before", "after"), changed),
+        table_block("Poses that were left alone", ("line", "reason"), alone),
     )
-    text = ResultText(verdict, exported.warnings, tuple(one for one in blocks if one.sentences))
+    text = ResultText(
+        verdict, exported.warnings, tuple(one for one in blocks if one.rows or one.what == "remarks")
+    )
     return Outcome(text, exported.failure or exported.shortfall or "")
+
+
+def side_by_side(diff: str) -> list[tuple[str, str, str]]:
+    """Return the changed lines of a unified diff without context: line, text before and text after."""
+    rows: list[tuple[str, str, str]] = []
+    for hunk in re.split(r"(?m)^(?=@@ )", diff)[1:]:
+        head, *lines = hunk.splitlines()
+        first = int(re.findall(r"-(\d+)", head)[0])
+        old, new = ([one[1:] for one in lines if one.startswith(sign)] for sign in "-+")
+        for number, (before, after) in enumerate(itertools.zip_longest(old, new, fillvalue="")):
+            rows.append((str(first + number) if number < len(old) else "", before, after))
+    return rows
+
+
+def report_cell(cell: Cell, form: Form, progress: Progress) -> Outcome:
+    """Write a report on the model in use, to the reports of the cell."""
+    out = output_path(cell.folder, REPORTS, ".html")
+    found = report(cell.model_folder(), None, progress, cell.cameras, acceptance_of(cell))
+    found.save(out)
+    return Outcome(report_text(found, [f"Report written to {out.name}."]), report_doubt(found))
 
 
 def try_pose(cell: Cell, form: Form) -> tuple[Outcome, Solution]:

@@ -12,7 +12,7 @@ from pisigma.deployment.export.targets import POSE_COLUMNS
 from pisigma.files.errors import ModelError, check_choice
 from pisigma.files.templates import template_environment
 from pisigma.lifetime.cell.events import EventKind
-from pisigma.lifetime.cell.layout import CELL_FILE, EXPORTS, MODELS, PLANS
+from pisigma.lifetime.cell.layout import CELL_FILE, EXPORTS, MODELS, PLANS, REPORTS
 from pisigma.lifetime.cell.status import CellStatus
 from pisigma.measurement.csv.columns import POSITION
 from pisigma.planning.plan_file import joint_columns, yaml_of
@@ -22,6 +22,7 @@ from pisigma.robot.robot_file import catalogue
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.workbench.forms import digest_of, form_of, form_of_cell, form_of_command, form_of_new_cell
 from pisigma.workbench.job import Jobs
+from pisigma.workbench.model_server import ModelServer
 from pisigma.workflow.cell.cell import Cell
 from pisigma.workflow.cell.incoming_rows import IncomingRows, Repair
 
@@ -74,10 +75,11 @@ class Tabs:
 
     Attributes:
         live: state of the session that is being followed; None if none is.
+        serving: the server of the model in use.
     """
 
-    def __init__(self, jobs: Jobs, growing: Path | None = None) -> None:
-        self._jobs, self._growing = jobs, growing
+    def __init__(self, jobs: Jobs, serving: ModelServer, growing: Path | None = None) -> None:
+        self._jobs, self.serving, self._growing = jobs, serving, growing
         self.live: SessionState | None = None
         self._environment = template_environment(
             "pisigma.workbench",
@@ -121,6 +123,7 @@ class Tabs:
             "folder": shlex.quote(str(cell.folder)),
             "forms": lambda step: form_of(step, cell.file),
             "growing": self._growing,
+            "serving": self.serving,
             "live": self.live and self.live.to_json(),
             "words": form_of_command(status.step.command) if status.step.command else None,
         }
@@ -210,6 +213,7 @@ def _more(name: str, cell: Cell, status: CellStatus, texts: Mapping[str, str]) -
             return {
                 "formats": {one: BUILT_IN[one][1] for one in FORMATS},
                 "downloads": _names(cell.folder / EXPORTS),
+                "reports": _names(cell.folder / REPORTS),
                 "columns": POSE_COLUMNS,
             }
     return {}
@@ -257,7 +261,7 @@ def _names(folder: Path) -> list[str]:
     return [one.name for one in sorted(files, key=lambda one: one.stat().st_mtime, reverse=True)]
 
 
-FOLDERS = {"plan": PLANS, "model": MODELS, "export": EXPORTS}
+FOLDERS = {"plan": PLANS, "model": MODELS, "export": EXPORTS, "report": REPORTS}
 """Folders of downloads by their kind."""
 
 

@@ -21,6 +21,7 @@ from pisigma.planning.session.state import SessionState
 from pisigma.workbench import steps
 from pisigma.workbench.cell_scene import CellScene
 from pisigma.workbench.job import Jobs, Outcome
+from pisigma.workbench.model_server import ModelServer
 from pisigma.workbench.server.answers import form_of, person_of, with_error_answers
 from pisigma.workbench.server.front_server import FrontServer
 from pisigma.workbench.server.viser_server import ViserBackend
@@ -40,6 +41,11 @@ STATIC = {
 """Type, package and folder of the files of the page."""
 NO_CELL = {"state": "no_cell", "reason": "the folder has no cell yet", "command": "pisigma new"}
 """Next step of a folder without a cell."""
+REPORT_POLICY = (
+    "sandbox allow-scripts; default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; img-src data:; "
+    "frame-ancestors 'self'"
+)
+"""A report is one file with its scripts inside, which cannot reach the page that shows it."""
 MAX_COMMAND = 2000
 """Longest command line that is shown."""
 
@@ -75,7 +81,7 @@ class Workbench(UploadedRows):
         self._status = None if cell is None else cell.status(), time.monotonic()
         self._reading, self._texts = threading.Lock(), dict[str, str]()
         self.jobs, self._uploads = Jobs(), Uploads()
-        self._tabs = Tabs(self.jobs, growing)
+        self._tabs = Tabs(self.jobs, ModelServer(folder), growing)
         self._behind = ViserBackend("pisigma")
         try:
             self._scene = CellScene(self._behind.server)
@@ -95,6 +101,7 @@ class Workbench(UploadedRows):
     def __exit__(self, *_: object) -> None:
         """Stop the running step, wait for its end, and stop serving."""
         self.jobs.close()
+        self._tabs.serving.stop()
         self._behind.close()
         self._front.close()
         self._uploads.close()
@@ -147,7 +154,7 @@ class Workbench(UploadedRows):
         if name not in TABS:
             raise web.HTTPNotFound
         text = await asyncio.to_thread(tab)
-        return web.Response(text=text, content_type="text/html")
+        return web.Response(text=self._uploads.without_folder(text), content_type="text/html")
 
     @with_error_answers
     async def _state(self, request: web.Request) -> web.StreamResponse:
@@ -180,8 +187,10 @@ class Workbench(UploadedRows):
     async def _download(self, request: web.Request) -> web.StreamResponse:
         kind, names = request.match_info["kind"], tuple(request.match_info["tail"].split("/"))
         path = await asyncio.to_thread(lambda: download_of(Cell.open(self.folder), kind, names))
-        shown = "inline" if path.suffix in (".png", ".svg") else "attachment"
+        shown = "inline" if path.suffix in (".png", ".svg", ".html") else "attachment"
         response = web.FileResponse(path)
+        if path.suffix == ".html":
+            response.headers["Content-Security-Policy"] = REPORT_POLICY
         response.headers["Content-Disposition"] = f"{shown}; filename*=UTF-8''{quote(path.name)}"
         return response
 
@@ -277,6 +286,15 @@ class Workbench(UploadedRows):
         }
         return steps.export(cell, form, files)
 
+    def serve(self, cell: Cell, form: Form, progress: Progress) -> Outcome:
+        """Start or stop the server of the model in use."""
+        if "off" in form:
+            self._tabs.serving.stop()
+        else:
+            progress("starting the server")
+            self._tabs.serving.start(cell.robot)
+        return Outcome()
+
     def try_pose(self, cell: Cell, form: Form, progress: Progress) -> Outcome:
         """Compute the joint values of a pose, and show the arm there."""
         progress("computing joint values")
@@ -304,6 +322,8 @@ STEPS: dict[str, Callable[[Workbench, Cell, Form, Progress], Outcome]] = {
     "export": Workbench.export,
     "ik": Workbench.try_pose,
     "cell": Workbench.write_cell,
+    "serve": Workbench.serve,
+    "report": lambda _, *given: steps.report_cell(*given),
     "event": lambda _, *given: steps.record(*given),
     "controller": lambda _, *given: steps.set_active_export(*given),
     "use": lambda _, *given: steps.use(*given),

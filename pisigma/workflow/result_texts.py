@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from pisigma.planning.session.state import AccuracyPoint, SessionState
+from pisigma.reporting.acceptance_tables import acceptance_sentences, budget_table, contradiction
 from pisigma.reporting.comparison_tables import comparison_blocks, model_rms
 from pisigma.reporting.derived_cards import candidate_names, candidate_table
 from pisigma.reporting.lifetime_tables import chart_table, session_table
@@ -12,6 +13,7 @@ from pisigma.reporting.verdict import Verdict, counted, rounded, uncapitalised
 from pisigma.workflow.monitor import Monitoring
 from pisigma.workflow.plan import Plan
 from pisigma.workflow.recalibrate import Recalibration
+from pisigma.workflow.report import Report
 from pisigma.workflow.verify import Verification
 
 MAX_POINTS = 8
@@ -251,3 +253,41 @@ def _recalibration_verdict(recalibration: Recalibration, folder: Path | None) ->
         if recalibration.trusted
         else "correct what is named above and recalibrate again; no model was written.",
     )
+
+
+def report_text(result: Report, closing: Sequence[str] = ()) -> ResultText:
+    """Lay out a report: its verdict, the advice on what to measure, and the acceptance of a cell.
+
+    Args:
+        result: the report.
+        closing: what was written where.
+    """
+    content, accepted = result.content, result.acceptance
+    trust = "yes: these rows were held out."
+    if result.diagnostics:
+        trust = f"no: {result.diagnostics[0].sentence}"
+    elif doubt := report_doubt(result):
+        trust = f"no: {uncapitalised(doubt)}"
+    elif not content.verdict.held_out:
+        trust = "with caution: no held-out rows were judged."
+    first, *others = content.advice or ("read the page.",)
+    blocks = [sentences("further advice", (f"- {one}" for one in others), "  ")]
+    if accepted is not None:
+        columns, rows = budget_table(accepted)
+        lacking = ", ".join(dict.fromkeys(line.partition(":")[0] for line in accepted.not_stated))
+        lines = (*acceptance_sentences(accepted), f"Not stated: {lacking}; see the page.")
+        budget = ("Uncertainty budget of one coordinate", columns[:-1], [row[:-1] for row in rows])
+        blocks += [sentences("acceptance", lines, "  "), table_block(*budget)]
+    return ResultText(
+        Verdict(result.verdict, trust, uncapitalised(first)),
+        tuple(one.sentence for one in result.diagnostics[1:]),
+        tuple(blocks),
+        closing=tuple(closing),
+    )
+
+
+def report_doubt(result: Report) -> str:
+    """Say why the rows of a report must not be trusted, or contradict the acceptance; "" if nothing does."""
+    if result.acceptance is not None and result.acceptance.contradicted and not result.diagnostics:
+        return contradiction(result.acceptance)
+    return " ".join(one.sentence for one in result.diagnostics)
