@@ -124,11 +124,7 @@ class Sessions:
         return True
 
     def check(self, file: str | os.PathLike[str] | Measurements, day: str = "") -> RowVerdict:
-        """Read and check rows as `add_session` does, without storing them.
-
-        Raises:
-            MeasurementError: see `add_session`.
-        """
+        """Read and check rows without storing them; see `add_session` for what it raises."""
         rows = self._read(file)
         return self._verdict(rows, _checked_day(rows, day))[0]
 
