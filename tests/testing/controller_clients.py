@@ -11,6 +11,24 @@ _WORD = r"[A-Za-z_$][\w.$]*"
 _TEXT = r"(?:\"(?:[^\"]|\"\")*\"|'[^']*')"
 _EXPRESSION = rf"(?:{_TEXT}|[\w $.#%+\-*/<>=(),\[\]{{}}:\\])+"
 
+_STRUCTURED_TEXT = (
+    r"\(\*[\s\S]*?\*\)|\{attribute 'pack_mode' := '1'\}",
+    (
+        (rf"TYPE {_WORD} :", "END_TYPE"),
+        ("STRUCT", "END_STRUCT"),
+        (rf"FUNCTION_BLOCK {_WORD}", "END_FUNCTION_BLOCK"),
+        ("VAR(_INPUT|_OUTPUT)?", "END_VAR"),
+        (rf"IF {_EXPRESSION} THEN", "END_IF;"),
+        (rf"CASE {_WORD} OF", "END_CASE;"),
+    ),
+    (
+        rf"{_WORD} : (ARRAY\[\d+\.\.\d+\] OF )?{_WORD}(\(\d+\))?( := {_EXPRESSION})?;",
+        rf"{_WORD}(\[\w+\](\.{_WORD})?)* := {_EXPRESSION};",
+        rf"{_WORD}\({_EXPRESSION}\);",
+        r"\d+:",
+    ),
+)
+
 LANGUAGES: dict[str, tuple[str, Sequence[tuple[str, str]], Sequence[str]]] = {
     "pisigma_client.src": (
         r";.*",
@@ -60,21 +78,8 @@ LANGUAGES: dict[str, tuple[str, Sequence[tuple[str, str]], Sequence[str]]] = {
             rf"{_WORD}\({_EXPRESSION}\)",
         ),
     ),
-    "pisigma_client.st": (
-        r"\(\*[\s\S]*?\*\)|\{attribute 'pack_mode' := '1'\}",
-        (
-            (rf"TYPE {_WORD} :", "END_TYPE"),
-            ("STRUCT", "END_STRUCT"),
-            (rf"FUNCTION_BLOCK {_WORD}", "END_FUNCTION_BLOCK"),
-            ("VAR(_INPUT|_OUTPUT)?", "END_VAR"),
-            (rf"IF {_EXPRESSION} THEN", "END_IF;"),
-        ),
-        (
-            rf"{_WORD} : (ARRAY\[\d+\.\.\d+\] OF )?{_WORD}( := {_EXPRESSION})?;",
-            rf"{_WORD}(\[{_WORD}\])? := {_EXPRESSION};",
-            rf"{_WORD}\({_EXPRESSION}\);",
-        ),
-    ),
+    "pisigma_client.st": _STRUCTURED_TEXT,
+    "pisigma_opcua.st": _STRUCTURED_TEXT,
 }
 """For each file: pattern of remarks, blocks with their ends, and other statements, one per line."""
 

@@ -14,6 +14,7 @@ from testing.controller_clients import LANGUAGES, parse, run_urscript
 from testing.serving import CLIENTS, client, json_client, running
 
 import pisigma
+from pisigma.deployment.serve.opcua import NAMESPACE
 from pisigma.deployment.serve.settings import ServeSettings
 from pisigma.robot.kernels.array_kinematics import transform_of
 
@@ -121,6 +122,12 @@ def test_the_channel_of_ethernetkrl_is_that_of_its_program():
     assert element.get("EOS") == "10"
     for flag in (element.get("Set_Flag"), tree.find("CONFIGURATION/INTERNAL/ALIVE").get("Set_Flag")):
         assert f"WAIT FOR $FLAG[{flag}]" in program
+
+
+def test_the_client_for_opc_ua_names_the_nodes_of_the_server():
+    text = (CLIENTS / "pisigma_opcua.st").read_text()
+    for name in (NAMESPACE, "Model0", "Model0.CorrectedJoints"):
+        assert f"'{name}'" in text
 
 
 def test_the_structures_of_structured_text_are_the_frames():
