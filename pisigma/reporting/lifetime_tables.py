@@ -30,7 +30,7 @@ def chart_table(charts: Sequence[Chart]) -> Table:
 def _chart_row(chart: Chart) -> tuple[str, ...]:
     last = float(chart.values[-1])
     shares = (f"{float(share[-1]):.2f}" for share in (chart.ewma_share, chart.cusum_share))
-    value = f"{last:.4f}" if last == last else "unobservable"
+    value = f"{last:z.4f}" if last == last else "unobservable"
     return (chart.what, value, chart.unit, *shares, " and ".join(chart.kinds) or "no")
 
 
@@ -55,4 +55,4 @@ def _difference_row(one: ParameterDifference) -> tuple[str, ...]:
     if one.shift is None or one.deviation is None or one.p is None:
         return (one.name, one.unit, *values, NO_VALUE, NO_VALUE, NO_VALUE)
     p = "<0.0001" if one.p < 1e-4 else f"{one.p:.2g}"
-    return (one.name, one.unit, *values, f"{one.shift:.4f}", f"{NORMAL_95 * one.deviation:.4f}", p)
+    return (one.name, one.unit, *values, f"{one.shift:z.4f}", f"{NORMAL_95 * one.deviation:.4f}", p)

@@ -1,5 +1,6 @@
 """Contents of the tabs of a page, read from the cell."""
 
+import math
 import re
 import shlex
 from collections.abc import Mapping, Sequence
@@ -17,6 +18,7 @@ from pisigma.lifetime.cell.status import CellStatus
 from pisigma.measurement.csv.columns import POSITION
 from pisigma.planning.plan_file import joint_columns, yaml_of
 from pisigma.planning.session.state import SessionState
+from pisigma.reporting.rendering import code
 from pisigma.reporting.result_text import merge_alike_warnings
 from pisigma.robot.robot_file import catalogue
 from pisigma.validation.held_out.diagnostic import Diagnostic
@@ -70,6 +72,13 @@ class TimelineEntry:
     alarm: bool = False
 
 
+def ticks(top: float) -> list[float]:
+    """Return round numbers for an axis from 0: multiples of 1, 2 or 5 times a power of ten, 3 to 6 of them."""
+    power = 10.0 ** math.floor(math.log10(top))
+    step = next(one * power for one in (0.2, 0.5, 1, 2) if top < 5.5 * one * power)
+    return [round(number * step, 9) for number in range(int(top / step + 1e-9) + 1)]
+
+
 class Tabs:
     """Renders the page and its tabs.
 
@@ -88,6 +97,8 @@ class Tabs:
                 "lines": lines_in,
                 "name": lambda path: Path(path).name,
                 "tab_of": lambda step: TAB_OF.get(step, step),
+                "code": code,
+                "ticks": ticks,
             },
         )
 

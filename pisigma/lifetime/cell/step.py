@@ -56,13 +56,17 @@ class Step:
 
     Attributes:
         state: state of the cell.
-        reason: why the step is due, in one sentence.
+        reason: why the step is due, in one sentence without its full stop.
         command: command to run; empty if nothing has to be done.
     """
 
     state: State
     reason: str
     command: str = ""
+
+    def __post_init__(self) -> None:
+        """Remove the full stop of a reason that is the summary of a check."""
+        object.__setattr__(self, "reason", self.reason.rstrip("."))
 
     @property
     def verb(self) -> str | None:

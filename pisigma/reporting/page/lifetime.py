@@ -158,7 +158,7 @@ def draw_values(
         quantity = "RMS error" if chart.one_sided else f"shift of {chart.what}"
         axes.set(ylabel=f"{quantity} [{chart.unit}]")
         _dates(axes)
-    last = "unobservable" if np.isnan(values[-1]) else f"{values[-1] + 0.0:.4f} {chart.unit}"
+    last = "unobservable" if np.isnan(values[-1]) else f"{values[-1]:z.4f} {chart.unit}"
     of = "with 95 % intervals" if chart.one_sided else "with the 95 % limits of an unchanged robot"
     alt = f"{_sentence(quantity)} in {len(days)} sessions, {of}; the last is {last}."
     return Drawing(f"{_key(chart)}_values", chart.what, alt, figure)

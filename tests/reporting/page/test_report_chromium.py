@@ -56,7 +56,7 @@ def picture(page):
     return page.evaluate("document.getElementById('canvas').toDataURL()")
 
 
-@pytest.mark.parametrize(("width", "scheme"), [(390, "light"), (1280, "light"), (1600, "dark")])
+@pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (1600, "dark")])
 def test_the_page_opens_without_errors_and_fits(browser, page_file, width, scheme):
     with opened(browser, page_file, width, color_scheme=scheme) as page:
         assert page.evaluate("document.documentElement.scrollWidth") == width

@@ -1,0 +1,90 @@
+"""All pages, made once: no NaN, nothing from elsewhere, accessible, and as wide as a phone."""
+
+import re
+from dataclasses import replace
+from importlib import resources
+from pathlib import Path
+
+import pytest
+from testing.aged import model_before, rows_later
+from testing.cell_models import cell_of_two_models
+from testing.compared import after_collision
+from testing.models import no_type_checker
+from testing.report import folder_with_held_out, hybrid_under_test
+
+from pisigma.lifetime.fleet.status import FleetStatus
+from pisigma.reporting.page.content import report_content
+from pisigma.reporting.page.figures import draw_figures
+from pisigma.reporting.page.lifetime import fleet_page
+from pisigma.reporting.page.page import render_page
+from pisigma.workflow.cell.cell import Cell
+from pisigma.workflow.compare import compare
+from pisigma.workflow.monitor import monitor
+
+NAMES = ("report", "monitoring", "comparison", "fleet")
+DAYS = {"2026-01-10": 9, "2026-02-10": 8, "2026-03-10": 3}
+"""Rows by day; the last ones do not determine every joint."""
+
+
+@pytest.fixture(scope="module")
+def pages(tmp_path_factory):
+    """The folder of the pages."""
+    folder = tmp_path_factory.mktemp("pages")
+    with no_type_checker():
+        arm, model = hybrid_under_test()
+        content = report_content(folder_with_held_out(arm, model, folder / "arm"), folder / "arm")
+        (folder / "report.html").write_text(render_page(content, draw_figures(content)), encoding="utf-8")
+        sessions = [
+            replace(rows_later(count, 30 + count), date=(day,) * count) for day, count in DAYS.items()
+        ]
+        metres = replace(sessions[1], position=sessions[1].position * 1e-3)
+        monitor(model_before(), [*sessions, metres]).save_page(folder / "monitoring.html")
+        compare(model_before(), after_collision()).save_page(folder / "comparison.html")
+        cell_of_two_models(folder / "cells" / "a")
+        Cell.create(folder / "cells" / "new", "ur5")
+        (folder / "cells" / "broken").mkdir()
+        (folder / "cells" / "broken" / "cell.yaml").write_text("robot: [\n")
+        status = FleetStatus.read(folder / "cells")
+        (folder / "fleet.html").write_text(fleet_page(status, folder), encoding="utf-8")
+    return folder
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_pages_have_no_nan_and_load_nothing(name, pages):
+    text = (pages / f"{name}.html").read_text(encoding="utf-8")
+    shown = re.sub("<[^>]*>", " ", re.sub("<(script|style).*?</\\1>", "", text, flags=re.DOTALL))
+    assert re.findall(r".{20}\b(?:nan|inf|None)\b", shown) == []
+    assert name != "monitoring" or "unobservable" in shown
+    addresses = re.findall(r'(?:src|href)="([^"]*)"', text)
+    assert [one for one in addresses if re.match(r"\w+:|//", one) and not one.startswith("data:")] == []
+    assert not re.search(r"@import|url\((?!data:)", text)
+
+
+def test_the_fleet_links_models_and_colours_states(pages):
+    text = (pages / "fleet.html").read_text(encoding="utf-8")
+    (link,) = re.findall('<a href="(cells[^"]*)">kiro4</a>', text)
+    assert (pages / link).is_file()
+    assert '<span class="badge bad">unreadable</span>' in text
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_pages_are_accessible_and_fit_a_phone(name, pages, browser):
+    axe = pytest.importorskip("axe_playwright_python", reason="axe is not installed")
+    script = resources.files(axe).joinpath("axe.min.js").read_text(encoding="utf-8")
+    page, faults = browser.new_page(viewport={"width": 390, "height": 900}, color_scheme="dark"), []
+    page.on("console", lambda one: faults.append(one.text) if one.type == "error" else None)
+    page.on("pageerror", lambda error: faults.append(str(error)))
+    page.goto((pages / f"{name}.html").as_uri())
+    assert page.evaluate("document.documentElement.scrollWidth") == 390
+    page.evaluate(script)
+    for scheme, options in (("dark", {}), ("light", {"runOnly": ["color-contrast"]})):
+        page.emulate_media(color_scheme=scheme)
+        found = page.evaluate("(options) => axe.run(options)", options | {"resultTypes": ["violations"]})
+        assert [(one["id"], [node["html"] for node in one["nodes"]]) for one in found["violations"]] == []
+    shown = "[...document.querySelectorAll('table:not(.legend, .point table), figure')]"
+    assert page.evaluate(f"{shown}.every(one => one.closest('.data, figure').querySelector('.copies'))")
+    with page.expect_download() as started:
+        page.locator("[data-csv]").first.click()
+    assert len(Path(started.value.path()).read_text(encoding="utf-8").splitlines()) > 2
+    assert faults == []
+    page.close()
