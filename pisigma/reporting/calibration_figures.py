@@ -9,7 +9,7 @@ from jaxtyping import Float64
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
-from matplotlib.ticker import LogLocator, NullFormatter
+from matplotlib.ticker import FixedFormatter, FixedLocator, LogLocator, NullFormatter
 from torch import Tensor
 
 from pisigma.calibration.geometric.identifiability.pairwise import CorrelationTable
@@ -139,9 +139,13 @@ def show_correlations(
 ) -> AxesImage:
     """Show a correlation matrix as colours with the names along both axes; undefined values are grey."""
     axes.set_facecolor("0.85")
-    axes.set_xticks(range(len(names)), names, rotation=90, fontsize=8)
-    axes.set_yticks(range(len(names)), names, fontsize=8)
-    return axes.imshow(values, cmap="RdBu", vmin=-1, vmax=1, interpolation="nearest")
+    shown = axes.imshow(values, cmap="RdBu", vmin=-1, vmax=1, interpolation="nearest")
+    for axis in (axes.xaxis, axes.yaxis):  # unlike `set_xticks`, this makes no label before it is drawn
+        axis.set_major_locator(FixedLocator(range(len(names))))
+        axis.set_major_formatter(FixedFormatter(names))
+    axes.tick_params(labelsize=8)
+    axes.tick_params(axis="x", labelrotation=90)
+    return shown
 
 
 def draw_corrections(correction: JointCorrection, measurements: Measurements, path: Path) -> None:
