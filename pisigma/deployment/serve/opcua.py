@@ -56,7 +56,8 @@ class OpcUa:
 
         Raises:
             ImportError: asyncua is not installed.
-            OutputError: the port is in use, or other machines can reach the server and there are no certificates.
+            OutputError: the port is in use, a certificate cannot be used, or other machines can reach the server and
+                there are no certificates.
         """
         try:
             import asyncua  # noqa: F401
@@ -71,6 +72,10 @@ class OpcUa:
             )
         logging.getLogger("asyncua").setLevel(logging.CRITICAL)  # it reports every client that is refused
         self._models, self._json, self._settings = models, JsonLines(models, metrics), settings
+        self._uri, self._trusted = f"{NAMESPACE}:{socket.gethostname()}", frozenset[bytes]()
+        if settings.opcua_certificates is not None:
+            self._trusted = _trusted_certificates(settings.opcua_certificates)
+            _make_own_certificate(settings.opcua_certificates, self._uri)
         self.port = settings.opcua_port or _free_port(settings.host)
         started: Future[asyncio.AbstractEventLoop] = Future()
         self._thread = threading.Thread(
@@ -123,19 +128,20 @@ class OpcUa:
         from asyncua import Server, ua
 
         folder = self._settings.opcua_certificates
-        trusted: frozenset[bytes] = frozenset() if folder is None else _trusted_certificates(folder)
         token = None if self._settings.token is None else self._settings.token.encode()
-        server = Server(user_manager=_Admission(self._is_local and token is None, token, trusted))
+        server = Server(user_manager=_Admission(self._is_local and token is None, token, self._trusted))
         await server.init()
         host = self._settings.host
         server.set_endpoint(f"opc.tcp://{f'[{host}]' if ':' in host else host}:{self.port}")
         server.set_server_name("pisigma")
-        await server.set_application_uri(f"{NAMESPACE}:{socket.gethostname()}")
+        await server.set_application_uri(self._uri)
         policies = [ua.SecurityPolicyType.NoSecurity] if self._is_local else []
         if folder is not None:
-            _make_own_certificate(folder, f"{NAMESPACE}:{socket.gethostname()}")
-            await server.load_certificate(folder / _CERTIFICATE)
-            await server.load_private_key(folder / _KEY)
+            try:
+                await server.load_certificate(folder / _CERTIFICATE)
+                await server.load_private_key(folder / _KEY)
+            except ValueError as problem:
+                raise _invalid_pair(folder, str(problem)) from None
             policies += [
                 ua.SecurityPolicyType.Basic256Sha256_SignAndEncrypt,
                 ua.SecurityPolicyType.Aes256Sha256RsaPss_SignAndEncrypt,
@@ -318,14 +324,17 @@ def _make_own_certificate(folder: Path, uri: str) -> None:
     """Write a key and a self-signed certificate of the server, unless the folder has them, so that clients can keep it.
 
     Raises:
-        OutputError: the files cannot be written.
+        OutputError: the folder has only one of both files, or they cannot be written.
     """
     from asyncua.crypto import cert_gen
     from cryptography import x509
     from cryptography.hazmat.primitives.serialization import Encoding
     from cryptography.x509.oid import ExtendedKeyUsageOID
 
-    if (folder / _KEY).is_file() and (folder / _CERTIFICATE).is_file():
+    present = [name for name in (_CERTIFICATE, _KEY) if (folder / name).exists()]
+    if len(present) == 1:
+        raise _invalid_pair(folder, f"only {present[0]} is there")
+    if present:
         return
     key, host = cert_gen.generate_private_key(), socket.gethostname()
     certificate = cert_gen.generate_self_signed_app_certificate(
@@ -336,11 +345,27 @@ def _make_own_certificate(folder: Path, uri: str) -> None:
         [ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH],
         _CERTIFICATE_DAYS,
     )
-    (folder / _TRUSTED).mkdir(parents=True, exist_ok=True)
-    descriptor = os.open(folder / _KEY, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
-    with os.fdopen(descriptor, "wb") as file:
-        file.write(cert_gen.dump_private_key_as_pem(key))
+    try:
+        (folder / _TRUSTED).mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(folder / _KEY, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+        with os.fdopen(descriptor, "wb") as file:
+            file.write(cert_gen.dump_private_key_as_pem(key))
+    except OSError as problem:
+        raise OutputError(
+            f"the certificate cannot be written ({problem.strerror})",
+            at=Place(folder),
+            option="--opcua-certificates",
+        ) from None
     write_atomically(folder / _CERTIFICATE, certificate.public_bytes(Encoding.DER))
+
+
+def _invalid_pair(folder: Path, why: str) -> OutputError:
+    return OutputError(
+        f"expected {_CERTIFICATE} (DER) and its key {_KEY} (PEM): {why}",
+        at=Place(folder),
+        option="--opcua-certificates",
+        remedy="give both files, or remove them to have new ones made",
+    )
 
 
 def _free_port(host: str) -> int:

@@ -146,7 +146,11 @@ def test_clients_of_other_machines_need_a_user_or_a_certificate_and_encryption(r
 
 def test_what_cannot_be_served_over_opcua_is_refused(repository, tmp_path):
     models = ServedModels([repository / "models" / "kiro4"])
+    (tmp_path / "file").write_text("")
+    (tmp_path / "one").mkdir()
+    (tmp_path / "one" / "server_key.pem").write_text("key")
     (tmp_path / "trusted").mkdir()
     (tmp_path / "trusted" / "damaged.der").write_bytes(b"damaged")
-    with refused(OutputError, file="damaged.der", option="--opcua-certificates"):
-        Server(models, replace(LOCAL, opcua_certificates=tmp_path))
+    for folder, file in (("file", "file"), ("one", "one"), (".", "damaged.der")):
+        with refused(OutputError, file=file, option="--opcua-certificates"):
+            Server(models, replace(LOCAL, opcua_certificates=tmp_path / folder))
