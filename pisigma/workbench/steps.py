@@ -199,7 +199,7 @@ def take_back(cell: Cell, form: Form, progress: Progress) -> Outcome:
     known = {one.name: one for one in cell.history.sessions() if one.set_aside and one.rows}
     name = form.get("session", "")
     check_choice(MeasurementError, "session", name, tuple(known))
-    incoming = incoming_rows([cell.sessions.path(known[name])], cell, {})
+    incoming = incoming_rows([cell.sessions.folder / f"{name}.csv"], cell, {})
     return import_session(incoming, {**form, "date": known[name].day})
 
 
@@ -210,7 +210,7 @@ def check_rows(cell: Cell, form: Form, progress: Progress) -> tuple[Outcome, Ses
     )
     sessions, name = {one.name: one for one in cell.sessions.valid_sessions()}, form.get("session", "")
     check_choice(MeasurementError, "session", name, tuple(sessions), Place(cell.folder))
-    path = cell.sessions.path(sessions[name])
+    path = cell.sessions.checked_path(sessions[name])
     growing: GrowingFile = growing_file(path, session.plan.arm.robot, session.plan.settings)
     progress("checking the rows against each other")
     growth = growing.read(final=True)

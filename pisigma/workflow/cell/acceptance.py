@@ -37,9 +37,8 @@ def acceptance_of(cell: Cell) -> Acceptance:
     model = load_model(folder := cell.model_folder())
     entry = cell.history.model(folder.name)
     document = cell.file.document
-    sessions = cell.status().facts.valid_sessions
-    made_of = entry.made_of
-    later = [one for one in sessions if one.name not in made_of and one.day >= entry.day]
+    facts, made_of = cell.status().facts, entry.made_of
+    sessions, later = facts.valid_sessions, facts.new_sessions(entry)
     known = later or [one for one in cell.history.sessions() if one.name in made_of[-1:]]
     if not known:  # the model was made outside of the cell
         remedy = "import rows that were measured with it"

@@ -6,7 +6,7 @@ import zipfile
 import zlib
 from pathlib import Path, PurePosixPath
 
-from pisigma.files.errors import MeasurementError, OutputError, Place, PlanningError
+from pisigma.files.errors import OutputError, Place, PlanningError
 from pisigma.files.output_file import check_output
 from pisigma.files.scratch import FILE, FOLDER, scratch_beside
 from pisigma.lifetime.cell.layout import CELL_FILE
@@ -33,12 +33,9 @@ def pack(cell: Cell, path: str | os.PathLike[str]) -> int:
     """
     target = Path(path)
     check_output(target, (".zip",), "a packed cell", (cell.folder,))
-    if edited := cell.status().facts.edited:
-        raise MeasurementError(
-            f"the file of session '{edited[0]}' was changed or removed after it was added",
-            at=Place(cell.folder),
-            remedy="restore the measured file, or set the session aside",
-        )
+    for session in cell.history.sessions():
+        if not session.set_aside:
+            cell.sessions.checked_path(session)
     journal = cell.history.path.with_name(f"{cell.history.path.name}-journal")
     files = sorted(
         one for one in cell.folder.rglob("*") if (not one.is_dir() or one.is_symlink()) and one != journal
@@ -100,29 +97,25 @@ def unpack(path: str | os.PathLike[str], folder: str | os.PathLike[str]) -> Cell
 
 def _check_members(archive: zipfile.ZipFile, path: str | os.PathLike[str]) -> None:
     """Refuse an archive that is not a packed cell, or that would write outside its folder."""
-    names = [one.filename for one in archive.infolist()]
-    if CELL_FILE not in names:
-        raise PlanningError(
-            expected=f"a packed cell with its {CELL_FILE}", value="another archive", at=Place(path)
-        )
-    if len({name.casefold() for name in names}) < len(names):
-        raise PlanningError(
-            expected="a different name for every file", value="a name that appears twice", at=Place(path)
-        )
-    for one in archive.infolist():
-        inside = PurePosixPath(one.filename)
-        if one.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-            raise PlanningError(expected="deflated files", value=one.filename, at=Place(path))
-        leads_out = (
-            inside.is_absolute() or ".." in inside.parts or "\\" in one.filename or ":" in one.filename
-        )
-        mode = one.external_attr >> 16
-        if leads_out or (mode and not (stat.S_ISREG(mode) or stat.S_ISDIR(mode))):
-            raise PlanningError(expected="regular files inside the cell", value=one.filename, at=Place(path))
-    if (size := sum(one.file_size for one in archive.infolist())) > MAX_BYTES:
-        raise PlanningError(
-            expected=f"files of at most {MAX_BYTES:,} bytes in total", value=size, at=Place(path)
-        )
+    members = archive.infolist()
+    names = [one.filename for one in members]
+
+    def check(is_met: bool, expected: str, value: object) -> None:
+        if not is_met:
+            raise PlanningError(expected=expected, value=value, at=Place(path))
+
+    check(CELL_FILE in names, f"a packed cell with its {CELL_FILE}", "another archive")
+    distinct = len({name.casefold() for name in names}) == len(names)
+    check(distinct, "a different name for every file", "a name that appears twice")
+    for one in members:
+        inside, mode = PurePosixPath(one.filename), one.external_attr >> 16
+        deflated = one.compress_type in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+        check(deflated, "deflated files", one.filename)
+        leads_out = inside.is_absolute() or ".." in inside.parts or {"\\", ":"} & {*one.filename}
+        is_regular = not mode or stat.S_ISREG(mode) or stat.S_ISDIR(mode)
+        check(is_regular and not leads_out, "regular files inside the cell", one.filename)
+    size = sum(one.file_size for one in members)
+    check(size <= MAX_BYTES, f"files of at most {MAX_BYTES:,} bytes in total", size)
 
 
 def _extract(

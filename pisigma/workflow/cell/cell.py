@@ -18,7 +18,7 @@ from pisigma.files.progress import Progress
 from pisigma.lifetime.cell.controller import findings
 from pisigma.lifetime.cell.facts import settings_hash
 from pisigma.lifetime.cell.history import HISTORY, Check, Entry, History, ModelEntry, SessionEntry, Use, now
-from pisigma.lifetime.cell.layout import MODELS, PLANS
+from pisigma.lifetime.cell.layout import MODELS, PLANS, model_folder
 from pisigma.lifetime.cell.status import CellStatus, status_of
 from pisigma.measurement.camera.camera_files import CameraFiles
 from pisigma.measurement.dataset import Measurements
@@ -131,13 +131,8 @@ class Cell:
             ModelError: there is no model with this name, or none is in use.
         """
         if name is None:
-            entry = self.history.in_use
-            if entry is None:
-                raise ModelError(
-                    "no model is in use", at=Place(self.folder), remedy=self.status().step.reason
-                )
-            name = entry.name
-        elif not is_model(self.folder / MODELS / name):
+            return model_folder(self.folder)
+        if not is_model(self.folder / MODELS / name):
             self.history.model(name)
         return self.folder / MODELS / name
 

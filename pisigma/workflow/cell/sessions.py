@@ -16,7 +16,7 @@ from pisigma.files.errors import AcceptanceError, MeasurementError, PisigmaError
 from pisigma.files.model_files import is_unchanged
 from pisigma.lifetime.cell.controller import Controller
 from pisigma.lifetime.cell.events import Event
-from pisigma.lifetime.cell.facts import facts_of, foreign_files, sha256_of, unrecorded_files
+from pisigma.lifetime.cell.facts import CellFacts, facts_of, foreign_files, sha256_of, unrecorded_files
 from pisigma.lifetime.cell.history import Check, History, ModelEntry, SessionEntry, now
 from pisigma.lifetime.cell.layout import MODELS, SESSIONS
 from pisigma.lifetime.cell.status import FOREIGN
@@ -53,9 +53,21 @@ class Sessions:
         self.folder, self.robot, self.cameras, self.history = cell / SESSIONS, robot, cameras, history
         self.one_by_one = False
 
-    def path(self, session: SessionEntry) -> Path:
-        """Return the file of a session."""
-        return self.folder / f"{session.name}.csv"
+    def checked_path(self, session: SessionEntry) -> Path:
+        """Return the file of a session.
+
+        Raises:
+            MeasurementError: the file was changed or removed after it was added.
+        """
+        path = self.folder / f"{session.name}.csv"
+        if sha256_of(path) != session.sha256:
+            raise MeasurementError(
+                f"the file of session '{session.name}' was changed or removed after it was added",
+                at=Place(path),
+                remedy=f"restore the measured file, or set the session aside (pisigma session {self.folder.parent} "
+                f"{session.name} --set-aside REASON)",
+            )
+        return path
 
     def add_session(
         self,
@@ -92,9 +104,8 @@ class Sessions:
         else:
             content = Path(file).read_bytes()
             inside = Path(file) if Path(file).parent.resolve() == self.folder.resolve() else None
-        path = inside or write_new(
-            self.folder, entry.day, content, {one.name for one in self.history.sessions()}
-        )
+        taken = {one.name for one in self.history.sessions()}
+        path = inside or write_new(self.folder, entry.day, content, taken)
         entry = replace(entry, name=path.stem, sha256=hashlib.sha256(content).hexdigest())
         models = [] if fitted is None else [with_session(fitted, entry)]
         if not self.history.add_session(entry, *models):  # another process was faster
@@ -109,8 +120,7 @@ class Sessions:
         Raises:
             PisigmaError: the rows cannot be used; the history records the reason.
         """
-        waiting = unrecorded_files(self.folder, self.history.sessions())
-        if not waiting:
+        if not (waiting := unrecorded_files(self.folder, self.history.sessions())):
             return False
         try:
             self.add_session(self.folder / waiting[0])
@@ -232,16 +242,20 @@ class Sessions:
         Raises:
             MeasurementError: there is none.
         """
+        return list(self._facts().valid_sessions)
+
+    def _facts(self) -> CellFacts:
+        """Return the facts about the cell, which has valid sessions, after adding new files in the folder."""
         while not self.one_by_one and self.add_next_file():
             pass
-        sessions = list(facts_of(self.folder.parent).valid_sessions)
-        if not sessions:
+        facts = facts_of(self.folder.parent)
+        if not facts.valid_sessions:
             raise MeasurementError(
                 "the cell has no session since the arm or its joint zeros were last changed",
                 at=Place(self.folder),
                 remedy="measure rows and import them",
             )
-        return sessions
+        return facts
 
     def new_to(self, model: ModelEntry) -> list[SessionEntry]:
         """Return the valid sessions to which a model was not fitted, measured on its newest day or later.
@@ -249,10 +263,7 @@ class Sessions:
         Raises:
             MeasurementError: there is none.
         """
-        found = [
-            one for one in self.valid_sessions() if one.name not in model.made_of and one.day >= model.day
-        ]
-        if not found:
+        if not (found := self._facts().new_sessions(model)):
             raise MeasurementError(
                 f"every valid session is older than model '{model.name}' or was used to fit it",
                 at=Place(self.folder),
@@ -266,10 +277,8 @@ class Sessions:
         Raises:
             MeasurementError: there is no such session with this name.
         """
-        new = self.new_to(model)
-        if name is None:
-            return new[-1]
-        sessions = {one.name: one for one in new}
+        sessions = {one.name: one for one in self.new_to(model)}
+        name = [*sessions][-1] if name is None else name
         check_choice(MeasurementError, "session", name, tuple(sessions), Place(self.folder))
         return sessions[name]
 
@@ -300,14 +309,7 @@ class Sessions:
         Raises:
             MeasurementError: the file was changed or removed after it was added.
         """
-        path = self.path(session)
-        if sha256_of(path) != session.sha256:
-            raise MeasurementError(
-                f"the file of session '{session.name}' was changed or removed after it was added",
-                at=Place(path),
-                remedy=f"restore the measured file, or set the session aside (pisigma session {self.folder.parent} "
-                f"{session.name} --set-aside REASON)",
-            )
+        path = self.checked_path(session)
         rows = read_rows(path, self.robot, self.cameras)
         last = max(rows.date or (session.day,))
         changes: list[tuple[str, str]] = [(one.day, one.kind) for one in self.history.events()]
