@@ -1,12 +1,12 @@
 """Direction of gravity, by the evidence for the axes of the base and for inclined directions."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float64
 from torch import Tensor
-from torch.autograd.functional import hessian, jacobian
 
 from pisigma.calibration.hybrid.design import AbstractDesignRegression, Design, Rows
 from pisigma.calibration.hybrid.regression import build_regression
@@ -83,35 +83,63 @@ def gravity_by_evidence(
     return best if first - second > CLEARLY + math.log(FLOOR_ODDS) else USUAL
 
 
+@dataclass(frozen=True, eq=False)
+class _EvidenceOfDirection:
+    """Log evidence for gravity along `Σ c_k a_k`, for the `AXES` a_k, with the same masses for all of them.
+
+    With the precision `P = 1 + Σ c_k c_l N_kl` and the descent `d = Σ c_k d_k` of the masses, it is
+    `(d P^-1 d - log det P) / 2`. c may have any length, which scales the prior size of the masses.
+
+    Attributes:
+        normal: the matrices `N_kl + N_lk`.
+        descent: the vectors `d_k`.
+    """
+
+    normal: Float64[Tensor, "3 3 masses masses"]
+    descent: Float64[Tensor, "3 masses"]
+
+    def __call__(self, c: Float64[Tensor, "*batch 3"]) -> Float64[Tensor, "*batch"]:
+        """Compute the log evidence."""
+        lower = torch.linalg.cholesky(self._precision(c))
+        gain = torch.linalg.solve_triangular(lower, (c @ self.descent)[..., None], upper=False)
+        return gain.square().sum((-2, -1)) / 2 - lower.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+
+    def derivatives(self, c: Float64[Tensor, " 3"]) -> tuple[Float64[Tensor, " 3"], Float64[Tensor, "3 3"]]:
+        """Compute gradient and Hessian by c."""
+        inverse = torch.linalg.inv(self._precision(c))
+        x = inverse @ (c @ self.descent)
+        slope = torch.einsum("kmln,l->kmn", self.normal.transpose(1, 2), c)
+        moved, turned = slope @ x, inverse @ slope
+        rest = self.descent - moved
+        gradient = self.descent @ x - moved @ x / 2 - turned.diagonal(dim1=1, dim2=2).sum(-1) / 2
+        traces = torch.einsum("kmn,lnm->kl", turned, turned) - torch.einsum(
+            "klmn,nm->kl", self.normal, inverse
+        )
+        curved = torch.einsum("m,klmn,n->kl", x, self.normal, x)
+        return gradient, rest @ inverse @ rest.t() + (traces - curved) / 2
+
+    def _precision(self, c: Float64[Tensor, "*batch 3"]) -> Float64[Tensor, "*batch masses masses"]:
+        products = (c[..., :, None] * c[..., None, :]).flatten(-2)
+        precision = (products @ self.normal.flatten(0, 1).flatten(1)) / 2
+        return precision.unflatten(-1, self.normal.shape[2:]) + torch.eye(self.normal.shape[-1]).to(c)
+
+
 def _evidence_of_direction(
     fit: AbstractDesignRegression, posterior: Posterior, design: Design
-) -> Callable[[Float64[Tensor, "*batch 3"]], Float64[Tensor, "*batch"]]:
-    """Return the log evidence for gravity along `Σ c_k a_k` from a fit with separate masses for each of the `AXES` a_k.
-
-    The weights of axis k are c_k times the same masses. Their evidence follows from the posterior of all weights
-    without their prior, so that c of any length may be tried: its length scales the prior size of the masses.
-    """
+) -> _EvidenceOfDirection:
+    """Compute the evidence from a fit with separate masses for each of the `AXES`, without their prior."""
     count = len(AXES)
     weights = slice(design.weights_of(0).start, design.weights_of(count - 1).stop)
     root = fit.covariance_root(posterior).as_matrix[weights].cpu()
     total, prior = torch.linalg.inv(root @ root.t()), posterior.prior.precision[weights].cpu()
     size = prior.unflatten(0, (count, -1))[0].rsqrt()
     normal = (total - prior.diag()).unflatten(1, (count, -1)).unflatten(0, (count, -1))
-    normal = normal * size[:, None, None] * size
+    normal = (normal * size[:, None, None] * size).transpose(1, 2)
     descent = (total @ posterior.x[weights].cpu()).unflatten(0, (count, -1)) * size
-
-    def log_evidence(c: Float64[Tensor, "*batch 3"]) -> Float64[Tensor, "*batch"]:
-        precision = torch.einsum("...k,kmln,...l->...mn", c, normal, c) + torch.eye(len(size)).to(c)
-        lower = torch.linalg.cholesky(precision)
-        gain = torch.linalg.solve_triangular(lower, (c @ descent)[..., None], upper=False)
-        return gain.square().sum((-2, -1)) / 2 - lower.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-
-    return log_evidence
+    return _EvidenceOfDirection(normal + normal.transpose(0, 1), descent)
 
 
-def _most_probable(
-    log_evidence: Callable[[Float64[Tensor, "*batch 3"]], Float64[Tensor, "*batch"]],
-) -> tuple[Direction, float]:
+def _most_probable(log_evidence: _EvidenceOfDirection) -> tuple[Direction, float]:
     """Find the direction with the highest evidence by Newton's method from the best of `STARTS` directions.
 
     Returns:
@@ -123,11 +151,12 @@ def _most_probable(
     tried = torch.stack([height, level * turn.cos(), level * turn.sin()], 1)
     for _ in range(UPDATES):
         c = tried[log_evidence(tried).argmax()]
-        curvature, along = torch.linalg.eigh(hessian(log_evidence, c))
-        step = along @ (along.t() @ jacobian(log_evidence, c) / curvature.abs())
+        gradient, hessian = log_evidence.derivatives(c)
+        curvature, along = torch.linalg.eigh(hessian)
+        step = along @ (along.t() @ gradient / curvature.abs())
         tried = c + step * torch.tensor([[0.0], [0.125], [0.25], [0.5], [1.0]]).to(c)
     across = torch.linalg.svd(c[None]).Vh[1:] * c.norm()
-    information = -across @ hessian(log_evidence, c) @ across.t()
+    information = -across @ log_evidence.derivatives(c)[1] @ across.t()
     x, y, z = (c / c.norm() @ c.new_tensor(AXES)).tolist()
     return (x, y, z), float(torch.linalg.det(information).clamp(min=1.0).rsqrt())
 
