@@ -128,7 +128,7 @@ def test_two_fits_are_equal_and_progress_is_reported() -> None:
     assert bool((first.deviation(simulated.test) == second.deviation(simulated.test)).all())
     assert said[0] == "gravity"
     assert any(what.startswith("gravity + series 8") for what in said)
-    assert "solving for everything" in said
+    assert "solving for all parameters" in said
 
 
 def test_product_units_are_kept_where_joints_act_on_each_other() -> None:
