@@ -109,10 +109,10 @@ def _print(evaluation: "Evaluation", verbose: bool) -> None:
 
 def _trust(evaluation: "Evaluation") -> str:
     """Return whether the models were accepted."""
-    from pisigma.reporting.verdict import counted
+    from pisigma.reporting.verdict import count_text
 
     stated, warnings = evaluation.settings.limits.stated, evaluation.warnings
-    cautions = f" ({counted(len(warnings), 'warning')})" if warnings else ""
+    cautions = f" ({count_text(len(warnings), 'warning')})" if warnings else ""
     if evaluation.missed:
         return f"not accepted: {'; '.join(evaluation.missed)}."
     if evaluation.diagnostics:

@@ -41,8 +41,8 @@ Tip = Annotated[str | None, typer.Option(help="With --like, tool link with which
 Geometry = Annotated[
     str | None,
     typer.Option(
-        help="With urdf and dh, geometry to write: that of the geometric fit (geometric, default), or the one that "
-        "belongs to the joint correction of --format onnx (hybrid)."
+        help="With urdf and dh, geometry to write: that of the geometric fit (geometric, default), or the one fitted "
+        "together with the joint correction of --format onnx (hybrid)."
     ),
 ]
 Poses = Annotated[

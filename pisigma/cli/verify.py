@@ -61,7 +61,9 @@ def verify(
         refuse_with_cell(DATA=data, __sha256=sha256)
         return _verify_cell(cell, settings, of_model, verbose, as_json)
     if data is None or of_model is not None:
-        raise typer.BadParameter("expected DATA" if data is None else "--model applies only to a cell")
+        raise typer.BadParameter(
+            "the argument DATA is missing" if data is None else "--model applies only to a cell"
+        )
     chosen = settings.build()
     if sha256 is not None:
         check_model_hash(model, sha256)

@@ -103,7 +103,7 @@ def content_hash(description: bytes, weights: bytes) -> str:
     return hashlib.sha256(description + weights).hexdigest()
 
 
-def hash_if_compiled(folder: Path) -> str | None:
+def compiled_model_hash(folder: Path) -> str | None:
     """Return the `content_hash` of a folder if its `compiled.npz` has the hash in its description, else None."""
     try:
         description, weights, compiled = (

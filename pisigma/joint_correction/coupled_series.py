@@ -81,7 +81,7 @@ class CoupledSeries(AbstractFeature):
         return () if robot.coupling is None else (CoupledSeries(robot),)
 
     def columns(self, state: JointState) -> Float[Tensor, "*batch dof columns"]:
-        """Return scaled values, sines and cosines of the harmonics of all axes, then derivatives by bar lengths."""
+        """Return scaled values, sines and cosines of all axes, then derivatives with respect to bar lengths."""
         q = self.robot.to_controller(state.q)
         scaled = (q - self._middle.to(q)) / self._half.to(q)
         angles = [k * self._rate.to(q) * q for k in range(1, HARMONICS + 1)]

@@ -194,7 +194,7 @@ class Measurements:
                 expected="poses",
                 value=f"no {lacking}",
                 at=Place(self.source),
-                remedy="use the other part alone, or measure poses",
+                remedy="use positions or orientations alone, or measure poses",
             )
         return transform(self.rotation, self.position)
 

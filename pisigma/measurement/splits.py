@@ -76,7 +76,7 @@ class Splitting:
                     at=Place(measurements.source),
                     remedy="measure more (about 50 for a good calibration), or do not cross-validate (--folds 0)",
                 )
-            splits = repeats(measurements, folds, self.seed, self.by, times)
+            splits = repeated_k_folds(measurements, folds, self.seed, self.by, times)
         if train_rows is None:
             return splits
         return [with_fewer_training_rows(measurements, folds, train_rows, self.seed) for folds in splits]
@@ -125,7 +125,7 @@ def k_folds(
     return tuple(_train_test(measurements, (fold[group] == number) & (group >= 0)) for number in range(folds))
 
 
-def repeats(
+def repeated_k_folds(
     measurements: Measurements, folds: int | None, seed: int, by: SplitBy = "joints", times: int | None = None
 ) -> tuple[tuple[TrainTest, ...], ...]:
     """Split the measurements into folds several times, differently each time.

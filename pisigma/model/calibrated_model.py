@@ -367,7 +367,7 @@ def _motion(arm: HybridArm, q: Tensor, exact: bool) -> tuple[Tensor, Tensor]:
 
 
 def _slope(arm: HybridArm, q: Float[Tensor, "poses dof"]) -> Float[Tensor, "poses dof dof"]:
-    """Compute the derivatives of the corrections by the joint values, by central differences in one call."""
+    """Compute the derivatives of corrections with respect to joint values, by central differences."""
     step = DIFFERENCE_STEP * torch.eye(q.shape[1], dtype=q.dtype, device=q.device)
     above, below = torch.chunk(arm.joint_correction(q[:, None] + torch.cat([step, -step])), 2, 1)
     slope: Tensor = (above - below).mT / (2 * DIFFERENCE_STEP)

@@ -16,7 +16,7 @@ from pisigma.network.correction_network import JointGroup
 from pisigma.network.inputs import POSE_INPUTS
 from pisigma.network.pi_sigma import PiSigma
 from pisigma.robot.kernels import arrays
-from pisigma.robot.kernels.array_kinematics import KINDS, arm_ends, arm_rows
+from pisigma.robot.kernels.array_kinematics import KINDS, arm_rows, base_and_tool_matrices
 from pisigma.robot.kernels.description_file import write_description
 from pisigma.robot.kernels.forms import MAX_JOINTS, KernelForms
 from pisigma.robot.kinematics.closed_form import AbstractClosedForm, closed_form_solver
@@ -108,7 +108,7 @@ def _arms(model: CalibratedModel) -> arrays.Arms:
     return arrays.Arms(
         kind=np.array([KINDS[row.type] for row in nominal.rows]),
         rows=np.stack([arm_rows(arm) for arm in arms]),
-        ends=np.stack([arm_ends(arm) for arm in arms]),
+        ends=np.stack([base_and_tool_matrices(arm) for arm in arms]),
         reach=np.array([arm.reach or 1.0 for arm in arms]),
         direction=nominal.directions,
         revolute=np.array(nominal.revolute, dtype=np.int64),

@@ -166,15 +166,15 @@ class RobotPosterior:
         return moved
 
     def columns(self, q: Float64[Tensor, "poses dof"]) -> Float64[Tensor, "poses 6 unknowns"]:
-        """Compute the derivatives of the target's position [m] and rotation vector [rad] by all unknowns."""
+        """Compute derivatives of the target's position [m] and rotation [rad] with respect to all unknowns."""
         return self.uncertainty.columns(JointState(q), self.corrected_joints(q))
 
     def tool(self, q: Float64[Tensor, "poses dof"]) -> Float64[Tensor, "poses 3 directions"]:
-        """Compute the derivative D of the target's position by standard normal numbers; its covariance is `D D^T`.
+        """Compute the derivative D of the target's position with respect to standard normal numbers.
 
-        The position is in the measuring frame; for distances, which do not determine where the robot is, it is in the
-        robot's base frame. For a camera, a rigid motion of all poses together is ignored, because the pose of the
-        board's frame is known through the arm only.
+        Its covariance is `D D^T`. The position is in the measuring frame; for distances, which do not determine where
+        the robot is, it is in the robot's base frame. For a camera, a rigid motion of all poses together is ignored,
+        because the pose of the board's frame is known through the arm only.
         """
         columns = self.columns(q)[:, :3]
         if self.instrument.sight is not None:

@@ -121,7 +121,7 @@ def order_of_use(chosen: int, check: int) -> Int64[Tensor, " poses"]:
     return torch.cat([torch.arange(chosen) + 0.0, between]).argsort(stable=True)
 
 
-def stages_of(poses: int) -> tuple[int, ...]:
+def stage_ends(poses: int) -> tuple[int, ...]:
     """Return numbers of poses after which a calibration may be good enough: `FIRST_STAGE` times powers of two."""
     return tuple(FIRST_STAGE * 2**k for k in range(poses.bit_length()) if FIRST_STAGE * 2**k < poses)
 

@@ -4,7 +4,7 @@ import math
 from pathlib import Path
 
 from pisigma.reporting.result_text import Table
-from pisigma.reporting.verdict import Verdict, counted, rms_text, rounded
+from pisigma.reporting.verdict import Verdict, count_text, rms_text, rounded
 from pisigma.validation.held_out.calibration_summary import CalibrationSummary, ScaleFigures
 from pisigma.validation.held_out.validation_figures import ValidationFigures
 
@@ -105,7 +105,7 @@ def _trust(summary: CalibrationSummary, warnings: int) -> str:
     )
     if cautions or warnings:
         which = f": {', '.join(cautions)}" if cautions else ""
-        return f"with caution ({counted(warnings, 'warning')}){which}{intervals}."
+        return f"with caution ({count_text(warnings, 'warning')}){which}{intervals}."
     return f"yes, for joint values like the measured ones{intervals}."
 
 

@@ -54,7 +54,7 @@ class FourBar:
         return self._other_end(u, self.rocker, self.crank, -1.0)
 
     def length_derivatives(self, x: Any) -> tuple[Any, Any, Any]:
-        """Return the derivatives of `joint_value` by crank, coupler and rocker, each times its length [rad]."""
+        """Return the derivatives of `joint_value` with respect to the bars' lengths, times the lengths [rad]."""
         step, result = 1e-5, []  # central differences, with errors of order step²
         for name in ("crank", "coupler", "rocker"):
             length = getattr(self, name)

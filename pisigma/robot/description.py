@@ -144,11 +144,11 @@ class Robot:
     def without_limits(self) -> "Robot":
         """The robot without joint limits, which values of swapped columns or of other units exceed."""
 
-        def unlimited(rows: Sequence[Row]) -> tuple[Row, ...]:
+        def without_limits(rows: Sequence[Row]) -> tuple[Row, ...]:
             return tuple(replace(row, lower=-np.inf, upper=np.inf) for row in rows)
 
-        coupling = self.coupling and replace(self.coupling, axes=unlimited(self.coupling.axes))
-        return replace(self, rows=unlimited(self.rows), coupling=coupling)
+        coupling = self.coupling and replace(self.coupling, axes=without_limits(self.coupling.axes))
+        return replace(self, rows=without_limits(self.rows), coupling=coupling)
 
     @property
     def directions(self) -> Float64[np.ndarray, " dof"]:

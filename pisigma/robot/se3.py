@@ -207,7 +207,7 @@ def check_transforms(T: Tensor, name: str, tolerance: float = 1e-6) -> None:
         expected = "homogeneous transforms of shape (*batch, 4, 4)"
         raise PoseError(expected=expected, value=shape, option=name)
     if not T.is_floating_point():
-        expected = "float64 or float32, lengths in metres"
+        expected = "float64 or float32 values with lengths in metres"
         raise PoseError(f"expected {expected}, got {T.dtype}", expected=expected, value=T.dtype, option=name)
     for bad, expected, remedy in transform_faults(T, tolerance):
         if bad.any():

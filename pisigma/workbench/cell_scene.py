@@ -17,8 +17,8 @@ from pisigma.workbench.viewing.scene import SessionScene
 from pisigma.workbench.viewing.session_view import (
     FIELD,
     MAGNIFICATIONS,
+    arrow_magnification,
     first_view,
-    magnification_of,
     top_of_scale,
 )
 from pisigma.workflow.cell.cell import Cell
@@ -86,7 +86,7 @@ class CellScene:
         self._server.flush()
         return self._turn
 
-    def dragged(self) -> dict[str, Any]:
+    def dragged_values(self) -> dict[str, Any]:
         """Return the keys of `cell.yaml` that people changed by dragging, since which call of `show_cell`."""
         with self._lock:
             before = self._before
@@ -118,7 +118,7 @@ class CellScene:
         """Show rows, with their errors if they have been compared with each other."""
         with self._lock, self._server.atomic():
             self._rows, self._marked = rows, []
-            times = magnification_of(top_of_scale(rows), self._reach)
+            times = arrow_magnification(top_of_scale(rows), self._reach)
             self._slider.value = times  # type: ignore[misc]  # a decorated setter
             self._draw_rows()
         self._server.flush()

@@ -29,7 +29,7 @@ from pisigma.planning.session.state import SessionState
 from pisigma.reporting.calibration_text import calibration_text
 from pisigma.reporting.result_text import ResultText, sentences, table_block
 from pisigma.reporting.solution_text import FAILURES, solution_text, statuses_of
-from pisigma.reporting.verdict import Verdict, counted, uncapitalised
+from pisigma.reporting.verdict import Verdict, count_text, uncapitalised
 from pisigma.robot.robot_file import catalogue
 from pisigma.workbench.forms import changed_cell, changed_settings, digest_of
 from pisigma.workbench.job import Outcome, StoppedError
@@ -184,11 +184,11 @@ def import_session(incoming: IncomingRows, form: Form) -> Outcome:
     entry = incoming.add(form.get("accept_implausible") == "true", form.get("date", "").strip())
     remarks = tuple(filter(None, (*said, entry.remark)))
     trust = (
-        f"with caution ({counted(len(remarks), 'remark')})" if remarks else "yes: nothing contradicts them"
+        f"with caution ({count_text(len(remarks), 'remark')})" if remarks else "yes: nothing contradicts them"
     )
     step = uncapitalised(incoming.cell.status().step.reason)
     verdict = Verdict(
-        f"{counted(entry.rows, 'row')} were added as session '{entry.name}'.", trust, step, "Rows"
+        f"{count_text(entry.rows, 'row')} were added as session '{entry.name}'.", trust, step, "Rows"
     )
     return Outcome(ResultText(verdict, remarks))
 
@@ -307,7 +307,7 @@ def try_pose(cell: Cell, form: Form) -> tuple[Outcome, Solution]:
     return Outcome(solution_text(solution, solver), refusal), solution
 
 
-def record(cell: Cell, form: Form, progress: Progress) -> Outcome:
+def record_event(cell: Cell, form: Form, progress: Progress) -> Outcome:
     """Record an event."""
     cell.history.record(
         form.get("kind", ""), form.get("date", ""), form.get("note", ""), form.get("person", "")

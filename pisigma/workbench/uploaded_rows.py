@@ -53,7 +53,7 @@ class UploadedRows:
             incoming = self._incoming(Cell.open(self.folder), form)
             text = self._tabs.proposal(incoming, form.get("files", ""))
             with contextlib.suppress(PisigmaError):  # the check says what is wrong
-                rows = incoming.unchecked
+                rows = incoming.unchecked_rows
                 self._scene.show_rows(RowsSoFar.unjudged(rows.line, rows.q.numpy()))
             return text
 

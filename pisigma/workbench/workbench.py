@@ -171,7 +171,7 @@ class Workbench(UploadedRows):
             "ended": self.jobs.ended,
             "running": running,
             "next": NO_CELL if status is None else status.step.to_json(),
-            "dragged": self._scene.dragged(),
+            "dragged": self._scene.dragged_values(),
         }
         return web.json_response(said)
 

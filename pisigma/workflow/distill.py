@@ -277,7 +277,7 @@ def _limitations(
 
 
 def _without_overtones(sizes: tuple[SizeFigures, ...]) -> str:
-    """Return the error with sines and cosines of the joints only, where that was tried but not chosen."""
+    """Return the error with sines and cosines of the joints only, if that was tried but not chosen."""
     smooth = [size for size in sizes if size.harmonics == 1]
     if not smooth or any(size.kept for size in smooth):
         return ""

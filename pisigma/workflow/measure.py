@@ -180,7 +180,7 @@ class MeasuringSession:
         return alarms
 
     def check_setup(self) -> tuple[Alarm, ...]:
-        """Look for a fault of the setup that all rows share, and return it where it is new."""
+        """Look for a fault of the setup that all rows share, and return it if it is new."""
         with self._lock:
             rows, usable, before = self._rows, self._judged.usable, self._setup
             counts = self._judged.judgement.counts

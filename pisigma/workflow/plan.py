@@ -41,7 +41,7 @@ from pisigma.planning.surroundings.arm_in_surroundings import ArmInSurroundings
 from pisigma.planning.surroundings.motion import Motions
 from pisigma.planning.surroundings.surroundings import Surroundings, read_surroundings
 from pisigma.planning.task import task_poses
-from pisigma.planning.tour import Tour, order_of_use, plan_tour, stages_of
+from pisigma.planning.tour import Tour, order_of_use, plan_tour, stage_ends
 from pisigma.robot.description import Robot
 from pisigma.validation.checks.camera import view_warnings
 from pisigma.validation.checks.check import MOVES
@@ -221,7 +221,7 @@ def plan(
             *problem.unexcited_joints,
             *problem.view_warnings(chosen),
         ),
-        problem.prospects(chosen),
+        problem.expected_camera_accuracy(chosen),
         time.perf_counter() - started,
     )
 
@@ -282,7 +282,7 @@ class _Problem:
             use = order_of_use(count, len(check))
             poses = torch.cat([chosen, check])[use]
             progress("order of the poses")
-            stages = stages_of(len(poses))
+            stages = stage_ends(len(poses))
             way = plan_tour(motions, q[poses], self.settings.pace, stages=stages)
             free = free[~torch.isin(free, poses[way.left_out])]
             if not len(way.left_out) or len(free) < len(poses):
@@ -318,7 +318,7 @@ class _Problem:
             low, high = (low, middle) if point.p95 <= limit else (middle, high)
         return high
 
-    def prospects(self, chosen: Int64[Tensor, " chosen"]) -> CameraProspects | None:
+    def expected_camera_accuracy(self, chosen: Int64[Tensor, " chosen"]) -> CameraProspects | None:
         """Return what limits a calibration with the chosen images; None without a camera."""
         if self.views is None:
             return None

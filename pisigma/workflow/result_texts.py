@@ -9,7 +9,7 @@ from pisigma.reporting.comparison_tables import comparison_blocks, model_rms
 from pisigma.reporting.derived_cards import candidate_names, candidate_table
 from pisigma.reporting.lifetime_tables import chart_table, session_table
 from pisigma.reporting.result_text import ResultText, sentences, table_block
-from pisigma.reporting.verdict import Verdict, counted, rounded, uncapitalised
+from pisigma.reporting.verdict import Verdict, count_text, rounded, uncapitalised
 from pisigma.workflow.monitor import Monitoring
 from pisigma.workflow.plan import Plan
 from pisigma.workflow.recalibrate import Recalibration
@@ -48,7 +48,7 @@ def plan_text(planned: Plan, files: Sequence[Path]) -> ResultText:
     short = rows if len(rows) <= MAX_POINTS else [*rows[:: -(-len(rows) // MAX_POINTS)], rows[-1]]
     weak = ["Main contributions to the expected error:", *(f"- {line}" for line in planned.weak)]
     points = sum(map(len, planned.stored.waypoints))
-    lines = [planned.candidates.sentence, f"The poses are joined with {counted(points, 'waypoint')}."]
+    lines = [planned.candidates.sentence, f"The poses are joined with {count_text(points, 'waypoint')}."]
     return ResultText(
         _plan_verdict(planned, files[0]),
         tuple(planned.warnings),
@@ -69,8 +69,8 @@ def plan_text(planned: Plan, files: Sequence[Path]) -> ResultText:
 def _plan_verdict(planned: Plan, file: Path) -> Verdict:
     """Describe how accurate a calibration with the poses is expected to be."""
     last, settings, warnings = planned.curve[-1], planned.stored.settings, planned.warnings
-    cautions = f"with caution ({counted(len(warnings), 'warning')})" if warnings else "yes"
-    checked = f"; {counted(planned.checks, 'pose')} will check it" if planned.checks else ""
+    cautions = f"with caution ({count_text(len(warnings), 'warning')})" if warnings else "yes"
+    checked = f"; {count_text(planned.checks, 'pose')} will check it" if planned.checks else ""
     more = "" if planned.curve[0].poses else "more "
     return Verdict(
         f"{rounded(last.rms * 1e3)} mm RMS and {rounded(last.p95 * 1e3)} mm for 95 % expected of the tool's position "
@@ -133,11 +133,13 @@ def session_text(state: SessionState, closing: Sequence[str] = ()) -> ResultText
     reached = "not known yet." if state.accuracy is None else accuracy_text(state.accuracy)
     alarmed = len(state.rows.line) - counting
     trust = (
-        f"{counted(counting, 'row')} counted, {alarmed} left out" if alarmed else f"all {counting} rows count"
+        f"{count_text(counting, 'row')} counted, {alarmed} left out"
+        if alarmed
+        else f"all {counting} rows count"
     )
     if state.advice.action == "correct":
         trust = "no: all rows have the same fault"
-    left = counted(len(state.remaining), "pose")
+    left = count_text(len(state.remaining), "pose")
     verdict = Verdict(
         reached, f"{trust}; {left} of the plan not measured.", uncapitalised(state.advice.sentence)
     )
@@ -200,10 +202,10 @@ def _monitoring_verdict(monitoring: Monitoring, advice: str) -> Verdict:
     changed = [one for one in sessions if one.session.verdict != "unchanged"]
     last = f"{sessions[-1].date}, {rounded(sessions[-1].session.rms * 1e3, 0)} mm RMS" if sessions else "none"
     alarms = [chart.what for chart in monitoring.charts if chart.alarm is not None]
-    doubts = [f"changed in {len(changed)} of {counted(len(sessions), 'session')}"] if changed else []
+    doubts = [f"changed in {len(changed)} of {count_text(len(sessions), 'session')}"] if changed else []
     doubts += [f"outside the limits of its chart: {', '.join(alarms)}"] if alarms else []
-    doubts += [f"{counted(untrusted, 'session')} left out"] if untrusted else []
-    trust = f"yes: unchanged in {counted(len(sessions), 'session')}."
+    doubts += [f"{count_text(untrusted, 'session')} left out"] if untrusted else []
+    trust = f"yes: unchanged in {count_text(len(sessions), 'session')}."
     return Verdict(
         f"last session {last} under the model, base and tool fitted where they were moved.",
         f"{'no' if monitoring.needs_action else 'with caution'}: {'; '.join(doubts)}." if doubts else trust,
@@ -241,7 +243,7 @@ def _recalibration_verdict(recalibration: Recalibration, folder: Path | None) ->
     first = texts.pop(summary.kept, "not known: too few rows")
     others = f"; {', '.join(texts.values())}" if texts else ""
     count = len(summary.warnings) + len(summary.outliers)
-    cautions = f"with caution ({counted(count, 'warning')})" if count else "yes"
+    cautions = f"with caution ({count_text(count, 'warning')})" if count else "yes"
     return Verdict(
         f"{first} RMS, held out in cross-validation of {summary.left_out} new rows{others}.",
         f"no: {summary.diagnostics[0].sentence}"

@@ -78,7 +78,7 @@ class Verification:
             setup fault explains the errors, so they prove nothing; "implausible" where they are too large for a
             calibrated robot and nothing explains them.
         sentence: the verdict with figures.
-        ratio: mean position error of the corrected model over that of the nominal robot; NaN where that is 0.
+        ratio: mean position error of the corrected model over that of the nominal robot; NaN if that is 0.
         better_share: fraction of the configurations in which the corrected model has the smaller error.
         comparison: figures of "nominal", "geometric" (of a hybrid) and "corrected".
         diagnostics: why the rows must not be trusted; see `pisigma.validation.gate`.

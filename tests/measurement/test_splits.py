@@ -11,7 +11,7 @@ from testing.refusals import refused
 from pisigma.files.errors import MeasurementError
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import groups_of_equal_joints, placements
-from pisigma.measurement.splits import SplitBy, holdout, k_folds, repeats
+from pisigma.measurement.splits import SplitBy, holdout, k_folds, repeated_k_folds
 
 WAYS = ("joints", "interleaved", "time", "space")
 
@@ -224,7 +224,7 @@ def test_refuses_more_folds_than_placements():
 
 def test_repeats_differ_and_start_with_the_folds_of_the_seed():
     measurements = repeated([row // 3 for row in range(72)])
-    found = repeats(measurements, 6, seed=4)
+    found = repeated_k_folds(measurements, 6, seed=4)
     assert len(found) == 8  # 200 of 24 groups
     first = [test.tolist() for _, test in k_folds(measurements, 6, seed=4)]
     assert [test.tolist() for _, test in found[0]] == first
@@ -246,12 +246,12 @@ def test_repeats_differ_and_start_with_the_folds_of_the_seed():
     ],
 )
 def test_few_poses_get_several_repeats(groups: int, folds: int | None, by: SplitBy, times: int):
-    assert len(repeats(repeated(list(range(groups))), folds, seed=0, by=by)) == times
+    assert len(repeated_k_folds(repeated(list(range(groups))), folds, seed=0, by=by)) == times
 
 
 @pytest.mark.parametrize(("folds", "by"), [(4, "time"), (4, "interleaved"), (12, "joints")])
 def test_refuses_repeats_that_would_be_equal(folds: int, by: SplitBy):
     measurements = repeated(list(range(12)))
-    assert len(repeats(measurements, folds, seed=0, by=by, times=1)) == 1
+    assert len(repeated_k_folds(measurements, folds, seed=0, by=by, times=1)) == 1
     with refused(MeasurementError, option="repeats", value=3):
-        repeats(measurements, folds, seed=0, by=by, times=3)
+        repeated_k_folds(measurements, folds, seed=0, by=by, times=3)

@@ -14,7 +14,7 @@ from pisigma.planning.candidates import draw_candidates
 from pisigma.planning.surroundings.arm_in_surroundings import ArmInSurroundings
 from pisigma.planning.surroundings.motion import Motions, is_free
 from pisigma.planning.surroundings.surroundings import Surroundings
-from pisigma.planning.tour import Pace, order_of_use, plan_tour, stages_of
+from pisigma.planning.tour import Pace, order_of_use, plan_tour, stage_ends
 from pisigma.robot import Robot
 
 ARM = ArmInSurroundings.from_robot(Robot.load("fanuc_r2000"), CELL)
@@ -50,8 +50,8 @@ def test_the_most_useful_poses_come_in_the_first_stage():
     arm = ArmInSurroundings.from_robot(Robot.load("fanuc_r2000"))
     order = plan_tour(Motions(arm, q), q, PACE, q[0], stages=(2, 5, 20)).order.tolist()
     assert [set(order[:2]), set(order[2:5]), set(order[5:])] == [{0, 1}, {2, 3, 4}, {5, 6, 7, 8}]
-    assert stages_of(20) == ()
-    assert stages_of(81) == (20, 40, 80)
+    assert stage_ends(20) == ()
+    assert stage_ends(81) == (20, 40, 80)
 
 
 def test_test_poses_are_distributed_evenly():

@@ -151,7 +151,7 @@ def _spoilt(change) -> torch.Tensor:
         (_spoilt(lambda T: T[2, 2].fill_(-1.0)), "a right-handed rotation part (determinant +1)", (1,)),
         (torch.zeros(3, 3, dtype=torch.float64), "homogeneous transforms of shape (*batch, 4, 4)", (3, 3)),
         (torch.zeros(4, dtype=torch.float64), "homogeneous transforms of shape (*batch, 4, 4)", (4,)),
-        (torch.eye(4, dtype=torch.int64), "float64 or float32, lengths in metres", torch.int64),
+        (torch.eye(4, dtype=torch.int64), "float64 or float32 values with lengths in metres", torch.int64),
     ],
 )
 def test_invalid_transforms_are_rejected_with_their_index(T, expected, value):

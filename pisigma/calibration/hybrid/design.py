@@ -84,7 +84,7 @@ class Design:
         return moved
 
     def columns(self, values: SensorValues, rows: slice) -> Float64[Tensor, "values components unknowns"]:
-        """Compute the derivative of a sensor's values by all unknowns, not weighted."""
+        """Compute the derivative of a sensor's values with respect to all unknowns, not weighted."""
         state = self.problem.state
         blocks = [values.geometry[rows]]
         blocks += [values.feature_columns(chosen, state, rows) for chosen in self.features]

@@ -30,7 +30,7 @@ class CalibrationNoise:
         return self.value[name] > MAX_ABSOLUTE if self.stated is None else name in self.stated
 
     def standard_deviation(self, name: str) -> float:
-        """Return the standard deviation of a sensor [m or rad]; NaN where it is not known."""
+        """Return the standard deviation of a sensor [m or rad]; NaN if it is unknown."""
         if name not in self.value or not self.is_factor(name):
             return self.value.get(name, math.nan)
         return math.nan if self.stated is None else self.value[name] * self.stated[name]

@@ -38,8 +38,9 @@ class NormalEquations(PrimalRegression, AbstractDesignRegression):
     def from_rows(design: Design, rows: Rows) -> "NormalEquations":
         """Sum the rows, chunk by chunk.
 
-        The columns of a joint's weights are its features times the derivative by its value, `J_j f_jm`. Therefore, for
-        two joints, `X_j^T X_i = f_j^T diag(J_j^T J_i) f_i`: the components of a value are summed before the products.
+        The columns of a joint's weights are its features times the derivative with respect to its value, `J_j f_jm`.
+        Therefore, for two joints, `X_j^T X_i = f_j^T diag(J_j^T J_i) f_i`: the components of a value are summed before
+        the products.
         """
         size = design.unknowns
         return_free_memory(size)

@@ -1,4 +1,4 @@
-"""Linearisation of all measured values at one point: residuals and derivatives by geometry and by joint values."""
+"""Linearisation of all measured values at one point, with respect to geometry and joint values."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -24,14 +24,14 @@ class SensorValues:
     Attributes:
         name: name of the sensor.
         row: number of every row in the problem.
-        geometry: derivative of the predicted values by the free parameters.
-        joints: derivative of the predicted values by the joint values.
+        geometry: derivative of the predicted values with respect to the free parameters.
+        joints: derivative of the predicted values with respect to the joint values.
         residual: measured minus predicted.
         root: 1 / standard deviation if the rows state it, else 1.
         stated: whether the rows state their standard deviations.
         certain: whether the values are certain (stated), not measured.
         other_row: number of the other row for distances between the targets of two rows; else None.
-        other_joints: derivative by the joint values of that row.
+        other_joints: derivative with respect to the joint values of that row.
         repetition: factor >= 1 on the variance, because values of several targets in one configuration share the
             errors of the model (design effect, Kish 1965).
     """
@@ -50,7 +50,7 @@ class SensorValues:
 
     @property
     def row_derivatives(self) -> list[tuple[Tensor, Tensor]]:
-        """Rows of the problem and derivatives by their joint values; two for distances between two rows."""
+        """Rows and derivatives with respect to their joint values; two of each for distances between rows."""
         sides = [(self.row, self.joints)]
         if self.other_row is not None and self.other_joints is not None:
             sides.append((self.other_row, self.other_joints))
@@ -59,7 +59,7 @@ class SensorValues:
     def feature_columns(
         self, chosen: AbstractFeature, state: JointState, rows: slice
     ) -> Float64[Tensor, "values components weights"]:
-        """Compute the derivative of the predicted values by the weights of the used columns of a feature.
+        """Compute the derivative of the predicted values with respect to the weights of the used columns of a feature.
 
         Args:
             chosen: the feature.
@@ -154,10 +154,10 @@ class SensorValues:
 def weight_columns(
     joints: Float64[Tensor, "values components dof"], chosen: AbstractFeature, state: JointState
 ) -> Float64[Tensor, "values components _weights"]:
-    """Compute the derivative by the weights of the used columns of a feature, concatenated for all joints.
+    """Compute the derivative with respect to the weights of the used columns of a feature, concatenated for all joints.
 
     Args:
-        joints: derivative by the joint values.
+        joints: derivative with respect to the joint values.
         chosen: the feature.
         state: joint state of every row.
     """

@@ -57,7 +57,7 @@ def log_number_of_orders(joints: int) -> float:
 def _slope_and_curvature(
     design: Design, rows: Rows, posterior: Posterior
 ) -> tuple[Float64[Tensor, "rows dof"], Float64[Tensor, "rows dof"]]:
-    """Compute the first and minus the second derivative of every row's log likelihood by its joint values."""
+    """Compute first and minus second derivatives of the rows' log likelihood with respect to the joint values."""
     slope, curvature = torch.zeros_like(design.problem.q), torch.zeros_like(design.problem.q)
     for sensor, sigma in zip(rows.values, posterior.noise, strict=True):
         if not sensor.certain:

@@ -42,7 +42,7 @@ fitting these then takes four fifths of the time."""
 
 @dataclass(frozen=True, eq=False)
 class PositionUncertainty:
-    """Standard deviations of positions: `sqrt(x C x^T)` with the derivative x of a coordinate by all unknowns.
+    """Standard deviations of positions, `sqrt(x C x^T)` with x the derivative with respect to all unknowns.
 
     Attributes:
         space: the parameters.
@@ -95,7 +95,7 @@ class PositionUncertainty:
     def columns(
         self, state: JointState, q_moved: Float64[Tensor, "rows dof"], frame: int = 0, target: int = 0
     ) -> Float64[Tensor, "rows 6 unknowns"]:
-        """Compute the derivative of position [m] and rotation vector [rad] of a target in a frame by all unknowns.
+        """Compute the derivative of a target's position [m] and rotation vector [rad] with respect to all unknowns.
 
         Args:
             state: commanded joint values and stated conditions.

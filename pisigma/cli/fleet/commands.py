@@ -122,13 +122,14 @@ def show_fleet(
 def _print_prior(result: "FleetPriorResult", out: Path, verbose: bool) -> None:
     """Print what robots have in common."""
     from pisigma.reporting.derived_cards import UNDETERMINED, common_table, spectrum_table
-    from pisigma.reporting.verdict import Verdict, counted
+    from pisigma.reporting.verdict import Verdict, count_text
 
     summary = result.summary
     warnings = len(summary.warnings)
     verdict = Verdict(
-        f"common errors of {counted(summary.robots, 'robot')}, in {counted(len(summary.parameters), 'parameter')}.",
-        f"with caution ({counted(warnings, 'warning')})." if warnings else "yes, for robots of this type.",
+        f"common errors of {count_text(summary.robots, 'robot')}, in "
+        f"{count_text(len(summary.parameters), 'parameter')}.",
+        f"with caution ({count_text(warnings, 'warning')})." if warnings else "yes, for robots of this type.",
         f"calibrate a robot of this type with few poses: `pisigma calibrate ROBOT ROWS.csv --prior {out} --out DIR`.",
         "Prior",
     )
@@ -147,13 +148,13 @@ def _print_prior(result: "FleetPriorResult", out: Path, verbose: bool) -> None:
 
 def _print_run(result: "FleetRun") -> None:
     """Print how many cells are done, and why others need attention."""
-    from pisigma.reporting.verdict import Verdict, counted
+    from pisigma.reporting.verdict import Verdict, count_text
 
     refused, folder = len(result.refused), result.results.parent
     unchanged = f"; nothing was due in {result.unchanged}" if result.unchanged else ""
     verdict = Verdict(
-        f"{result.done} of {counted(result.cells, 'cell')} are done{unchanged}; {result.seconds:.1f} s.",
-        f"no: {counted(refused, 'cell')} need attention."
+        f"{result.done} of {count_text(result.cells, 'cell')} are done{unchanged}; {result.seconds:.1f} s.",
+        f"no: {count_text(refused, 'cell')} need attention."
         if refused
         else "see `pisigma fleet status` for the errors of each robot.",
         f"{'correct what is named below and run it again' if refused else 'see the summary'}: "

@@ -85,15 +85,17 @@ def new(
 
 def _print_cells(made: "NewCells", out: Path, as_json: bool) -> None:
     """Print how many cells were created, and which robots were refused."""
-    from pisigma.reporting.verdict import Verdict, counted
+    from pisigma.reporting.verdict import Verdict, count_text
 
     if as_json:
         print_json(made.to_json())
     else:
         refused = [f"{name}: {reason}" for name, reason in made.refused.items()]
         verdict = Verdict(
-            f"{counted(made.created, 'cell')} created, {counted(made.sessions, 'file')} of rows added, in {out}.",
-            f"no: {counted(len(refused), 'robot')} refused." if refused else "yes: all robots have a cell.",
+            f"{count_text(made.created, 'cell')} created, {count_text(made.sessions, 'file')} of rows added, in {out}.",
+            f"no: {count_text(len(refused), 'robot')} refused."
+            if refused
+            else "yes: all robots have a cell.",
             f"`pisigma fleet run {out}`.",
             "Done",
         )

@@ -9,7 +9,7 @@ import typer
 from pisigma.cli.output import print_json
 from pisigma.cli.screen import print_screen
 from pisigma.reporting.result_text import sentences, table_block
-from pisigma.reporting.verdict import Verdict, counted
+from pisigma.reporting.verdict import Verdict, count_text
 
 if TYPE_CHECKING:
     from pisigma.workflow.images.calibrate_camera import CameraCalibration
@@ -58,4 +58,4 @@ def write_result(
 
 def trust_text(warnings: int, otherwise: str) -> str:
     """Return whether to trust a result with this number of warnings."""
-    return f"with caution ({counted(warnings, 'warning')})." if warnings else otherwise
+    return f"with caution ({count_text(warnings, 'warning')})." if warnings else otherwise

@@ -13,7 +13,7 @@ from pisigma.cli.screen import print_screen
 from pisigma.cli.settings_options import StatedSettings, takes_settings
 from pisigma.files.errors import AcceptanceError
 from pisigma.reporting.result_text import sentences, table_block
-from pisigma.reporting.verdict import Verdict, counted, rounded
+from pisigma.reporting.verdict import Verdict, count_text, rounded
 from pisigma.workflow.settings.comparison import ComparisonSettings
 
 if TYPE_CHECKING:
@@ -117,7 +117,7 @@ def _verdict(compared: "ComparedModels") -> Verdict:
     errors = compared.workspace.errors.figures.figures_by_name
     count, better = len(compared.parameters.differing), compared.better
     which = (
-        f"the arms differ in {counted(count, 'parameter')}"
+        f"the arms differ in {count_text(count, 'parameter')}"
         if count
         else "the arms do not differ beyond uncertainty"
     )

@@ -130,7 +130,7 @@ def measure(
 
     Ends when more poses would not help, or with Ctrl-C. Never overwrites the plan: if the remaining poses are planned
     again, they are written to --rest. With --json, progress goes to stderr and one JSON object to stdout at the end.
-    Exits with status 3 while all rows have the same fault.
+    Exits with status 3 if all rows have the same fault.
     """
     from pisigma.lifetime.cell.controller import model_in_use_warnings
     from pisigma.lifetime.cell.layout import newest_plan

@@ -23,7 +23,7 @@ class PageAddress:
     """Where the page of a cell is served.
 
     Attributes:
-        host: address to serve the page at; other machines can open it at an address of this machine or 0.0.0.0.
+        host: address to serve the page at; an address of this machine or 0.0.0.0 opens it to other machines.
         port: port of the page, or the next free one.
     """
 

@@ -15,7 +15,7 @@ from pisigma.cli.screen import print_screen
 from pisigma.cli.settings_options import takes_settings
 from pisigma.files.errors import PoseError, RecipeError
 from pisigma.reporting.result_text import sentences, table_block
-from pisigma.reporting.verdict import Verdict, counted, rms_text
+from pisigma.reporting.verdict import Verdict, count_text, rms_text
 from pisigma.workflow.settings.distillation import DistillationSettings
 
 if TYPE_CHECKING:
@@ -134,7 +134,7 @@ def _print(distillation: "Distillation", out: Path, as_json: bool, verbose: bool
         return
     summary = distillation.summary
     errors, count = summary.held_out, summary.poses.held_out
-    cautions = f"with caution ({counted(len(summary.warnings), 'warning')})" if summary.warnings else "yes"
+    cautions = f"with caution ({count_text(len(summary.warnings), 'warning')})" if summary.warnings else "yes"
     verdict = Verdict(
         f"{rms_text(errors.distilled, count)} RMS from the full model at {count} held-out poses; nominal "
         f"{rms_text(errors.nominal, count)}.",

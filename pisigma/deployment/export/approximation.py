@@ -69,7 +69,7 @@ class ApproximationProblem:
         return self.robot.reach / 2
 
     def residual(self, robot: Robot) -> tuple[Float64[Tensor, " values"], Float64[Tensor, "values unknowns"]]:
-        """Compute the residual [m] and its derivatives by the parameters [rad or m], base and tool [m, rad].
+        """Compute the residual [m] and its derivatives with respect to parameters, base and tool [m or rad].
 
         Base and tool change by small translations and rotations, of the base in the frame of the poses, of the tool in
         the tool frame.

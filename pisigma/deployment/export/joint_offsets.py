@@ -72,7 +72,7 @@ def offsets_between(nominal: Robot, moved: Robot) -> Float64[np.ndarray, " axes"
 
 
 def joints_by_axes(robot: Robot) -> Float64[np.ndarray, "dof axes"]:
-    """Return the derivative of theta or d of every joint by the offset of every axis of the controller.
+    """Return the derivative of theta or d of every joint with respect to the offset of every axis of the controller.
 
     Raises:
         RobotError: a joint is passive or driven by a four-bar linkage, so its zero is not that of a single axis.

@@ -93,11 +93,11 @@ def parameter_differences(pair: ModelPair, level: float = LEVEL) -> ParameterDif
     """Test which parameters of two models differ.
 
     Differences e of the parameters displace the tool by `d = J e`. Under posteriors with covariances `C1` and `C2`, d
-    is normal with the covariance `X1 C1 X1^T + X2 C2 X2^T`, where X are derivatives by all unknowns, including the
-    weights of a joint correction. The corrections may therefore be of different kinds, and unobservable differences do
-    not count. Base and tool are free where frames are fitted. The parameter whose shift alone explains most of d is
-    tested, at the level over the number of parameters (Bonferroni); then the next one in addition, until none is
-    significant.
+    is normal with the covariance `X1 C1 X1^T + X2 C2 X2^T`, where X are derivatives with respect to all unknowns,
+    including the weights of a joint correction. The corrections may therefore be of different kinds, and unobservable
+    differences are ignored. Base and tool are free where frames are fitted. The parameter whose shift alone explains
+    most of d is tested, at the level over the number of parameters (Bonferroni); then the next one in addition, until
+    none is significant.
 
     Args:
         pair: the models.

@@ -58,10 +58,10 @@ class Difference:
 class ParameterEffects:
     """Displacement of the tool between two models, and the effects of parameters on it, both whitened.
 
-    With d the displacement at the points of a pair and J its derivatives by the parameters, values are `L^-1 d` and
-    columns `L^-1 J`, where `L L^T` is the covariance of d under both posteriors. The parameters are those of the arm
-    (theta, d, a, alpha, beta of every row), then translation and rotation of the base, about its origin and along the
-    axes of the measuring frame, and those of the tool, along its own axes.
+    With d the displacement at the points of a pair and J its derivatives with respect to the parameters, values are
+    `L^-1 d` and columns `L^-1 J`, where `L L^T` is the covariance of d under both posteriors. The parameters are those
+    of the arm (theta, d, a, alpha, beta of every row), then translation and rotation of the base, about its origin and
+    along the axes of the measuring frame, and those of the tool, along its own axes.
 
     Attributes:
         tested: indices of the tested parameters: one of several exchangeable ones, and none that moves the tool as base
@@ -267,7 +267,7 @@ def _spread(
 def _frame_columns(
     T: Float64[Tensor, "poses 4 4"], base: Float64[Tensor, "3"]
 ) -> Float64[Tensor, "poses 6 12"]:
-    """Compute derivatives of tool poses by translation and rotation of the base, about its origin, and of the tool."""
+    """Compute derivatives of tool poses with respect to the poses of base (about its origin) and tool."""
     R, none = T[:, :3, :3], torch.zeros_like(T[:, :3, :3])
     eye = torch.eye(3, dtype=T.dtype).expand_as(R)
     shift = torch.cat([eye, -skew(T[:, :3, 3] - base), R, none], -1)

@@ -53,7 +53,8 @@ class JointZeros:
     Attributes:
         shift: shifts [rad or m].
         deviation: standard deviations, including the uncertainty of the model and the prior of about 1 deg [rad or m].
-        influence: derivatives of the shifts by the directions of the model's uncertainty, which all sessions share.
+        influence: derivatives of the shifts with respect to the directions of the model's uncertainty, which all
+            sessions share.
         own: covariance due to the noise and the moved bases and tools of this session.
     """
 

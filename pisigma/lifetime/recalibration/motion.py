@@ -36,7 +36,7 @@ def judged_motion(
 
     Args:
         model: the model.
-        rows: rows whose frames and targets the model has or are fitted.
+        rows: rows; the model has their frames and targets, or these are fitted.
         fitted: bases or tools that are known to have moved.
 
     Returns:

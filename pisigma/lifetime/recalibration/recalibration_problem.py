@@ -58,7 +58,7 @@ class RecalibrationProblem:
         design: unknowns: all parameters of the model and the rows, and the weights of the correction.
         mean: prior mean of the unknowns, parameters counted from `design.problem.nominal`.
         root: root of their prior covariance, parameters relative to the anchors of the setup.
-        change: derivative of the parameters in the user's coordinates by those of the problem.
+        change: derivative of the parameters in the user's coordinates with respect to those of the problem.
         groups: groups that may drift, with size 0, and moved bases and tools.
         standing: root of the covariance of unknowns that are held fixed.
     """

@@ -113,7 +113,7 @@ def triangular_factor(
 def linearise_pixels(
     camera: Camera, corners: np.ndarray, pixels: np.ndarray, sigma: np.ndarray, R: np.ndarray, t: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return measured minus predicted pixels and the derivatives of the prediction by pose and point, over sigma."""
+    """Return measured minus predicted pixels, and derivatives with respect to pose and point, over sigma."""
     rotated = corners @ R.T
     predicted, by_point = camera.project(rotated + t)
     by_rotation = -by_point @ skew(torch.from_numpy(rotated)).numpy()

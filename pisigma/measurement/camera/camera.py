@@ -223,7 +223,7 @@ class Camera:
     def project(
         self, points: Float64[np.ndarray, "*batch 3"]
     ) -> tuple[Float64[np.ndarray, "*batch 2"], Float64[np.ndarray, "*batch 2 3"]]:
-        """Return the pixels of points in the camera's frame [m] and their derivative by the points [px/m]."""
+        """Return the pixels of points in the camera's frame [m], and the derivative with respect to these [px/m]."""
         xy = points[..., :2] / points[..., 2:]
         distorted, derivative = self._distorted(xy)
         scale = np.array([self.fx, self.fy])
@@ -234,7 +234,7 @@ class Camera:
         return distorted * scale + (self.cx, self.cy), scale[:, None] * (derivative @ by_point)
 
     def by_intrinsics(self, points: Float64[np.ndarray, "*batch 3"]) -> Float64[np.ndarray, "*batch 2 9"]:
-        """Return the derivative of the pixels of points in the camera's frame [m] by the intrinsics.
+        """Return the derivative of the pixels of points in the camera's frame [m] with respect to the intrinsics.
 
         The pixels are linear in the focal lengths times a polynomial that is linear in the distortion, so the columns
         are these factors themselves.
@@ -266,7 +266,7 @@ class Camera:
         return xy
 
     def _distorted(self, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return distorted x / z and y / z, and their derivative by the undistorted ones."""
+        """Return distorted x / z and y / z, and their derivative with respect to the undistorted ones."""
         x, y = xy[..., 0], xy[..., 1]
         square = x * x + y * y
         radial = 1 + square * (self.k1 + square * (self.k2 + square * self.k3))

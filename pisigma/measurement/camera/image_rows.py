@@ -129,7 +129,7 @@ def image_measurements(
 def _readings(
     solved: SolvedImages, changes: Sequence[np.ndarray], board: Board, repeatability: Repeatability
 ) -> dict[str, torch.Tensor | tuple[str, ...]]:
-    """Return the columns of `CornerSensor`; `changes` are derivatives of the rows' poses by those of the board."""
+    """Return the columns of `CornerSensor`; `changes` are derivatives with respect to the board's poses."""
     at_board = solved.noise / solved.camera.fx * float(np.median([pose.t[2] for pose in solved.poses]))
     of_robot = np.diag([repeatability.length**2] * 3 + [repeatability.angle**2] * 3)
     of_corners = [
@@ -208,7 +208,7 @@ def _refuse_other_boards(images: Images, board: Board, poses: Sequence[BoardPose
 
 
 def _target_pose(pose: BoardPose, is_fixed: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the pose of the target in its frame, and its derivative (in axes of the frame) by the board's pose.
+    """Return the target's pose, and its derivative (in axes of the frame) with respect to the board's pose.
 
     For a shift and a rotation vector of the board's pose, the position `-R^T t` of the inverse pose changes by
     `-R^T (shift + t × rotation)`, and its rotation by `-R^T rotation`.

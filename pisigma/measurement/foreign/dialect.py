@@ -211,7 +211,7 @@ def _check_decimal(dialect: Dialect, rows: Sequence[tuple[int, list[str]]], sour
         f"'{cell}' is ambiguous: '{sign}' may be a decimal or a thousands separator",
         at=Place(source, number, k + 1),
         value=cell,
-        remedy="state --set decimal=point or --set decimal=comma",
+        remedy="use --set decimal=point or --set decimal=comma",
     )
 
 

@@ -171,7 +171,7 @@ def _check_skipped(row: list[str], dialect: Dialect, width: int, at: Place) -> N
         expected=f"{width} cells as in the other rows",
         value=len(row),
         at=at,
-        remedy="complete or remove the row, or state --set decimal=point if decimal commas were read as separators",
+        remedy="complete or remove the row, or use --set decimal=point if decimal commas were read as separators",
     )
 
 

@@ -74,7 +74,7 @@ def _unit_apart(text: str) -> tuple[str, str, str]:
 
 
 @dataclass(frozen=True)
-class Maker:
+class MakerHeadings:
     """A maker's names of columns.
 
     Attributes:
@@ -95,15 +95,15 @@ class Maker:
 
 
 MAKERS = (
-    Maker("KUKA", "a#", "kuka", length="mm", angle="deg"),
-    Maker("ABB", "rax#", "abb", length="mm", angle="deg"),
-    Maker("Kawasaki", "jt#", "kawasaki", length="mm", angle="deg"),
-    Maker("Yaskawa", "s l u r b t", "yaskawa", length="mm", angle="deg"),
-    Maker("Universal Robots", "q#", "ur", "tcppose0", "m", "rad"),
-    Maker("Universal Robots", "base shoulder elbow wrist1 wrist2 wrist3", "ur"),
-    Maker("FANUC", "", "fanuc", length="mm", angle="deg"),
-    Maker("Epson", "", "epson", length="mm", angle="deg"),
-    Maker("Kawasaki", "", "kawasaki", length="mm", angle="deg"),
+    MakerHeadings("KUKA", "a#", "kuka", length="mm", angle="deg"),
+    MakerHeadings("ABB", "rax#", "abb", length="mm", angle="deg"),
+    MakerHeadings("Kawasaki", "jt#", "kawasaki", length="mm", angle="deg"),
+    MakerHeadings("Yaskawa", "s l u r b t", "yaskawa", length="mm", angle="deg"),
+    MakerHeadings("Universal Robots", "q#", "ur", "tcppose0", "m", "rad"),
+    MakerHeadings("Universal Robots", "base shoulder elbow wrist1 wrist2 wrist3", "ur"),
+    MakerHeadings("FANUC", "", "fanuc", length="mm", angle="deg"),
+    MakerHeadings("Epson", "", "epson", length="mm", angle="deg"),
+    MakerHeadings("Kawasaki", "", "kawasaki", length="mm", angle="deg"),
 )
 """Makers; a further one is one line. Makers without specific names of joints are recognised by their rotations."""
 
@@ -149,7 +149,7 @@ def joint_of(name: str, pattern: str) -> int | None:
 
     Args:
         name: name in a heading.
-        pattern: the maker's names, see `Maker.joints`.
+        pattern: the maker's names, see `MakerHeadings.joints`.
     """
     if not pattern.endswith("#"):
         names = pattern.split()

@@ -8,7 +8,7 @@ from pisigma.files.errors import MeasurementError, Place, check_choice
 from pisigma.measurement.csv.columns import POSITION
 from pisigma.measurement.foreign.dialect import is_missing
 from pisigma.measurement.foreign.export_file import ExportFile
-from pisigma.measurement.foreign.headings import Maker, parse_heading
+from pisigma.measurement.foreign.headings import MakerHeadings, parse_heading
 from pisigma.measurement.foreign.proposal import (
     NO_ROTATION,
     UNRECOGNISED,
@@ -237,7 +237,7 @@ def ambiguous_spelling(file: ExportFile, index: int, kind: UnitKind | None) -> s
 
 
 def _units_of_maker(
-    maker: Maker | None, file: ExportFile, columns: tuple[MappedColumn, ...]
+    maker: MakerHeadings | None, file: ExportFile, columns: tuple[MappedColumn, ...]
 ) -> dict[UnitKind, str]:
     """Return the units that a maker always writes, if the values can be in no other unit."""
     if maker is None:

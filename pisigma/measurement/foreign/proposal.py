@@ -14,7 +14,7 @@ from pisigma.measurement.foreign.headings import (
     MEANINGS,
     POSITIONS,
     Heading,
-    Maker,
+    MakerHeadings,
     joint_of,
     parse_heading,
 )
@@ -53,7 +53,7 @@ class Proposal:
 
     file: ExportFile
     columns: dict[int, MappedColumn] = field(default_factory=dict)
-    maker: Maker | None = None
+    maker: MakerHeadings | None = None
     rotations: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -198,10 +198,10 @@ def _check_times(proposal: Proposal, of_index: Mapping[int, str]) -> None:
             continue
         unit = "mm" if quantity in POSITION else "deg"
         raise MeasurementError(
-            f"the file has no headings, and this column runs from {numbers[0]:g} to {numbers[-1]:g}, as times do",
+            f"the file has no headings, and this column runs from {numbers[0]:g} to {numbers[-1]:g}, like a time",
             at=Place(file.source, file.lines[0], index + 1),
             value=f"{numbers[0]:g} to {numbers[-1]:g}",
-            remedy=f"state it with --map {index + 1}=time_s or --map {index + 1}={quantity}_{unit}",
+            remedy=f"map it with --map {index + 1}=time_s or --map {index + 1}={quantity}_{unit}",
         )
 
 
@@ -241,7 +241,7 @@ def _take_joints(proposal: Proposal) -> None:
         return
     names = proposal.names("angle", "length")
     makers = [one for one in MAKERS if one.joints and (not one.position or one.position in names)]
-    general = (Maker("", f"{name}#") for name in JOINT_NAMES)
+    general = (MakerHeadings("", f"{name}#") for name in JOINT_NAMES)
     best: dict[str, int] = {}
     shift, most = 0, 1
     for maker in (*makers, *general):

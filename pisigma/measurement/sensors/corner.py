@@ -93,9 +93,9 @@ class CornerSensor(AbstractSensor):
         present: which rows are from an image.
         camera: index of the camera among those whose intrinsics are estimated, -1 in rows without one.
         at: intrinsics with which the poses were solved.
-        by_intrinsics: derivative of the weighted measured pose by the intrinsics.
+        by_intrinsics: derivative of the weighted measured pose with respect to the intrinsics.
         board: index of the board, -1 in rows without one.
-        by_scale: derivative of the weighted measured pose by the scale of the board [m].
+        by_scale: derivative of the weighted measured pose with respect to the scale of the board [m].
         sigma: None; the noise is estimated.
     """
 
@@ -178,7 +178,7 @@ class CornerSensor(AbstractSensor):
     def unknown_derivatives(
         self, motion: ToolMotion, unknowns: Unknowns, rows: slice
     ) -> tuple[UnknownDerivative, ...]:
-        """Return the negative derivative of the measured pose by the intrinsics and the scale of the board."""
+        """Return the negative derivative of the measured pose with respect to intrinsics and board scale."""
         of_camera = UnknownDerivative(
             "camera", self.camera[rows], -self.by_intrinsics[..., rows].transpose(0, 1)
         )

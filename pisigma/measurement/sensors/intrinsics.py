@@ -50,7 +50,7 @@ class ImageIntrinsics:
     """Information of the corners of images on their camera's intrinsics k, linearised at `at`.
 
     Attributes:
-        by: derivative of the measured position and rotation vector, in the axes of the row's frame, by k.
+        by: derivative of the measured position and rotation vector, in the axes of the row's frame, with respect to k.
         root: equations of k with the poses eliminated: `root (k - at) = residual` with unit variances.
         residual: see `root`.
         at: intrinsics at which the images were linearised.

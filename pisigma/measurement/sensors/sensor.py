@@ -36,7 +36,7 @@ Poses = Float64[Tensor, "rows 4 4"]
 Values = Float[Tensor, "components poses"]
 """Measured values of a sensor, or their residuals [m or rad]."""
 Derivative = Float[Tensor, "parameters components poses"]
-"""Derivative of predicted values by parameters that move the tool [m/m, m/rad, rad/m or rad/rad]."""
+"""Derivative of predicted values with respect to parameters that move the tool [m/m, m/rad, rad/m or rad/rad]."""
 
 
 @dataclass(frozen=True)
@@ -136,12 +136,12 @@ class SensorRows:
 
 @dataclass(frozen=True, eq=False)
 class UnknownDerivative:
-    """Derivative of a sensor's values by the unknowns of a group.
+    """Derivative of a sensor's values with respect to the unknowns of a group.
 
     Attributes:
         group: name of the group.
         owner: per row, the index of the owner on whose unknowns the value depends.
-        derivative: derivative of the predicted value by each of that owner's unknowns.
+        derivative: derivative of the predicted value with respect to each of that owner's unknowns.
     """
 
     group: str
@@ -197,10 +197,10 @@ class AbstractSensor(ABC):
 
     @abstractmethod
     def derivative(self, motion: ToolMotion, unknowns: Unknowns, rows: slice) -> Derivative:
-        """Return the derivative of the predicted values by every parameter that moves the tool."""
+        """Return the derivative of the predicted values with respect to every parameter that moves the tool."""
 
     def partner_derivative(self, motion: ToolMotion) -> Derivative:
-        """Return the derivative by the next row's tool for paired values; else 0."""
+        """Return the derivative with respect to the next row's tool for paired values; else 0."""
         return motion.derivative.new_zeros(1, self.components, 1).expand(
             motion.derivative.shape[0], -1, motion.derivative.shape[2]
         )
@@ -208,7 +208,7 @@ class AbstractSensor(ABC):
     def unknown_derivatives(
         self, motion: ToolMotion, unknowns: Unknowns, rows: slice
     ) -> tuple[UnknownDerivative, ...]:
-        """Return the derivatives of the predicted values by the sensor's unknowns, if it has any."""
+        """Return the derivatives of the predicted values with respect to the sensor's unknowns, if it has any."""
         return ()
 
     @classmethod

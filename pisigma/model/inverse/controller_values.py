@@ -26,7 +26,7 @@ IGNORED_WEIGHT = 1e-6
 only decide between joint values that reach the other axes. The tool may then be tilted by up to `MAX_TILT`."""
 Values = Float64[np.ndarray, "rows axes"]
 Motion = Callable[[Values], tuple[Any, Any]]
-"""Pose `(rows, 4, 4)` and Jacobian `(rows, 6, axes)` of an arm by the controller's values."""
+"""Pose `(rows, 4, 4)` and Jacobian `(rows, 6, axes)` of an arm as functions of the controller's values."""
 
 
 class ControllerValues:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pisigma.files.errors import ModelError, Place, PoseError
-from pisigma.files.model_files import COMPILED, hash_if_compiled, model_hash
+from pisigma.files.model_files import COMPILED, compiled_model_hash, model_hash
 from pisigma.model.inverse.joint_input import Postures, as_array, checked_approach, pose_array
 from pisigma.model.inverse.solution import AbstractInverse, Solution
 from pisigma.robot.kernels.array_kinematics import call_with_tensors, is_tensor
@@ -253,7 +253,7 @@ class CorrectedIK(AbstractInverse):
         """Return the corrected inverse kinematics at a payload or temperature other than the mean of the calibration.
 
         Outside the measured range the correction stays that of the nearest measured temperature, and the effect of the
-        payload is extrapolated linearly; `warnings` of the result then says so.
+        payload is extrapolated linearly; `warnings` of the result then states this.
 
         Args:
             payload_kg: mass that the robot carries [kg]; None for the mean of the calibration rows.
@@ -388,7 +388,7 @@ def load(folder: str | os.PathLike[str]) -> CorrectedIK:
 
 def _stored_kernels(path: Path) -> "pisigma.model.inverse.compiled_ik.CompiledIK | None":
     """Read the compiled arrays of a model folder; None if they are missing, damaged or out of date."""
-    stated = hash_if_compiled(path)
+    stated = compiled_model_hash(path)
     if stated is None:
         return None
     from pisigma.model.inverse.compiled_ik import CompiledIK

@@ -34,7 +34,7 @@ _FAULTS = {
 """Faults of a pose, or of the joint values `near`, by the code that the kernels return."""
 
 _POSES = "homogeneous transforms of shape (*batch, 4, 4)"
-_METRES = "an array of real numbers, lengths in metres"
+_METRES = "an array of real numbers with lengths in metres"
 
 
 def fault_error(code: int, index: tuple[int, ...] = ()) -> PoseError:
@@ -61,7 +61,9 @@ def pose_array(values: Any) -> tuple[Any, bool, Any]:
     tensor = values if is_tensor(values) else None
     if tensor is not None and str(tensor.dtype) not in ("torch.float32", "torch.float64"):
         raise PoseError(
-            expected="float64 or float32, lengths in metres", value=values.dtype, option="T_base_tool"
+            expected="float64 or float32 values with lengths in metres",
+            value=values.dtype,
+            option="T_base_tool",
         )
     try:
         given = np.asarray(values if tensor is None else tensor.detach().numpy(force=True))

@@ -116,7 +116,7 @@ class _Chain:
         arms["dof"], arms["rows_used"] = robot.dof, rows
         arms["kind"][0, :rows] = [KINDS[row.type] for row in robot.rows]
         arms["rows"][0, 0, :rows] = arm_rows(robot)
-        arms["ends"][0, 0] = arm_ends(robot)
+        arms["ends"][0, 0] = base_and_tool_matrices(robot)
         arms["direction"][0, : robot.dof] = robot.directions
         arms["revolute"][0, : robot.dof] = robot.revolute
         self._dof, self._check = robot.dof, robot.check_joint_count
@@ -182,7 +182,7 @@ def arm_rows(robot: "pisigma.robot.description.Robot") -> np.ndarray:
     )
 
 
-def arm_ends(robot: "pisigma.robot.description.Robot") -> np.ndarray:
+def base_and_tool_matrices(robot: "pisigma.robot.description.Robot") -> np.ndarray:
     """Return base and tool of an arm as transforms without their last rows, `(2, 3, 4)`."""
     return np.stack([transform_of(end)[:3] for end in (robot.base.tolist(), robot.tool.tolist())])
 

@@ -21,8 +21,8 @@ class CompiledForm:
 
     Attributes:
         add: adds corrections of all joints to `memory.delta` [rad or m].
-        add_slope: adds the derivatives of every joint's correction by its own value to `memory.slope`; None where
-            they are small.
+        add_slope: adds the derivatives of every joint's correction with respect to its own value to `memory.slope`;
+            None if they are small.
         frames: whether `add` reads `memory.frames`: of every joint axis and origin, axes and origin of its row's
             frame, in the frame of the first row of the nominal arm.
     """

@@ -71,7 +71,7 @@ def joint_correction(arms: Record, correction: Record, memory: Record, q: Array)
 
 @kernel
 def correction_slope(arms: Record, correction: Record, memory: Record, q: Array) -> None:
-    """Write large derivatives of every joint's correction by its own value into `memory.slope`.
+    """Write large derivatives of every joint's correction with respect to its own value into `memory.slope`.
 
     Args:
         arms: the arms.

@@ -207,7 +207,7 @@ def optimised_object(code: str, machine: Any) -> bytes:
 def cache_folders() -> list[Path]:
     """Return the cache folders of machine code: next to the package, or else in the user's cache folder.
 
-    `XDG_CACHE_HOME` counts where it is an absolute path, as its specification says; without a home there is no cache
+    `XDG_CACHE_HOME` is used if it is an absolute path, as its specification says; without a home there is no cache
     of the user.
     """
     folders = [Path(__file__).parent / "__pycache__"]

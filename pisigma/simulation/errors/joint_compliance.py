@@ -77,8 +77,8 @@ def gravity_load(
 ) -> Float[Tensor, "*batch dof"]:
     """Return the gravity torque [N m] or force [N] of every joint, with the sign of the controller's joint values.
 
-    It is the negative derivative of the potential energy by the joint values. The sum over the masses beyond a
-    joint is kept as their total M and first moment S = Σ m r: `tau_j = z_j · ((S - M p_j) x g)`.
+    It is the negative derivative of the potential energy with respect to the joint values. The sum over the masses
+    beyond a joint is kept as their total M and first moment S = Σ m r: `tau_j = z_j · ((S - M p_j) x g)`.
 
     Args:
         robot: the robot, whose base is ignored.

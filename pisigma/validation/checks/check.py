@@ -256,5 +256,5 @@ def _unknown(names: tuple[str, ...], known: Collection[str]) -> bool:
 
 
 def _position_noise(noise: CalibrationNoise) -> float:
-    """Return the noise of a coordinate [m]; 0 where the calibration had no positions, NaN where it is not known."""
+    """Return the noise of a coordinate [m]; 0 if the calibration had no positions, NaN if it is not known."""
     return noise.standard_deviation("position") if "position" in noise.value else 0.0

@@ -119,7 +119,7 @@ def _consequence(ratio: PriorRatio, usual: RobotClass, possible: RobotClass | No
     if believed and possible is not None:
         return (
             f"which is usual for robots of class {possible.name}, not {usual.name}; held-out rows are predicted well, "
-            f"so the size of the prior was estimated from the data; if this is right, state --set class={possible.name}"
+            f"so the size of the prior was estimated from the data; if this is right, use --set class={possible.name}"
         )
     if possible is None:
         return (

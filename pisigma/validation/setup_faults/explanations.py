@@ -125,7 +125,7 @@ def _likely_conventions(arm: PredictingArm, here: Hypothesis) -> Iterator[tuple[
     eye = torch.eye(3).to(here.T)
     tried = list(other_conventions(here.measured.rotation))
     R = torch.where(turned[:, None, None], torch.stack([rotation for rotation, _, _ in tried]), eye)
-    for mode in arm.modes:
+    for mode in arm.fits_of_frames:
         errors = error_with_fitted(mode, here.T, replace(here.measured, rotation=R))
         limit = max(NEAR_BEST**2 * float(errors.min()), NOTICED**2)
         for number in errors.argsort()[:MAX_CONVENTIONS].tolist():

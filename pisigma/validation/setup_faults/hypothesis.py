@@ -71,7 +71,7 @@ class PredictingArm:
         return forward_kinematics(self.robot, rows.q)
 
     @property
-    def modes(self) -> tuple[FittedFrames, ...]:
+    def fits_of_frames(self) -> tuple[FittedFrames, ...]:
         """Frames that are fitted to compare hypotheses; without a model, base and tool always are."""
         return ("base and tool",) if self.model is None else ("none", "base", "base and tool")
 
@@ -305,8 +305,8 @@ def _turned(
     rotation.
 
     Returns:
-        The joint values, and the derivative of the target's pose by the joint: shift [m] and rotation [rad] in the
-        measuring frame.
+        The joint values, and the derivative of the target's pose with respect to the joint: shift [m] and rotation
+        [rad] in the measuring frame.
     """
     base, tool = frames
     T = forward_kinematics(robot, q)

@@ -251,7 +251,7 @@ def likely_maps(arm: PredictingArm, measurements: Measurements, measured: Measur
     some, few = measurements.select(rows), measured.select(rows)
 
     def errors_of(
-        maps: JointMaps, modes: Sequence[FittedFrames] = arm.modes
+        maps: JointMaps, modes: Sequence[FittedFrames] = arm.fits_of_frames
     ) -> Float64[Tensor, "modes maps"]:
         return arm.screened_errors(some, maps.apply(some.q), few, modes)
 
@@ -265,7 +265,7 @@ def likely_maps(arm: PredictingArm, measurements: Measurements, measured: Measur
     tried = [(maps, errors_of(maps)) for maps in kinds]
     unchanged = errors_of(JointMaps.unchanged(1, robot.dof))[:, 0].tolist()
     likely: list[JointMaps] = []
-    for number, mode in enumerate(arm.modes):
+    for number, mode in enumerate(arm.fits_of_frames):
         zeros = _best_zeros(robot, lambda maps, mode=mode: errors_of(maps, [mode])[0])  # type: ignore[misc]
         candidates = [(maps, errors[number]) for maps, errors in tried]
         candidates.append((zeros, errors_of(zeros, [mode])[0]))

@@ -207,8 +207,8 @@ def are_unrelated(robot: Robot, measurements: Measurements) -> bool:
 def usual_error(robot: Robot, q: Float64[Tensor, "rows dof"]) -> float:
     """Compute the RMS position error [m] caused by geometric errors of 1 mm and 1 mrad.
 
-    Its covariance is `J P J^T` for the derivative `J` of the position by the DH parameters and their prior covariance
-    `P`. The part that base and tool absorb is neglected.
+    Its covariance is `J P J^T` for the derivative `J` of the position with respect to the DH parameters and their prior
+    covariance `P`. The part that base and tool absorb is neglected.
     """
     J = identification_jacobian(robot, q)[1][:, :3, : 5 * len(robot.rows)]
     return USUAL * float(J.square().sum((1, 2)).mean().sqrt())

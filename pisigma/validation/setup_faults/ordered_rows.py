@@ -40,7 +40,7 @@ class OrderedRows:
         problem: the problem of these rows.
         number: number of every row in the measurements.
         residual: three values per sensor, 0 where nothing was measured.
-        derivative: derivative of the values by all parameters.
+        derivative: derivative of the values with respect to all parameters.
         values: number of measured values.
         noise: standard deviation of every column of values [m or rad], or the factor on those stated in the rows.
     """
@@ -135,7 +135,7 @@ class OrderedRows:
     def motion_derivative(
         self, kind: Literal["frame", "target"]
     ) -> tuple[Int64[np.ndarray, " rows"], Float64[np.ndarray, "rows values motion"]]:
-        """Return the frame or target of every row, and the derivative of its values by their shift and rotation.
+        """Return the frame or target of every row, and derivatives with respect to its shift and rotation.
 
         Positions do not depend on the rotation of a target.
         """
@@ -149,7 +149,7 @@ class OrderedRows:
 
     @cached_property
     def joint_derivative(self) -> Float64[np.ndarray, "rows values dof"]:
-        """Derivative of the values by the joint values."""
+        """Derivative of the values with respect to the joint values."""
         robot = self.problem.space.robot
         theta_or_d = 5 * np.array(robot.joint_rows) + ~np.array(robot.revolute)
         derivative: np.ndarray = self.derivative[:, :, theta_or_d] * robot.directions
@@ -157,7 +157,7 @@ class OrderedRows:
 
     @cached_property
     def jacobian(self) -> Float64[np.ndarray, "rows values unknowns"]:
-        """Derivative by the parameters of the calibration, and by the weights of a series of joint errors."""
+        """Derivative with respect to the calibration's parameters, and the weights of a series of joint errors."""
         robot = self.problem.space.robot
         series = FourierSeries(robot, HARMONICS).columns(self.problem.state).cpu().numpy()
         by_weights = self.joint_derivative[..., None] * series[:, None]

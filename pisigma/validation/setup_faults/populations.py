@@ -132,7 +132,7 @@ def _alternating(second: Bool[np.ndarray, " rows"]) -> Bool[np.ndarray, " rows"]
 def _differences(
     rows: OrderedRows,
 ) -> Iterator[tuple[_Differing, Float64[np.ndarray, "rows values numbers"], Float64[np.ndarray, " numbers"]]]:
-    """Yield the derivatives by each thing that may differ, with the precision of the prior of its difference."""
+    """Yield derivatives with respect to all possible differences, with the prior precision of each."""
     kinds: tuple[tuple[_Differing, Literal["frame", "target"]], ...] = (
         ("tool", "target"),
         ("frame", "frame"),

@@ -111,7 +111,7 @@ class _Candidate:
         moved: see `Motion`.
         number: number of the frame or the target.
         index: indices of its rows, in the order of the file.
-        full: derivative of their values by its motion.
+        full: derivative of their values with respect to its motion.
         course: share of every motion completed at each row: 0 or 1 for a sudden motion.
         first: see `Motion`.
     """
@@ -125,7 +125,7 @@ class _Candidate:
 
     @cached_property
     def columns(self) -> Float64[np.ndarray, "own values motions"]:
-        """Derivative of the rows' values by all its motions."""
+        """Derivative of the rows' values with respect to all its motions."""
         return np.concatenate([self.full * course[:, None, None] for course in self.course.T], 2)
 
     @property

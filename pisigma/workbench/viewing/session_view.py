@@ -112,7 +112,7 @@ class SessionView:
         with self._lock, self._server.atomic():
             self._state = state
             if not self._magnified_by_hand:
-                times = magnification_of(top, self._reach)
+                times = arrow_magnification(top, self._reach)
                 self._panel.magnification.value = times  # type: ignore[misc]  # mypy misses its decorated setter
             self._scene.show_robot(state)
             if state.base is not None:
@@ -143,7 +143,7 @@ def first_view(arm: ArmInSurroundings) -> tuple[Float64[np.ndarray, " 3"], Float
     return middle + CLOSER * radius / np.sin(FIELD / 2) * direction / np.linalg.norm(direction), middle
 
 
-def magnification_of(top: float, reach: float) -> int:
+def arrow_magnification(top: float, reach: float) -> int:
     """Return the magnification with which errors can be seen next to a robot.
 
     Args:

@@ -104,7 +104,7 @@ class IncomingRows:
         return None if self.is_ready else import_rows(self.proposal)
 
     @cached_property
-    def unchecked(self) -> Measurements:
+    def unchecked_rows(self) -> Measurements:
         """The rows, which need not be possible for the robot.
 
         Raises:

@@ -204,8 +204,8 @@ class CalibrationSettings:
         stated = [name for name in self.__dataclass_fields__ if getattr(self, name) != getattr(usual, name)]
         if stated:
             raise IdentificationError(
-                "a calibration with the prior of a fleet is a hybrid of all its parameters, and is cross-validated "
-                "row by row",
+                "a calibration with a fleet prior estimates all parameters of a hybrid, and is cross-validated row "
+                "by row",
                 option=", ".join(stated),
                 remedy="omit this, or the prior",
             )

@@ -21,7 +21,7 @@ class MonitorSettings:
         moved: what was moved after the model was made: base, tool or base,tool (empty: neither). None: detected from
             the rows.
         limit_mm: limit of the RMS error [mm]; the date of crossing it is predicted.
-        history: do not read or write the history of the model, which keeps the sessions of all calls.
+        history: do not read or write the history of the model, which stores the sessions of all calls.
         cameras: cameras and boards, for files of detected board corners.
 
     Raises:

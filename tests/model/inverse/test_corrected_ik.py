@@ -111,8 +111,8 @@ def test_integers_are_accepted():
 @pytest.mark.parametrize(
     ("poses", "fields"),
     [
-        ([["a"] * 4] * 4, {"expected": "an array of real numbers, lengths in metres"}),
-        ([[1.0, 2.0], [3.0]], {"expected": "an array of real numbers, lengths in metres"}),
+        ([["a"] * 4] * 4, {"expected": "an array of real numbers with lengths in metres"}),
+        ([[1.0, 2.0], [3.0]], {"expected": "an array of real numbers with lengths in metres"}),
         (np.eye(3), {"value": (3, 3)}),
         (torch.eye(4, dtype=torch.int64), {"value": torch.int64}),
         (torch.full((2, 4, 4), torch.nan), {"expected": "finite entries"}),

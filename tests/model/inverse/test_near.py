@@ -83,7 +83,7 @@ def test_near_broadcasts_and_may_be_a_list(name):
         ([math.nan] * 6, {"expected": "finite joint values"}),
         ([0.0, -90.0, 90.0, 0.0, 90.0, 0.0], {"value": -90.0}),
         (torch.zeros(3, 6, dtype=torch.float64), {"value": (3,)}),
-        (["left"] * 6, {"expected": "an array of real numbers, lengths in metres"}),
+        (["left"] * 6, {"expected": "an array of real numbers with lengths in metres"}),
     ],
 )
 @pytest.mark.parametrize("name", ["kiro4", "ur10"])

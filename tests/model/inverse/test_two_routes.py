@@ -13,7 +13,7 @@ from testing.refusals import numbers_in, refused
 
 import pisigma
 from pisigma.files.errors import ModelError, PoseError
-from pisigma.files.model_files import COMPILED, DESCRIPTION, WEIGHTS, hash_if_compiled
+from pisigma.files.model_files import COMPILED, DESCRIPTION, WEIGHTS, compiled_model_hash
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import save_model
 from pisigma.model.inverse.corrected_ik import CorrectedIK, load
@@ -226,7 +226,7 @@ def test_compiled_arrays_belong_to_the_state_of_the_model(folder, tmp_path, pose
     (copy / COMPILED).unlink()
     assert_close(call(load(copy), poses.numpy()).q, call(load(folder), poses.numpy()).q, atol=1e-12)
     (copy / WEIGHTS).unlink()
-    assert hash_if_compiled(copy) is None
+    assert compiled_model_hash(copy) is None
     with refused(ModelError, value=WEIGHTS):
         load(copy)
 

@@ -208,8 +208,8 @@ INVALID = {
     "mirrored": (np.diag([1.0, 1.0, -1.0, 1.0]), "a right-handed rotation part (determinant +1)"),
     "last row": (2 * np.eye(4), "the last row 0 0 0 1"),
     "shape": (np.eye(3), "one homogeneous transform of shape (4, 4)"),
-    "text": ([["a"] * 4] * 4, "an array of real numbers, lengths in metres"),
-    "ragged": ([[1.0], [1.0, 2.0]], "an array of real numbers, lengths in metres"),
+    "text": ([["a"] * 4] * 4, "an array of real numbers with lengths in metres"),
+    "ragged": ([[1.0], [1.0, 2.0]], "an array of real numbers with lengths in metres"),
 }
 
 
@@ -229,7 +229,7 @@ def test_invalid_poses_are_rejected_on_one_line(case, arms):
     [
         ({"near": np.zeros(5)}, "6 columns"),
         ({"near": np.full(6, np.nan)}, "finite joint values"),
-        ({"near": "here"}, "an array of real numbers, lengths in metres"),
+        ({"near": "here"}, "an array of real numbers with lengths in metres"),
         ({"branch": "front/elbow_up/no_flop"}, ""),
     ],
 )
@@ -247,7 +247,7 @@ def test_invalid_batches_are_rejected(arms):
         kernels.solve_batch(GOOD[:3])
     with refused(PoseError, option="threads", value=0):
         kernels.solve_batch(GOOD[None], threads=0)
-    with refused(PoseError, option="T_base_tool", expected="an array of real numbers, lengths in metres"):
+    with refused(PoseError, option="T_base_tool", expected="an array of real numbers with lengths in metres"):
         kernels.solve_batch([["a"] * 4] * 4)
 
 

@@ -312,7 +312,7 @@ def test_other_wrists_and_links_without_length_have_no_closed_form(row, column, 
             (),
         ),
         (torch.eye(3), "homogeneous transforms of shape (*batch, 4, 4)", (3, 3)),
-        (torch.eye(4, dtype=torch.int32), "float64 or float32, lengths in metres", torch.int32),
+        (torch.eye(4, dtype=torch.int32), "float64 or float32 values with lengths in metres", torch.int32),
     ],
 )
 def test_invalid_poses_are_rejected(name, T, expected, value, robots):

@@ -175,7 +175,7 @@ class BaseToolProblem(AbstractLeastSquares[BaseToolState]):
         return 2 * torch.finfo(self.position.dtype).eps * (float(self.p_flange.abs().max()) + 1e-3)
 
     def _shifts(self, state: BaseToolState, R_base_flange: Tensor) -> Tensor:
-        """Compute the derivative of the positions by all unknowns."""
+        """Compute the derivative of the positions with respect to all unknowns."""
         rows, targets = self.position.shape[0], len(self.targets)
         J = self.position.new_zeros((rows, 3, 9 + 3 * targets))
         J[..., :3] = torch.eye(3, dtype=J.dtype, device=J.device)
@@ -188,7 +188,7 @@ class BaseToolProblem(AbstractLeastSquares[BaseToolState]):
         return J
 
     def _turns(self, R_base_flange: Tensor) -> Tensor:
-        """Compute the derivative of the rotations by all unknowns."""
+        """Compute the derivative of the rotations with respect to all unknowns."""
         J = self.position.new_zeros((self.position.shape[0], 3, 9 + 3 * len(self.targets)))
         rotated = self.rotated[:, None, None]
         J[..., 3:6] = rotated * torch.eye(3, dtype=J.dtype, device=J.device)

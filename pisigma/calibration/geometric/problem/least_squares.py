@@ -47,7 +47,7 @@ class Linearisation(Generic[Point]):
     Attributes:
         point: the point.
         cost: cost at the point [1].
-        descent: minus half the gradient of the cost by the unknowns.
+        descent: minus half the gradient of the cost with respect to the unknowns.
         normal: half its Gauss-Newton Hessian, whose inverse is the covariance of the unknowns.
         misfit: part of the cost due to the data; the remainder is due to the prior.
         rounding: misfit that rounding errors alone can cause.

@@ -271,7 +271,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         return [slice(start, min(start + JACOBIAN_CHUNK, self.rows)) for start in starts]
 
     def motion(self, point: Tensor, rows: slice, active: Tensor) -> ToolMotion:
-        """Compute the tool poses of some rows and their derivatives by some parameters.
+        """Compute the tool poses of some rows and their derivatives with respect to some parameters.
 
         The columns are 0 for bases and tools in rows of other frames and targets, and for parameters that do not move
         the tool.
@@ -290,7 +290,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         return ToolMotion(motion.position, motion.rotation, J)
 
     def _motion(self, point: Tensor, rows: slice) -> ToolMotion:
-        """Compute the tool poses of some rows and their derivatives by every kind of parameter."""
+        """Compute the tool poses of some rows and their derivatives with respect to every kind of parameter."""
         dh, bases, tools = self.space.split(point)
         frame, target = (
             None if len(owners) == 1 else number[rows]
@@ -302,7 +302,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
     def derivative(
         self, sensor: AbstractSensor, motion: ToolMotion, unknowns: Unknowns, rows: slice, active: Tensor
     ) -> Tensor:
-        """Compute the derivative of a sensor's values by the parameters that the motion was computed for."""
+        """Compute the derivative of a sensor's values with respect to the parameters of the motion."""
         J = sensor.derivative(motion, unknowns, rows)
         for block in sensor.unknown_derivatives(motion, unknowns, rows):
             positions, owner, column = self.space.positions_of(block.group, active)

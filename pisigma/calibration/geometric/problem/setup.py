@@ -288,7 +288,7 @@ class IdentifiedGeometry:
 
     @cached_property
     def coordinate_jacobian(self) -> Float64[Tensor, "parameters parameters"]:
-        """Derivative of all parameters in these coordinates by those of the problem; requires `setup` and `point`."""
+        """Derivative of the coordinates with respect to the problem's parameters; requires `setup` and `point`."""
         assert self.setup is not None
         assert self.point is not None
         return coordinate_change(self.setup, self.point.cpu())
@@ -336,7 +336,7 @@ def in_user_coordinates(
 def coordinate_change(
     setup: CalibrationSetup, point: Float64[Tensor, " parameters"]
 ) -> Float64[Tensor, "parameters parameters"]:
-    """Return the derivative of all parameters in the user's coordinates by those of the problem.
+    """Return the derivative of all parameters in the user's coordinates with respect to those of the problem.
 
     Args:
         setup: setup with the anchors that bases and tools of the problem are relative to.

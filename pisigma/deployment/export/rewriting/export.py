@@ -149,7 +149,7 @@ def _warnings(corrected: CorrectedProgram, source: str) -> tuple[str, ...]:
     """Return warnings on the branches of the targets, and on everything that was left unchanged."""
     sentences = [
         f"Targets are corrected for the branch {' and '.join(corrected.branches) or 'of the model'}. The program's "
-        "configuration was not checked: if the arm is in another configuration, state --branch."
+        "configuration was not checked: if the arm is in another configuration, use --branch."
     ]
     if corrected.left:
         sentences.append(

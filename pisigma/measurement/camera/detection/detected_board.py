@@ -111,7 +111,7 @@ def refine_corners(image: Image, detected: DetectedBoard, board: Board) -> Detec
 def _axes_of_squares(
     grid: Float64[np.ndarray, "corners 2"], pixels: Float64[np.ndarray, "corners 2"]
 ) -> Float64[np.ndarray, "corners 2 2"] | None:
-    """Return the derivatives of pixels by steps along rows and columns of squares, or None without a homography."""
+    """Return the change of pixels per step along rows and columns of squares; None without a homography."""
     H = cv2.findHomography(grid, pixels)[0] if len(grid) > MIN_CORNERS and np.ptp(grid, 0).all() else None
     if H is None:
         return None
@@ -196,7 +196,7 @@ def fit_saddles(
     Args:
         gray: gray values of the image.
         pixels: corners, accurate to half a pixel [px].
-        axes: derivative of pixels by steps along rows and columns of squares, one in each column [px].
+        axes: derivative of pixels with respect to steps along rows and columns of squares, one in each column [px].
         share: distance up to which nothing else is printed, relative to a square.
 
     Returns:
@@ -242,7 +242,7 @@ def _windows(
 def _saddle(
     x: Float64[np.ndarray, "corners window 2"], state: Float64[np.ndarray, "corners _unknowns"]
 ) -> tuple[Float64[np.ndarray, "corners window"], Float64[np.ndarray, "corners window 5"]]:
-    """Return the product of both blurred steps, and its derivatives by corner, angles and logarithm of the blur."""
+    """Return the product of both blurred steps, and its derivatives with respect to corner, angles and log blur."""
     off = x - state[:, None, :2]
     blur = np.exp(state[:, 4, None])
     steps, slopes, alongs, normals = [], [], [], []
@@ -253,7 +253,8 @@ def _saddle(
         steps.append(erf(distance / np.sqrt(2)))
         slopes.append(np.sqrt(2 / np.pi) * np.exp(-(distance**2) / 2))
         alongs.append((cos * off[..., 0] + sin * off[..., 1]) / blur)
-        # Derivatives of d: by the corner (sin, -cos) / blur, by the angle -along, by the logarithm of the blur -d.
+        # Derivatives of d: with respect to the corner (sin, -cos) / blur, by the angle -along, by the logarithm of the
+        # blur -d.
         normals.append((sin / blur, -cos / blur, distance))
     by = np.empty((*x.shape[:2], 5))
     first, second = slopes[0] * steps[1], steps[0] * slopes[1]
@@ -267,7 +268,7 @@ def _saddle(
 def _predicted(
     x: Float64[np.ndarray, "corners window 2"], state: Float64[np.ndarray, "corners 9"]
 ) -> tuple[Float64[np.ndarray, "corners window"], Float64[np.ndarray, "corners window 9"]]:
-    """Return predicted gray values, and their derivatives by all unknowns."""
+    """Return predicted gray values, and their derivatives with respect to all unknowns."""
     saddle, by = _saddle(x, state)
     light = 1 + (state[:, None, 7:] * x).sum(-1)
     printed = state[:, 5, None] + state[:, 6, None] * saddle

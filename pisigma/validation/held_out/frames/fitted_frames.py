@@ -171,7 +171,7 @@ def fit_frames(
         fitted: what is fitted.
 
     Returns:
-        The poses, and the derivatives of their values by all fitted parameters, see `frame_columns`.
+        The poses, and the derivatives of their values with respect to all fitted parameters, see `frame_columns`.
     """
     frame, target = numbers_of_names(rows.frame), numbers_of_names(rows.target)
     bases, tools = (torch.eye(4).to(T).repeat(int(number.max()) + 1, 1, 1) for number in (frame, target))
@@ -217,7 +217,7 @@ def _columns(
     tools: tuple[Tensor, Int64[Tensor, " rows"]],
     fitted: Collection[FrameKind],
 ) -> tuple[Float64[Tensor, "rows 6 numbers"], Float64[Tensor, "rows 6"]]:
-    """Compute the derivatives of all values by the fitted bases and tools, and the errors; see `frame_columns`."""
+    """Compute derivatives with respect to the fitted bases and tools, and the errors; see `frame_columns`."""
     J, error = frame_columns(T, measured, bases[0][bases[1]], tools[0][tools[1]])
     blocks = []
     for kind, (frames, number), part in zip(
