@@ -18,7 +18,7 @@ def markdown_table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str
 
 
 def figure_text(value: float) -> str:
-    """Write a figure with four decimals; with two digits and an exponent where it is below 0.001; NaN as "unknown"."""
+    """Write a figure with four decimals; with two digits and an exponent if it is below 0.001; NaN as "unknown"."""
     if math.isnan(value):
         return "unknown"
     return f"{value:.4f}" if value == 0 or abs(value) >= 1e-3 else f"{value:.1e}"

@@ -324,7 +324,7 @@ STEPS: dict[str, Callable[[Workbench, Cell, Form, Progress], Outcome]] = {
     "cell": Workbench.write_cell,
     "serve": Workbench.serve,
     "report": lambda _, *given: steps.report_cell(*given),
-    "event": lambda _, *given: steps.record(*given),
+    "event": lambda _, *given: steps.record_event(*given),
     "controller": lambda _, *given: steps.set_active_export(*given),
     "use": lambda _, *given: steps.use(*given),
     "session": lambda _, *given: steps.set_aside(*given),
