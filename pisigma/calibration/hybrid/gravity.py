@@ -102,7 +102,8 @@ class _EvidenceOfDirection:
         """Compute the log evidence."""
         lower = torch.linalg.cholesky(self._precision(c))
         gain = torch.linalg.solve_triangular(lower, (c @ self.descent)[..., None], upper=False)
-        return gain.square().sum((-2, -1)) / 2 - lower.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+        value: Tensor = gain.square().sum((-2, -1)) / 2 - lower.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+        return value
 
     def derivatives(self, c: Float64[Tensor, " 3"]) -> tuple[Float64[Tensor, " 3"], Float64[Tensor, "3 3"]]:
         """Compute gradient and Hessian by c."""
@@ -121,7 +122,9 @@ class _EvidenceOfDirection:
     def _precision(self, c: Float64[Tensor, "*batch 3"]) -> Float64[Tensor, "*batch masses masses"]:
         products = (c[..., :, None] * c[..., None, :]).flatten(-2)
         precision = (products @ self.normal.flatten(0, 1).flatten(1)) / 2
-        return precision.unflatten(-1, self.normal.shape[2:]) + torch.eye(self.normal.shape[-1]).to(c)
+        return precision.reshape(*c.shape[:-1], *self.normal.shape[2:]) + torch.eye(self.normal.shape[-1]).to(
+            c
+        )
 
 
 def _evidence_of_direction(
@@ -132,10 +135,10 @@ def _evidence_of_direction(
     weights = slice(design.weights_of(0).start, design.weights_of(count - 1).stop)
     root = fit.covariance_root(posterior).as_matrix[weights].cpu()
     total, prior = torch.linalg.inv(root @ root.t()), posterior.prior.precision[weights].cpu()
-    size = prior.unflatten(0, (count, -1))[0].rsqrt()
-    normal = (total - prior.diag()).unflatten(1, (count, -1)).unflatten(0, (count, -1))
+    size = prior.reshape(count, -1)[0].rsqrt()
+    normal = (total - prior.diag()).reshape(count, len(size), count, len(size))
     normal = (normal * size[:, None, None] * size).transpose(1, 2)
-    descent = (total @ posterior.x[weights].cpu()).unflatten(0, (count, -1)) * size
+    descent = (total @ posterior.x[weights].cpu()).reshape(count, -1) * size
     return _EvidenceOfDirection(normal + normal.transpose(0, 1), descent)
 
 
