@@ -72,7 +72,7 @@ def press(page, step) -> None:
     """Press the button of a form with a key, and wait for the end."""
     before = int(page.get_attribute("body", "data-ended"))
     page.press(f"form[data-step={step}] button[type=submit]", "Enter")
-    page.wait_for_selector(f"body[data-ended='{before + 1}']")
+    page.wait_for_selector(f"body[data-ended='{before + 1}']", timeout=60_000)
 
 
 def do(page, step, **fields):

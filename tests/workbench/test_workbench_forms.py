@@ -100,6 +100,7 @@ def test_a_text_is_kept_until_it_is_saved_and_no_other_is_replaced(browser, benc
         press(first, bench)
         assert first.query_selector(".refusal") is not None
         assert first.input_value("[name=text]") == "limit_mm: 'wrong"
+        expect(first.locator("form[data-name=text] button[type=submit]")).to_be_focused()
         second.fill("[name=text]", f"{text}\n# of the second\n")
         first.fill("[name=text]", changed)
         second.fill("[name=limit_mm]", "0.75")

@@ -43,8 +43,7 @@ async function show(name) {
   wanted = name;
   const text = await (await ask(`tab/${name}`)).text(), parts = document.createElement("div");
   if (wanted !== name) return;  // another tab was chosen meanwhile
-  const top = name === tab ? content.scrollTop : 0, focus = document.activeElement;
-  const place = focus.form && name === tab ? [keyOf(focus.form), focus.name] : [];
+  const top = name === tab ? content.scrollTop : 0;
   parts.innerHTML = text;
   if (kept[tab]) kept[tab].open = [...content.querySelectorAll("details[open]")].map(nameOf);
   const left = kept[name] ||= { forms: {}, open: [] };
@@ -60,8 +59,6 @@ async function show(name) {
   if (proposal) parts.querySelector("#proposal")?.append(proposal);
   content.replaceChildren(...parts.childNodes);
   content.querySelectorAll("details").forEach(one => { one.open ||= left.open.includes(nameOf(one)); });
-  const [form, field] = [left.forms[place[0]]?.form, place[1]];  // the form may be a new one
-  if (form) (form.elements[field] || form.querySelector("[type=submit]")).focus({ preventScroll: true });
   content.scrollTop = top;
   tab = name;
   for (const button of document.querySelectorAll("[role=tab]")) {
@@ -76,6 +73,15 @@ async function show(name) {
   content.querySelectorAll(".outcome[data-field]").forEach(one => { if (refusals[one.dataset.step] === one.outerHTML) mark(one, refused === one.outerHTML); });
   content.querySelectorAll("form").forEach(say);
   lock();
+}
+
+let place = null;  // what has the focus in a tab
+document.addEventListener("focusin", ({ target }) => { place = content.contains(target) ? { target, tab, key: target.form && keyOf(target.form), name: target.name } : null; });
+
+function focusAgain() {  // forms that were replaced, and buttons that were locked, have lost it
+  if (place?.tab !== tab || document.activeElement !== document.body) return;
+  const form = kept[tab]?.forms[place.key]?.form;
+  (content.contains(place.target) ? place.target : form?.elements[place.name] || form?.querySelector("[type=submit]"))?.focus({ preventScroll: true });
 }
 
 function isEdited(one) {
@@ -211,7 +217,10 @@ async function propose(fields) {  // how the columns are read at once, then what
   } catch (problem) { shown.textContent = problem.message; shown.hidden = false; }
 }
 
-function lock() { content.querySelectorAll("form button[type=submit]").forEach(one => { one.disabled = running !== null && one.closest("form").dataset.go === undefined; }); }
+function lock() {
+  content.querySelectorAll("form button[type=submit]").forEach(one => { one.disabled = running !== null && one.closest("form").dataset.go === undefined; });
+  focusAgain();
+}
 
 let polling = null;
 async function poll() {
