@@ -5,6 +5,7 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from testing.cell_rows import ROBOT, day, measured
@@ -345,7 +346,7 @@ def test_status_is_printed_again_until_it_is_interrupted(run, cell, monkeypatch)
         if len(waited) == 2:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr("time.sleep", sleep)
+    monkeypatch.setattr("pisigma.cli.cell.time", SimpleNamespace(sleep=sleep))
     result = run("status", cell, "--watch", 5)
     assert waited == [5.0, 5.0]
     assert result.stdout.count("pisigma plan") == 2

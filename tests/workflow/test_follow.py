@@ -1,5 +1,7 @@
 """Following a growing file."""
 
+from types import SimpleNamespace
+
 import pytest
 from testing.measured_plans import header, measured_plan, row_lines
 from testing.models import no_type_checker
@@ -27,7 +29,7 @@ def test_rows_are_checked_as_they_are_measured_until_the_plan_is_done(tmp_path, 
         with file.open("a") as out:
             out.write(lines.pop(0) if lines else "")
 
-    monkeypatch.setattr("pisigma.workflow.follow.time.sleep", measure_one)
+    monkeypatch.setattr("pisigma.workflow.follow.time", SimpleNamespace(sleep=measure_one))
     seen, waited = [], []
     with no_type_checker():
         for step in follow(session(), GrowingFile(file, ROBOT)):

@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from testing.measured_plans import header, measured_plan, row_lines, with_offset
@@ -75,7 +76,7 @@ def test_ctrl_c_ends_with_the_summary(run, folder, monkeypatch):
     def interrupt(seconds: float) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("pisigma.workflow.follow.time.sleep", interrupt)
+    monkeypatch.setattr("pisigma.workflow.follow.time", SimpleNamespace(sleep=interrupt))
     result = run("measure", folder / "poses.csv", "--rows", folder / "rows.csv", "--set", "every=100")
     assert result.exit_code == 0, result.output
     assert "Trust: 11 rows counted, 1 left out" in result.stdout
