@@ -213,7 +213,7 @@ def _settings_changed(facts: CellFacts, _: ModelEntry | None = None) -> Step | N
     last = _last_calibration(facts)
     if last is None or last.settings_sha256 in ("", facts.settings_sha256):
         return None
-    why = "the settings of the calibration in cell.yaml, or a file that they name, were changed after it"
+    why = "the settings of the calibration in cell.yaml, or a file that they name, were changed after the last one"
     return Step("settings_changed", why, facts.command("calibrate"))
 
 
