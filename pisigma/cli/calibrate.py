@@ -48,7 +48,7 @@ Tip = Annotated[str | None, typer.Option(help="Tool link of a URDF file. [defaul
 Prior = Annotated[
     Path | None,
     typer.Option(
-        help="Start from this model folder of `pisigma fleet prior` where that predicts held-out rows better.",
+        help="Start from this model folder of `pisigma fleet prior` if it predicts held-out rows better.",
         autocompletion=complete_model,
     ),
 ]
@@ -72,7 +72,7 @@ def calibrate(
 ) -> None:
     """Calibrate a robot from measurements and write a model folder with card and figures.
 
-    Estimates geometry, base, tool and, where it predicts held-out rows better, a joint correction. Exits with status 3
+    Estimates geometry, base, tool and, if it predicts held-out rows better, a joint correction. Exits with status 3
     and writes no folder if the result must not be trusted.
     """
     from pisigma.files.output_folder import check_folder

@@ -48,7 +48,7 @@ class ServeSettings:
         json_port: port for lines of JSON (0: any free port).
         binary_port: port for binary frames (0: any free port).
         zmq_port: port for ZeroMQ (0: any free port). Needs the extra serve. None: no ZeroMQ.
-        opcua: whether to serve over OPC UA as well. Needs the extra opcua.
+        opcua: also serve over OPC UA. Needs the extra opcua.
         opcua_port: port for OPC UA (0: any free port).
         opcua_certificates: folder of the certificate for OPC UA, which is made if it is missing, and of the
             certificates of clients in its folder `trusted`. Needed if other machines can reach the server.

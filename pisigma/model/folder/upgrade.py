@@ -85,7 +85,7 @@ class Upgrade:
 def upgrade_folder(folder: str | os.PathLike[str], check: Callable[[CalibratedModel, Path], None]) -> Upgrade:
     """Convert a model folder of an earlier version to the format of this one, completely or not at all.
 
-    Tensors, figures and all other files stay as they are, except for the type of a covariance root, and so does the
+    Tensors, figures and all other files are unchanged, except for the type of a covariance root, and so is the
     card except for statements that are no longer true; the file for the compiled kernels is written again.
 
     Args:

@@ -93,7 +93,7 @@ class CalibrationSettings:
     """Settings of a calibration and of its validation.
 
     Attributes:
-        model: kind of calibration: hybrid (geometry and, where the data support it, a joint correction) or geometric.
+        model: kind of calibration: hybrid (geometry and, if the data support it, a joint correction) or geometric.
         folds: number of folds of the cross-validation (0: none). None: 5, or one per placement.
         hold_out: fraction of the rows to hold out once, instead of a cross-validation.
         split: how to split the rows: joints (at random), interleaved, time, space or placement. Rows of equal joint
