@@ -14,7 +14,7 @@ from pisigma.estimation.prior import GaussianPrior
 from pisigma.estimation.regression import AbstractRegression, Posterior, SensorCount
 
 DETERMINED = 1e-9
-"""Share of the precision of a value, or of the best determined unknown, below which it counts as undetermined."""
+"""Share of the precision of a value, or of the best determined unknown, below which it is treated as undetermined."""
 MAX_VARIANCE_RATIO = 1e6
 """Ratio of the values' prior variances to the noise variance up to which traces of P are accurate to 1e-4."""
 
@@ -71,7 +71,7 @@ class DualRegression(AbstractRegression):
         # Parameters without a prior have precision 0; their constant term is left out.
         stated = precision[:active]
         evidence = float(self.y @ alpha) + log_det - float(stated[stated > 0].log().sum())
-        # |V| contains the noise of all values; repeated poses count as fewer independent ones (`SensorCount`).
+        # |V| contains the noise of all values; repeated poses are treated as fewer independent ones (`SensorCount`).
         evidence += log_noise(self.sensors, noise) - float(variance.log().sum())
         # Residuals are variance · alpha; the leverage of a value is 1 - variance · P_ii.
         misfit = self._by_sensor((variance * alpha).square())

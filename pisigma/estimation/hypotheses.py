@@ -233,7 +233,7 @@ class SessionEvidence:
 
     def _gain(self, groups: Sequence[DriftGroup], noise_factor: float) -> tuple[Tensor, Tensor]:
         """Return the gain matrix from values to an estimate of the groups' unknowns, and its covariance."""
-        # Groups of fixed size are part of K, but those to be estimated must not count as noise too.
+        # Groups of fixed size are part of K, but those to be estimated must not be treated as noise too.
         V = self._K + self._noise(noise_factor).square().diag()
         for B in (self.values.X[:, one.index] * one.deviation for one in groups if one.fixed_size):
             V = V - B @ B.t()

@@ -29,7 +29,7 @@ from pisigma.files.schema_choices import allowed_texts, valid_keys
 MAX_BYTES = 2**18
 """Largest YAML file that people write; reading it takes two seconds."""
 MAX_VALUES = 200_000
-"""Most values in a file with its aliases expanded; `CHARACTERS_PER_VALUE` characters of a text count as one."""
+"""Most values in a file with its aliases expanded; `CHARACTERS_PER_VALUE` characters of a text are treated as one."""
 CHARACTERS_PER_VALUE = 64
 SAFE_DEPTH = 2000
 """Nesting depth that libyaml, which does not check its stack, certainly parses without overflow."""
@@ -248,7 +248,7 @@ def _composed(text: str) -> tuple[Any, yaml.Node | None]:
 
 
 def _count(node: yaml.Node, known: dict[int, int]) -> int:
-    """Count the values at and below a node; long texts count as several, aliases once per use."""
+    """Count the values at and below a node; long texts are treated as several, aliases once per use."""
     if id(node) not in known:
         children: list[yaml.Node] = []
         if isinstance(node, yaml.MappingNode):

@@ -32,10 +32,10 @@ class ConditionFeatures(AbstractFeature):
     """Payload and temperature, each times 1, sine and cosine of the joint's own value (prismatic: scaled value).
 
     A condition is expressed in standard deviations from its mean over the measured rows, so that missing
-    conditions count as their means. The payload also multiplies the gravity torques of a mass in the last row's frame;
-    its effect is proportional, beyond the measured values too. Beyond the lowest and highest measured temperature the
-    correction is constant, because thermal expansion of an arm is not linear and extrapolating it would soon increase
-    the errors.
+    conditions are treated as their means. The payload also multiplies the gravity torques of a mass in the last row's
+    frame; its effect is proportional, beyond the measured values too. Beyond the lowest and highest measured
+    temperature the correction is constant, because thermal expansion of an arm is not linear and extrapolating it would
+    soon increase the errors.
 
     Attributes:
         names: names of the conditions.
@@ -123,7 +123,7 @@ class ConditionFeatures(AbstractFeature):
     ) -> Float[Tensor, "*batch conditions"]:
         """Conditions [kg, deg C] in standard deviations from their means; 0 where one is NaN.
 
-        A temperature beyond the measured ones counts as the nearest of these.
+        A temperature beyond the measured ones is treated as the nearest of these.
         """
         low, high = stated.new_tensor(self.measured).unbind(-1)
         kept = torch.tensor([name == "temperature_c" for name in self.names], device=stated.device)

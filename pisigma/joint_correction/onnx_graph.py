@@ -115,7 +115,7 @@ class OnnxGraph:
         a = node("Cast", node("Atan", node("Cast", ratio, to=floats)), to=doubles)
         a = node("Where", node("Greater", high, wide), node("Sub", math.pi / 2, a), a)
         a = node("Where", node("Less", cosine, 0.0), node("Sub", math.pi, a), a)
-        below = node("Less", node("Reciprocal", sine), 0.0)  # -0 counts as negative, as for atan2
+        below = node("Less", node("Reciprocal", sine), 0.0)  # -0 is treated as negative, as for atan2
         a = node("Where", below, node("Neg", a), a)
         square = node("Add", node("Mul", sine, sine), node("Mul", cosine, cosine))
         length = node("Max", node("Sqrt", square), _TINY)

@@ -9,7 +9,7 @@ MARGIN = 1.05
 """Factor between the radius of a domain and the largest distance between neighbouring training rows."""
 
 REPEAT = 1e-3
-"""Training rows that are closer than this, in scaled inputs from -1 to 1, count as repeats of one measurement."""
+"""Training rows that are closer than this, in scaled inputs from -1 to 1, are treated as repeats of one measurement."""
 
 _CHUNK = 4096
 
@@ -18,8 +18,8 @@ class Domain(nn.Module):
     """Region of the network's scaled inputs that the training rows cover.
 
     The measure of a pose is its distance to the nearest training row divided by `radius`, which is the largest distance
-    of a training row to its nearest neighbour plus 5 % (repeats do not count as neighbours). A pose with a measure of
-    at most 1 is inside.
+    of a training row to its nearest neighbour plus 5 % (repeats are not treated as neighbours). A pose with a measure
+    of at most 1 is inside.
 
     Attributes:
         samples: `(samples, inputs)`: scaled inputs of training rows.

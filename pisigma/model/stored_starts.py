@@ -12,7 +12,7 @@ from pisigma.robot.kinematics.task_axes import WHOLE, TaskAxes
 MAX_STARTS = 512
 
 SAME = 1e-6
-"""[rad or m] Joint values that round to the same multiple of this count as equal."""
+"""[rad or m] Joint values that round to the same multiple of this are treated as equal."""
 _CHUNK = 4096
 """Poses whose distances to all starts are computed at once, which bounds the memory."""
 

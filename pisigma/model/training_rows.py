@@ -70,7 +70,7 @@ def training_row_warnings(
     """Return a warning if rows that a model is evaluated on are among its training rows; else nothing.
 
     A model stores joint values and readings of its rows; one of an earlier version only a hash of all rows and the
-    joint values of some, so poses that were measured again count as training rows too.
+    joint values of some, so poses that were measured again are treated as training rows too.
 
     Args:
         model: model of any kind.

@@ -21,7 +21,7 @@ TARGET_RANGE = 1.25
 sign. With [-1, 1] some starts end in poor minima, with [0, 2] the paper's learning rates diverge."""
 
 _MIN_INPUT_RANGE = 1e-9
-"""Range of an input [m, rad or 1] below which it counts as constant."""
+"""Range of an input [m, rad or 1] below which it is treated as constant."""
 _MIN_TARGET_RANGE = 1e-12
 """Smallest range by which targets are scaled [rad or m]."""
 

@@ -62,7 +62,7 @@ def select_poses(
         )
     if not len(D):
         raise PlanningError(
-            expected="joint values of the task", value="none", option="task", remedy="state some poses"
+            expected="joint values of the task", value="none", option="task", remedy="add poses to the task"
         )
     goal = condense_derivatives(D)
     first = PoseSelection(B, goal, "D")

@@ -103,7 +103,7 @@ def best_base(
     M = (measured.position - wanted).mT @ (T[..., :3, 3] - middle)
     if bool(measured.has_rotation.any()):
         weight = measured.has_rotation.to(T)[:, None, None]
-        # As in `squared_errors`, every column of a rotation counts as a point of weight lever² / 2.
+        # As in `squared_errors`, every column of a rotation is treated as a point of weight lever² / 2.
         M = M + measured.lever**2 / 2 * (weight * measured.rotation @ T[..., :3, :3].mT).sum(-3)
     R = nearest_rotation(M)
     return transform(R, (wanted - middle @ R.mT)[..., 0, :])

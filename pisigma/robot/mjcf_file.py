@@ -148,7 +148,7 @@ class MjcfDrawing:
             or (before is not None and parent is not before)
         ):
             raise RobotError(
-                expected="one joint in every body, each body in the one before, and joint values of 0 as drawn",
+                expected="a chain of nested bodies with one joint each, drawn at joint values of 0",
                 value=str(body.get("name")),
                 at=Place(self.path, body.sourceline),
                 option="--like",

@@ -188,7 +188,7 @@ def _sections(robot: Robot, size: NetworkSize, q: Float64[Tensor, "poses dof"]) 
             shared += [f"sin({name})", f"cos({name})"] if revolute else [name]
     if not shared:
         raise IdentificationError(
-            "no joint moves among the poses to distil from",
+            "all poses to distil from have the same joint values",
             expected="poses with different joint values",
             remedy="give a larger region, or joint values that differ",
         )

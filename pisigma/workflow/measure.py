@@ -119,7 +119,7 @@ class MeasuringSession:
         return tuple(sorted(alarms, key=lambda alarm: alarm.line))
 
     @property
-    def is_due(self) -> bool:
+    def is_update_due(self) -> bool:
         """Whether there are enough new rows to update the accuracy: one, before the first update and after the plan."""
         with self._lock:
             new = self._training_rows - self._worked_out
@@ -144,7 +144,7 @@ class MeasuringSession:
 
     def next_step(self) -> Callable[[], tuple[Alarm, ...]] | None:
         """Return the most urgent step of `update`, except the cross-validation; None if all is done."""
-        if self.is_due:
+        if self.is_update_due:
             return self._calibrate
         if self._so_far is not self._ahead_of:
             return self._look_ahead

@@ -46,7 +46,7 @@ RESAMPLES = (200, 2000)
 NOMINAL, GEOMETRIC, CORRECTED = "nominal", "geometric", "corrected"
 
 HALVED = 0.5
-"""Largest ratio of the errors at which the corrected model counts as better although a setup fault was found."""
+"""Largest ratio of the errors at which the corrected model is treated as better although a setup fault was found."""
 
 MOTIONS = {"joint_zero", "frame", "tool"}
 """Setup faults that the posterior of a model explains in more detail."""

@@ -15,7 +15,7 @@ from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.kinematics.tolerances import MEASURED_ROUNDING
 
 LARGEST_GAP = math.radians(60)
-"""[rad] Largest distance of two measured joint values between which all values count as measured."""
+"""[rad] Largest distance of two measured joint values between which all values are treated as measured."""
 
 
 @dataclass(frozen=True, eq=False)

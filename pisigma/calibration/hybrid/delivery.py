@@ -35,7 +35,7 @@ EXACT_GROUPS = 200
 """Poses or positions up to which held-out rows are predicted by exact fits; those of other sensors always are."""
 
 TOLERANCE = 1.005
-"""Ratio of RMS errors above which errors count as larger; a smaller difference does not matter in practice."""
+"""Ratio of RMS errors above which errors are treated as larger; a smaller difference does not matter in practice."""
 REFITS = 10
 """Gauss-Newton steps for unknowns that only held-out rows determine, such as the position of their socket."""
 

@@ -30,7 +30,7 @@ A threshold of 3 gains nothing for arms with joint errors: on 16 to 30 positions
 are 0.998 and 1.001 times those at 5 in the mean of 80 fits each, on 20 to 30 of simulated arms 0.997 and 1.004 (120
 fits each). On simulated arms with errors of the geometry alone it costs 1.7 %."""
 CLEAR_GAIN = 1.0
-"""[standard errors] Decrease of the held-out squares that counts as better."""
+"""[standard errors] Decrease of the held-out squares that is regarded as an improvement."""
 STRONGLY = 3.0
 """Increase of the log evidence that is strong: a Bayes factor of 20, same source."""
 MAX_EFFECTIVE_SHARE = 0.75

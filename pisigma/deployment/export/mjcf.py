@@ -30,7 +30,7 @@ from pisigma.robot.urdf_rows import rows_of_chain
 from pisigma.robot.writing import comment_text, robot_to_urdf, unused_name
 
 SAME = 2e-3
-"""[m or rad] Largest difference of rows that count as those of the drawn model, which may be rounded to millimetres."""
+"""[m or rad] Largest difference from rows of the drawn model, which may be rounded to millimetres."""
 SNAP = 1e-5
 """Deviations of drawn right angles [rad] up to this are due to rounding."""
 DIGITS = 6
@@ -288,7 +288,7 @@ def _segments(robot: Robot) -> list[Frame]:
 def _row_frames(nominal: Robot, origins: Sequence[Frame], path: str | os.PathLike[str]) -> list[Frame]:
     """Return the frames of the nominal robot's moved rows in the drawn ones.
 
-    Both are converted to rows in the same way, and agree except for where the first row begins on its axis.
+    Both are converted to rows in the same way, so they agree except for the start of the first row along its axis.
 
     Args:
         nominal: the robot.

@@ -76,7 +76,7 @@ def _check(request: ExportRequest) -> None:
         check_rewriting(request)
     elif request.out.suffix.lower() in set(SCANNERS) - set(LANGUAGES):
         raise OutputError(
-            "this kind of file is written with --program only",
+            "files of this kind can be written only with --program",
             option="--out",
             value=request.out.suffix,
             at=Place(request.out),

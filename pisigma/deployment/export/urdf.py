@@ -43,7 +43,7 @@ MISSING = (
     f"{INERTIA} kg m2, {EFFORT}, {VELOCITY}), in {{links}}. Enter the maker's values before you simulate forces."
 )
 SAME = 1e-9
-"""[m or rad] Largest difference of rows that count as those of the file."""
+"""[m or rad] Largest difference of rows that are treated as those of the file."""
 
 
 def check_tip(request: ExportRequest) -> None:

@@ -138,7 +138,7 @@ class ServedModel:
 
 @dataclass(frozen=True)
 class ModelStatus:
-    """What an operator has to know about a served model.
+    """State of a served model, for operators.
 
     Attributes:
         model: name of the model.

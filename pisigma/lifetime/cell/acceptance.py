@@ -14,7 +14,7 @@ from pisigma.validation.uncertainty.instrument import Instrument
 EXPLAINED = 0.999
 """Probability with which errors that the budget explains are found to be explained by it."""
 MAX_FREEDOM = 1e9
-"""Degrees of freedom that count as infinite."""
+"""Degrees of freedom that are treated as infinite."""
 NO_PATHS = "AT and RT: the sessions of a cell contain no measured paths."
 
 

@@ -25,7 +25,7 @@ from pisigma.measurement.dates import date_in_name
 BEFORE_FIT = ("plan", "import")
 """Commands whose checks conclude nothing from measured rows."""
 MIN_MEASURED_SHARE = 0.9
-"""Smallest share of the poses of a plan after which it counts as measured; some poses may be out of sight."""
+"""Smallest share of the poses of a plan after which it is treated as measured; some poses may be out of sight."""
 
 
 NOT_TRUSTED = ("implausible", "setup_fault", "not_trusted")

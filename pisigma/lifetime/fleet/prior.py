@@ -69,8 +69,8 @@ def fleet_prior(name: str, robot: Robot, fleet: Sequence[Measurements]) -> Fleet
     """Estimate the distribution of the errors of a fleet.
 
     Every robot has errors `u ~ N(μ, Σ)` and rows that are linear in them. Expectation-maximisation (Dempster, Laird and
-    Rubin 1977, J. Royal Statistical Society B 39(1), 1-38) finds μ and Σ, so that each robot counts as far as its rows
-    determine its errors. The usual errors of the robot's class have a small weight, see
+    Rubin 1977, J. Royal Statistical Society B 39(1), 1-38) finds μ and Σ, so that each robot is treated as far as its
+    rows determine its errors. The usual errors of the robot's class have a small weight, see
     `pisigma.estimation.population.CLASS_ROBOTS`. Robots whose rows are too improbable given the others are left out,
     and the others are estimated again.
 

@@ -49,7 +49,7 @@ class RecalibrationSummary(AbstractSummary):
         outliers: rows that were left out.
         kept: candidate that was kept.
         verdict: sentence on which candidate was kept, with the errors of all.
-        left_out: number of rows that were held out in cross-validation and count.
+        left_out: number of rows that were held out in cross-validation and used.
         cross_validation: errors of held-out rows by candidate.
         changed: sentence on what moved.
         moved: significant movements.

@@ -21,7 +21,7 @@ _LIMITS = 1e8
 _NONE = 1e12
 """[rad²] Cost of a pose without a solution, as much as 10,000 poses outside joint limits."""
 _SMALL = 0.1
-"""[rad or m] A smaller step on one branch never counts as a jump."""
+"""[rad or m] A smaller step on one branch never is treated as a jump."""
 CHUNK = 8_192
 """Steps whose transitions between all pairs of branches are in memory at the same time."""
 _TURN = 2 * math.pi
@@ -30,7 +30,7 @@ _OTHER_BRANCH = 1e4
 _LATER = 1e-3
 """[rad²] Cost of a start on a later branch if none is requested, per place in the order of branches."""
 _STILL = 1e-9
-"""[rad or m] A joint that moves by less does not count as moving."""
+"""[rad or m] A joint that moves by less is not treated as moving."""
 
 
 @dataclass(frozen=True)

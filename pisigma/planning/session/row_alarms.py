@@ -88,7 +88,7 @@ def other_joint_values(
             )
         else:
             text = _in_other_unit(robot, rows.q[row : row + 1], poses, names) or (
-                "its joint values are not those of a planned pose; the row counts as an additional pose."
+                "its joint values are not those of a planned pose; the row is treated as an additional pose."
             )
         yield Alarm(rows.line[row], "pose", f"line {rows.line[row]}: {text}", repeat=False, counts=True)
 

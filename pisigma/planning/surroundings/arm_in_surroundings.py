@@ -20,7 +20,7 @@ from pisigma.robot.kinematics.tolerances import LIMIT_TOLERANCE
 POSES_PER_CHUNK = 2048
 """Poses that are checked together: some MB."""
 ROUNDING = 1e-9
-"""[m] Distance by which a measured pose counts as free of self-collision."""
+"""[m] Distance by which a measured pose is treated as free of self-collision."""
 
 
 @dataclass(frozen=True, eq=False)

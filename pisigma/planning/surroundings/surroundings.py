@@ -171,7 +171,7 @@ class LensSection(Section):
         aperture: f-number.
         focus_mm: depth of the focus plane [mm].
         pixel_um: edge length of a pixel [um].
-        blur_px: diameter of a point's image up to which it counts as sharp [px].
+        blur_px: diameter of a point's image up to which it is treated as sharp [px].
     """
 
     aperture: Positive

@@ -4,22 +4,22 @@ POSE_TOLERANCE, POSE_TOLERANCE_SINGLE = 1e-6, 1e-4
 """Largest deviation of `R^T R` from the identity and of the last row from (0, 0, 0, 1), for float64 and float32."""
 
 MEASURED_ROUNDING = 1e-9
-"""Largest excess [rad] over the measured joint range that still counts as measured: commanded values of measured
+"""Largest excess [rad] over the measured joint range that still is treated as measured: commanded values of measured
 poses equal those of the rows up to the residuals of their solution."""
 
 LIMIT_TOLERANCE = 1e-9
-"""Largest excess [rad or m] over a joint limit that still counts as inside; the value is not changed."""
+"""Largest excess [rad or m] over a joint limit that still is treated as inside; the value is not changed."""
 
 SINGULAR_TOLERANCE = 1e-5
 """`singularity_measure` below which a solution is SINGULAR (in float32: 3e-3). The iteration gets within about 1e-6 rad
 of a singular solution, because residuals grow with the square of the joint error there."""
 
 ROUNDING_UNITS = 500
-"""Multiples of the float type's epsilon up to which a cosine beyond 1 counts as 1 and a length as 0 (1.1e-13 in
+"""Multiples of the float type's epsilon up to which a cosine beyond 1 is treated as 1 and a length as 0 (1.1e-13 in
 float64)."""
 
 TILT_TOLERANCE = 1e-9
-"""Largest tilt [rad] of the target tool axis from the joint axes of a SCARA that counts as rounding."""
+"""Largest tilt [rad] of the target tool axis from the joint axes of a SCARA that is treated as rounding."""
 
 TRIANGLE_MARGIN = 1e-9
 """Relative distance of two links from stretched or folded, if a free joint moves to make them reach."""
@@ -49,7 +49,7 @@ NEAR_MISS = 0.01
 correction."""
 
 REACH_ROUNDING = 1e-9
-"""Relative excess of a pose's distance over the reach that counts as rounding."""
+"""Relative excess of a pose's distance over the reach that is treated as rounding."""
 
 NEAREST_MARGIN = 2e-4
 """Distance of the cosine from 1 (1.1 deg) that stretched or folded branches keep as starts of an iteration."""

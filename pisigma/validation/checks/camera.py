@@ -27,11 +27,11 @@ from pisigma.validation.held_out.diagnostic import Diagnostic
 FRONTAL = np.deg2rad(12.0)
 """[rad] If 90 % of the views are less oblique, the error over the workspace is 1.5 to 3 times that of usual views."""
 ONE_BRANCH = 0.95
-"""Share of the images in one branch of the arm above which the other branches count as not measured."""
+"""Share of the images in one branch of the arm above which the other branches are treated as not measured."""
 EXPLAINED = 1.3
 """Scatter of the images over that explained by their corners, below which no model of the arm can improve the fit."""
 WIDE = 3.0
-"""Standard deviation of the focal length [px] above which the intrinsics count as free; a usual calibration has 0.5."""
+"""Standard deviation of the focal length [px] above which intrinsics are regarded as free; usual is 0.5."""
 CONTRADICTED = 4.0
 """[standard deviations] Estimated intrinsics that deviate by more contradict their calibration."""
 POSTURES = 200

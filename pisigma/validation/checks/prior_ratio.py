@@ -17,7 +17,7 @@ IMPLAUSIBLE = 10.0
 """The same above which the rows do not belong to this robot (the user can state a wider prior): the odds against one
 normal error of 10 standard deviations are 1e23 to 1."""
 PREDICTED_SHARE = 0.25
-"""Held-out rows count as predicted well if their error is below this share of that of the nominal robot,"""
+"""Held-out rows are treated as predicted well if their error is below this share of that of the nominal robot,"""
 PREDICTED_REACH = 0.005
 """and below this share of the reach."""
 NAMES = {

@@ -18,7 +18,7 @@ from pisigma.validation.held_out.summary import AbstractSummary
 from pisigma.validation.held_out.validation_figures import ErrorFigures
 
 LEVEL = 0.05
-"""Relative change of an error below which it counts as unchanged."""
+"""Relative change of an error below which it is treated as unchanged."""
 
 
 Effect = Literal["lowers", "does not change", "raises"]

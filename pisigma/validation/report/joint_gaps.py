@@ -17,7 +17,7 @@ Stretch = tuple[float, float]
 COVERED = 0.98
 """Share of a joint's range above which no gap is reported."""
 NOT_MOVED = 1e-3
-"""Share of a joint's range below which the joint counts as not moved."""
+"""Share of a joint's range below which the joint is treated as not moved."""
 
 
 @dataclass(frozen=True)

@@ -42,7 +42,7 @@ SMALL_SHARE = 2e-4
 PLAUSIBLE_SHARE = 0.01
 """Largest errors of a calibrated robot, and after correcting a fault, as a share of the reach."""
 PLAUSIBLE_TURN = PLAUSIBLE_SHARE / LEVER_SHARE
-"""The same for orientations [rad], whose errors count as position errors at a distance of `LEVER_SHARE` of the
+"""The same for orientations [rad], whose errors are treated as position errors at a distance of `LEVER_SHARE` of the
 reach."""
 AS_GOOD = 1.5
 """Errors of a simpler explanation over the smallest ones up to which the simpler one is chosen."""

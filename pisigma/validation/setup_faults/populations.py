@@ -342,7 +342,7 @@ def two_populations(residuals: Float64[np.ndarray, "rows components"]) -> Mixtur
     # Log likelihoods of both models without their common constant; the BIC counts mean, covariance and share below.
     alone = np.linalg.slogdet(centred.T @ centred / rows + floor)[1]
     gain = np.logaddexp(*logs).sum() + rows / 2 * (alone + components)
-    # Scatters within a factor of 2 (geometric mean) count as equal: then the smaller population is the odd one.
+    # Scatters within a factor of 2 (geometric mean) are treated as equal: then the smaller population is the odd one.
     alike = abs(determinants[1] - determinants[0]) < 2 * components * math.log(2.0)
     far = int(np.argmin(counts) if alike else np.argmax(determinants))
     return Mixture(

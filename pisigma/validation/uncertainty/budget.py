@@ -17,7 +17,7 @@ class Component:
         evaluation: "A": from repeated observations (JCGM 100:2008, 4.2); "B": from other knowledge (4.3).
         standard_uncertainty: standard uncertainty of one coordinate of the tool's position [m].
         degrees_of_freedom: its degrees of freedom; infinite where the value is taken as exact; None if they are not
-            known, in which case they count as infinite.
+            known, in which case they are treated as infinite.
         source: where the figure comes from.
     """
 

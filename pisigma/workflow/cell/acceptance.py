@@ -46,7 +46,7 @@ def acceptance_of(cell: Cell) -> Acceptance:
             f"the cell has no session of model '{entry.name}'", at=Place(cell.folder), remedy=remedy
         )
     new = known[-1]
-    seen = cell.sessions.rows_for(entry, cell.sessions.as_measured(new), new.day)
+    seen = cell.sessions.rows_with_model_names(entry, cell.sessions.as_measured(new), new.day)
     measured, problem = _measured(cell, entry, new, seen) if later else (None, NO_SESSION)
     instrument = document.instrument or Instrument()
     repeats = tuple(

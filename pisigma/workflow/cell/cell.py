@@ -269,7 +269,7 @@ class Cell:
         warnings, sessions = self.controller_warnings("monitor", entry), self.sessions.new_to(entry)
         found: Monitoring | None = None
         for one in sessions:
-            seen = self.sessions.rows_for(entry, self.sessions.as_measured(one), one.day)
+            seen = self.sessions.rows_with_model_names(entry, self.sessions.as_measured(one), one.day)
             moved = {"moved": ",".join(seen.moved)} if seen.moved else {}
             settings = replace(
                 self.file.settings_of_step("monitor", **(moved | changed)), cameras=None, dates=(one.day,)
@@ -392,4 +392,8 @@ class Cell:
         entry = self._candidate(model)
         self.controller_warnings(command, entry)
         chosen = self.sessions.choose(entry, session)
-        return entry, chosen, self.sessions.rows_for(entry, self.sessions.as_measured(chosen), chosen.day)
+        return (
+            entry,
+            chosen,
+            self.sessions.rows_with_model_names(entry, self.sessions.as_measured(chosen), chosen.day),
+        )

@@ -66,7 +66,7 @@ def is_better(
         target_day=newest_day(events, "tool", day),
     )
     rows = stored.as_measured(newest)
-    seen = [stored.rows_for(one, rows, newest.day) for one in (in_use, entry)]
+    seen = [stored.rows_with_model_names(one, rows, newest.day) for one in (in_use, entry)]
     old = load_model(folder)
     judged = evaluate(
         [replace(old, name="in use"), replace(with_setup_names_of(without.model, entry, in_use), name="new")],

@@ -177,7 +177,7 @@ class Sessions:
                 check_rows(rows, self.robot),
             )  # other joint zeros: it does not describe the arm
         else:
-            seen = self.rows_for(model, rows, day)
+            seen = self.rows_with_model_names(model, rows, day)
             stated = RecalibrationSettings(seen.moved or None)
             loaded = load_model(self._folder_of(model))
             verdict = check_rows(seen.rows, loaded, stated.fitted, may_move(stated))
@@ -323,7 +323,7 @@ class Sessions:
             )
         return rows
 
-    def rows_for(self, model: ModelEntry, rows: Measurements, day: str) -> ModelRows:
+    def rows_with_model_names(self, model: ModelEntry, rows: Measurements, day: str) -> ModelRows:
         """Return rows with the names of a model's frame and target, and what was moved between them and the model.
 
         Args:

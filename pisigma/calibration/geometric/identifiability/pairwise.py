@@ -9,7 +9,7 @@ from pisigma.calibration.geometric.identifiability.redundancy import NO_EFFECT, 
 from pisigma.calibration.geometric.problem.information import Information
 
 CORRELATION_TOLERANCE = 1e-6
-"""Largest difference from ±1 of a correlation that counts as ±1."""
+"""Largest difference from ±1 of a correlation that is treated as ±1."""
 PAPER_ORDER = ("a", "d", "alpha", "theta", "beta", "base", "tool")
 
 

@@ -11,9 +11,9 @@ from pisigma.calibration.geometric.problem.information import Information
 from pisigma.calibration.geometric.problem.parameters import Parameter
 
 RANK_TOLERANCE = 1e-6
-"""Singular value of the column-scaled Jacobian over the largest one below which it counts as zero."""
+"""Singular value of the column-scaled Jacobian over the largest one below which it is treated as zero."""
 NO_EFFECT = 1e-9
-"""Length of a column over the longest one below which it counts as zero."""
+"""Length of a column over the longest one below which it is treated as zero."""
 PREFERENCE = ("base", "tool", "theta", "a", "d", "alpha", "beta")
 """Order in which parameters are kept; each class has ten times the weight of the next."""
 _WEIGHT = {group: 10.0**-rank for rank, group in enumerate(PREFERENCE)}
@@ -24,7 +24,7 @@ EXPLAINED = 0.5
 SIGNIFICANT = 20.0
 """and the F statistic that this must have."""
 VISIBLE = 1e-7
-"""Share of a column's length orthogonal to the kept columns below which it counts as dependent."""
+"""Share of a column's length orthogonal to the kept columns below which it is treated as dependent."""
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ MAX_ITERATIONS = 60
 LINEAR_ROWS = 13
 """Rows that determine base and tool by a linear system."""
 DEPENDENT = 1e-9
-"""Singular value of the linear system over the largest one below which it counts as zero."""
+"""Singular value of the linear system over the largest one below which it is treated as zero."""
 UNDETERMINED = 1e-9
 """Relative weight of the given rotation, which sets what points do not determine."""
 SINGLE = 0.9

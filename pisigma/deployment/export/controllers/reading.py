@@ -81,7 +81,7 @@ def read_controller_file(path: Path, nominal: Robot, max_change: float = MAX_CHA
     read = read_offsets if file is None or file.read is None else file.read
     robot = read(text, str(path), nominal)
     convention = file.convention(nominal) if file else Convention(nominal)
-    # The base and tool of the file define the frames of its poses and do not count as changes by the calibration.
+    # The base and tool of the file define the frames of its poses and are not treated as changes by the calibration.
     there = nominal.with_geometry(base=robot.base, tool=robot.tool)
     change = departure_from_nominal(robot, with_frames(convention.nominal, text) if file else there)
     if not max(change.mean_mm, LEVER * change.mean_mrad) <= max_change:

@@ -29,8 +29,8 @@ KEYS = {"delta_theta": 0, "delta_a": 2, "delta_d": 1, "delta_alpha": 3}
 """Column of `DH_COLUMNS` for every key of the file; radians and metres."""
 
 TILTED = 1e-6
-"""Sine of the angle between two axes below which they count as parallel: otherwise their common normal would be 1,000
-km away, and rounding of such large numbers would move the tool."""
+"""Sine of the angle between two axes below which they are treated as parallel: otherwise their common normal would be
+1,000 km away, and rounding of such large numbers would move the tool."""
 
 _LINE = r"(?m)^[ \t]*{key}[ \t]*=[ \t]*\[([^\]\n]*)\]"
 

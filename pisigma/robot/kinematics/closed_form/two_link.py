@@ -94,7 +94,7 @@ def solve_two_link(
 
     Returns:
         The angles; for a point out of reach they are those of the nearest arm and `reached` is False.
-        A cosine beyond 1 by rounding counts as 1.
+        A cosine beyond 1 by rounding is treated as 1.
     """
     cosine = (x * x + y * y - (a * a + b * b)) / (2 * a * b)
     reached = cosine.abs() <= 1 + rounding(x.dtype)
