@@ -42,11 +42,16 @@ CHROMIUM = (
 """Options of a browser that fetches nothing by itself and draws in three dimensions without a graphics card."""
 
 
+def pytest_configure() -> None:
+    """Do not look for garbage while tests are collected, which takes a fifth of that time."""
+    gc.disable()
+
+
 def pytest_collection_finish() -> None:
     """Leave torch and the tests out of garbage collections, which take some per cent of the time."""
-    gc.collect()
     gc.freeze()
     gc.set_threshold(20_000, 20, 20)
+    gc.enable()
 
 
 @pytest.fixture(scope="session")
