@@ -14,7 +14,7 @@ from pisigma.measurement.sensors.socket import matching_sockets
 from pisigma.model.folder.model_folder import load_model
 from pisigma.validation.held_out.calibration_summary import CalibrationSummary
 from pisigma.workflow.calibrate import calibrator_of
-from pisigma.workflow.settings.calibration import CalibrationSettings, socket_distances
+from pisigma.workflow.settings.calibration import CalibrationSettings, parse_socket_distances
 
 SOCKETS = ("left/0", "left/1", "right/0", "right/1", "right/0", "lonely/0", "")
 
@@ -104,7 +104,7 @@ def test_a_prior_that_is_not_a_number_is_refused():
 
 def distances(*stated: str) -> dict[tuple[str, str], float]:
     """Known distances of the calibrator, as the command line states them."""
-    settings = CalibrationSettings(model="geometric", socket_distances=socket_distances(stated))
+    settings = CalibrationSettings(model="geometric", socket_distances=parse_socket_distances(stated))
     matching = matching_sockets(settings.socket_distances, SOCKETS)
     return calibrator_of(settings, pisigma.Robot.load("panda"), matching).socket_distances
 
