@@ -28,7 +28,7 @@ CHROMIUM = "--headless --no-sandbox --use-gl=angle --use-angle=swiftshader --ena
 SIZES = {1280: 800, 800: 1100}
 """Height of the window by its width [px]."""
 POSE = {"x_mm": 600, "y_mm": 100, "z_mm": 800, "roll_deg": 0, "pitch_deg": 90, "yaw_deg": 0}
-QUALITY = 32
+QUALITY = 28
 """Quality of the pictures (WebP)."""
 CUT = """
 const left = "#scene, textarea, input, [hidden], .table";
@@ -101,7 +101,7 @@ def work(page: Page, rows: list[Path]) -> None:
 
 def take(page: Page, name: str, axe: str) -> list[str]:
     """Take the picture of the present tab, and return what is wrong with it."""
-    page.wait_for_timeout(6_000)  # the scene is drawn without a graphics card
+    page.wait_for_timeout(1_500)
     image = Image.open(io.BytesIO(page.screenshot())).convert("RGB")
     image.save(FOLDER / f"{name}.webp", quality=QUALITY, method=6)
     wrong = [f"{name}: cut off: {one}" for one in page.evaluate(f"() => {{{CUT}}}")]

@@ -1,6 +1,7 @@
 """Values that are drawn in a figure, as CSV: read from the figure, so that both agree."""
 
 import csv
+import datetime
 import io
 from collections.abc import Iterable, Iterator
 from typing import Any
@@ -34,9 +35,11 @@ def csv_of(figure: Figure) -> str:
     for axes in figure.axes:
         if axes not in bars:
             points += _points_of(axes)
-    columns = dict.fromkeys(name for one in points for name in one)
+    columns = dict.fromkeys(
+        name for one in points for name, text in one.items() if text
+    )  # without empty ones
     stream = io.StringIO()
-    writer = csv.DictWriter(stream, columns, lineterminator="\n")
+    writer = csv.DictWriter(stream, columns, extrasaction="ignore", lineterminator="\n")
     writer.writeheader()
     writer.writerows(points)
     return stream.getvalue()
@@ -53,7 +56,9 @@ def _points_of(axes: Axes) -> Iterator[Point]:
     for line in axes.lines:
         across: Any = line.get_xdata(orig=True)
         if line.get_transform() == axes.transData and len(across):
-            yield from _series(panel, line.get_label(), zip(names, (across, line.get_ydata()), strict=True))
+            first = "date" if isinstance(across[0], datetime.date) else names[0]
+            drawn = {first: across, names[1]: line.get_ydata()}
+            yield from _series(panel, line.get_label(), drawn.items())
     for steps in (one for one in axes.patches if isinstance(one, StepPatch)):
         values, edges, _ = steps.get_data()
         both = {f"{names[0]} from": edges[:-1], "to": edges[1:], names[1]: values}

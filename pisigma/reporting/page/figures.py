@@ -212,11 +212,16 @@ def draw_correction(curve: CorrectionCurve) -> Drawing:
         figure, axes = make_panel()
         for low, high in _stretches(curve.values, curve.measured):
             axes.axvspan(low, high, color="0.92", linewidth=0)
-        dots = axes.plot(curve.dot_values, curve.dots, ".", color=OTHER, alpha=0.5, markersize=3)
+        dots = axes.plot(
+            curve.dot_values, curve.dots, ".", color=OTHER, alpha=0.5, markersize=3, label="_rows"
+        )
         dots[0].set_rasterized(len(curve.dots) > MANY_DOTS)
-        for where, line in ((curve.measured, "-"), (~curve.measured, "--")):
+        for where, line, label in (
+            (curve.measured, "-", "_measured"),
+            (~curve.measured, "--", "_extrapolated"),
+        ):
             shown = np.where(where, curve.correction, np.nan)
-            axes.plot(curve.values, shown, line, color=AFTER, linewidth=1.3)
+            axes.plot(curve.values, shown, line, color=AFTER, linewidth=1.3, label=label)
         axes.axhline(0.0, color="black", linewidth=0.6)
         axes.set(xlabel=f"{curve.joint} [{curve.unit}]", ylabel=f"correction [{curve.small_unit}]")
     return Drawing(f"correction_{curve.joint}", curve.joint, curve_text(curve), figure)
@@ -314,7 +319,7 @@ def _lengths(axes: Axes, dependence: Dependence) -> None:
     """Draw lengths on a logarithmic axis: dots after, and RMS before and after."""
     after = dependence.errors["after"]
     floor = max(float(np.quantile(after, 0.01)) / 2, 1e-9) if len(after) else 1e-9
-    _dots(axes, dependence.values, np.maximum(after, floor), AFTER)
+    _dots(axes, dependence.values, np.maximum(after, floor), AFTER, "rows, after")
     for name, color, line in (("before", BEFORE, "--"), ("after", AFTER, "-")):
         lengths = dependence.errors[name]
         finite = np.isfinite(lengths)
@@ -335,7 +340,7 @@ def _signed(axes: Axes, dependence: Dependence) -> None:
     number = dependence.values
     for name, (color, line, mark) in styles.items():
         errors = dependence.errors[name]
-        _dots(axes, number, errors, color)
+        _dots(axes, number, errors, color, f"rows, {name}")
         stretches = np.array_split(np.arange(len(errors)), min(20, max(len(errors) // 8, 1)))
         middle, mean = ([values[rows].mean() for rows in stretches] for values in (number, errors))
         style = {"marker": mark, "markersize": 3.5, "color": color, "label": f"mean {name}", "linewidth": 1.8}
@@ -347,10 +352,12 @@ def _signed(axes: Axes, dependence: Dependence) -> None:
     axes.legend(ncols=3, loc="lower left", bbox_to_anchor=(0, 1), borderaxespad=0.1)
 
 
-def _dots(axes: Axes, x: np.ndarray, y: np.ndarray, color: str) -> None:
+def _dots(axes: Axes, x: np.ndarray, y: np.ndarray, color: str, series: str) -> None:
+    """Draw a dot per row; `series` is named in the CSV only."""
     opacity = float(np.clip(800 / max(len(x), 1), 0.15, 0.6))
     size = 3.6 if len(x) < 3_000 else 2.0
-    drawn = axes.plot(x, y, ".", color=color, alpha=opacity, markersize=size, markeredgewidth=0)
+    look: dict[str, Any] = {"color": color, "alpha": opacity, "markersize": size, "markeredgewidth": 0}
+    drawn = axes.plot(x, y, ".", label=f"_{series}", **look)
     drawn[0].set_rasterized(len(x) > MANY_DOTS)
 
 

@@ -6,6 +6,7 @@ from importlib import resources
 from pathlib import Path
 
 import pytest
+from matplotlib.figure import Figure
 from testing.aged import model_before, rows_later
 from testing.cell_models import cell_of_two_models
 from testing.compared import after_collision
@@ -14,6 +15,7 @@ from testing.report import folder_with_held_out, hybrid_under_test
 
 from pisigma.lifetime.fleet.status import FleetStatus
 from pisigma.reporting.page.content import report_content
+from pisigma.reporting.page.drawn_values import csv_of
 from pisigma.reporting.page.figures import draw_figures
 from pisigma.reporting.page.lifetime import fleet_page
 from pisigma.reporting.page.page import render_page
@@ -88,3 +90,17 @@ def test_pages_are_accessible_and_fit_a_phone(name, pages, browser):
     assert len(Path(started.value.path()).read_text(encoding="utf-8").splitlines()) > 2
     assert faults == []
     page.close()
+
+
+def test_the_values_of_a_figure_are_those_drawn():
+    axes = (figure := Figure()).add_subplot()
+    axes.set(xlabel="q [deg]", ylabel="error [mm]")
+    axes.plot([1.0, 2.0, 3.0], [0.1, float("nan"), 0.3], label="RMS")
+    axes.axhline(0.2)
+    axes.stairs([5.0], [0.0, 2.0], baseline=None, label="_bins")
+    assert csv_of(figure).splitlines() == [
+        "series,q [deg],error [mm],q [deg] from,to",
+        "RMS,1,0.1,,",
+        "RMS,3,0.3,,",
+        "bins,,5,0,2",
+    ]
