@@ -32,7 +32,9 @@ def report(
         Path | None,
         typer.Option(help="Page to write (.html). [default: report.html, or in reports/ of a cell]"),
     ] = None,
-    figures: Annotated[Path | None, typer.Option(help="Folder for the figures as PNG, SVG and CSV files.")] = None,
+    figures: Annotated[
+        Path | None, typer.Option(help="Folder for the figures as PNG, SVG and CSV files.")
+    ] = None,
     cameras: CameraFiles | None = None,
     as_json: AsJson = False,
 ) -> None:
