@@ -2,6 +2,7 @@
 
 import hashlib
 import itertools
+import re
 import shlex
 import types
 from collections.abc import Iterator, Mapping
@@ -145,7 +146,7 @@ def _section(section: type[Section], stated: Any, prefix: str) -> Iterator[Field
         elif get_origin(kind) is not dict:
             limits = " and ".join(filter(None, map(_bound, bounds)))
             default = "required" if info.is_required() else _text(info.default) or "not stated"
-            meaning = meanings.get(name, "").partition("; None")[0]
+            meaning = re.split(r"[;.] None for ", meanings.get(name, ""))[0]  # an empty field says it
             help_ = f"{meaning[:1].upper()}{meaning[1:]}"
             yield Field(key, help_, *_kind(kind), limits, default, _text(value))
 
