@@ -200,7 +200,7 @@ def lines_in(text: str) -> list[int]:
     """Return the lines of rows that a sentence names, such as "line 12" or "lines 3, 7 to 9"."""
     found: list[int] = []
     for first, last in RANGES.findall(" ".join(LINES.findall(text))):
-        found += range(int(first), int(last or first) + 1)
+        found += range(int(first), min(int(last or first), int(first) + MAX_LINES) + 1)
     return found[:MAX_LINES]
 
 

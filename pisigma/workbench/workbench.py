@@ -41,6 +41,8 @@ STATIC = {
 """Type, package and folder of the files of the page."""
 NO_CELL = {"state": "no_cell", "reason": "the folder has no cell yet", "command": "pisigma new"}
 """Next step of a folder without a cell."""
+HELD = 10
+"""How often a request for the state is looked at again."""
 REPORT_POLICY = (
     "sandbox allow-scripts; default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; img-src data:; "
     "frame-ancestors 'self'"
@@ -158,6 +160,10 @@ class Workbench(UploadedRows):
 
     @with_error_answers
     async def _state(self, request: web.Request) -> web.StreamResponse:
+        for _ in range(HELD):  # while a step runs, a change is answered at once, and the progress after 0.3 s
+            if self.jobs.running is None or request.query.get("version") != str(self.jobs.version):
+                break
+            await asyncio.sleep(0.3 / HELD)
         status, job = await asyncio.to_thread(self.status), self.jobs.running
         running = job and {
             "step": job.step,

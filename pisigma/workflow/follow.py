@@ -16,7 +16,7 @@ from pisigma.workflow.measure import MeasuringSession
 
 REST_SUFFIX = ".rest.csv"
 """Suffix of the remaining plan: that of `poses.csv` is written to `poses.rest.csv`."""
-PAUSE = 0.2
+PAUSE = 0.05
 """Time between two reads of the file [s]."""
 
 

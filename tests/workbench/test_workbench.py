@@ -25,7 +25,8 @@ from pisigma.cli.main import app
 from pisigma.files.errors import PlanningError, system_fault
 from pisigma.lifetime.cell.layout import CELL_FILE
 from pisigma.workbench.job import BusyError, Jobs, Outcome
-from pisigma.workbench.tabs import TABS
+from pisigma.workbench.steps import side_by_side
+from pisigma.workbench.tabs import MAX_LINES, TABS, lines_in
 from pisigma.workbench.workbench import STEPS, Workbench
 from pisigma.workflow.cell.cell import Cell
 
@@ -305,6 +306,36 @@ def test_the_meaning_of_columns_can_be_changed(browser_with_link):
     wrong = proposed(**{"column 0 7": HOSTILE})
     assert wrong.status == 422
     assert json.loads(wrong.body)["error"]
+
+
+def test_a_mistake_is_named_with_its_repair(browser_with_link):
+    rows = measured(30, 7)
+    lines = ["q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg,x_mm,y_mm,z_mm"]
+    for q, x in zip(rows.q.rad2deg().tolist(), (1e3 * rows.position).tolist(), strict=True):
+        q[3] *= -1
+        lines.append(",".join(map(repr, [*q, *x])))
+    number = upload(browser_with_link, "rows.csv", "\n".join(lines).encode())
+
+    def checked(**form):
+        answer = browser_with_link.ask("/check", "POST", json.dumps({"files": number, **form}))
+        return html.unescape(answer.body.decode())
+
+    text = checked()
+    assert 'data-cause="joint_sign"' in text
+    repair = json.loads(re.search('data-repair="(.*?})"', text)[1])
+    assert repair["column 0 3"] == "-q4_deg"
+    assert "data-cause" not in checked(**repair)
+    assert browser_with_link.ask("/show", "POST", json.dumps({"text": "lines 3, 7 to 9"})).status == 200
+
+
+def test_changes_of_a_program_are_shown_side_by_side():
+    diff = "--- a\n+++ b\n@@ -6 +6,2 @@\n-LIN P1\n+LIN P2\n+LIN P3\n@@ -9 +10 @@\n-PTP A\n+PTP B"
+    assert side_by_side(diff) == [("6", "LIN P1", "LIN P2"), ("", "", "LIN P3"), ("9", "PTP A", "PTP B")]
+
+
+def test_sentences_name_the_lines_of_rows():
+    assert lines_in("rows.csv, line 62: moved; 3 more of this kind: lines 3, 7 to 9.") == [62, 3, 7, 8, 9]
+    assert len(lines_in("lines 1 to 999999999")) <= MAX_LINES
 
 
 @pytest.mark.parametrize(

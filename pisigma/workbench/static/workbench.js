@@ -226,7 +226,7 @@ let polling = null;
 async function poll() {
   clearTimeout(polling);
   try {
-    const state = await (await ask("state")).json();
+    const state = await (await ask(`state?version=${version}`)).json();
     document.getElementById("next").textContent = state.next.command ? `Next: ${state.next.reason}.` : `Nothing to do: ${state.next.reason}.`;
     if (document.body.dataset.state === "no_cell" && state.next.state !== "no_cell") return location.reload();
     document.body.dataset.state = state.next.state;
@@ -242,7 +242,7 @@ async function poll() {
     for (const [name, value] of Object.entries(dragging ? state.dragged.values : {})) for (const one of content.querySelectorAll(`[name="${name}"]`)) one.value = value;
     document.body.dataset.ended = ended;
   } catch (problem) { document.getElementById("next").textContent = `The server does not answer (${problem.message}).`; }
-  polling = setTimeout(poll, running || dragging ? 300 : 2000);
+  polling = setTimeout(poll, running ? 10 : dragging ? 300 : 2000);
 }
 
 document.querySelector("nav").addEventListener("click", event => { if (event.target.dataset.tab) show(event.target.dataset.tab); });

@@ -42,8 +42,8 @@ SHEET, PRINT = (245, 245, 245), (20, 20, 20)
 """Colours of a board's sheet and corners."""
 CORNER_DOT = 0.25
 """Diameter of a corner's dot, as a share of the distance of two corners."""
-MAX_LABELS = 50
-"""Wrong rows that are labelled with their line."""
+MAX_LABELS, MAX_ARROWS = 50, 1000
+"""Wrong rows that are labelled with their line, and errors that are drawn as arrows; more are drawn as lines."""
 FLOOR, TRACKER_HEAD, CONE, BEAM, HANDLE = 5.0, 0.05, 0.2, 0.003, 0.3
 """Shares of the robot's reach: edge of the floor, radius of the tracker, length of the cone, width of the beam, size of
 the arrows by which objects are dragged."""
@@ -161,6 +161,10 @@ class SessionScene:
         lengths = magnification * np.linalg.norm(rows.error, axis=1, keepdims=True)
         arrow = magnification * rows.error * np.minimum(1.0, MAX_ARROW * reach / np.maximum(lengths, 1e-12))
         ends = np.stack([position, position + arrow], axis=1)
+        if judged.sum() > MAX_ARROWS:
+            both = np.repeat(colors[judged][:, None], 2, axis=1)
+            self._scene.add_line_segments("/rows/errors", ends[judged], both, thickness=SHAFT * reach)
+            return
         self._scene.add_arrows(
             "/rows/errors",
             ends[judged],

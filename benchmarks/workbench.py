@@ -1,0 +1,496 @@
+"""The workbench in Chromium: simulated arms by clicks and keys alone, mistakes in uploads, times, and hostile requests.
+
+Run `python benchmarks/workbench.py FOLDER_OF_SIM [--arms kr10 rail] [--parts arms mistakes times fuzz]` on an otherwise
+idle machine with the extra `view`, playwright and chromium. FOLDER_OF_SIM contains `sim.py` and URDF files of the arms.
+
+- arms: from an empty folder to a corrected KRL program, with the forms of the page; the files of the cell are compared
+  with those of the same commands, byte by byte.
+- mistakes: inches, the sign of joint 4, two swapped joint columns and a moved tracker are uploaded by hand: times until
+  they are named, and until the repair by its button is checked.
+- times: until the page is shown, until an appended row is shown, and 10,000 rows in three dimensions.
+- fuzz: hostile uploads and forms, reloads during a calibration, and two browsers at once.
+"""
+
+import argparse
+import contextlib
+import hashlib
+import importlib.util
+import io
+import json
+import logging
+import math
+import random
+import re
+import shutil
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from playwright.sync_api import Browser, Page, sync_playwright
+from typer.testing import CliRunner
+
+from pisigma.cli.main import app
+from pisigma.deployment.export.targets import POSE_COLUMNS
+from pisigma.measurement.dataset import Measurements
+from pisigma.planning.session.state import RowsSoFar
+from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.robot.kinematics.status import Status
+from pisigma.robot.se3 import xyzrpy_from_transform
+from pisigma.workbench.workbench import Workbench
+from pisigma.workflow.cell.cell import Cell
+from pisigma.workflow.load import load
+
+ARMS = ("kr10", "irb120", "arm7", "scara", "rail")
+CHROMIUM = (
+    "--no-sandbox --disable-background-networking --use-gl=angle --use-angle=swiftshader "
+    "--enable-unsafe-swiftshader"
+)
+PLAN, CALIBRATE = {"count": "20", "check": "5"}, {"model": "geometric", "folds": "0"}
+"""Settings that are filled in, so that the page and not the calculation is measured."""
+ROWS, CHECK_ROWS, MANY_ROWS = 60, 20, 10_000
+REQUESTS, RELOADS = 500, 50
+WAIT = 300_000
+"""Longest time to wait for the page [ms]."""
+COMPARED = (
+    "cell.yaml",
+    "plans/*",
+    "sessions/*",
+    "models/*/model.yaml",
+    "models/*/*.safetensors",
+    "exports/*",
+)
+HOSTILE = (
+    "",
+    "\0",
+    "../../etc/passwd",
+    "<script>alert(1)</script>",
+    "nan",
+    "-1e308",
+    "9" * 400,
+    "é\u202e",
+    "'; DROP TABLE x",
+    "{}",
+)
+
+
+def simulator(folder: Path) -> Any:
+    """Load `sim.py`."""
+    spec = importlib.util.spec_from_file_location("sim", folder / "sim.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def measured(sim: Any, arm: str, rows: int, seed: int, path: Path) -> Path:
+    """Write simulated rows of an arm."""
+    true = sim.True_(arm, seed=3)
+    q = true.sample(rows, seed)
+    x, _ = true.measure(q, rng=np.random.default_rng(seed))
+    sim.write_csv(path, true, q, x)
+    return path
+
+
+@contextlib.contextmanager
+def opened(
+    browser: Browser, folder: Path, scene: bool = False, rows: Path | None = None
+) -> Iterator[tuple[Page, Workbench, float]]:
+    """Open the page of a folder; yield it, the server, and the time until it was shown [s]."""
+    faults: list[str] = []
+    with (
+        Workbench(folder, port=0, growing=rows) as bench,
+        contextlib.closing(browser.new_context(viewport={"width": 1280, "height": 800})) as context,
+    ):
+        page = context.new_page()
+        page.set_default_timeout(WAIT)
+        page.on(
+            "console",
+            lambda one: faults.append(one.text) if one.type == "error" and "422" not in one.text else None,
+        )
+        page.on("pageerror", lambda error: faults.append(str(error)))
+        if not scene:
+            page.route("**/scene/**", lambda route: route.fulfill(body="", content_type="text/html"))
+        begun = time.perf_counter()
+        page.goto(bench.url)
+        page.wait_for_selector("#content h2")
+        yield page, bench, time.perf_counter() - begun
+        assert not faults, faults
+
+
+def show(page: Page, tab: str) -> None:
+    """Open a tab."""
+    page.press(f"#tab-{tab}", "Enter")
+    page.wait_for_selector(f"#tab-{tab}[aria-selected=true]")
+
+
+def do(page: Page, step: str, **fields: str) -> None:
+    """Fill a form, press its button with a key, and wait for the end of the step."""
+    for name, value in fields.items():
+        field = f"form[data-step={step}] [name='{name}']"
+        if page.locator(field).evaluate("one => one.tagName") == "SELECT":
+            page.select_option(field, value)
+        else:
+            page.fill(field, value)
+    before = int(page.get_attribute("body", "data-ended") or 0)
+    page.press(f"form[data-step={step}] button[type=submit]", "Enter")
+    page.wait_for_selector(f"body[data-ended='{before + 1}']")
+    refusal = page.query_selector(f"form[data-step={step}] + .outcome .refusal")
+    assert refusal is None, refusal.inner_text()
+
+
+def upload(page: Page, path: Path) -> tuple[float, float]:
+    """Upload rows; return the times until their columns, and what the check finds, are shown [s]."""
+    begun = time.perf_counter()
+    page.set_input_files("#files", path)
+    page.wait_for_selector(f"#proposal form:has-text('{path.name}')")
+    read = time.perf_counter() - begun
+    page.wait_for_selector("#findings > div, #findings > .good, #findings > .refusal")
+    return read, time.perf_counter() - begun
+
+
+def command(*words: object) -> None:
+    """Run a command."""
+    result = CliRunner().invoke(app, [str(word) for word in words])
+    assert result.exit_code == 0, result.output
+
+
+def by_clicks(browser: Browser, folder: Path, urdf: Path, first: Path, second: Path) -> float:
+    """Do everything on the page; return the time until it is shown [s]."""
+    with opened(browser, folder) as (page, _, seconds):
+        page.set_input_files("[data-links]", urdf)
+        page.wait_for_selector("[name=tip] option:nth-child(2)", state="attached")
+        do(page, "new")
+        page.wait_for_selector("#tab-plan")
+        show(page, "plan")
+        do(page, "plan", **PLAN)
+        show(page, "measure")
+        upload(page, first)
+        do(page, "import")
+        show(page, "calibrate")
+        do(page, "calibrate", **CALIBRATE)
+        show(page, "measure")
+        upload(page, second)
+        do(page, "import")
+        show(page, "verify")
+        do(page, "verify")
+        show(page, "deliver")
+        pose = reachable_pose(Cell.open(folder), first)
+        do(page, "ik", **pose)
+        poses = folder.parent / "poses.csv"
+        poses.write_text(f"{','.join(pose)}\n{','.join(pose.values())}\n")
+        page.select_option("[name=format]", "targets")
+        page.set_input_files("[data-upload=poses]", poses)
+        do(page, "export", out="job.src")
+        do(page, "serve")
+        assert "µs in the median" in page.inner_text("form[data-step=serve]")
+        do(page, "serve")
+    return seconds
+
+
+def by_commands(folder: Path, urdf: Path, first: Path, second: Path) -> None:
+    """Do the same with commands."""
+    command("new", urdf, "--out", folder)
+    command("plan", folder, *(word for key, value in PLAN.items() for word in (f"--{key}", value)))
+    command("import", first, "--cell", folder)
+    command("calibrate", folder, *(word for key, value in CALIBRATE.items() for word in (f"--{key}", value)))
+    command("import", second, "--cell", folder)
+    command("verify", folder)
+    (folder / "exports").mkdir()
+    command(
+        "export",
+        folder,
+        "--format",
+        "targets",
+        "--poses",
+        folder.parent / "poses.csv",
+        "--out",
+        folder / "exports/job.src",
+    )
+
+
+def reachable_pose(cell: Cell, rows: Path) -> dict[str, str]:
+    """Return the first pose of some rows that the model reaches, by the names of the fields."""
+    model = cell.model
+    assert model is not None
+    T = forward_kinematics(model.robot, Measurements.read_csv(rows, cell.robot).q)
+    reached = (load(cell.folder)(T).status == Status.REACHED).nonzero()[:, 0].tolist()
+    x, y, z, *angles = xyzrpy_from_transform(T[reached[0]]).tolist()
+    values = (1e3 * x, 1e3 * y, 1e3 * z, *map(math.degrees, angles))
+    return dict(zip(POSE_COLUMNS, map(repr, values), strict=True))
+
+
+def different_files(one: Path, other: Path) -> tuple[int, list[str]]:
+    """Return the number of compared files of two cells, and the names of those that differ."""
+    names = sorted(
+        {
+            str(path.relative_to(folder))
+            for folder in (one, other)
+            for name in COMPARED
+            for path in folder.glob(name)
+        }
+    )
+    bytes_of = [
+        {name: (folder / name).read_bytes() if (folder / name).is_file() else b"" for name in names}
+        for folder in (one, other)
+    ]
+    return len(names), [name for name in names if bytes_of[0][name] != bytes_of[1][name]]
+
+
+def run_arms(browser: Browser, simulated: Path, arms: list[str], work: Path) -> None:
+    """Compare the page with the commands for every arm."""
+    sim = simulator(simulated)
+    print(f"{'arm':<8}{'page shown [s]':>15}{'all steps [s]':>15}{'files':>7}  differ from the commands")
+    for arm in arms:
+        folder = work / arm
+        folder.mkdir()
+        first = measured(sim, arm, ROWS, 1, folder / "2026-11-01.csv")
+        second = measured(sim, arm, CHECK_ROWS, 2, folder / "2026-11-02.csv")
+        begun = time.perf_counter()
+        seconds = by_clicks(browser, folder / "page", simulated / f"{arm}.urdf", first, second)
+        whole = time.perf_counter() - begun
+        by_commands(folder / "commands", simulated / f"{arm}.urdf", first, second)
+        count, different = different_files(folder / "page", folder / "commands")
+        print(
+            f"{arm:<8}{seconds:>15.2f}{whole:>15.1f}{count:>7}  {', '.join(different) or 'none'}", flush=True
+        )
+
+
+def mistaken(rows: Path, folder: Path) -> dict[str, Path]:
+    """Write rows with each of the four mistakes."""
+    header, *lines = rows.read_text().splitlines()
+    right = np.array([line.split(",") for line in lines], dtype=float)
+    values = {
+        name: right.copy() for name in ("inches", "sign of joint 4", "swapped columns", "tracker moved")
+    }
+    values["inches"][:, 6:] /= 25.4
+    values["sign of joint 4"][:, 3] *= -1
+    values["swapped columns"][:, [1, 2]] = right[:, [2, 1]]
+    values["tracker moved"][len(right) // 2 :, 6:] += [300.0, -200.0, 100.0]
+    paths = {}
+    for name, table in values.items():
+        paths[name] = folder / f"{name.replace(' ', '_')}.csv"
+        np.savetxt(paths[name], table, delimiter=",", header=header, comments="", fmt="%.17g")
+    return paths
+
+
+def run_mistakes(browser: Browser, simulated: Path, work: Path) -> None:
+    """Upload the mistakes, repair them with the button, and add the rows."""
+    work = work / "mistakes"
+    work.mkdir()
+    rows = measured(simulator(simulated), "kr10", ROWS, 1, work / "2026-11-01.csv")
+    print(f"{'mistake':<17}{'columns [s]':>12}{'named [s]':>11}{'repaired [s]':>13}  named as, repair")
+    for name, path in mistaken(rows, work).items():
+        cell = Cell.create(work / path.stem, simulated / "kr10.urdf")
+        with opened(browser, cell.folder) as (page, _, _):
+            show(page, "measure")
+            read, named = upload(page, path)
+            cause = page.get_attribute("#findings .refusal", "data-cause")
+            begun, text = time.perf_counter(), page.inner_text("[data-repair]")
+            page.press("[data-repair]", "Enter")
+            page.wait_for_selector("#findings > .good")
+            repaired = time.perf_counter() - begun
+            do(page, "import")
+        (entry,) = cell.history.sessions()
+        assert entry.remark.startswith("Imported with "), entry.remark
+        print(f"{name:<17}{read:>12.2f}{named:>11.2f}{repaired:>13.2f}  {cause}: {text}"[:100], flush=True)
+
+
+def run_times(browser: Browser, simulated: Path, work: Path) -> None:
+    """Measure the page with its scene."""
+    folder, sim = work / "times", simulator(simulated)
+    cell = Cell.create(folder, simulated / "kr10.urdf")
+    cell.plan(count=20, check=0, candidates=200)
+    lines = measured(sim, "kr10", ROWS, 1, work / "rows.csv").read_text().splitlines(keepends=True)
+    growing = work / "growing.csv"
+    growing.write_text("".join(lines[:21]))
+    with opened(browser, folder, scene=True, rows=growing) as (page, bench, seconds):
+        scene = next(one for one in page.frames if "/scene/" in one.url)
+        scene.wait_for_selector("canvas")
+        print(f"page shown: {seconds:.2f} s (asked: 3 s)")
+        show(page, "measure")
+        page.press("form[data-step=follow] button[type=submit]", "Enter")
+        page.wait_for_selector("[data-rows='20']")
+        waits = []
+        for row in range(21, 31):
+            begun = time.perf_counter()
+            with growing.open("a") as file:
+                file.write(lines[row])
+            page.wait_for_selector(f"[data-rows='{row}']")
+            waits.append(time.perf_counter() - begun)
+        print(
+            f"row appended to shown: median {np.median(waits):.2f} s, largest {max(waits):.2f} s of "
+            f"{len(waits)} (asked: 0.3 s)"
+        )
+        page.press("#stop", "Enter")
+        page.wait_for_selector("body[data-running='']")
+        true = sim.True_("kr10", seed=3)
+        q, rng = true.sample(MANY_ROWS, 5), np.random.default_rng(0)
+        no = np.zeros(MANY_ROWS, dtype=bool)
+        rows = RowsSoFar(
+            tuple(range(2, MANY_ROWS + 2)), q, true.tip(q)[0], rng.normal(0, 3e-4, (MANY_ROWS, 3)), no, no
+        )
+        before = frames(scene)
+        begun = time.perf_counter()
+        bench._scene.show_rows(rows)
+        sent = time.perf_counter() - begun
+        page.wait_for_timeout(3000)
+        print(
+            f"10,000 rows, points and line segments of one object each: sent in {sent:.2f} s; "
+            f"{frames(scene):.1f} pictures/s in software, {before:.1f} with 30 rows"
+        )
+
+
+def frames(scene: Any) -> float:
+    """Return the pictures per second of the scene over three seconds."""
+    return float(
+        scene.evaluate("""() => new Promise(done => {
+          let count = 0; const begun = performance.now();
+          const next = () => { count++; const passed = performance.now() - begun;
+            if (passed < 3000) requestAnimationFrame(next); else done(1000 * count / passed); };
+          requestAnimationFrame(next); })""")
+    )
+
+
+FUZZED = {
+    "plan": "count",
+    "calibrate": "folds",
+    "verify": "of_model",
+    "monitor": "seed",
+    "recalibrate": "draws",
+    "measure": "session",
+    "session": "session",
+    "event": "kind",
+    "use": "model",
+    "export": "format",
+    "ik": "x_mm",
+    "cell": "seen",
+    "controller": "export",
+    "import": "files",
+}
+"""Steps, each with a field whose hostile value has to be refused."""
+ASK = """async ([path, method, body]) => {
+  const answer = await fetch(path, { method, body: method === "GET" ? undefined : body });
+  return [answer.status, await answer.text()]; }"""
+
+
+def run_fuzz(browser: Browser, simulated: Path, work: Path, seed: int) -> None:
+    """Send hostile requests, reload the page during a calibration, and look at it with two browsers."""
+    folder, chosen = work / "fuzz", random.Random(seed)
+    cell = Cell.create(folder, simulated / "kr10.urdf")
+    cell.add_session(measured(simulator(simulated), "kr10", ROWS, 1, work / "2026-11-01.csv"))
+    shutil.copytree(folder, work / "same")
+    before, said = digests(folder), io.StringIO()
+    handler = logging.StreamHandler(said)
+    logging.getLogger("aiohttp").addHandler(handler)
+    with contextlib.redirect_stderr(said), opened(browser, folder) as (page, bench, _):
+        statuses: dict[int, int] = {}
+        for _ in range(REQUESTS):
+            status, text = page.evaluate(ASK, hostile_request(chosen))
+            statuses[status] = statuses.get(status, 0) + 1
+            assert status < 500, text
+            assert "Traceback" not in text
+            while bench.jobs.running is not None:
+                time.sleep(0.01)
+        assert all("defect" not in one.refusal for one in bench.jobs.outcomes.values()), bench.jobs.outcomes
+        assert digests(folder) == before
+        print(
+            f"{REQUESTS} hostile requests: statuses {dict(sorted(statuses.items()))}, no traceback, nothing changed"
+        )
+        with contextlib.closing(browser.new_context()) as context:
+            other = context.new_page()
+            other.goto(bench.url)
+            show(page, "calibrate")
+            for name, value in CALIBRATE.items():
+                page.fill(f"form[data-step=calibrate] [name={name}]", value)
+            ended = bench.jobs.ended
+            page.press("form[data-step=calibrate] button[type=submit]", "Enter")
+            for _ in range(RELOADS):
+                chosen.choice((page, other)).reload(wait_until="commit")
+            while bench.jobs.ended == ended:
+                time.sleep(0.05)
+            for one in (page, other):
+                one.goto(f"{one.url.partition('#')[0]}#calibrate")
+                one.reload()
+                one.wait_for_selector(".outcome dd")
+    command(
+        "calibrate",
+        work / "same",
+        *(word for key, value in CALIBRATE.items() for word in (f"--{key}", value)),
+    )
+    count, different = different_files(folder, work / "same")
+    assert not different, different
+    assert "Traceback" not in said.getvalue(), said.getvalue()
+    print(f"{RELOADS} reloads of two browsers during a calibration: {count} files as those of the command")
+
+
+def hostile_request(chosen: random.Random) -> tuple[str, str, str]:
+    """Return path, method and body of a request that has to be refused, or changes nothing."""
+    value, kind = chosen.choice(HOSTILE), chosen.randrange(6)
+    if kind == 0:
+        body = "".join(chosen.choices("q1_deg,x_mm;\t\n0123456789.-\"'eE\0", k=chosen.randrange(400)))
+        return "upload?name=" + re.sub(r"[^a-z.%0-9]", "%2f", value)[:50], "POST", body
+    if kind == 1:
+        return (
+            chosen.choice(("propose", "check")),
+            "POST",
+            json.dumps(
+                {
+                    "files": str(chosen.randrange(40)),
+                    "unit": value,
+                    "new_frame_at": value,
+                    "column 0 0": value,
+                }
+            ),
+        )
+    if kind == 2:
+        step, field = chosen.choice([*FUZZED.items()])
+        return f"step/{step}?person=x", "POST", json.dumps({field: value or "?", "command": value})
+    if kind == 3:
+        return (
+            chosen.choice(("show", "drag", "stop", "step/plan", "propose")),
+            "POST",
+            chosen.choice(("", "{", "[]", '{"a": 1}', '"x"', "nul")),
+        )
+    if kind == 4:
+        return "show", "POST", json.dumps({"text": f"line {value} lines 1 to 99999999 {value}.csv"})
+    folder, way = (
+        chosen.choice(("plan", "model", "export", "report", "x")),
+        chosen.choice(("..%2f", "%2e%2e/", "")),
+    )
+    return f"download/{folder}/{way}cell.yaml", "GET", ""
+
+
+def digests(folder: Path) -> dict[str, str]:
+    """Return the SHA-256 of the files of a cell except its history."""
+    files = [one for one in folder.rglob("*") if one.is_file() and "history" not in one.name]
+    return {str(one.relative_to(folder)): hashlib.sha256(one.read_bytes()).hexdigest() for one in files}
+
+
+def main() -> None:
+    """Run the parts that the command line names."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
+    parser.add_argument("simulated", type=Path)
+    parser.add_argument("--arms", nargs="+", default=ARMS, choices=ARMS)
+    parser.add_argument("--parts", nargs="+", default=("arms", "mistakes", "times", "fuzz"))
+    parser.add_argument("--seed", type=int, default=0)
+    stated = parser.parse_args()
+    path = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    with sync_playwright() as running, tempfile.TemporaryDirectory() as folder:
+        browser, work = running.chromium.launch(executable_path=path, args=CHROMIUM.split()), Path(folder)
+        if "arms" in stated.parts:
+            run_arms(browser, stated.simulated, stated.arms, work)
+        if "mistakes" in stated.parts:
+            run_mistakes(browser, stated.simulated, work)
+        if "times" in stated.parts:
+            run_times(browser, stated.simulated, work)
+        if "fuzz" in stated.parts:
+            run_fuzz(browser, stated.simulated, work, stated.seed)
+        browser.close()
+
+
+if __name__ == "__main__":
+    main()
