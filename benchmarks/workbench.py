@@ -44,6 +44,8 @@ from pisigma.workflow.cell.cell import Cell
 from pisigma.workflow.load import load
 
 ARMS = ("kr10", "irb120", "arm7", "scara", "rail")
+KRL_ARMS = ("kr10", "irb120")
+"""Arms with six revolute joints, as KRL programs require; the targets of the others are exported as a table."""
 CHROMIUM = (
     "--no-sandbox --disable-background-networking --use-gl=angle --use-angle=swiftshader "
     "--enable-unsafe-swiftshader"
@@ -158,7 +160,7 @@ def command(*words: object) -> None:
     assert result.exit_code == 0, result.output
 
 
-def by_clicks(browser: Browser, folder: Path, urdf: Path, first: Path, second: Path) -> float:
+def by_clicks(browser: Browser, folder: Path, urdf: Path, first: Path, second: Path, program: Path) -> float:
     """Do everything on the page; return the time until it is shown [s]."""
     with opened(browser, folder) as (page, _, seconds):
         page.set_input_files("[data-links]", urdf)
@@ -184,14 +186,14 @@ def by_clicks(browser: Browser, folder: Path, urdf: Path, first: Path, second: P
         poses.write_text(f"{','.join(pose)}\n{','.join(pose.values())}\n")
         page.select_option("[name=format]", "targets")
         page.set_input_files("[data-upload=poses]", poses)
-        do(page, "export", out="job.src")
+        do(page, "export", out=str(program))
         do(page, "serve")
         assert "µs in the median" in page.inner_text("form[data-step=serve]")
         do(page, "serve")
     return seconds
 
 
-def by_commands(folder: Path, urdf: Path, first: Path, second: Path) -> None:
+def by_commands(folder: Path, urdf: Path, first: Path, second: Path, program: Path) -> None:
     """Do the same with commands."""
     command("new", urdf, "--out", folder)
     command("plan", folder, *(word for key, value in PLAN.items() for word in (f"--{key}", value)))
@@ -208,7 +210,7 @@ def by_commands(folder: Path, urdf: Path, first: Path, second: Path) -> None:
         "--poses",
         folder.parent / "poses.csv",
         "--out",
-        folder / "exports/job.src",
+        folder / "exports" / program,
     )
 
 
@@ -249,10 +251,11 @@ def run_arms(browser: Browser, simulated: Path, arms: list[str], work: Path) -> 
         folder.mkdir()
         first = measured(sim, arm, ROWS, 1, folder / "2026-11-01.csv")
         second = measured(sim, arm, CHECK_ROWS, 2, folder / "2026-11-02.csv")
+        program = Path("job.src" if arm in KRL_ARMS else "job.csv")
         begun = time.perf_counter()
-        seconds = by_clicks(browser, folder / "page", simulated / f"{arm}.urdf", first, second)
+        seconds = by_clicks(browser, folder / "page", simulated / f"{arm}.urdf", first, second, program)
         whole = time.perf_counter() - begun
-        by_commands(folder / "commands", simulated / f"{arm}.urdf", first, second)
+        by_commands(folder / "commands", simulated / f"{arm}.urdf", first, second, program)
         count, different = different_files(folder / "page", folder / "commands")
         print(
             f"{arm:<8}{seconds:>15.2f}{whole:>15.1f}{count:>7}  {', '.join(different) or 'none'}", flush=True

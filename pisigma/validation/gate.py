@@ -114,12 +114,30 @@ def _until_implausible(checks: Iterable[Iterable[Diagnostic]]) -> tuple[Diagnost
 
 def _against_robot(rows: Measurements, robot: Robot) -> Iterator[Iterable[Diagnostic]]:
     """Run the checks by the nominal robot, the most reliable first."""
+    yield _moved_setup(rows, robot)
     yield setup_diagnostics(robot, rows)
     yield check_position_size(robot, rows)
     yield joint_columns(robot, rows)
     yield other_robot_diagnostics(robot, rows)
     if rows.rows >= MIN_ROWS_TO_CALIBRATE:
         yield _as_calibrated(rows, robot)
+
+
+def _moved_setup(rows: Measurements, robot: Robot) -> tuple[Diagnostic, ...]:
+    """Name the row before which the instrument or the tool was moved so far that no calibration works."""
+    if (moved := new_setup_refusal(robot, rows)) is None:
+        return ()
+    return (
+        Diagnostic(
+            kind="row_order",
+            severity="implausible",
+            sentence=str(moved),
+            rows=(str(Place(rows.source, moved.line)),),
+            cause="frame",
+            values={} if moved.line is None else {"first_line": moved.line},
+            remedy=moved.remedy,
+        ),
+    )
 
 
 def _as_calibrated(rows: Measurements, robot: Robot) -> tuple[Diagnostic, ...]:
@@ -131,18 +149,6 @@ def _as_calibrated(rows: Measurements, robot: Robot) -> tuple[Diagnostic, ...]:
         found = diagnostics_of_rows(GeometricCalibrator(robot), rows)
         return tuple(one for one in found if not _is_unmodelled(one))
     except IdentificationError as refusal:  # no calibration error explains the rows
-        if moved := new_setup_refusal(robot, rows):
-            return (
-                Diagnostic(
-                    kind="row_order",
-                    severity="implausible",
-                    sentence=str(moved),
-                    rows=(str(Place(rows.source, moved.line)),),
-                    cause="frame",
-                    values={} if moved.line is None else {"first_line": moved.line},
-                    remedy=moved.remedy,
-                ),
-            )
         sentence = str(refusal).removeprefix(f"{rows.source}: ")
         return (Diagnostic(kind="implausible_errors", severity="implausible", sentence=sentence),)
 

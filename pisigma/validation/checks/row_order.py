@@ -136,6 +136,8 @@ def new_setup_refusal(robot: Robot, measurements: Measurements) -> Identificatio
     third = max(len(order) // 3, MIN_ROWS)
     if len(order) < 2 * MIN_ROWS + 1:
         return None
+    if float(np.median(_errors(robot, measurements, order))) < FITS_SHARE * robot.reach:
+        return None  # one setup explains all rows
     for backwards in (False, True):
         along = order[::-1] if backwards else order
         errors = _errors(robot, measurements, along[:third])[along]
