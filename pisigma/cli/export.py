@@ -33,16 +33,16 @@ Form = Annotated[
 Like = Annotated[
     Path | None,
     typer.Option(
-        help="File to update: a URDF file for urdf and xacro (default: that of the robot), the controller's file for "
-        "ur-calibration and staubli."
+        help="File to update: a URDF file for urdf, mjcf and xacro (default: that of the robot), a drawn MJCF model "
+        "for mjcf, the controller's file for ur-calibration and staubli."
     ),
 ]
 Tip = Annotated[str | None, typer.Option(help="With --like, tool link with which the robot was loaded.")]
 Geometry = Annotated[
     str | None,
     typer.Option(
-        help="With urdf and dh, geometry to write: that of the geometric fit (geometric, default), or the one fitted "
-        "together with the joint correction of --format onnx (hybrid)."
+        help="With urdf, mjcf and dh, geometry to write: that of the geometric fit (geometric, default), or the one "
+        "fitted together with the joint correction of --format onnx (hybrid)."
     ),
 ]
 Poses = Annotated[

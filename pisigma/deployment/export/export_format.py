@@ -18,9 +18,10 @@ class ExportRequest:
     Attributes:
         model: model folder.
         out: file to write.
-        like: file whose other content is kept; for urdf and xacro a URDF file, by default the one in the model folder.
+        like: file whose other content is kept; for urdf, mjcf and xacro a URDF file, by default the one in the model
+            folder, and for mjcf also an MJCF file.
         tip: link of the tool in `like`.
-        geometry: "geometric" or "hybrid", for urdf and dh.
+        geometry: "geometric" or "hybrid", for urdf, mjcf and dh.
         poses: file of poses, for targets.
         targets: "joints" or "cartesian", for targets.
         branch: branch to use instead of the trained one, for targets.
