@@ -30,7 +30,7 @@ def report(
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option(help="Page to write (.html). [default: report.html, or in reports/ of a cell]"),
+        typer.Option(help="Page to write (.html). [default: report.html, or a file in reports/ of a cell]"),
     ] = None,
     figures: Annotated[
         Path | None, typer.Option(help="Folder for the figures as PNG, SVG and CSV files.")

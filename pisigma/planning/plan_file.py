@@ -215,5 +215,5 @@ def _numbers(table: Table, name: str) -> list[int]:
     for line, cell in zip(table.lines, cells, strict=True):
         if not (cell.isascii() and cell.isdigit()):
             at = Place(table.source, line, name)
-            raise MeasurementError(expected="a number from 1", value=cell, at=at)
+            raise MeasurementError(expected="a number >= 1", value=cell, at=at)
     return list(map(int, cells))

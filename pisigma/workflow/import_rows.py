@@ -146,7 +146,7 @@ def propose_import(
 
 
 def _check_different(files: Sequence[str | os.PathLike[str]]) -> None:
-    """Check that no file is given twice, because its rows would count twice.
+    """Check that no file is given twice, because its rows would be used twice.
 
     Raises:
         MeasurementError: a file is given twice.

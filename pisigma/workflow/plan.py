@@ -378,7 +378,7 @@ def _check_measured(model: CalibratedModel | None, settings: PlanSettings, robot
         raise MeasurementError(f"{settings.measured}: {implausible[0].sentence}", value=implausible[0].kind)
     if model is not None and bool(known_rows(model, rows).all()):
         raise MeasurementError(
-            f"expected rows to which model '{model.name}' was not fitted, because these would count twice",
+            f"expected rows to which model '{model.name}' was not fitted, because these would be used twice",
             value=model.name,
             at=Place(settings.measured),
             option="--measured",

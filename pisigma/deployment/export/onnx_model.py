@@ -175,7 +175,7 @@ def export_onnx(model: CalibratedModel, model_sha256: str = "") -> bytes:
     if model.hybrid is not None:
         return _forward(model, model.hybrid, model_sha256)
     raise ModelError(
-        f"model '{model.name}' has no network, only a geometry",
+        f"model '{model.name}' contains a geometry but no network",
         value=model.kind,
         remedy="export the geometry with --format urdf or dh, or distil it into a network with `pisigma distill`",
     )

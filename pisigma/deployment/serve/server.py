@@ -242,5 +242,5 @@ def check_host(settings: ServeSettings) -> None:
             "the token is empty",
             option="--token-file",
             value=settings.token,
-            remedy="give one that cannot be guessed",
+            remedy="give a file with a long random token",
         )

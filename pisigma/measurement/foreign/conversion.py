@@ -240,7 +240,7 @@ def _rotation(
             expected=f"a rotation in the encoding '{encoding.name}' ({encoding.meaning})",
             value=", ".join(file.column(column.index)[row] for column in columns),
             at=Place(file.source, file.lines[row], columns[0].heading),
-            remedy="correct or empty its cells, or state another --rotation",
+            remedy="correct its cells, leave them empty, or state another --rotation",
         )
     quaternions = _quaternion_texts(encoding, values, measured)
     return dict(zip(QUATERNION, zip(*quaternions, strict=True), strict=True))

@@ -48,7 +48,7 @@ def test_a_camera_and_a_page_are_written(run, files, tmp_path):
     assert any("upper left" in warning for warning in printed["warnings"])
     assert any("5 images" in warning for warning in printed["warnings"])
     text = page.read_text()
-    assert text.count("<figure>") == 6
+    assert text.count("<figure data-name=") == 6
     assert "Left out: " in text
     assert "http" not in text.replace("http://www.w3.org", "")
 

@@ -122,7 +122,7 @@ def test_a_page_shows_every_image(run, files, tmp_path):
     result = run("detect", *options(files), "--out", tmp_path / "corners.csv", "--page", page)
     assert result.exit_code == 0, result.output
     text = page.read_text()
-    assert text.count("<figure>") == 4
+    assert text.count("<figure data-name=") == 4
     assert "Left out: " in text
     assert "3.8 px" in text
 
