@@ -26,8 +26,6 @@ BEFORE_FIT = ("plan", "import")
 """Commands whose checks conclude nothing from measured rows."""
 MIN_MEASURED_SHARE = 0.9
 """Smallest share of the poses of a plan after which it is treated as measured; some poses may be out of sight."""
-
-
 NOT_TRUSTED = ("implausible", "setup_fault", "not_trusted")
 """Verdicts of `verify`, `monitor` and `recalibrate` after which nothing is concluded from a session."""
 
@@ -97,8 +95,8 @@ class CellFacts:
         A recalibration finds what has moved since its parent, so the calibration that it goes back to counts.
         """
         models = {one.name: one for one in self.models}
-        while model.parent in models:
-            model = models[model.parent]
+        while (parent := models.pop(model.parent, None)) is not None:
+            model = parent
         first = min((one.day for one in self.sessions if one.name in model.made_of), default=model.day)
         changes: list[tuple[str, str, str]] = [
             (one.day, one.recorded, one.kind) for one in self.events if one.kind in CHANGING_EVENTS
