@@ -130,7 +130,7 @@ def session(arm: Arm, how: str) -> tuple[int, float]:
             q=torch.from_numpy(state.next_pose.q[None]), position=torch.from_numpy(x), line=(line,)
         )
         measuring.add(row)
-        if measuring.is_due:
+        if measuring.is_update_due:
             measuring.update()
     rows = measuring.rows
     assert rows is not None

@@ -61,6 +61,7 @@ class Cell:
     def __init__(self, folder: Path, file: CellFile) -> None:
         self.folder, self.file = folder, file
         self.history = History(folder / HISTORY)
+        self._settings_sha256 = settings_hash(folder)  # of the file as it was read
 
     @staticmethod
     def open(folder: str | os.PathLike[str]) -> "Cell":
@@ -201,7 +202,7 @@ class Cell:
             MeasurementError: there are no valid sessions.
         """
         sessions, started, events = self.sessions.valid_sessions(), now(), self.history.events()
-        warnings, stated = self.controller_warnings("calibrate", None), settings_hash(self.folder)
+        warnings, stated = self.controller_warnings("calibrate", None), self._settings_sha256
         settings: CalibrationSettings = self.file.settings_of_step("calibrate", **changed)
         result = calibrate_rows(
             self.robot, self.sessions.rows_of(sessions, events), settings, prior, progress
