@@ -20,6 +20,8 @@ from typing import Any
 PACKAGE = Path(__file__).parents[1] / "integrations" / "ros2" / "pisigma_ros"
 MAX_WAIT = 2.0
 """[s] An answer that takes longer counts as lost."""
+MAX_START = 60.0
+"""[s] Longest wait for a node to start or to end."""
 
 
 def empty_node() -> None:
@@ -61,7 +63,10 @@ class Client:
         """Wait until the node is there."""
         import rclpy
 
+        end = time.monotonic() + MAX_START
         while self.publisher.get_subscription_count() < 1:
+            if time.monotonic() > end:
+                raise TimeoutError("the node did not start")
             rclpy.spin_once(self.node, timeout_sec=0.05)
 
     def ask(self, frame: str, pose: list[float], number: int) -> list[float]:
@@ -182,7 +187,10 @@ def main() -> None:
     finally:
         for process in processes:
             process.terminate()
-            process.wait()
+        for process in processes:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(MAX_START)
+            process.kill()
 
 
 if __name__ == "__main__":
