@@ -20,6 +20,9 @@ from pisigma.reporting.tables import (
     pose_table,
 )
 
+WRAPPED = 24
+"""Characters of a text above which its column is wrapped."""
+
 
 def render(template: str, **content: object) -> str:
     """Fill in a template.
@@ -47,13 +50,15 @@ def code(line: str) -> Markup:
     return Markup(re.sub("`([^`]+)`", r"<code>\1</code>", str(escape(line))))
 
 
-def text_columns(table: Table) -> tuple[bool, ...]:
-    """Return which columns of a table contain texts, which are left-aligned, rather than numbers."""
-    stated = [[Markup(cell).striptags() for cell in cells if cell] for cells in zip(*table.rows, strict=True)]
-    texts = ([one for one in cells if re.search(r"[^\W\d_]{2}", one)] for cells in stated)
-    return tuple(2 * len(text) > len(cells) for text, cells in zip(texts, stated, strict=True)) or (
-        True,
-    ) * len(table.columns)
+def column_classes(table: Table) -> tuple[str, ...]:
+    """Return the style of each column of a table: "" for numbers, "text", or "text long" for texts that are wrapped."""
+    classes = []
+    for place in range(len(table.columns)):
+        cells = [Markup(row[place]).striptags() for row in table.rows if row[place]]
+        texts = [one for one in cells if re.search(r"[^\W\d_]{2}", one)]
+        is_long = max(map(len, cells), default=0) > WRAPPED
+        classes.append("" if 2 * len(texts) <= len(cells) else "text long" if is_long else "text")
+    return tuple(classes)
 
 
 def file_name(text: str) -> str:
@@ -69,7 +74,7 @@ def _environment() -> jinja2.Environment:
             "figure": figure_text,
             "digits": "{:.4g}".format,
             "code": code,
-            "text_columns": text_columns,
+            "column_classes": column_classes,
             "pose_table": pose_table,
             "joint_table": joint_table,
             "distance_table": lambda distances: markdown_table(*distance_table(distances)),

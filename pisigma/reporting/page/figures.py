@@ -295,7 +295,7 @@ def draw_map(
             top = max(float(values.max(initial=0.0)), 1e-12)
             for axes, (a, b) in zip(grid[:, column], ((0, 1), (0, 2)), strict=True):
                 dots = axes.scatter(
-                    at[:, a], at[:, b], c=values, s=2 + 16 * values / top, cmap="cividis", vmin=0.0, vmax=top,
+                    at[:, a], at[:, b], c=values, s=2 + 16 * values / top, cmap="cividis_r", vmin=0.0, vmax=top,
                     linewidths=0, rasterized=len(values) > MANY_DOTS,
                 )  # fmt: skip
                 axes.set_aspect("equal", "datalim")
