@@ -102,7 +102,7 @@ def test_calibrate_keeps_what_a_report_shows(run, tmp_path):
         assert [frame["name"] for frame in found["frames"]] == ["</script>", "$b"]
         assert found["correlated"]
         page = (tmp_path / "page.html").read_text()
-        assert page.count("</script>") == 2
+        assert page.count("</script>") == 3
         assert "repeated 3 times" in page
     (folder / HELD_OUT_CSV).write_text("q1_deg\n1\n")
     refused = run("report", folder, "--out", tmp_path / "page.html")
