@@ -159,7 +159,7 @@ class Loop:
             else None,
         )
         rows.write_csv(self.folder / f"{name}.csv", self.robot)
-        self.cell.add_session(self.folder / f"{name}.csv")
+        self.cell.take_in(self.folder / f"{name}.csv")
         return rows
 
 

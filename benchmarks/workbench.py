@@ -383,7 +383,7 @@ def run_fuzz(browser: Browser, simulated: Path, work: Path, seed: int) -> None:
     """Send hostile requests, reload the page during a calibration, and look at it with two browsers."""
     folder, chosen = work / "fuzz", random.Random(seed)
     cell = Cell.create(folder, simulated / "kr10.urdf")
-    cell.add_session(measured(simulator(simulated), "kr10", ROWS, 1, work / "2026-11-01.csv"))
+    cell.take_in(measured(simulator(simulated), "kr10", ROWS, 1, work / "2026-11-01.csv"))
     shutil.copytree(folder, work / "same")
     before, said = digests(folder), io.StringIO()
     handler = logging.StreamHandler(said)

@@ -37,7 +37,7 @@ def cell(tmp_path_factory):
     with no_type_checker():
         made = Cell.create(tmp_path_factory.mktemp("cells") / "welder7", "ur10", limit_mm=0.5)
         for number, ago in enumerate((20, 10)):
-            made.add_session(measured(20, number), day=day(ago))
+            made.take_in(measured(20, number), day=day(ago))
         made.sessions.set_aside(day(10), HOSTILE)
         made.history.record("firmware", note=HOSTILE)
     return made
@@ -414,9 +414,9 @@ def test_results_are_those_of_the_commands(tmp_path):
     """The page on a cell and the commands on a copy of it: the same figures, and attention at the same time."""
     with no_type_checker():
         made = Cell.create(tmp_path / "page", "ur10", limit_mm=0.5)
-        made.add_session(measured(40, 0), day=day(20))
+        made.take_in(measured(40, 0), day=day(20))
         made.calibrate(folds=0)
-        made.add_session(measured(15, 1, zero=0.2), day=day(10))
+        made.take_in(measured(15, 1, zero=0.2), day=day(10))
         shutil.copytree(made.folder, tmp_path / "commands")
         with Workbench(made.folder, port=0) as bench:
             browser = visitor(bench.url)

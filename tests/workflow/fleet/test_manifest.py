@@ -162,7 +162,7 @@ def test_the_model_of_a_folder_goes_into_use(tmp_path, model):
     assert cell.robot.dh == pytest.approx(model_before().robot.dh)
     assert (cell.status().step.state, cell.history.in_use.made_of) == ("no_plan", ())
     rows_later(10, 11).write_csv(tmp_path / "new.csv", cell.robot)
-    cell.add_session(tmp_path / "new.csv")
+    cell.take_in(tmp_path / "new.csv")
     assert cell.status().step.state == "session_not_judged"
 
 
