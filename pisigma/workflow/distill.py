@@ -231,7 +231,7 @@ def _warnings(held_out: DistilledErrors, rows: int, joints: int) -> tuple[str, .
     for key, what, unit in (("rms_mm", "position", "mm"), ("rms_deg", "orientation", "deg")):
         if distilled[key] > MAX_ERROR_SHARE * nominal[key]:
             sentences.append(
-                f"It removes only {max(1 - distilled[key] / nominal[key], 0):.0%} of the nominal {what} error "
+                f"It removes only {100 * max(1 - distilled[key] / nominal[key], 0):.0f} % of the nominal {what} error "
                 f"({distilled[key]:.3g} of {nominal[key]:.3g} {unit} RMS remain): the region is too large for this "
                 "network; give a smaller --region, more --poses, or use the parent."
             )

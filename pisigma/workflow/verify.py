@@ -315,8 +315,8 @@ def _sentence(
         return f"{start}: {figures}, but {MIN_CONFIGURATIONS} or more different joint values are needed."
     return (
         f"{start}: {figures}, it differs by {interval[0]:.3g} to {interval[1]:.3g} mm with "
-        f"{comparison.bootstrap.confidence:.0%} confidence, and it is smaller in {difference.better_share:.0%} of "
-        f"{count} configurations."
+        f"{100 * comparison.bootstrap.confidence:.0f} % confidence, and it is smaller in "
+        f"{100 * difference.better_share:.0f} % of {count} configurations."
     )
 
 

@@ -48,7 +48,9 @@ def _verdict(calibrated: "CameraCalibration", out: Path) -> Verdict:
     return Verdict(
         f"corners fit to {rounded(detection.rms)} px RMS of u and v in {len(detection.boards)} of "
         f"{len(detection.images)} images; focal length {fx:.5g} +- {sigma:.2g} px.",
-        trust_text(len(calibrated.warnings), f"yes: corners are in {covered:.0%} of the cells of the image."),
+        trust_text(
+            len(calibrated.warnings), f"yes: corners are in {100 * covered:.0f} % of the cells of the image."
+        ),
         (
             "take the images that the warnings ask for"
             if calibrated.warnings

@@ -158,8 +158,8 @@ def _large_errors(
     missed = f"{rows.source}: the RMS error of held-out rows is {error * 1e3:.3g} mm"
     if error > limit:
         sentence = (
-            f"{missed}, more than {PLAUSIBLE_SHARE:.0%} of the reach of robot '{parent.robot.name}': another robot was "
-            "measured, or columns or units are wrong; run `pisigma verify` on these rows."
+            f"{missed}, more than {100 * PLAUSIBLE_SHARE:.0f} % of the reach of robot '{parent.robot.name}': another "
+            "robot was measured, or columns or units are wrong; run `pisigma verify` on these rows."
         )
     elif error > SUSPICIOUS_FACTOR * usual > 0 and parent.kind != FLEET_PRIOR:
         sentence = (

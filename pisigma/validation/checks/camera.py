@@ -79,9 +79,9 @@ def view_warnings(
     if share >= ONE_BRANCH:
         yield _warning(
             "one_branch",
-            f"{share:.0%} of the images were taken in one branch of the arm (the same configuration of shoulder, elbow "
-            "and wrist); the errors look small there and are up to three times as large in other configurations; take "
-            "images in other branches.",
+            f"{100 * share:.0f} % of the images were taken in one branch of the arm (the same configuration of "
+            "shoulder, elbow and wrist); the errors look small there and are up to three times as large in other "
+            "configurations; take images in other branches.",
             share=share,
         )
 
@@ -146,7 +146,9 @@ def _limit(images: Measurements, result: CalibrationResult) -> Iterator[Diagnost
     if ratio >= EXPLAINED:
         return
     total, shares = _predicted_error(result)
-    parts = [f"{share:.0%} of its square from {what}" for what, share in shares.items() if share >= 0.1]
+    parts = [
+        f"{100 * share:.0f} % of its square from {what}" for what, share in shares.items() if share >= 0.1
+    ]
     yield _warning(
         "camera_limits",
         f"The camera limits this calibration: its images scatter by {ratio:.2f} times what their corners and "

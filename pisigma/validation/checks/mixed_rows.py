@@ -198,7 +198,7 @@ def _two_sizes(checked: CheckedCalibration) -> Iterator[Diagnostic]:
         yield Diagnostic(
             kind="two_populations",
             severity="warning",
-            sentence=f"{fit.share:.0%} of the values of {sensor} are off by about {size:.2g} {unit}, while the "
+            sentence=f"{100 * fit.share:.0f} % of the values of {sensor} are off by about {size:.2g} {unit}, while the "
             f"others scatter by {scatter:.2g} {unit} per axis: many rows are wrong, or were measured under "
             "different conditions; check whether a target or an instrument was moved or hit.",
             cause="sizes",

@@ -57,7 +57,7 @@ def check_rounding(checked: CheckedCalibration) -> Iterator[Diagnostic]:
             kind="rounding",
             severity="warning",
             sentence=f"The joint values are rounded to {_steps_text(checked.robot, rounding.steps)}: this alone "
-            f"causes position errors of {length_text(rounding.error)} RMS, {rounding.share:.0%} of the squared "
+            f"causes position errors of {length_text(rounding.error)} RMS, {100 * rounding.share:.0f} % of the squared "
             "errors of the rows; log them with more decimals.",
             cause="joint_values",
             values={"error_mm": rounding.error * 1e3, "share": rounding.share},

@@ -64,8 +64,8 @@ class CameraCalibration:
         tilts = np.rad2deg(self.calibration.tilts)
         return (
             *self.detection.sentences,
-            f"Corners are in {self.calibration.covered.mean():.0%} of the cells of the image; views are tilted by "
-            f"{np.median(tilts):.0f} deg (median), from {tilts.min():.0f} to {tilts.max():.0f} deg.",
+            f"Corners are in {100 * self.calibration.covered.mean():.0f} % of the cells of the image; views are tilted "
+            f"by {np.median(tilts):.0f} deg (median), from {tilts.min():.0f} to {tilts.max():.0f} deg.",
         )
 
     @property

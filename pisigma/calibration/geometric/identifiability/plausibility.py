@@ -56,8 +56,9 @@ def refuse_implausible(problem: CalibrationProblem, here: Linearisation[Tensor],
     size = float(sizes.median()) if len(sizes) else 0.0
     if size > IMPLAUSIBLE_SHARE * robot.reach:
         raise ImplausibleError(
-            f"with the best fit, the median residual is still {size * 1e3:.3g} mm per axis, {size / robot.reach:.1%} "
-            f"of the reach of robot '{robot.name}', which no calibration error explains",
+            f"with the best fit, the median residual is still {size * 1e3:.3g} mm per axis, "
+            f"{100 * size / robot.reach:.1f} % of the reach of robot '{robot.name}', which no calibration error "
+            "explains",
             value=size,
             at=Place(source),
             remedy="check the units (millimetres in a _m column?), stated distances, order and directions of the "
