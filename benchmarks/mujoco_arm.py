@@ -19,7 +19,7 @@ STEP_S = 2e-3
 """Step of the simulation."""
 RAMP_S = 0.3
 """Duration of a motion from one commanded pose to the next."""
-SETTLING_S = 3.0
+SETTLING_S = 1.0
 """Longest time to wait after a motion."""
 AT_REST = 1e-8
 """Speed [rad/s or m/s] below which an arm is at rest: 2e-10 rad from its equilibrium."""

@@ -5,6 +5,8 @@ import sys
 
 import pytest
 
+from pisigma.workflow.cell.cell_file import MEASURED_JOINTS
+
 pytest.importorskip("mujoco", reason="MuJoCo is not installed")
 
 
@@ -25,3 +27,4 @@ def test_wanted_poses_are_reached_in_mujoco(closed_loop, tmp_path):
     assert closed.rms_mm < 0.05
     assert 0.8 < closed.predicted_p95_mm / closed.p95_mm < 1.3
     assert closed.verdict == "better"
+    assert MEASURED_JOINTS in closed.warnings

@@ -207,7 +207,7 @@ class Cell:
         result = calibrate_rows(
             self.robot, self.sessions.rows_of(sessions, events), settings, prior, progress
         )
-        result = with_warnings(result, warnings)
+        result = with_warnings(result, (*warnings, *self.file.row_warnings()))
         doubt = "" if result.trusted else result.diagnostics[0].sentence
         if doubt and not accept_implausible:
             refused = ("calibrate", "", "", "not_trusted", doubt)
@@ -323,7 +323,8 @@ class Cell:
         parent, chosen, seen = self._new_rows("recalibrate", None, session)
         settings = seen.settings_to_recalibrate(self.file.settings_of_step("recalibrate", **changed))
         result = recalibrate(self.model_folder(parent.name), seen.rows, settings, progress)
-        result = with_warnings(result, self.controller_warnings("recalibrate", parent))
+        warnings = (*self.controller_warnings("recalibrate", parent), *self.file.row_warnings())
+        result = with_warnings(result, warnings)
         if not (result.trusted or accept_implausible):
             doubt = result.diagnostics[0].sentence
             refused = ("recalibrate", parent.name, chosen.name, "not_trusted", doubt)

@@ -49,6 +49,10 @@ STEPS: dict[str, type] = {
 CAMERA_KEYS = ("camera", "board", "fixed_camera", "intrinsics", "repeatability_mm", "repeatability_deg")
 STATED_ABOVE = {"plan": ("limit_mm", "sensor"), "measure": ("limit_mm",)}
 """Keys of a step whose values are those of the cell, in addition to `CAMERA_KEYS`. `monitor` has another limit."""
+MEASURED_JOINTS = (
+    "The rows contain joint values that the encoders read, so the model corrects these and not the deviation of the "
+    "controller: a commanded pose is reached if the encoders then read the corrected joint values."
+)
 MAX_WIDTH = 100
 _COMMENT: Mapping[str, Any] = {"initial_indent": "# ", "subsequent_indent": "# "}
 
@@ -89,6 +93,8 @@ class CellDocument(Section):
         tip: tool link of the URDF file; None for its only end.
         sensor: sensor that measures the robot.
         limit_mm: limit of the 95 % quantile of the position errors [mm]; None for no limit.
+        joint_values: whether rows contain the joint values that were commanded (the default) or those that the encoders
+            read ("measured"), to which the controller then has to move without a deviation.
         instrument: measuring instrument and its calibration certificate; None if it is not stated.
         pose_repeatability_mm: pose repeatability RP after ISO 9283 that the maker of the robot states [mm]; None if it
             is not stated.
@@ -112,6 +118,7 @@ class CellDocument(Section):
     tip: str | None = None
     sensor: SensorName = "tracker"
     limit_mm: Annotated[Bounded, Field(gt=0)] | None = None
+    joint_values: Literal["commanded", "measured"] = "commanded"
     instrument: Instrument | None = None
     pose_repeatability_mm: Annotated[Bounded, Field(gt=0)] | None = None
     expansion_per_k: Annotated[Bounded, Field(ge=0, le=1e-3)] | None = None
@@ -223,6 +230,10 @@ class CellFile:
             frozenset(changed),
         )
 
+    def row_warnings(self) -> tuple[str, ...]:
+        """Return warnings about models that are fitted to the rows of the cell."""
+        return (MEASURED_JOINTS,) if self.document.joint_values == "measured" else ()
+
     def plan_settings(self, facts: CellFacts, **changed: Any) -> PlanSettings:
         """Return the settings of the next plan: a few poses if a model has to be checked, other ones in every plan.
 
@@ -328,7 +339,17 @@ def cell_template(document: Mapping[str, Any], calibrate: Mapping[str, Any] | No
         return yaml_text(stated | ({"calibrate": dict(calibrate)} if calibrate else {}))
     lines = ["# A cell: one robot on its mount, and its sensor. Lines that begin with # state defaults."]
     meaning = {key: text.partition("; None")[0] for key, text in attributes_of(CellDocument).items()}
-    for key in ("robot", "base", "tip", "sensor", "limit_mm", "pose_repeatability_mm", "expansion_per_k"):
+    known = (
+        "robot",
+        "base",
+        "tip",
+        "sensor",
+        "limit_mm",
+        "joint_values",
+        "pose_repeatability_mm",
+        "expansion_per_k",
+    )
+    for key in known:
         if document.get(key) is not None:
             lines.append(f"{key}: {_yaml(document[key])}")
         else:
