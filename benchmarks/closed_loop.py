@@ -28,6 +28,7 @@ from scipy.spatial.transform import Rotation
 
 import pisigma
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
+from pisigma.files.errors import AcceptanceError
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.accuracy import deviation_of_rows
 from pisigma.planning.candidates import draw_candidates
@@ -105,6 +106,7 @@ class Closed:
         seconds: computing time [s].
         errors_mm: all errors.
         nominal_errors_mm: all errors of the nominal arm.
+        was_refused: whether the import refused rows, although they are right; they were then accepted by hand.
     """
 
     arm: str
@@ -124,6 +126,7 @@ class Closed:
     seconds: float
     errors_mm: tuple[float, ...]
     nominal_errors_mm: tuple[float, ...]
+    was_refused: bool = False
 
 
 class Loop:
@@ -138,7 +141,7 @@ class Loop:
         self.arm = FalseArm(drawn, errors, seed, self.payload)
         turn = Rotation.from_euler("z", self.rng.uniform(-180, 180), degrees=True)
         self.tracker = turn * Rotation.from_rotvec(self.rng.normal(0, 0.01, 3)), self.rng.uniform(-3, 3, 3)
-        self.folder = folder
+        self.folder, self.was_refused = folder, False
         Cell.create(folder / "cell", drawn.urdf, base=drawn.base, tip=drawn.tip)
         if self.case.measured:
             with (folder / "cell" / "cell.yaml").open("a", encoding="utf-8") as file:
@@ -164,8 +167,13 @@ class Loop:
             if self.case.states_payload
             else None,
         )
-        rows.write_csv(self.folder / f"{name}.csv", self.robot)
-        self.cell.take_in(self.folder / f"{name}.csv")
+        file = self.folder / f"{name}.csv"
+        rows.write_csv(file, self.robot)
+        try:
+            self.cell.take_in(file)
+        except AcceptanceError:
+            self.was_refused = True
+            self.cell.take_in(file, accept_implausible=True)
         return rows
 
 
@@ -219,6 +227,7 @@ def close_loop(
         time.perf_counter() - began,
         tuple(errors.tolist()),
         tuple(before.tolist()),
+        loop.was_refused,
     )
 
 
@@ -275,7 +284,14 @@ def table(results: Sequence[Closed]) -> str:
                 f"| {sum(one.reached for one in some) / len(some) / WANTED:.1%} |"
             )
     verified = sum(one.verdict == "better" for one in results)
-    return "\n".join([*lines, "", f"verified as better than the nominal arm: {verified} of {len(results)}"])
+    refused = sum(one.was_refused for one in results)
+    return "\n".join(
+        [
+            *lines,
+            "",
+            f"verified as better than the nominal arm: {verified} of {len(results)}; refused at import: {refused}",
+        ]
+    )
 
 
 def draw(results: Sequence[Closed], file: Path) -> None:
