@@ -323,8 +323,9 @@ class Cell:
         parent, chosen, seen = self._new_rows("recalibrate", None, session)
         settings = seen.settings_to_recalibrate(self.file.settings_of_step("recalibrate", **changed))
         result = recalibrate(self.model_folder(parent.name), seen.rows, settings, progress)
-        warnings = (*self.controller_warnings("recalibrate", parent), *self.file.row_warnings())
-        result = with_warnings(result, warnings)
+        result = with_warnings(
+            result, (*self.controller_warnings("recalibrate", parent), *self.file.row_warnings())
+        )
         if not (result.trusted or accept_implausible):
             doubt = result.diagnostics[0].sentence
             refused = ("recalibrate", parent.name, chosen.name, "not_trusted", doubt)
