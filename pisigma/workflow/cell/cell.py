@@ -142,8 +142,7 @@ class Cell:
     ) -> tuple[Plan, Path]:
         """Plan which poses to measure, different ones in every plan of a cell.
 
-        Without a model these are the poses of a calibration. With a model these are a few poses that verify or monitor
-        it, or, if its errors are above the limit, the poses that reduce them most.
+        Without a model they are for a calibration. With one, a few verify or monitor it or, above the limit, improve it.
 
         Args:
             progress: called with the name of each step.
@@ -323,9 +322,8 @@ class Cell:
         parent, chosen, seen = self._new_rows("recalibrate", None, session)
         settings = seen.settings_to_recalibrate(self.file.settings_of_step("recalibrate", **changed))
         result = recalibrate(self.model_folder(parent.name), seen.rows, settings, progress)
-        result = with_warnings(
-            result, (*self.controller_warnings("recalibrate", parent), *self.file.row_warnings())
-        )
+        found = (*self.controller_warnings("recalibrate", parent), *self.file.row_warnings())
+        result = with_warnings(result, found)
         if not (result.trusted or accept_implausible):
             doubt = result.diagnostics[0].sentence
             refused = ("recalibrate", parent.name, chosen.name, "not_trusted", doubt)
