@@ -142,7 +142,7 @@ class Cell:
     ) -> tuple[Plan, Path]:
         """Plan which poses to measure, different ones in every plan of a cell.
 
-        Without a model they are for a calibration. With one, a few verify or monitor it or, above the limit, improve it.
+        Without a model they are for a calibration; with one they verify or monitor it or, above the limit, improve it.
 
         Args:
             progress: called with the name of each step.
