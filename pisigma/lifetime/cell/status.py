@@ -257,8 +257,10 @@ def _after(facts: CellFacts, last: Check, failed: tuple[str, ...]) -> Step | Non
         if any(one.name == last.model and not one.has_posterior for one in facts.models):
             why = f"{last.summary.rstrip('.')}; record the change with `pisigma event`, then measure and calibrate"
             return Step("moved", why, facts.command("plan"))
-        state: State = "older_than_evidence" if last.verdict == "unchanged" else "moved"
-        return Step(state, last.summary, facts.command("recalibrate"))
+        if last.verdict != "unchanged":
+            return Step("moved", last.summary, facts.command("recalibrate"))
+        why = f"recalibrated with session '{last.session}', the model predicts held-out rows better: {last.summary}"
+        return Step("older_than_evidence", why, facts.command("recalibrate"))
     if last.verdict in failed and not any(one.made >= last.checked for one in facts.models):
         return _calibrate(facts, "verification_failed", last.summary)
     return None
