@@ -33,7 +33,7 @@ from pisigma.reporting.verdict import Verdict, count_text, uncapitalised
 from pisigma.robot.robot_file import catalogue
 from pisigma.workbench.forms import changed_cell, changed_settings, digest_of
 from pisigma.workbench.job import Outcome, StoppedError
-from pisigma.workbench.tabs import download_of
+from pisigma.workbench.tabs import CHARTS, download_of
 from pisigma.workflow.calibrate import Calibration
 from pisigma.workflow.cell.acceptance import acceptance_of
 from pisigma.workflow.cell.cell import Cell
@@ -133,9 +133,11 @@ def verify(cell: Cell, form: Form, progress: Progress) -> Outcome:
 
 
 def monitor(cell: Cell, form: Form, progress: Progress) -> Outcome:
-    """Compare every new session with the model in use."""
+    """Compare every new session with the model in use, and write the charts to the reports of the cell."""
     found = cell.monitor(progress, **changed_settings("monitor", form))
-    return Outcome(_in_cell(monitoring_text(found), cell), NEEDS_ACTION if found.needs_action else "")
+    found.save_page(out := output_path(cell.folder, REPORTS, CHARTS))
+    text = monitoring_text(found, [f"Charts written to {out.name}."])
+    return Outcome(_in_cell(text, cell), NEEDS_ACTION if found.needs_action else "")
 
 
 def recalibrate(cell: Cell, form: Form, progress: Progress) -> Outcome:

@@ -48,6 +48,8 @@ TAB_OF = {
 """Tab of a command that has not the name of a tab."""
 FORMATS = tuple(name for name in BUILT_IN if name not in ("staubli", "xacro", "library", "ur-calibration"))
 """Formats that need no file of the controller."""
+CHARTS = "-monitoring.html"
+"""End of the names of pages with control charts in the reports of a cell."""
 FIGURES = (".png", ".svg")
 FIRST_ROWS, MAX_ROWS, MAX_LINES = 8, 40, 2000
 """First rows of an upload that are shown, and largest numbers of rows with findings, and of lines in a sentence."""
@@ -220,11 +222,13 @@ def _more(name: str, cell: Cell, status: CellStatus, texts: Mapping[str, str]) -
             return {"columns": [*joint_columns(cell.robot), *(f"{one}_mm" for one in POSITION)]}
         case "calibrate":
             return {"figures": figures(cell, status)}
+        case "verify":
+            return {"charts": [one for one in _names(cell.folder / REPORTS) if one.endswith(CHARTS)][:1]}
         case "deliver":
             return {
                 "formats": {one: BUILT_IN[one][1] for one in FORMATS},
                 "downloads": _names(cell.folder / EXPORTS),
-                "reports": _names(cell.folder / REPORTS),
+                "reports": [one for one in _names(cell.folder / REPORTS) if not one.endswith(CHARTS)],
                 "columns": POSE_COLUMNS,
             }
     return {}

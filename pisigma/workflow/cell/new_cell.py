@@ -14,7 +14,7 @@ from pisigma.files.model_files import DESCRIPTION, model_hash
 from pisigma.files.output_file import write_atomically
 from pisigma.files.scratch import FOLDER, remove_stale_scratch, scratch_beside
 from pisigma.lifetime.cell.history import HISTORY, History, ModelEntry, Use, now
-from pisigma.lifetime.cell.layout import CELL_FILE, MODELS, PLANS, SESSIONS
+from pisigma.lifetime.cell.layout import CELL_FILE, EXPORTS, MODELS, PLANS, REPORTS, SESSIONS
 from pisigma.measurement.camera.camera_files import CameraFiles
 from pisigma.measurement.dates import is_date
 from pisigma.model.folder.model_folder import load_model
@@ -81,7 +81,7 @@ class NewCell:
 
     def _fill(self, folder: Path) -> None:
         """Write all files of the cell."""
-        for part in (PLANS, SESSIONS, MODELS):
+        for part in (PLANS, SESSIONS, MODELS, EXPORTS, REPORTS):
             (folder / part).mkdir()
         known: dict[str, Any] = {
             "robot": self._copied_robot(folder),
