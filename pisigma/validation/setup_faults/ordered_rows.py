@@ -8,14 +8,17 @@ from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float64, Int64
+from jaxtyping import Bool, Float64, Int64
 
 from pisigma.calibration.geometric.initial_guess.initial_guess import randomly_chosen_rows
 from pisigma.calibration.geometric.problem.noise import ALWAYS_GOOD, UNDETERMINED, renumber, sensor_view_of
 from pisigma.calibration.geometric.problem.problem import CalibrationProblem
 from pisigma.calibration.geometric.result import CalibrationResult
+from pisigma.calibration.hybrid.gravity import USUAL, to_first_row_frame
 from pisigma.calibration.hybrid.result import HybridResult
+from pisigma.joint_correction.feature import AbstractFeature
 from pisigma.joint_correction.fourier_series import FourierSeries
+from pisigma.joint_correction.gravity_torques import GravityTorques
 
 MAX_ROWS = 4_000
 """Rows that are used, drawn from all of them."""
@@ -27,6 +30,9 @@ HARMONICS, JOINT_ERROR = 3, 3e-4
 """Harmonics of a series of the joint values, and prior standard deviation of its weights [rad]. The series is fitted
 together with the parameters, because in rows ordered by a joint's values, slow errors of its gear look like a slow
 motion."""
+SAG = 1e-3
+"""Prior standard deviation of the weights of gravity torques [rad], which are fitted too: the sag of elastic joints can
+look like a second arm. It is 8.6e-4 for the measured UR10."""
 VALUES_PER_POSE = 6
 """Independent values of a configuration (the pose of the tool), for any number of targets and repeats."""
 
@@ -157,12 +163,25 @@ class OrderedRows:
 
     @cached_property
     def jacobian(self) -> Float64[np.ndarray, "rows values unknowns"]:
-        """Derivative with respect to the calibration's parameters, and the weights of a series of joint errors."""
+        """Derivative with respect to the calibration's parameters, and the weights of joint errors."""
+        by_weights = [
+            (self.joint_derivative[..., None] * feature.columns(self.problem.state).cpu().numpy()[:, None])[
+                ..., used
+            ]
+            for feature, used, _ in self._joint_errors
+        ]
+        return np.concatenate([self.derivative[:, :, self.problem.active.cpu().numpy()], *by_weights], 2)
+
+    @cached_property
+    def _joint_errors(self) -> tuple[tuple[AbstractFeature, Bool[np.ndarray, "dof columns"], float], ...]:
+        """Unmodelled joint errors of healthy robots, their weights, and the prior standard deviation of these [rad].
+
+        Gravity acts on masses at the origins of the frames.
+        """
         robot = self.problem.space.robot
-        series = FourierSeries(robot, HARMONICS).columns(self.problem.state).cpu().numpy()
-        by_weights = self.joint_derivative[..., None] * series[:, None]
-        by_weights = by_weights.reshape(*self.residual.shape, -1)
-        return np.concatenate([self.derivative[:, :, self.problem.active.cpu().numpy()], by_weights], 2)
+        series, sag = FourierSeries(robot, HARMONICS), GravityTorques(robot, to_first_row_frame(robot, USUAL))
+        masses = sag.used.numpy() & (np.arange(sag.used.shape[1]) % 4 == 0)
+        return (series, series.used.numpy(), JOINT_ERROR), (sag, masses, SAG)
 
     @cached_property
     def precision(self) -> Float64[np.ndarray, " unknowns"]:
@@ -175,9 +194,11 @@ class OrderedRows:
             .cpu()
             .numpy()
         )
-        size = JOINT_ERROR * np.where(robot.revolute, 1.0, robot.reach)
-        weights: np.ndarray = np.repeat(size**-2, (self.jacobian.shape[2] - len(precision)) // robot.dof)
-        return np.concatenate([precision, weights])
+        unit = np.where(robot.revolute, 1.0, robot.reach)[:, None]
+        weights = [
+            np.broadcast_to((size * unit) ** -2.0, used.shape)[used] for _, used, size in self._joint_errors
+        ]
+        return np.concatenate([precision, *weights])
 
     @cached_property
     def covariance(self) -> Float64[np.ndarray, "unknowns unknowns"]:
