@@ -70,9 +70,9 @@ def test_every_rule_of_the_table(command, situation, tmp_path):
     assert (bool(found.refusal), len(found.warnings)) == (effect == "refuse", int(effect == "warn"))
     if effect == "refuse":
         with refused(ModelError, file=tmp_path):
-            found.accepted(tmp_path)
+            found.checked_warnings(tmp_path)
     else:
-        assert found.accepted(tmp_path) == found.warnings
+        assert found.checked_warnings(tmp_path) == found.warnings
 
 
 @pytest.mark.parametrize("command", RULES)
