@@ -31,7 +31,7 @@ def test_a_report_is_written_with_its_figures(folder, tmp_path):
     assert len(steps) == 2
     assert report.verdict in json.dumps(report.to_json(), ensure_ascii=False)
     written = report.save(tmp_path / "page.html", tmp_path / "figures")
-    assert len(written) == 2 * len(report.figures.all)
+    assert len(written) == 3 * len(report.figures.all)  # PNG, SVG and CSV
     assert report.verdict.split(";")[0] in (tmp_path / "page.html").read_text()
     with refused(OutputError, file="page.pdf"):
         report.save(tmp_path / "page.pdf")

@@ -83,7 +83,7 @@ class SetupFault:
         """The numbers of the sentence; joints count from 1; see `Diagnostic.values`."""
         figures = {"before_mm": self.before * 1e3, "after_mm": self.after * 1e3}
         finite = {name: value for name, value in figures.items() if np.isfinite(value)}
-        if len(self.amounts) == 1 and self.kinds[0].endswith("_unit"):
+        if len(self.amounts) == 1 and self.kinds[0].endswith("_unit") and np.isfinite(self.amounts[0]):
             finite["ratio"] = self.amounts[0]
         columns = {"columns": self.columns} if self.columns else {}
         return {**finite, "joints": tuple(joint + 1 for joint in self.joints), **columns}

@@ -49,7 +49,7 @@ def test_sockets_of_exact_data_are_met_where_they_were_held_out() -> None:
     assert float(nominal.mean()) > 0.1
     lines = held_out_lines(figures)
     assert lines[0].startswith("6 sockets ")
-    assert lines[1].startswith("Stated distances of sockets (3, ")
+    assert lines[1].startswith("Stated distances between sockets (3, ")
     table = distance_table(distance)
     assert [row[0] for row in table.rows] == ["high/0 to high/1", "low/0 to low/1", "plate/0 to plate/1"]
 
