@@ -281,7 +281,7 @@ def table(results: Sequence[Closed]) -> str:
                 f"| {arm} | {len(some)} | {some[0].rows} | {np.median(before):.2f} ({max(before):.2f}) "
                 f"| {np.median(after):.3f} ({max(after):.3f}) | {case.limit_mm:.2f} "
                 f"| {ratio:.2f} ({ratios[0]:.2f} to {ratios[-1]:.2f}) "
-                f"| {sum(one.reached for one in some) / len(some) / WANTED:.1%} |"
+                f"| {100 * sum(one.reached for one in some) / len(some) / WANTED:.1f} % |"
             )
     verified = sum(one.verdict == "better" for one in results)
     refused = sum(one.was_refused for one in results)

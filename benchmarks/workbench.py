@@ -14,32 +14,28 @@ idle machine with the extra `view`, playwright and chromium. FOLDER_OF_SIM conta
 import argparse
 import contextlib
 import hashlib
-import importlib.util
 import io
-import json
 import logging
 import math
 import random
-import re
 import shutil
 import tempfile
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from playwright.sync_api import Browser, Page, sync_playwright
-from typer.testing import CliRunner
+from hostile_requests import hostile_request
+from playwright.sync_api import Browser, sync_playwright
+from simulated_arm import import_simulator
+from workbench_page import command, do, measured, opened, show, upload
 
-from pisigma.cli.main import app
 from pisigma.deployment.export.targets import POSE_COLUMNS
 from pisigma.measurement.dataset import Measurements
 from pisigma.planning.session.state import RowsSoFar
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.kinematics.status import Status
 from pisigma.robot.se3 import xyzrpy_from_transform
-from pisigma.workbench.workbench import Workbench
 from pisigma.workflow.cell.cell import Cell
 from pisigma.workflow.load import load
 
@@ -54,8 +50,6 @@ PLAN, CALIBRATE = {"count": "20", "check": "5"}, {"model": "geometric", "folds":
 """Settings that are filled in, so that the page and not the calculation is measured."""
 ROWS, CHECK_ROWS, MANY_ROWS = 60, 20, 10_000
 REQUESTS, RELOADS = 500, 50
-WAIT = 300_000
-"""Longest time to wait for the page [ms]."""
 COMPARED = (
     "cell.yaml",
     "plans/*",
@@ -64,101 +58,6 @@ COMPARED = (
     "models/*/*.safetensors",
     "exports/*",
 )
-HOSTILE = (
-    "",
-    "\0",
-    "../../etc/passwd",
-    "<script>alert(1)</script>",
-    "nan",
-    "-1e308",
-    "9" * 400,
-    "é\u202e",
-    "'; DROP TABLE x",
-    "{}",
-)
-
-
-def simulator(folder: Path) -> Any:
-    """Load `sim.py`."""
-    spec = importlib.util.spec_from_file_location("sim", folder / "sim.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-def measured(sim: Any, arm: str, rows: int, seed: int, path: Path) -> Path:
-    """Write simulated rows of an arm."""
-    true = sim.True_(arm, seed=3)
-    q = true.sample(rows, seed)
-    x, _ = true.measure(q, rng=np.random.default_rng(seed))
-    sim.write_csv(path, true, q, x)
-    return path
-
-
-@contextlib.contextmanager
-def opened(
-    browser: Browser, folder: Path, scene: bool = False, rows: Path | None = None, hostile: bool = False
-) -> Iterator[tuple[Page, Workbench, float]]:
-    """Open the page of a folder; yield it, the server, and the time until it was shown [s]."""
-    faults: list[str] = []
-    with (
-        Workbench(folder, port=0, growing=rows) as bench,
-        contextlib.closing(browser.new_context(viewport={"width": 1280, "height": 800})) as context,
-    ):
-        page = context.new_page()
-        page.set_default_timeout(WAIT)
-        expected = "status of 4" if hostile else "status of 422"
-        page.on(
-            "console",
-            lambda one: faults.append(one.text) if one.type == "error" and expected not in one.text else None,
-        )
-        page.on("pageerror", lambda error: faults.append(str(error)))
-        if not scene:
-            page.route("**/scene/**", lambda route: route.fulfill(body="", content_type="text/html"))
-        begun = time.perf_counter()
-        page.goto(bench.url)
-        page.wait_for_selector("#content h2")
-        yield page, bench, time.perf_counter() - begun
-        assert not faults, faults
-
-
-def show(page: Page, tab: str) -> None:
-    """Open a tab."""
-    page.press(f"#tab-{tab}", "Enter")
-    page.wait_for_selector(f"#tab-{tab}[aria-selected=true]")
-
-
-def do(page: Page, step: str, **fields: str) -> None:
-    """Fill a form, press its button with a key, and wait for the end of the step."""
-    for name, value in fields.items():
-        field = f"form[data-step={step}] [name='{name}']"
-        if page.locator(field).evaluate("one => one.tagName") == "SELECT":
-            page.select_option(field, value)
-        else:
-            page.fill(field, value)
-    before = int(page.get_attribute("body", "data-ended") or 0)
-    page.press(f"form[data-step={step}] button[type=submit]", "Enter")
-    page.wait_for_selector(f"body[data-ended='{before + 1}']")
-    refusal = page.query_selector(f"form[data-step={step}] + .outcome .refusal")
-    assert refusal is None, refusal.inner_text()
-
-
-def upload(page: Page, path: Path) -> tuple[float, float]:
-    """Upload rows; return the times until their columns, and what the check finds, are shown [s]."""
-    begun = time.perf_counter()
-    page.set_input_files("#files", path)
-    page.wait_for_selector(f"#proposal form:has-text('{path.name}')")
-    read = time.perf_counter() - begun
-    page.wait_for_selector("#findings > div, #findings > .good, #findings > .refusal")
-    return read, time.perf_counter() - begun
-
-
-def command(*words: object) -> None:
-    """Run a command."""
-    result = CliRunner().invoke(app, [str(word) for word in words])
-    assert result.exit_code == 0, result.output
 
 
 def by_clicks(browser: Browser, folder: Path, urdf: Path, first: Path, second: Path, program: Path) -> float:
@@ -245,7 +144,7 @@ def different_files(one: Path, other: Path) -> tuple[int, list[str]]:
 
 def run_arms(browser: Browser, simulated: Path, arms: list[str], work: Path) -> None:
     """Compare the page with the commands for every arm."""
-    sim = simulator(simulated)
+    sim = import_simulator(simulated)
     print(f"{'arm':<8}{'page shown [s]':>15}{'all steps [s]':>15}{'files':>7}  differ from the commands")
     for arm in arms:
         folder = work / arm
@@ -285,7 +184,7 @@ def run_mistakes(browser: Browser, simulated: Path, work: Path) -> None:
     """Upload the mistakes, repair them with the button, and add the rows."""
     work = work / "mistakes"
     work.mkdir()
-    rows = measured(simulator(simulated), "kr10", ROWS, 1, work / "2026-11-01.csv")
+    rows = measured(import_simulator(simulated), "kr10", ROWS, 1, work / "2026-11-01.csv")
     print(f"{'mistake':<17}{'columns [s]':>12}{'named [s]':>11}{'repaired [s]':>13}  named as, repair")
     for name, path in mistaken(rows, work).items():
         cell = Cell.create(work / path.stem, simulated / "kr10.urdf")
@@ -305,7 +204,7 @@ def run_mistakes(browser: Browser, simulated: Path, work: Path) -> None:
 
 def run_times(browser: Browser, simulated: Path, work: Path) -> None:
     """Measure the page with its scene."""
-    folder, sim = work / "times", simulator(simulated)
+    folder, sim = work / "times", import_simulator(simulated)
     cell = Cell.create(folder, simulated / "kr10.urdf")
     cell.plan(count=20, check=0, candidates=200)
     lines = measured(sim, "kr10", ROWS, 1, work / "rows.csv").read_text().splitlines(keepends=True)
@@ -357,23 +256,6 @@ def frames(scene: Any) -> float:
     )
 
 
-FUZZED = {
-    "plan": "count",
-    "calibrate": "folds",
-    "verify": "of_model",
-    "monitor": "seed",
-    "recalibrate": "draws",
-    "measure": "session",
-    "session": "session",
-    "event": "kind",
-    "use": "model",
-    "export": "format",
-    "ik": "x_mm",
-    "cell": "seen",
-    "controller": "export",
-    "import": "files",
-}
-"""Steps, each with a field whose hostile value has to be refused."""
 ASK = """async ([path, method, body]) => {
   const answer = await fetch(path, { method, body: method === "GET" ? undefined : body });
   return [answer.status, await answer.text()]; }"""
@@ -383,7 +265,7 @@ def run_fuzz(browser: Browser, simulated: Path, work: Path, seed: int) -> None:
     """Send hostile requests, reload the page during a calibration, and look at it with two browsers."""
     folder, chosen = work / "fuzz", random.Random(seed)
     cell = Cell.create(folder, simulated / "kr10.urdf")
-    cell.take_in(measured(simulator(simulated), "kr10", ROWS, 1, work / "2026-11-01.csv"))
+    cell.take_in(measured(import_simulator(simulated), "kr10", ROWS, 1, work / "2026-11-01.csv"))
     shutil.copytree(folder, work / "same")
     before, said = digests(folder), io.StringIO()
     handler = logging.StreamHandler(said)
@@ -427,43 +309,6 @@ def run_fuzz(browser: Browser, simulated: Path, work: Path, seed: int) -> None:
     assert not different, different
     assert "Traceback" not in said.getvalue(), said.getvalue()
     print(f"{RELOADS} reloads of two browsers during a calibration: {count} files as those of the command")
-
-
-def hostile_request(chosen: random.Random) -> tuple[str, str, str]:
-    """Return path, method and body of a request that has to be refused, or changes nothing."""
-    value, kind = chosen.choice(HOSTILE), chosen.randrange(6)
-    if kind == 0:
-        body = "".join(chosen.choices("q1_deg,x_mm;\t\n0123456789.-\"'eE\0", k=chosen.randrange(400)))
-        return "upload?name=" + re.sub(r"[^a-z.%0-9]", "%2f", value)[:50], "POST", body
-    if kind == 1:
-        return (
-            chosen.choice(("propose", "check")),
-            "POST",
-            json.dumps(
-                {
-                    "files": str(chosen.randrange(40)),
-                    "unit": value,
-                    "new_frame_at": value,
-                    "column 0 0": value,
-                }
-            ),
-        )
-    if kind == 2:
-        step, field = chosen.choice([*FUZZED.items()])
-        return f"step/{step}?person=x", "POST", json.dumps({field: value or "?", "command": value})
-    if kind == 3:
-        return (
-            chosen.choice(("show", "drag", "stop", "step/plan", "propose")),
-            "POST",
-            chosen.choice(("", "{", "[]", '{"a": 1}', '"x"', "nul")),
-        )
-    if kind == 4:
-        return "show", "POST", json.dumps({"text": f"line {value} lines 1 to 99999999 {value}.csv"})
-    folder, way = (
-        chosen.choice(("plan", "model", "export", "report", "x")),
-        chosen.choice(("..%2f", "%2e%2e/", "")),
-    )
-    return f"download/{folder}/{way}cell.yaml", "GET", ""
 
 
 def digests(folder: Path) -> dict[str, str]:

@@ -198,17 +198,10 @@ class MjcfDrawing:
 
 def _rotation(quaternion: Float64[np.ndarray, " 4"]) -> Float64[np.ndarray, "3 3"]:
     """Return the rotation of a quaternion w, x, y, z of any length; multiples of 90 deg are exact."""
-    quaternion = quaternion / np.linalg.norm(quaternion)
-    w, x, y, z = (2 * quaternion[:, None] * quaternion).tolist()
-    R = np.array(
-        [
-            [1 - y[2] - z[3], x[2] - w[3], x[3] + w[2]],
-            [x[2] + w[3], 1 - x[1] - z[3], y[3] - w[1]],
-            [x[3] - w[2], y[3] + w[1], 1 - x[1] - y[2]],
-        ]
-    )
-    whole = np.abs(R - R.round()) < 1e-14
-    return np.where(whole, R.round(), R)
+    from scipy.spatial.transform import Rotation
+
+    R: Float64[np.ndarray, "3 3"] = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
+    return np.where(np.abs(R - R.round()) < 1e-14, R.round(), R)
 
 
 def numbers(text: str) -> list[float]:

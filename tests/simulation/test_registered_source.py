@@ -57,7 +57,9 @@ def test_recipes_take_a_registered_source(drift):
     error = section.true_robot().joint_error(q)
     assert_close(error, [torch.pi / 180, 1e-3 * 0.2, 0, 0, 0, 0], atol=1e-15)
     assert read(RECIPE) == section
-    assert TrueRobotSection(**section.model_dump()) == section
+    restored = TrueRobotSection(**section.model_dump())
+    assert isinstance(restored.errors[1], Drift)
+    assert_close(restored.true_robot().joint_error(q), error, atol=0)
     assert section.model_dump()["errors"][1] == {"kind": "drift", "joint": "theta_2", "share": 1e-3}
 
 

@@ -16,16 +16,16 @@ from pisigma.deployment.export.geometry import check_geometry, chosen_geometry
 from pisigma.deployment.export.urdf import (
     CALIBRATED_FRAME,
     CALIBRATED_TOOL,
+    check_same_geometry,
     check_tip,
     missing_meshes,
     updated_urdf_text,
 )
-from pisigma.files.errors import Place, RobotError
 from pisigma.robot.description import Robot
 from pisigma.robot.mjcf_file import MjcfDrawing, numbers
 from pisigma.robot.row import Row
 from pisigma.robot.urdf_chain import Chain, ChainJoint
-from pisigma.robot.urdf_frames import Frame, frame_of, inverse, rotation, row_frame, translation, xyzrpy_of
+from pisigma.robot.urdf_frames import Frame, frame_of, inverse, rotation, row_frame, translation
 from pisigma.robot.urdf_rows import rows_of_chain
 from pisigma.robot.writing import comment_text, robot_to_urdf, unused_name
 
@@ -34,7 +34,7 @@ SAME = 2e-3
 SNAP = 1e-5
 """Deviations of drawn right angles [rad] up to this are due to rounding."""
 DIGITS = 6
-"""Decimals of drawn positions [m] that count."""
+"""Decimals of drawn positions [m] that are used."""
 MESHES = (".stl", ".obj", ".msh")
 """Meshes that MuJoCo reads."""
 ORIENTATIONS = ("quat", "euler", "axisangle", "xyaxes", "zaxis")
@@ -201,26 +201,12 @@ def _add_mimics(mjcf: Any, joints: Sequence[Any]) -> None:
 
 def _place(element: Any, T: Frame) -> None:
     """State the pose of an element in its parent, with all digits."""
+    from scipy.spatial.transform import Rotation
+
     for name in ORIENTATIONS:
         element.attrib.pop(name, None)
     element.set("pos", _text(T[:3, 3]))
-    element.set("quat", _text(_quaternion(T)))
-
-
-def _quaternion(T: Frame) -> Float64[np.ndarray, " 4"]:
-    """Return the quaternion w, x, y, z of a frame."""
-    quaternion = np.array([1.0, 0.0, 0.0, 0.0])
-    for axis, angle in zip((2, 1, 0), xyzrpy_of(T)[3:], strict=True):
-        turn = np.zeros(4)
-        turn[0], turn[1 + axis] = math.cos(angle / 2), math.sin(angle / 2)
-        quaternion = _product(quaternion, turn)
-    return quaternion
-
-
-def _product(a: Float64[np.ndarray, " 4"], b: Float64[np.ndarray, " 4"]) -> Float64[np.ndarray, " 4"]:
-    """Multiply two quaternions."""
-    vector = a[0] * b[1:] + b[0] * a[1:] + np.cross(a[1:], b[1:])
-    return np.array([a[0] * b[0] - a[1:] @ b[1:], *vector])
+    element.set("quat", _text(Rotation.from_matrix(T[:3, :3]).as_quat(scalar_first=True)))
 
 
 def _text(values: Sequence[float] | Float64[np.ndarray, " values"]) -> str:
@@ -307,15 +293,7 @@ def _row_frames(nominal: Robot, origins: Sequence[Frame], path: str | os.PathLik
     start = rotation(2, by[0]) @ translation(0.0, 0.0, by[1])
     differences = (drawn.fields.dh - own.fields.dh)[:-1]
     differences[:1, :2] = 0.0
-    if (far := float(np.abs(differences).max(initial=0.0))) > SAME:
-        raise RobotError(
-            f"the drawn geometry differs from that of the nominal robot '{nominal.name}' by {far:.2g} m or rad",
-            expected="a drawing of the nominal robot",
-            value=far,
-            at=Place(path),
-            option="--like",
-            remedy="give the MJCF file of this robot, with the same joints",
-        )
+    check_same_geometry(differences, SAME, path, "give the MJCF file of this robot, with the same joints")
     frames = [there @ inverse(here) for there, here in zip(drawn.frames, own.frames, strict=True)]
     return [drawn.frames[0] @ start @ inverse(own.frames[0]), *frames[1:]]
 

@@ -8,6 +8,7 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from jaxtyping import Float64
 
 from pisigma.deployment.export.export_format import Exported, ExportFormat, ExportRequest, model_facts
 from pisigma.deployment.export.geometry import check_geometry, chosen_geometry
@@ -215,15 +216,35 @@ def _check_same(described: RobotFields, nominal: Robot, path: str) -> None:
             option="--like",
             remedy="give the file that the robot was loaded from, and the same tip",
         )
-    far = float(np.abs(described.dh - nominal.dh)[:-1].max(initial=0.0))
-    if far > SAME:
+    remedy = "give the file that the robot was loaded from"
+    check_same_geometry((described.dh - nominal.dh)[:-1], SAME, path, remedy)
+
+
+def check_same_geometry(
+    differences: Float64[np.ndarray, "rows parameters"],
+    largest: float,
+    path: str | os.PathLike[str],
+    remedy: str,
+) -> None:
+    """Raise an error if the geometry of a file differs from that of the nominal robot.
+
+    Args:
+        differences: differences of the DH parameters [m or rad].
+        largest: largest difference that is accepted [m or rad].
+        path: the file, for the message.
+        remedy: what the user should do.
+
+    Raises:
+        RobotError: a difference is larger.
+    """
+    if (far := float(np.abs(differences).max(initial=0.0))) > largest:
         raise RobotError(
-            f"the nominal geometry differs from that of the model by {far:.2g} m or rad",
-            expected="the nominal geometry of the model",
+            f"the geometry of the file differs from that of the nominal robot by {far:.2g} m or rad",
+            expected="the geometry of the nominal robot",
             value=far,
             at=Place(path),
             option="--like",
-            remedy="give the file that the robot was loaded from",
+            remedy=remedy,
         )
 
 

@@ -136,7 +136,7 @@ def test_files_of_other_robots_are_refused(path):
     with refused(RobotError, option="--like", value="one, two, three"):
         update_urdf(Robot.load("ur10"), Robot.load("ur10"), path, "tool0")
     longer = nominal.with_geometry(nominal.dh + 0.01)
-    with refused(RobotError, option="--like", expected="the nominal geometry of the model"):
+    with refused(RobotError, option="--like", expected="the geometry of the nominal robot"):
         update_urdf(longer, longer, path, "tool0")
     with pytest.raises(RobotError, match="2"):
         update_urdf(nominal, nominal, path)
