@@ -179,7 +179,7 @@ def _check_one_unit(place: Place, columns: list[Column]) -> None:
     for column in columns:
         if column.unit != columns[0].unit:
             raise MeasurementError(
-                expected=f"{columns[0].unit} as in '{columns[0].name}'",
+                expected=f"the unit of '{columns[0].name}', {columns[0].unit}",
                 value=column.unit,
                 at=replace(place, column=column.name),
                 remedy="use one unit for both",

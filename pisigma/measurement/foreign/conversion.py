@@ -85,7 +85,7 @@ def check_complete(mapping: FileMapping) -> None:
         for column in group:
             if column.target.unit and group[0].target.unit not in ("", column.target.unit):
                 raise MeasurementError(
-                    expected=f"{group[0].target.unit} as in '{group[0].heading}'",
+                    expected=f"the unit of '{group[0].heading}', {group[0].target.unit}",
                     value=column.target.unit,
                     at=mapping.place_of(column),
                     remedy="give both in one unit",
