@@ -13,7 +13,7 @@ from testing.cell_rows import day, measured
 from testing.models import no_type_checker
 from testing.pages import visitor
 from testing.report import HOSTILE
-from testing.workbench_requests import do, ended, seen, state
+from testing.workbench_requests import do, ended, seen, state, upload
 from typer.testing import CliRunner
 
 pytest.importorskip("viser", reason="the extra view is not installed")
