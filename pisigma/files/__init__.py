@@ -1,1 +1,1 @@
-"""Reading and writing files: bounded inputs, outputs that are complete or absent, and errors with file and line."""
+"""Read and write files: inputs of limited size, outputs that are complete or absent, errors with file and line."""

@@ -1,4 +1,4 @@
-"""Conflicts of an output: with an input of the same call, or with a model folder."""
+"""Detect conflicts of an output with an input of the same call or with a model folder."""
 
 import os
 from collections.abc import Iterable

@@ -1,4 +1,4 @@
-"""Every exception that pisigma raises on purpose.
+"""Exceptions that pisigma raises on purpose.
 
 All messages have one form, which `PisigmaError` makes from its fields: ``expected X, got Y (file, line, column); do
 Z.`` The command line prints any `PisigmaError` as one line on stderr and exits with status 2, with status 3 for an
@@ -13,10 +13,10 @@ from dataclasses import dataclass
 from typing import Any
 
 MAX_WORD_CHARACTERS = 200
-"""Longest word of a file or a command line that a message quotes in full."""
+"""Largest number of characters of a word that a message quotes in full."""
 
 MAX_MESSAGE_CHARACTERS = 2000
-"""Longest message."""
+"""Largest number of characters of a message."""
 
 _UNPRINTABLE = re.compile(
     r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]"
@@ -28,8 +28,8 @@ def make_printable(text: str, cut: bool = True) -> str:
     r"""Return a text that is safe to print on a terminal, even if parts of it come from a file.
 
     Control characters, direction marks and surrogates are written as escapes (`\x1b`), so that nothing moves the
-    cursor, sets colours or hides the text that follows. A word longer than `MAX_WORD_CHARACTERS` is shortened to its
-    start and its length, a text longer than `MAX_MESSAGE_CHARACTERS` to its start and its end.
+    cursor, sets colours or hides the text that follows. A word longer than `MAX_WORD_CHARACTERS` is replaced by its
+    start and its length, and a text longer than `MAX_MESSAGE_CHARACTERS` by its start and its end.
 
     Args:
         text: any text.
@@ -74,13 +74,13 @@ class PisigmaError(Exception):
     length.`` It is printable, see `make_printable`. All fields are attributes, so that callers need not parse it.
 
     Attributes:
-        file: the file at fault; None if there is none.
-        line: its line, counted from 1; None for the whole file.
+        file: the file that caused the error; None if the error is not in a file.
+        line: line number in the file, counted from 1; None for the whole file.
         column: name or number of the column, or the YAML key; None for the whole line.
-        option: the option or argument at fault, for example ``"--camera"``; empty if there is none.
+        option: the option or argument that caused the error, for example ``"--camera"``; empty if none did.
         value: the value that was given; None if it is not known.
         expected: what was expected; empty if `problem` says what is wrong.
-        problem: what is wrong, a clause; empty if the message says what was expected.
+        problem: a clause that states what is wrong; empty if the message says what was expected.
         remedy: how to correct the input; empty if the message does not say.
     """
 
@@ -97,12 +97,12 @@ class PisigmaError(Exception):
         """Build the message from its parts.
 
         Args:
-            problem: what is wrong, a clause without a full stop; if omitted, the message says
-                ``expected ..., got ...``. Without any other argument it is the whole message, unchanged.
+            problem: a clause without a full stop that states what is wrong; if omitted, the message says ``expected
+                ..., got ...``. Without any other argument it is the whole message, unchanged.
             expected: what was expected, for example ``"a length > 0"``.
             value: the value that was given.
-            at: the place in a file; it follows the problem in parentheses.
-            option: the option or argument at fault; it precedes the problem.
+            at: the place in a file; the message gives it in parentheses after the problem.
+            option: the option or argument that caused the error; the message names it before the problem.
             remedy: how to correct the input, an imperative clause without a full stop.
         """
         self.file = None if at is None else os.fspath(at.file)
@@ -126,7 +126,7 @@ class PisigmaError(Exception):
         super().__init__(make_printable(sentence if is_whole else f"{sentence}."))
 
     def fields(self) -> dict[str, Any]:
-        """Return class, message and all fields that are set, as plain values for JSON."""
+        """Return the class name, the message and all attributes that are set, as plain values for JSON."""
         stated = {"class": type(self).__name__, "message": str(self)}
         names = ("file", "line", "column", "option", "value", "expected", "remedy")
         values = {name: getattr(self, name) for name in names}
@@ -145,17 +145,17 @@ class PisigmaError(Exception):
         return other
 
     def with_option(self, option: str) -> "PisigmaError":
-        """Return a copy of an error of a value with another name of its option; an error of a file is unchanged."""
+        """Return a copy with another option name; an error in a file is returned unchanged."""
         if option == self.option or self.file is not None or self._follows:
             return self
         fields = {name: getattr(self, name) for name in ("expected", "value", "remedy")}
         return type(self)(self.problem.rstrip("."), option=option, **fields)
 
     def with_place(self, at: Place, error: "type[PisigmaError] | None" = None) -> "PisigmaError":
-        """Return a copy of the error with a place, for errors that are found by code that does not know the file.
+        """Return a copy of the error with a place in a file, for code that knows the file when the cause does not.
 
         Args:
-            at: the place in a file. If the error has a place already, `at` precedes the message instead.
+            at: the place in a file. If the error has a place already, the new message begins with `at` instead.
             error: class of the copy; None for the class of this error.
         """
         make = error or type(self)
@@ -171,7 +171,7 @@ class PisigmaError(Exception):
 
 
 def _quoted(value: Any) -> str:
-    """Format a value for a message: texts in quotation marks, numbers as they are."""
+    """Format a value for a message: texts in quotation marks, numbers without."""
     if isinstance(value, str):
         return f"'{value}'"
     return f"{value:,.12g}" if isinstance(value, float) else str(value)
@@ -222,7 +222,7 @@ class ImplausibleError(IdentificationError):
 
 
 class PlanningError(PisigmaError, ValueError):
-    """A cell, a plan or the settings of one cannot be used."""
+    """A cell, a plan, or the settings of a plan cannot be used."""
 
 
 class FleetError(PisigmaError, ValueError):
@@ -238,7 +238,7 @@ class OutputError(PisigmaError, ValueError):
 
 
 class AcceptanceError(PisigmaError, ValueError):
-    """A model exceeds the limits that were set for it, or rows or a model must not be trusted.
+    """A model exceeds the limits that were set for it, or the rows or the model must not be trusted.
 
     Attributes:
         findings: what the checks of rows found (`pisigma.validation.held_out.diagnostic.Diagnostic`).
@@ -268,13 +268,13 @@ EXTRAS = {
     "opencv-python-headless": "camera",
     "pin": "bench",
 }
-"""The extra that installs each optional package."""
+"""Name of the extra (`pip install pisigma[EXTRA]`) that installs each optional package."""
 _PACKAGES = {"cv2": "opencv-python-headless", "pinocchio": "pin"}
-"""Packages whose module has another name, by that name."""
+"""Names of packages whose module has a different name, by module name."""
 
 
 def system_fault(problem: BaseException) -> str:
-    """Describe which file cannot be used, or that memory ran out; "" for every other problem."""
+    """Describe a file that cannot be used, or a lack of memory; return "" for every other problem."""
     if isinstance(problem, OSError) and problem.filename is not None:
         return f"{problem.filename}: cannot be used ({problem.strerror}); check the path."
     if isinstance(problem, MemoryError):
@@ -283,7 +283,7 @@ def system_fault(problem: BaseException) -> str:
 
 
 def missing_extra(problem: ImportError) -> MissingExtraError | None:
-    """Return an error that names the extra with the package that could not be imported; None if no extra has it."""
+    """Return an error that names the extra of a package that could not be imported; None if no extra contains it."""
     module = (problem.name or "").split(".")[0]
     package = _PACKAGES.get(module, module)
     if package not in EXTRAS:
@@ -305,7 +305,7 @@ def check_choice(
         name: the option, argument or key.
         value: the value to check.
         choices: the valid values.
-        at: where in a file the value was given.
+        at: place in a file at which the value was given.
 
     Raises:
         PisigmaError: the value is not valid; the exception has the class `error` and names the nearest choice.
@@ -321,7 +321,7 @@ def check_choice(
 
 
 def nearest_choice(given: str, choices: Iterable[str]) -> str:
-    """Return a remedy that lists the valid choices and the one nearest to `given`.
+    """Return a remedy that lists the valid choices and suggests the one nearest to `given`.
 
     Returns:
         For example ``"did you mean 'epochs'? Valid: epochs, seed."``.

@@ -1,4 +1,4 @@
-"""File systems of networks, whose locks do not reliably protect a database from two machines."""
+"""Detect network file systems, whose locks do not reliably protect a database from two machines."""
 
 import os
 import re
@@ -32,23 +32,23 @@ NETWORK_TYPES = frozenset(
 )
 """Types of file systems that several machines can write to, by their names in mount tables."""
 MOUNTINFO = Path("/proc/self/mountinfo")
-"""Table of mounts on Linux."""
+"""File with the table of mounts on Linux."""
 _TYPES: dict[tuple[Path, int], str | None] = {}
-"""Results of `_network_type` by table and number of the device, which changes when something else is mounted."""
+"""Cached results of `_network_type` by mount table and device number, which changes with the mounted file system."""
 _DRIVE_REMOTE = 4
-"""Result of `GetDriveTypeW` of Windows for a network drive."""
+"""Return value of the Windows function `GetDriveTypeW` for a network drive."""
 _MACOS_MOUNT = re.compile(r"^.* on (?P<point>/.*) \((?P<type>\w+)[,)]", re.MULTILINE)
 """A line of the macOS command `mount`: ``//user@server/share on /Volumes/share (smbfs, nodev)``."""
 
 
 def check_local(folder: Path) -> None:
-    """Check that a folder for a database is not on the file system of a network.
+    """Check that a folder for a database is not on a network file system.
 
     Args:
         folder: the folder; a folder that does not exist is not checked.
 
     Raises:
-        OutputError: the folder is on the file system of a network.
+        OutputError: the folder is on a network file system.
     """
     try:
         device = os.stat(folder).st_dev
@@ -57,7 +57,7 @@ def check_local(folder: Path) -> None:
     if (
         MOUNTINFO,
         device,
-    ) not in _TYPES:  # for many folders, reading the table takes longer than everything else
+    ) not in _TYPES:  # cached, because for many folders reading the table takes longer than everything else
         _TYPES[MOUNTINFO, device] = _network_type(os.path.realpath(folder))
     if kind := _TYPES[MOUNTINFO, device]:
         raise OutputError(
@@ -69,7 +69,7 @@ def check_local(folder: Path) -> None:
 
 
 def _network_type(folder: str) -> str | None:
-    """Return the type of the network file system of a folder; None for a local disk, or if the type is unknown.
+    """Return the type of the network file system that contains a folder; None for a local disk or an unknown type.
 
     Args:
         folder: the real path of the folder.
@@ -85,17 +85,17 @@ def _network_type(folder: str) -> str | None:
             mounts = macos_mounts(subprocess.run(["/sbin/mount"], capture_output=True, text=True).stdout)
         else:
             mounts = linux_mounts(MOUNTINFO.read_text(encoding="utf-8", errors="replace"))
-    except OSError:  # systems without a table of mounts
+    except OSError:  # this system has no table of mounts
         return None
     kind = file_system_type(folder, mounts)
     return kind if kind in NETWORK_TYPES else None
 
 
 def linux_mounts(mountinfo: str) -> list[tuple[str, str]]:
-    """Return the mount points and types of file systems in a table such as `/proc/self/mountinfo`.
+    """Return mount point and type of every file system in a table such as `/proc/self/mountinfo`.
 
-    Its format is that of proc(5): the fifth field is the mount point, with blanks as octal escapes, and the first
-    field after " - " is the type.
+    proc(5) defines the format: the fifth field is the mount point, with blanks as octal escapes, and the first field
+    after " - " is the type.
     """
     mounts = []
     for line in mountinfo.splitlines():
@@ -107,7 +107,7 @@ def linux_mounts(mountinfo: str) -> list[tuple[str, str]]:
 
 
 def macos_mounts(printed: str) -> list[tuple[str, str]]:
-    """Return the mount points and types of file systems that the macOS command `mount` prints."""
+    """Return mount point and type of every file system in the output of the macOS command `mount`."""
     return [(match["point"], match["type"]) for match in _MACOS_MOUNT.finditer(printed)]
 
 
@@ -116,8 +116,7 @@ def file_system_type(path: str, mounts: Iterable[tuple[str, str]]) -> str | None
 
     Args:
         path: an absolute path without links.
-        mounts: mount points and types in the order in which they were mounted; a later one covers an earlier one at
-            the same place.
+        mounts: mount points and types in the order of mounting; a later mount hides an earlier one at the same place.
 
     Returns:
         The type, such as "ext4" or "nfs4"; None if no mount point contains the path.

@@ -1,4 +1,4 @@
-"""Reading one file whole, within bounds on size and time."""
+"""Read whole files, with limits on size and waiting time."""
 
 import os
 import select
@@ -7,22 +7,22 @@ import stat
 from pisigma.files.errors import PisigmaError, Place
 
 MAX_BYTES = 2**26
-"""Largest file that is read; files that people or instruments write are smaller (half a million rows, say)."""
+"""Largest size of an input file [bytes]; files that people or instruments write are smaller (half a million rows)."""
 MAX_WAIT_S = 4.0
 """Longest time that a pipe or a terminal may stay silent [s]."""
 _CHUNK_BYTES = 2**20
 
 
 def read_input(path: str | os.PathLike[str], error: type[PisigmaError], max_bytes: int = MAX_BYTES) -> bytes:
-    """Read a file or a pipe whole, with bounds on memory and time.
+    """Return all bytes of a file or a pipe, with limits on memory and time.
 
     Args:
         path: the file.
-        error: class of the exception to raise, so that callers can distinguish a bad recipe from a bad robot.
-        max_bytes: largest size of the file; a larger one is rejected before it is read.
+        error: class of the exception to raise, such as `RecipeError`.
+        max_bytes: largest size of the file [bytes]; a larger file is rejected before it is read.
 
     Raises:
-        error: the file is missing, a folder or too large, cannot be read, or is a pipe into which nothing is written.
+        error: the file is missing, is a folder, is too large or cannot be read, or nothing is written to the pipe.
     """
     content = bytearray()
     try:
@@ -36,7 +36,7 @@ def read_input(path: str | os.PathLike[str], error: type[PisigmaError], max_byte
     except OSError as problem:
         what = f"the file cannot be read: {problem.strerror}"
         raise error(what, value=problem.strerror, at=Place(path), remedy="check the path") from None
-    except ValueError:  # a NUL, or characters that the file system cannot encode
+    except ValueError:  # the name has a NUL, or characters that the file system cannot encode
         what = "the path is not a valid file name"
         raise error(what, expected="a file name", at=Place(path), remedy="check the path") from None
     raise error(
@@ -48,7 +48,7 @@ def read_input(path: str | os.PathLike[str], error: type[PisigmaError], max_byte
 
 
 def open_input(path: str, flags: int) -> int:
-    """Open a file without blocking, as an opener for `open`, which would wait forever for a pipe without a writer.
+    """Open a file without blocking, as the opener of `open`, which otherwise waits forever for a pipe without a writer.
 
     Raises:
         TimeoutError: the file is a pipe or a device that delivers nothing for `MAX_WAIT_S`.
@@ -65,16 +65,16 @@ def open_input(path: str, flags: int) -> int:
 def read_text(
     path: str | os.PathLike[str], error: type[PisigmaError], kind: str, max_bytes: int = MAX_BYTES
 ) -> str:
-    """Read a text file in UTF-8, with or without a byte order mark; see `read_input`.
+    """Return the text of a UTF-8 file, with or without a byte order mark, within the limits of `read_input`.
 
     Args:
         path: the file.
         error: class of the exception to raise.
-        kind: the expected format for the message, such as "YAML".
-        max_bytes: largest size of the file.
+        kind: name of the expected format for messages, such as "YAML".
+        max_bytes: largest size of the file [bytes].
 
     Raises:
-        error: see `read_input`, or the file is not UTF-8 text; the exception names the line.
+        error: the file cannot be read (see `read_input`) or is not UTF-8 text; the exception names the line.
     """
     content = read_input(path, error, max_bytes)
     try:

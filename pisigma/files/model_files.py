@@ -9,17 +9,17 @@ from pisigma.files.errors import ModelError, Place
 from pisigma.files.input_file import MAX_BYTES, read_input
 
 DESCRIPTION = "model.yaml"
-"""Description: robot, network, provenance, metrics."""
+"""File with the description of a model: robot, network, provenance and metrics."""
 WEIGHTS = "model.safetensors"
-"""All tensors of the model."""
+"""File with all tensors of a model."""
 COMPILED = "compiled.npz"
-"""The model as arrays for the compiled kernels, made from the two files above; a folder is complete without it."""
+"""Optional file with the arrays for the compiled kernels, made from `model.yaml` and `model.safetensors`."""
 DRAWING = "drawing.urdf"
-"""The URDF file of the nominal robot, if the robot came from one."""
+"""URDF file of the nominal robot, if the robot was read from one."""
 CARD = "README.md"
-"""Model card for people."""
+"""File with the model card."""
 HELD_OUT_CSV = "held_out.csv"
-"""All held-out rows with their errors."""
+"""File with all held-out rows and their errors."""
 PARAMETERS_CSV = "parameters.csv"
 CORRELATION_CSV = "correlation.csv"
 ENERGY_CSV = "energy.csv"
@@ -39,14 +39,14 @@ MODEL_FILES = frozenset(
 
 
 _MAX_BYTES = {DESCRIPTION: 2**21, WEIGHTS: 2**28, HELD_OUT_CSV: 2**28}
-"""Largest sizes of files for which it is not `MAX_BYTES`."""
+"""Largest sizes [bytes] of files whose limit is not `MAX_BYTES`."""
 
 _WEIGHTS_HASH = re.compile(rb"^weights_sha256: ['\"]?([0-9a-f]{64})", re.MULTILINE)
 _SIGNED = re.compile(rb"(.*\n)compiled_sha256: (\S+)\nsha256: ([0-9a-f]{64})\n", re.DOTALL)
 
 
 def read_model_file(folder: Path, name: str) -> bytes:
-    """Read a file of a model folder.
+    """Return the bytes of a file in a model folder.
 
     Raises:
         ModelError: the file is missing, not a regular file, too large, or cannot be read.
@@ -68,7 +68,7 @@ def model_hash(folder: str | os.PathLike[str]) -> str:
 
 
 def is_unchanged(folder: Path, sha256: str) -> bool:
-    """Return whether the description and the weights of a model are those of a `model_hash`."""
+    """Return whether the description and the weights of a model have the given `model_hash`."""
     try:
         description, weights = (read_model_file(folder, name) for name in (DESCRIPTION, WEIGHTS))
     except ModelError:
@@ -86,7 +86,7 @@ def check_model_hash(folder: str | os.PathLike[str], sha256: str) -> None:
         sha256: the expected `model_hash`, as `sha256sum` prints it.
 
     Raises:
-        ModelError: the model is another one or was changed, or cannot be read.
+        ModelError: the model is a different one, was changed, or cannot be read.
     """
     if (actual := model_hash(folder)) != sha256.strip().lower():
         raise ModelError(
@@ -99,12 +99,12 @@ def check_model_hash(folder: str | os.PathLike[str], sha256: str) -> None:
 
 
 def content_hash(description: bytes, weights: bytes) -> str:
-    """Return the SHA-256 of the sources of the compiled arrays: description without its last two lines, and weights."""
+    """Return the SHA-256 of a description, without its last two lines, and of the weights, as in `compiled.npz`."""
     return hashlib.sha256(description + weights).hexdigest()
 
 
 def compiled_model_hash(folder: Path) -> str | None:
-    """Return the `content_hash` of a folder if its `compiled.npz` has the hash in its description, else None."""
+    """Return the `content_hash` of a folder if its `compiled.npz` has the hash in the description, otherwise None."""
     try:
         description, weights, compiled = (
             read_model_file(folder, name) for name in (DESCRIPTION, WEIGHTS, COMPILED)
@@ -118,7 +118,7 @@ def compiled_model_hash(folder: Path) -> str | None:
 
 
 def is_model(folder: Path) -> bool:
-    """Whether a folder contains the description of a model, of any format version and even if damaged.
+    """Return whether a folder contains the description of a model, even in another format version or damaged.
 
     Raises:
         OSError: the folder cannot be accessed.

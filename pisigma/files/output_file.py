@@ -1,4 +1,4 @@
-"""Write a file completely or not at all, and never over an input or a part of a model."""
+"""Write a file completely or not at all, and never replace an input or a part of a model."""
 
 import errno
 import os
@@ -15,17 +15,17 @@ from pisigma.files.scratch import FILE, remove_stale_scratch, scratch_beside
 def check_output(
     path: Path, suffixes: tuple[str, ...] = (), what: str = "", inputs: Iterable[Input] = ()
 ) -> None:
-    """Check that a file may be written, before the work starts.
+    """Check that an output file may be written, before the computation starts.
 
     Args:
         path: the file.
         suffixes: file name extensions that are allowed; () for any.
-        what: contents of the file, for the message about its extension.
+        what: name of the contents for messages about the extension, such as "the page".
         inputs: files and folders that the same call reads.
 
     Raises:
-        OutputError: the path has another extension, is an input, a part of a model or not a regular file, or its folder
-            is missing or read-only.
+        OutputError: the path has another extension, is an input, a part of a model or not a regular file, or its
+            folder is missing or read-only.
     """
     if suffixes and path.suffix.lower() not in suffixes:
         endings = " or ".join(suffixes)
@@ -58,7 +58,7 @@ def _refusal(path: Path, problem: str, expected: str, value: str) -> OutputError
 
 
 def check_page(page: Path, inputs: Iterable[Input] = ()) -> None:
-    """Check that an HTML page may be written; see `check_output`."""
+    """Check that an HTML page may be written, as `check_output` does."""
     check_output(page, (".html", ".htm"), "a page", inputs)
 
 
@@ -66,7 +66,7 @@ def write_atomically(path: Path, content: str | bytes) -> None:
     """Write a file next to `path` and rename it to `path` in one step; an existing file is replaced.
 
     Raises:
-        OutputError: see `check_output`, or writing fails; nothing is left behind.
+        OutputError: the path is not allowed (see `check_output`), or writing fails; no scratch file remains.
     """
     with open_atomically(path) as file:
         if isinstance(content, bytes):
@@ -79,11 +79,11 @@ def write_atomically(path: Path, content: str | bytes) -> None:
 def open_atomically(path: Path) -> Iterator[TextIO]:
     """Open a text file next to `path` for writing and rename it to `path` at the end; an existing file is replaced.
 
-    Nothing is left behind if the block ends with an exception or an interruption. Scratch files of killed processes are
-    removed.
+    Nothing is left behind if the block ends with an exception or an interruption. Scratch files of killed processes
+    are removed.
 
     Raises:
-        OutputError: see `check_output`, or writing fails.
+        OutputError: the path is not allowed (see `check_output`), or writing fails.
     """
     check_output(path)
     try:
@@ -101,7 +101,7 @@ def open_atomically(path: Path) -> Iterator[TextIO]:
 
 
 def write_failure(path: str | os.PathLike[str], problem: OSError) -> OutputError:
-    """Return the error of an output that the operating system refuses to write."""
+    """Return an `OutputError` for an output that the operating system refuses to write."""
     is_full = problem.errno in (errno.ENOSPC, errno.EDQUOT)
     return OutputError(
         f"the output cannot be written: {problem.strerror}",

@@ -1,4 +1,4 @@
-"""Write a model folder completely or not at all, and never over anything but a model."""
+"""Write a model folder completely or not at all, and never replace anything but a model."""
 
 import os
 from collections.abc import Collection, Iterable, Iterator
@@ -12,7 +12,7 @@ from pisigma.files.output_file import write_failure
 from pisigma.files.scratch import ASIDE, FOLDER, KEPT, remove_stale_scratch, scratch_beside
 
 MAX_NEW_FOLDERS = 100
-"""Most nested folders that are created for a model."""
+"""Largest number of nested folders that are created for a model."""
 
 
 def check_folder(
@@ -21,7 +21,7 @@ def check_folder(
     inputs: Iterable[Input] = (),
     names: Collection[str] = MODEL_FILES,
 ) -> None:
-    """Check that a model may be written to a folder, before the work starts.
+    """Check that a model may be written to a folder, before the computation starts.
 
     Args:
         folder: folder to write; it may be missing, empty or, with `overwrite`, a model.
@@ -31,14 +31,14 @@ def check_folder(
 
     Raises:
         OutputError: the folder is a file, the working directory or a parent of it, conflicts with an input or another
-            model (see `check_conflicts`), contains anything but a model, or a model without `overwrite`, needs too many
-            new parent folders, or cannot be written to.
+            model (see `check_conflicts`), contains anything but a model, or a model without `overwrite`, needs too
+            many new parent folders, or cannot be written to.
     """
     try:
         target = Path(os.path.realpath(folder))
         if target in (here := Path.cwd(), *here.parents):
             problem = "the output is the working directory or contains it"
-            raise _refusal(folder, problem, expected="a folder of its own", value=str(here))
+            raise _refusal(folder, problem, expected="a folder that contains nothing else", value=str(here))
         parent = next(path for path in target.parents if path.exists())
         if (new := len(target.relative_to(parent).parts)) > MAX_NEW_FOLDERS:
             problem = f"the output needs more than {MAX_NEW_FOLDERS} nested new folders"
@@ -78,10 +78,10 @@ def _check_content(
         also = f" and {len(others) - 1} more" if len(others) > 1 else ""
         raise OutputError(
             f"the output contains a model, but also '{others[0]}'{also}, not written by pisigma",
-            expected="a model alone",
+            expected="a folder with a model only",
             value=others[0],
             at=Place(folder),
-            remedy="move that away or choose another --out",
+            remedy="move that file away or choose another --out",
         )
     if not overwrite:
         raise OutputError(
@@ -104,8 +104,8 @@ def staged_folder(
 ) -> Iterator[Path]:
     """Yield a scratch folder that becomes `folder` if the block succeeds, and is removed otherwise.
 
-    A killed process leaves the old model or the new one, never a part of one. If it is killed between the two renames,
-    the old model is kept next to `folder` and restored by the next call.
+    A killed process leaves the old or the new model, never a part of a model. If it is killed between the two
+    renames, the old model is kept next to `folder`, and the next call restores it.
 
     Args:
         folder: folder to write; see `check_folder`.
@@ -123,15 +123,15 @@ def staged_folder(
             scratch.chmod(0o755)
             yield scratch
             strange = {entry.name for entry in scratch.iterdir()} - set(names)
-            assert not strange, f"{sorted(strange)} could not be replaced later: name them in MODEL_FILES"
-            _check_content(folder, target, overwrite, names)  # files may have been added meanwhile
+            assert not strange, f"{sorted(strange)} could not be replaced later; add them to MODEL_FILES"
+            _check_content(folder, target, overwrite, names)  # other processes may have added files meanwhile
             _replace(scratch, target)
     except OSError as problem:
         raise write_failure(folder, problem) from None
 
 
 def _replace(scratch: Path, target: Path) -> None:
-    """Rename `scratch` to `target`; an existing folder is restored if that fails."""
+    """Rename `scratch` to `target`; if that fails, restore the existing folder."""
     if not target.exists():
         os.replace(scratch, target)
         return

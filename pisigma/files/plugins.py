@@ -1,4 +1,4 @@
-"""Plug-ins: modules from outside the package that register sensors, features, exports, error sources or closed forms.
+"""Load plug-ins: modules outside the package that register sensors, features, exports, error sources or closed forms.
 
 A plug-in is a program that runs with the user's permissions. So only installed packages (entry points of the group
 `pisigma.plugins`) and the command line (`--plugin FILE`) can name one: never a model, a recipe, a manifest or a cell,
@@ -24,7 +24,7 @@ ENTRY_POINTS = "pisigma.plugins"
 
 @dataclass(frozen=True)
 class Plugins:
-    """The plug-ins that a process has loaded, to be loaded by its workers too.
+    """The plug-ins that a process has loaded and that its workers load too.
 
     Attributes:
         files: absolute paths in the order of loading.
@@ -54,15 +54,15 @@ def loaded_plugins() -> Plugins:
 
 
 def load_installed() -> None:
-    """Import the modules that installed packages name as entry points, once per process.
+    """Import the plug-in modules that installed packages declare as entry points, once per process.
 
     Raises:
-        PluginError: one cannot be imported.
+        PluginError: a module cannot be imported.
     """
     global _loaded
     if _loaded.installed:
         return
-    from importlib.metadata import entry_points  # takes 0.1 s
+    from importlib.metadata import entry_points  # imported here, because it takes 0.1 s
 
     for point in entry_points(group=ENTRY_POINTS):
         origin = f"plug-in '{point.name}'" + (f" of {point.dist.name}" if point.dist else "")
@@ -97,7 +97,9 @@ def _run(path: Path) -> None:
     spec = spec_from_file_location(name, path, loader=SourceFileLoader(name, str(path)))
     assert spec is not None
     assert spec.loader is not None
-    sys.modules[name] = module_from_spec(spec)  # before it runs: dataclasses look their module up
+    sys.modules[name] = module_from_spec(
+        spec
+    )  # registered before it runs, because dataclasses look their module up
     try:
         spec.loader.exec_module(sys.modules[name])
     except BaseException:
@@ -107,7 +109,7 @@ def _run(path: Path) -> None:
 
 @contextlib.contextmanager
 def _as_plugin(origin: str, remedy: str, file: str | os.PathLike[str] | None = None) -> Iterator[None]:
-    """Attribute any exception to the plug-in, and redirect its output to stderr, as stdout is for results."""
+    """Raise any exception as a `PluginError`, and redirect the plug-in's output to stderr: stdout is for results."""
     try:
         with contextlib.redirect_stdout(sys.stderr):
             yield

@@ -10,7 +10,7 @@ Progress = Callable[[str], None]
 
 
 def no_progress(what: str) -> None:
-    """Ignore progress, for processes without a listener."""
+    """Ignore a progress message; the default callback."""
 
 
 def with_stage(progress: Progress, name: str, separator: str = ": ") -> Progress:
@@ -26,11 +26,11 @@ def _within_stage(progress: Progress, prefix: str, what: str) -> None:
 
 
 _STEP = re.compile(r"\b[a-z]+ (\d[\d,]*) of (\d+(?:,\d+)*)")
-"""A numbered step, such as "fold 2 of 5"."""
+"""Pattern of a numbered step, such as "fold 2 of 5"."""
 
 
 def share_done(what: str) -> float | None:
-    """Return the share of nested steps that are done: 0.1 of "half 1 of 2, fold 2 of 5"; None without a step."""
+    """Return the share of nested steps that are complete: 0.1 for "half 1 of 2, fold 2 of 5"; None without steps."""
     steps = [tuple(int(number.replace(",", "")) for number in one) for one in _STEP.findall(what)]
     share, width = 0.0, 1.0
     for number, count in steps:
@@ -40,25 +40,25 @@ def share_done(what: str) -> float | None:
 
 
 def step_name(what: str) -> str:
-    """Return the current step, without its details."""
+    """Return the name of the current step without its details."""
     last = max((match.end() for match in _STEP.finditer(what)), default=0)
     return what[:last] if last else what.partition(": ")[0]
 
 
 class TimeLeft:
-    """Time left of a computation whose steps are numbered."""
+    """Estimate the time left of a computation with numbered steps."""
 
     def __init__(self) -> None:
         self._first: tuple[float, float] | None = None
         self._last = 0.0
 
     def after(self, what: str) -> str:
-        """Return the current step, with the time left if steps are numbered."""
+        """Return the text of the current step, with the estimated time left if the steps are numbered."""
         share, now = share_done(what), time.monotonic()
         if share is None:
             return what
         left = ""
-        if self._first is None or share < self._last:  # the first steps, or those of another stage
+        if self._first is None or share < self._last:  # the first step of a stage
             self._first = (share, now)
         elif share > self._first[0]:
             begun, since = self._first

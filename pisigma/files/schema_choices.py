@@ -1,4 +1,4 @@
-"""Valid keys and texts at a place of a pydantic model, for errors that list them."""
+"""Find the valid keys and texts at a place of a pydantic model, for errors that list them."""
 
 from typing import Any
 
@@ -11,12 +11,12 @@ _Schema = dict[str, Any]
 
 
 def valid_keys(document: type[BaseModel], path: SchemaPath) -> set[str]:
-    """Return the keys that are valid at the end of a validation path."""
+    """Return the valid keys of the document's section at the end of a validation path."""
     return {key for schema in _follow(document, path) for key in schema.get("properties", {})}
 
 
 def allowed_texts(document: type[BaseModel], path: SchemaPath) -> list[str]:
-    """Return the texts that are allowed at the end of a validation path, sorted; none where any text is allowed."""
+    """Return the sorted texts that are allowed at the end of a validation path; empty if any text is allowed."""
     texts: set[str] = set()
     for schema in _follow(document, path):
         values = [schema["const"]] if "const" in schema else schema.get("enum", [])
@@ -42,7 +42,7 @@ def _follow(document: type[BaseModel], path: SchemaPath) -> list[_Schema]:
                 following.append(candidate["additionalProperties"])
         if following:
             nodes = _alternatives(following, definitions)
-        else:  # the tag of a union: keep the alternative with that tag
+        else:  # the key is the tag of a union: keep the alternative with that tag
             nodes = [candidate for candidate in nodes if part in _tags(candidate)] or nodes
     return nodes
 

@@ -14,9 +14,9 @@ from contextlib import contextmanager
 from pathlib import Path
 
 FILE, FOLDER, ASIDE = ".part", ".partial", ".old"
-"""Suffixes of scratch files, of scratch folders, and of folders with the output that is being replaced."""
+"""Suffixes of scratch files, of scratch folders, and of folders that hold the output to be replaced."""
 KEPT = "model"
-"""Name of the folder that is being replaced within its folder with the suffix `ASIDE`."""
+"""Name of the folder to be replaced, inside the folder with the suffix `ASIDE`."""
 
 
 @contextmanager
@@ -45,7 +45,7 @@ def scratch_beside(target: Path, suffix: str) -> Iterator[Path]:
 
 
 def remove_stale_scratch(target: Path) -> None:
-    """Remove the scratch of killed processes next to `target`, and restore a moved `target` if it is missing.
+    """Remove scratch files of killed processes next to `target`, and restore `target` if it was moved away.
 
     Args:
         target: path to be written, links resolved.
@@ -62,7 +62,7 @@ def remove_stale_scratch(target: Path) -> None:
 
 @contextmanager
 def _owned(path: Path) -> Iterator[bool]:
-    """Hold the lock of a scratch; yields False if another process holds it."""
+    """Hold the lock of a scratch file or folder; yield whether it was obtained."""
     handle = None
     with contextlib.suppress(OSError, ImportError):  # some file systems and Windows have no such locks
         import fcntl

@@ -1,4 +1,4 @@
-"""Settings as fields of a dataclass, from which command-line options and pages of the documentation are generated.
+"""Settings as dataclass fields, from which command-line options and documentation pages are generated.
 
 The type and the default of a setting are those of the field, its help is the attribute's text in the docstring of the
 class, and an `Option` in the annotation states how the command line differs.
@@ -18,12 +18,12 @@ from typing import Annotated, Any, ForwardRef, Literal, Union, get_args, get_ori
 from pisigma.files.errors import PisigmaError, SettingError
 
 UNITS = {"mm": ("m", 1e-3), "mrad": ("rad", 1e-3), "deg": ("rad", math.pi / 180.0), "ms": ("s", 1e-3)}
-"""Units of the command line, with the unit of the setting and the conversion factor."""
+"""SI unit and conversion factor by unit of the command line."""
 
 
 @dataclass(frozen=True)
 class Option:
-    """Command-line form of a setting, where it does not follow from the name and type.
+    """Command-line form of a setting, as far as it does not follow from its name and type.
 
     Attributes:
         name: name of the option, such as "--camera"; None: made from the name of the setting.
@@ -33,7 +33,7 @@ class Option:
         min: smallest value that is accepted.
         max: largest value that is accepted.
         metavar: placeholder of the value in the help.
-        default: default that the help shows if that of the setting has another type.
+        default: default that the help shows, if the setting's default has another type.
         is_key: whether the setting has no option of its own and is set by its key: in `cell.yaml`, and with `--set`.
         hidden: whether the setting can be set in Python only.
     """
@@ -51,25 +51,25 @@ class Option:
 
 
 HIDDEN = Option(hidden=True)
-"""For settings that can be set in Python only."""
+"""Annotation of settings that can be set in Python only."""
 KEY = Option(is_key=True)
-"""For settings that have a key and no option of their own."""
+"""Annotation of settings that have a key in `cell.yaml` but no option."""
 FILE = Option(kind=Path, read=str)
-"""For settings that are a path as text."""
+"""Annotation of settings that are a path, stored as text."""
 
 
 def as_texts(stated: Iterable[object]) -> tuple[str, ...]:
-    """Convert several command-line values to texts."""
+    """Return several command-line values as texts."""
     return tuple(map(str, stated))
 
 
 def split_names(stated: str) -> tuple[str, ...]:
-    """Split names that are separated by commas."""
+    """Return the names in texts that separate names by commas."""
     return tuple(name.strip() for name in stated.split(",")) if stated else ()
 
 
 NAMES = Option(kind=str, read=split_names)
-"""For settings that are several names."""
+"""Annotation of settings that are several names, separated by commas on the command line."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class Setting:
         default: default in the unit of the option.
         is_required: whether there is no default.
         help: help text of the option.
-        option: see `Option`.
+        option: command-line form, see `Option`.
     """
 
     field: str
@@ -99,7 +99,7 @@ class Setting:
 
     @property
     def name(self) -> str:
-        """Name of the option, such as "--limit-mm"; of a key, the name that it would have."""
+        """Name of the option, such as "--limit-mm", even if the setting can be set by its key only."""
         return self.option.name or f"--{self.field.replace('_', '-')}"
 
     @property
@@ -154,16 +154,16 @@ def by_key(group: type) -> dict[str, Setting]:
 
 
 def build_settings(group: type, stated: Mapping[str, Any], is_optional: bool = False) -> Any:
-    """Make an instance of a class of settings.
+    """Return an instance of a class of settings.
 
     Args:
         group: class of the settings.
         stated: values by `Setting.key`, as on a command line; other settings keep their defaults.
-        is_optional: return None if no setting of the class is stated.
+        is_optional: whether to return None if no setting of the class is stated.
 
     Raises:
-        PisigmaError: some settings are stated that need others, or a value is not valid, such as a number that is not
-            finite; its option is the key.
+        PisigmaError: a required setting is missing, or a value is not valid, such as a number that is not finite;
+            the option of the error is the key.
     """
     found: dict[str, Any] = {}
     for setting in settings_of(group):
@@ -187,7 +187,7 @@ def build_settings(group: type, stated: Mapping[str, Any], is_optional: bool = F
         raise PisigmaError(expected=f"{names} together", option=missing[0].spelling, remedy="give both")
     try:
         return group(**found)
-    except PisigmaError as problem:  # its option is the name of a field
+    except PisigmaError as problem:  # the option of the error is the name of a field
         keys = {one.field: one.key for one in settings_of(group)}
         raise problem.with_option(" ".join(keys.get(word, word) for word in problem.option.split())) from None
 
@@ -240,7 +240,7 @@ def _stated_default(default: Any, option: Option) -> Any:
 
 
 def _help(meaning: str, option: Option, is_repeated: bool) -> str:
-    """Return the help of an option: full sentences in the option's unit, with the meaning of None as the default."""
+    """Return the help text of an option, in complete sentences and in the unit of the option."""
     if option.unit is not None:
         meaning = meaning.replace(f"[{UNITS[option.unit][0]}]", f"[{option.unit}]")
     meaning = re.sub(r"[;.]? None: ([^.]*)\.?$", r". [default: \1]", meaning)

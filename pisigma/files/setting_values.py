@@ -1,4 +1,4 @@
-"""Values of settings by their keys, from `cell.yaml`, a manifest or the option `--set`, with the same errors."""
+"""Read values of settings by key from `cell.yaml`, a manifest or the option `--set`."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
@@ -8,7 +8,7 @@ from pisigma.files.errors import Place, SettingError, nearest_choice
 from pisigma.files.setting import Setting
 
 _TYPES = {bool: "true or false", int: "an integer", float: "a number", str: "a text", Path: "a path"}
-"""Names of the types of settings in messages."""
+"""Names of the types of settings for messages."""
 
 
 def read_assignments(
@@ -19,7 +19,7 @@ def read_assignments(
     Args:
         assignments: the texts.
         known: settings by their keys.
-        option: option that states them; empty in a file.
+        option: option that states the texts, for messages; empty for a file.
 
     Raises:
         SettingError: a text has another form, a key is unknown, or a value has the wrong type or is out of range.
@@ -41,7 +41,7 @@ def checked_values(
     Args:
         stated: values by their keys, in the units of the command line.
         known: settings by their keys.
-        place_of: returns the place of a key in its file; None for values of a command line.
+        place_of: function that returns the place of a key in its file; None for values of the command line.
 
     Raises:
         SettingError: a key is unknown, or a value has the wrong type or is out of range.
@@ -59,7 +59,9 @@ def checked_values(
         kind = known[key].kind
         single = _listed(value, kind)
         several = single if isinstance(single, list | tuple) else (single,)
-        if kind is not bool and any(isinstance(one, bool) for one in several):  # pydantic reads true as 1
+        if kind is not bool and any(
+            isinstance(one, bool) for one in several
+        ):  # pydantic would read true as 1
             raise setting_error(key, single, _type_text(kind))
         try:
             converted = TypeAdapter(kind).validate_python(single)
@@ -71,7 +73,7 @@ def checked_values(
 
 
 def _listed(value: Any, kind: Any) -> Any:
-    """Return a single value as a list if the setting may be repeated, else a list of one value as this value."""
+    """Convert a value to a list if the setting may be repeated, otherwise a list of one value to that value."""
     is_list, is_repeated = isinstance(value, list | tuple), get_origin(kind) is list
     if is_list and not is_repeated and len(value) == 1:
         return value[0]
@@ -79,14 +81,14 @@ def _listed(value: Any, kind: Any) -> Any:
 
 
 def _type_text(kind: Any) -> str:
-    """Name the type of a setting in a message."""
+    """Return the name of a setting's type for messages."""
     if get_origin(kind) is Literal:
         return " or ".join(get_args(kind))
     return _TYPES.get(kind) or f"a list, each {_TYPES[get_args(kind)[0]]}"
 
 
 def _missed_bounds(setting: Setting, value: Any) -> str:
-    """Return the range of a setting if a value is outside of it; "" otherwise."""
+    """Return a text with the valid range of a setting if a value is outside it; "" otherwise."""
     least, most = setting.option.min, setting.option.max
     if (least is None or value >= least) and (most is None or value <= most):
         return ""

@@ -1,4 +1,4 @@
-"""Texts from templates: Python computes, the template defines layout and wording."""
+"""Render texts from templates, which define layout and wording of results that Python computes."""
 
 from collections.abc import Callable
 from typing import Any
@@ -13,7 +13,7 @@ def template_environment(package: str, filters: dict[str, Callable[..., Any]]) -
 
     Args:
         package: name of the package, such as "pisigma.reporting".
-        filters: functions that templates may call, by name.
+        filters: functions that templates may call as filters, by name.
     """
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader(package),

@@ -11,22 +11,22 @@ from pisigma.files.yaml_file import plain_content, yaml_text
 
 Keys = Sequence[str | int]
 INDENT = 2
-"""Spaces by which the first key of an empty section is indented."""
+"""Number of spaces by which the first key of an empty section is indented."""
 _COMMENTS = re.compile(r"[^\n]*\n(?:[ \t]*(?:#[^\n]*)?\n)*")
-"""The end of a line, and the blank lines and comments after it."""
+"""Pattern of the end of a line with the blank lines and comments after it."""
 
 
 def with_value(text: str, keys: Keys, value: Any, source: str) -> str:
-    """Return the text of a YAML file with another value of a key.
+    """Return the text of a YAML file after a change of one value.
 
-    A key that the text does not have is added before the comment that states its default ("# folds: 5"), if there is
-    one, else at the end of its section. Only a collection in braces loses the comments inside it.
+    A missing key is added before the comment that states its default ("# folds: 5"), otherwise at the end of its
+    section. Only a collection in braces loses the comments inside it.
 
     Args:
         text: a valid YAML document.
         keys: keys from the outermost section to the value; a number counts the items of a list, and the number after
             the last item appends one.
-        value: plain value. None: remove the key, and the sections inside another section that become empty.
+        value: plain value. None removes the key, and nested sections that become empty.
         source: name of the file in errors.
 
     Raises:
@@ -45,7 +45,7 @@ def with_value(text: str, keys: Keys, value: Any, source: str) -> str:
 
 
 def _changed(content: Any, keys: Keys, value: Any, depth: int = 0) -> Any:
-    """Return plain values with another value of a key."""
+    """Return the plain values of a document after a change of one value."""
     key, *deeper = keys
     known = dict(enumerate(content)) if isinstance(content, list) else dict(content or {})
     if deeper:
@@ -88,7 +88,7 @@ def _has(content: Any, key: str | int) -> bool:
 
 
 def _entry(node: yaml.Node, key: str | int) -> tuple[int, yaml.Node] | None:
-    """Return where the entry of a collection with a key starts, and its value; None if there is none."""
+    """Return the start of a collection's entry with a key, and its value; None without such an entry."""
     if isinstance(node, yaml.MappingNode):
         return next(((k.start_mark.index, v) for k, v in node.value if k.value == key), None)
     if isinstance(node, yaml.SequenceNode) and isinstance(key, int) and key < len(node.value):
@@ -97,7 +97,7 @@ def _entry(node: yaml.Node, key: str | int) -> tuple[int, yaml.Node] | None:
 
 
 def _end(node: yaml.Node) -> int:
-    """Return where a value ends, without the comments after it, which YAML counts to collections in block style."""
+    """Return the end of a value, excluding the comments after it, which YAML counts as part of block collections."""
     if isinstance(node, yaml.CollectionNode) and not node.flow_style and node.value:
         last = node.value[-1]
         return _end(last[1] if isinstance(last, tuple) else last)
@@ -105,19 +105,19 @@ def _end(node: yaml.Node) -> int:
 
 
 def _with_replaced(text: str, node: yaml.Node, value: Any) -> str:
-    """Return a text with another value, in one line, in place of a value."""
+    """Return the text with a value replaced by another one, written in one line."""
     start, is_block = node.start_mark.index, isinstance(node, yaml.CollectionNode) and not node.flow_style
     is_apart = text[start - 1 : start].isspace() or text[start - 1 : start] in ("[", "{")
     gap = (
         "" if is_apart and not is_block else " "
-    )  # a block may begin in the column of its key, a line may not
+    )  # a block may begin in the column of its key, a value in one line may not
     return f"{text[:start]}{gap}{yaml_text(value, in_one_line=True)}{text[_end(node) :]}"
 
 
 def _with_added(
     text: str, start: int, parent: Any, node: Any, key: str | int, value: Any, wanted: Any
 ) -> str:
-    """Return a text with another entry of a collection: before the comment that states its default, or at the end.
+    """Return the text with a new entry in a collection: before the comment that states its default, or at the end.
 
     Args:
         text: the text.
@@ -125,7 +125,7 @@ def _with_added(
         parent: collection that contains the collection.
         node: the collection, or an empty value in its place.
         key: key of the new entry.
-        value: its value.
+        value: value of the new entry.
         wanted: plain value of the collection with the entry.
     """
     is_empty = isinstance(node, yaml.ScalarNode)

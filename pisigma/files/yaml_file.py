@@ -27,9 +27,9 @@ from pisigma.files.input_file import read_text
 from pisigma.files.schema_choices import allowed_texts, valid_keys
 
 MAX_BYTES = 2**18
-"""Largest YAML file that people write; reading it takes two seconds."""
+"""Largest size of a YAML file [bytes]; reading such a file takes two seconds."""
 MAX_VALUES = 200_000
-"""Most values in a file with its aliases expanded; `CHARACTERS_PER_VALUE` characters of a text are treated as one."""
+"""Largest number of values in a file with expanded aliases; `CHARACTERS_PER_VALUE` characters count as one value."""
 CHARACTERS_PER_VALUE = 64
 SAFE_DEPTH = 2000
 """Nesting depth that libyaml, which does not check its stack, certainly parses without overflow."""
@@ -103,7 +103,7 @@ class _PlainLoader(yaml.SafeLoader):
 
 
 class _CompiledLoader(yaml.CSafeLoader if yaml.__with_libyaml__ else yaml.SafeLoader):  # type: ignore[misc]
-    """The same loader on libyaml, ten times as fast."""
+    """`_PlainLoader` on libyaml, which is ten times as fast."""
 
     yaml_implicit_resolvers: dict[str, Any] = {}  # noqa: RUF012
 
@@ -181,7 +181,7 @@ def read_yaml(path: str | os.PathLike[str], document: type[Document], error: typ
     Args:
         path: the file.
         document: pydantic model of the file.
-        error: class of the exception to raise, so that callers can distinguish a bad recipe from a bad robot.
+        error: class of the exception to raise, such as `RecipeError`.
 
     Raises:
         error: the file is missing, is not valid YAML, or does not fit the model; its `file`, `line` and `column` (the
@@ -199,7 +199,7 @@ def parse_yaml(text: str, document: type[Document], error: type[PisigmaError], s
     if node is None or not isinstance(content, dict):
         raise error(expected="a YAML mapping of keys to values", at=Place(source))
     try:
-        # By way of JSON, because strict validation of Python objects expects tuples where YAML has lists.
+        # Validated as JSON, because strict validation of Python objects expects tuples where YAML has lists.
         return document.model_validate_json(json.dumps(content), strict=True)
     except TypeError as problem:
         remedy = "write numbers, texts, lists and mappings without tags"
@@ -209,16 +209,16 @@ def parse_yaml(text: str, document: type[Document], error: type[PisigmaError], s
 
 
 def place_of_key(path: str | os.PathLike[str], keys: _Path) -> Place:
-    """Return the place of the value under `keys` in a YAML file, or of its innermost section that the file has.
+    """Return the place of the value under `keys` in a YAML file, or of the innermost section that exists.
 
-    For errors of values that are checked against something else than the file's own format, such as a robot.
+    It is used for values that are checked against something other than the format of the file, such as a robot.
     """
     node, _ = _load(read_text(path, PisigmaError, "YAML", MAX_BYTES), PisigmaError, str(path))
     return Place(path, _locate(node, keys)[0] if node else 1, _dotted(keys))
 
 
 def _load(text: str, error: type[PisigmaError], source: str) -> tuple[yaml.Node | None, Any]:
-    """Return the root node, which knows the lines, and the document as plain values."""
+    """Return the root node, which contains the line numbers, and the document as plain values."""
     try:
         loader, node = _composed(text)
         if node is not None and _count(node, {}) > MAX_VALUES:
@@ -239,7 +239,7 @@ def _load(text: str, error: type[PisigmaError], source: str) -> tuple[yaml.Node 
 
 
 def _composed(text: str) -> tuple[Any, yaml.Node | None]:
-    """Return a loader and the root node: of libyaml, unless it might overflow its stack or fails (less clearly)."""
+    """Return a loader and the root node; the loader uses libyaml unless that might overflow its stack or fails."""
     longest_line = max(map(len, text.splitlines()), default=0)
     if text.count("[") + text.count("{") + 2 * longest_line < SAFE_DEPTH:
         with suppress(yaml.YAMLError):
@@ -248,7 +248,7 @@ def _composed(text: str) -> tuple[Any, yaml.Node | None]:
 
 
 def _count(node: yaml.Node, known: dict[int, int]) -> int:
-    """Count the values at and below a node; long texts are treated as several, aliases once per use."""
+    """Count the values at and below a node; a long text counts as several values, an alias once per use."""
     if id(node) not in known:
         children: list[yaml.Node] = []
         if isinstance(node, yaml.MappingNode):
@@ -268,7 +268,7 @@ def _error_of(
     error: type[PisigmaError],
     source: str,
 ) -> PisigmaError:
-    """Make an error of the first finding of pydantic, unknown keys before others as they often cause them."""
+    """Return an error for one finding of pydantic: an unknown key if there is one, otherwise the first finding."""
     errors = problem.errors()
     first = next((item for item in errors if item["type"] == "extra_forbidden"), errors[0])
     found = _error_at(first, node, document, error, source)
@@ -281,7 +281,7 @@ def _error_of(
 def _error_at(
     finding: Any, node: yaml.Node, document: type[BaseModel], error: type[PisigmaError], source: str
 ) -> PisigmaError:
-    """Make an error of one finding of pydantic."""
+    """Return an error for one finding of pydantic."""
     path: _Path = finding["loc"]
     line, keys = _locate(node, path)
     context, value = finding.get("ctx", {}), finding["input"]
@@ -319,7 +319,7 @@ def _error_at(
 
 
 def _dotted(keys: Iterable[str | int]) -> str:
-    """Join keys to a column of a `Place`."""
+    """Return keys joined by dots, as the column of a `Place`."""
     return ".".join(map(str, keys))
 
 

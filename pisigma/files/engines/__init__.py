@@ -1,1 +1,1 @@
-"""Engines that run the same work for many items: in processes of this machine, or on a cluster."""
+"""Engines that run a function for many items, in processes of this machine or on a cluster."""

@@ -1,4 +1,4 @@
-"""Interface of engines, which run the same work for many items on one machine or many."""
+"""Interface of engines, which run a function for many items on one machine or on several."""
 
 import math
 import pickle
@@ -17,7 +17,7 @@ of workers."""
 
 
 class AbstractEngine(ABC):
-    """Runs the same function for many items in other processes.
+    """Interface of engines that run a function for many items in other processes.
 
     The function writes its results itself, so that an interrupted call loses only the items in progress.
     """
@@ -33,12 +33,13 @@ class AbstractEngine(ABC):
     ) -> Iterator[tuple[Item, Result | None]]:
         """Yield every item with its result as they finish.
 
-        If a worker is killed or runs out of memory, its items are tried once more, one at a time. An item whose worker
-        dies again has the result None.
+        If a worker is killed or runs out of memory, its items are tried once more, one at a time. An item whose
+        worker dies again has the result None.
 
         Args:
-            work: function to call with each item: a function of a module, or a `functools.partial` of one.
-            items: the items; they and the results are pickled. Workers first load the plug-ins of this process.
+            work: function to call with each item: a function at module level, or a `functools.partial` of one.
+            items: the items to process; items and results are pickled. Workers first load the plug-ins of this
+                process.
             chunk: number of items that a worker gets at once; it should be some seconds of work.
         """
         size = max(1, min(chunk, math.ceil(len(items) / self.workers)))
@@ -59,7 +60,7 @@ class AbstractEngine(ABC):
 
 
 def pack_arguments(work: Callable[[Item], Result], chunk: Sequence[Item]) -> tuple[Plugins, bytes]:
-    """Return the arguments of `process_chunk`; plug-ins are separate, because they have to be loaded first."""
+    """Return the plug-ins and the pickled work and chunk; plug-ins are separate because workers load them first."""
     return loaded_plugins(), pickle.dumps((work, list(chunk)))
 
 

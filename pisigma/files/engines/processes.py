@@ -24,10 +24,10 @@ from pisigma.files.errors import PisigmaError
 
 
 class ProcessEngine(AbstractEngine):
-    """Runs the work in newly started processes of this machine, which end with this one."""
+    """Engine that runs a function for many items in new processes of this machine, which end with this one."""
 
     def __init__(self, workers: int) -> None:
-        """Make an engine with a number of processes."""
+        """Make an engine that uses `workers` processes."""
         self._workers = workers
 
     @property
@@ -96,17 +96,17 @@ def _start_worker(*_: Any) -> None:
 
 
 def run_in_threads(tasks: Sequence[Callable[[], Result]], one_at_a_time: bool) -> Iterator[Result]:
-    """Yield the results of tasks in their order.
+    """Run tasks in threads and yield their results in the order of the tasks.
 
-    Small calibrations gain nothing from several threads in one matrix product, but they release Python's lock most of
-    the time: two of them with one thread each take 0.6 of the time that they take one after the other.
+    Small calibrations gain nothing from several threads in one matrix product, but they release Python's lock most
+    of the time: two calibrations in parallel, with one thread each, take 0.6 of the time that they take sequentially.
 
     Args:
         tasks: functions without arguments; none may change data that others read.
         one_at_a_time: whether to run the tasks sequentially, because one alone keeps all cores busy or needs much
             memory.
     """
-    import torch  # here, so that workers, which import this module, start without it
+    import torch  # imported here, so that workers, which import this module, start faster
 
     workers = 1 if one_at_a_time else min(len(tasks), torch.get_num_threads())
     if workers < 2:
@@ -117,16 +117,16 @@ def run_in_threads(tasks: Sequence[Callable[[], Result]], one_at_a_time: bool) -
 
 
 def run_in_processes(tasks: Sequence[Callable[[], Result]], jobs: int) -> Iterator[Result]:
-    """Yield the results of tasks in their order, each as soon as it is known, from processes with one thread each.
+    """Run tasks in processes with one thread each, and yield their results in the order of the tasks.
 
     Args:
-        tasks: each a `functools.partial` of a function of a module; they are started in their order.
+        tasks: the tasks, each a `functools.partial` of a function at module level; they are started in this order.
         jobs: largest number of processes.
 
     Raises:
-        PisigmaError: a task raised it. It is raised when all earlier tasks have returned, so that the outcome does not
-            depend on which task ends first.
-        MemoryError: the process of a task died twice, as happens when memory runs out.
+        PisigmaError: a task raised this error. It is raised after all earlier tasks have returned, so that the
+            outcome does not depend on which task ends first.
+        MemoryError: the process of a task died twice, usually because memory ran out.
     """
     engine, outcomes, due = ProcessEngine(min(jobs, len(tasks))), dict[int, Result | PisigmaError](), 0
     for (number, _), outcome in engine.results(_outcome, [*enumerate(tasks)], 1):

@@ -1,4 +1,4 @@
-"""Engine of a Ray cluster, or of Ray's workers on this machine."""
+"""Engine that uses a Ray cluster, or Ray's workers on this machine."""
 
 import logging
 import os
@@ -18,7 +18,7 @@ from pisigma.files.engines.engine import (
 
 
 class RayEngine(AbstractEngine):
-    """Runs the work as Ray tasks of one core each; all machines must see the files under the same paths."""
+    """Engine that runs a function as Ray tasks of one core; all machines must see the files under the same paths."""
 
     def __init__(self, workers: int | None, address: str | None = None) -> None:
         """Start Ray on this machine, or join a cluster.
@@ -32,7 +32,7 @@ class RayEngine(AbstractEngine):
         """
         import ray
 
-        self._ray: Any = ray  # most of it has no types
+        self._ray: Any = ray  # most functions of Ray have no types
         stated = {"address": address} if address else {"num_cpus": workers}
         variables = ONE_THREAD if address else {**ONE_THREAD, "PYTHONPATH": os.pathsep.join(sys.path)}
         self._ray.init(
