@@ -1,1 +1,1 @@
-"""Linear-Gaussian estimation: priors, evidence, posteriors and their update, held-out values, wrong rows and losses."""
+"""Linear-Gaussian estimation: priors, evidence, posteriors, updates, held-out errors, wrong rows and losses."""

@@ -1,4 +1,4 @@
-"""Cholesky factors of symmetric matrices, and operations on them with little memory."""
+"""Cholesky factors of symmetric matrices, and operations on these factors that need little memory."""
 
 import ctypes
 import sys
@@ -17,11 +17,11 @@ MANY_UNKNOWNS = 1_000
 
 
 def scaled_cholesky(matrix: Callable[[], Float64[Tensor, "unknowns unknowns"]]) -> tuple[Tensor, Tensor]:
-    """Return the column scale and the Cholesky factor of the scaled symmetric matrix.
+    """Return the column scale D and the Cholesky factor L of a symmetric matrix M, with `D M D = L L^T`.
 
     Args:
-        matrix: function that returns the matrix, row-major; its upper triangle is read. The factor overwrites it, so it
-            is called again if the factorisation fails.
+        matrix: function that returns the matrix, row-major; its upper triangle is read. The factor overwrites it, so
+            it is called again if the factorisation fails.
 
     Raises:
         IdentificationError: the matrix is not finite.
@@ -56,12 +56,12 @@ def covariance_factor(V: Float64[Tensor, "values values"]) -> Float64[Tensor, "v
 
 
 def log_determinant(scale: Tensor, factor: Tensor) -> float:
-    """Return the log determinant of a matrix from the results of `scaled_cholesky`."""
+    """Return the natural logarithm of the determinant of a matrix from its column scale and Cholesky factor."""
     return 2 * float(factor.diagonal().log().sum()) - 2 * float(scale.log().sum())
 
 
 def invert_from_factor(scale: Tensor, factor: Tensor) -> Float64[Tensor, "unknowns unknowns"]:
-    """Return the inverse of a matrix from the results of `scaled_cholesky`, in the memory of the factor."""
+    """Return the inverse of a matrix from its column scale and Cholesky factor, whose memory it overwrites."""
     inverse: Tensor = torch.cholesky_inverse(factor, out=factor).mT  # symmetric, so this is row-major
     return inverse.mul_(scale).mul_(scale[:, None])
 
@@ -81,15 +81,15 @@ def invert_triangle(factor: Tensor) -> None:
 
 
 def row_blocks(count: int, size: int) -> list[slice]:
-    """Return the slices of rows of all blocks."""
+    """Return slices that divide `count` rows into blocks of `size` rows."""
     return [slice(start, start + size) for start in range(0, count, size)]
 
 
 def return_free_memory(unknowns: int) -> None:
-    """Return free memory to the system if the C library can (`malloc_trim` of glibc), for many unknowns only.
+    """Return free memory to the system after fits of many unknowns, if the C library can (`malloc_trim` of glibc).
 
-    After fits of thousands of unknowns more than 100 MB are free in fragments, and the matrices of the next fit would
-    be allocated in addition to them.
+    After a fit of thousands of unknowns, more than 100 MB of free memory is fragmented, and the matrices of the next
+    fit would be allocated in addition to it.
     """
     if unknowns > MANY_UNKNOWNS and sys.platform == "linux":
         trim = getattr(ctypes.CDLL(None), "malloc_trim", None)

@@ -1,4 +1,4 @@
-"""Square root R of the covariance of all unknowns, `C = R R^T`, as a matrix or in factors for few values."""
+"""Square root R of the covariance of all unknowns, `C = R R^T`, stored as a matrix or, for few values, in factors."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -12,12 +12,12 @@ from torch import Tensor
 class ImplicitCovarianceRoot:
     """Covariance root of the weights after n values: `D (I - Z^T L^-T (L + 1)^-1 Z)` with `L L^T = Z Z^T + 1`.
 
-    Its product with its transpose is `D (Z^T Z + 1)^-1 D`: the update of Andrews 1968 (AIAA Journal 6(6), 1165-1166)
-    for all values at once.
+    Its product with its transpose is `D (Z^T Z + 1)^-1 D`: this is the update of Andrews 1968 (AIAA Journal 6(6),
+    1165-1166) for all values at once.
 
     Attributes:
         size: prior standard deviation of every weight, the diagonal of D.
-        Z: derivatives of the values with respect to the weights, times D and divided by the noise.
+        Z: derivatives of the values with respect to the weights, multiplied by D and divided by the noise.
         factor: L, lower triangular.
     """
 
@@ -26,7 +26,7 @@ class ImplicitCovarianceRoot:
     factor: Float64[Tensor, "values values"]
 
     def left_multiply(self, columns: Float64[Tensor, "*batch weights"]) -> Float64[Tensor, "*batch weights"]:
-        """Return `columns @ root`."""
+        """Return the product `columns @ root`."""
         scaled = columns.flatten(0, -2) * self.size
         once = self.factor + torch.eye(len(self.factor)).to(self.factor)
         inner = torch.linalg.solve_triangular(self.factor, self.Z @ scaled.t(), upper=False)
@@ -37,7 +37,7 @@ class ImplicitCovarianceRoot:
     def right_multiply(
         self, matrix: Float64[Tensor, "weights columns"]
     ) -> Float64[Tensor, "weights columns"]:
-        """Return `root @ matrix`."""
+        """Return the product `root @ matrix`."""
         once = self.factor + torch.eye(len(self.factor)).to(self.factor)
         inner = torch.linalg.solve_triangular(once, self.Z @ matrix, upper=False)
         inner = torch.linalg.solve_triangular(self.factor.t(), inner, upper=True)
@@ -52,7 +52,7 @@ def multiply_updated_root(
 
     Args:
         along: `A R` with the root R before the measurement.
-        B: derivatives of the values along the directions of R, divided by their noise.
+        B: derivatives of the values along the columns of R, divided by the noise of the values.
     """
     lower = torch.linalg.cholesky(torch.eye(B.shape[1]).to(B) + B.t() @ B)
     after: Tensor = torch.linalg.solve_triangular(lower, along.flatten(0, -2).t(), upper=False).t()
@@ -61,7 +61,7 @@ def multiply_updated_root(
 
 @dataclass(frozen=True, eq=False)
 class CovarianceRoot:
-    """R as columns for all unknowns, and in factors for columns of the weights only (for few values).
+    """Covariance root R: columns for all unknowns, and optionally columns in factors that concern the weights only.
 
     Attributes:
         directions: columns of R for all unknowns.
@@ -84,7 +84,7 @@ class CovarianceRoot:
     def left_multiply(
         self, columns: Float64[Tensor, "*batch unknowns"]
     ) -> Float64[Tensor, "*batch directions"]:
-        """Return `columns @ R`."""
+        """Return the product `columns @ R`."""
         # one product of two matrices, because torch would read R once for every row of a non-contiguous view
         result = columns.flatten(0, -2) @ self.directions
         if self.weights is not None:
@@ -95,7 +95,7 @@ class CovarianceRoot:
     def covariance_times(
         self, matrix: Float64[Tensor, "unknowns columns"]
     ) -> Float64[Tensor, "unknowns columns"]:
-        """Return `C @ matrix`."""
+        """Return the product `C @ matrix` with the covariance C."""
         result = self.directions @ (self.directions.t() @ matrix)
         if self.weights is not None:
             first = len(result) - len(self.weights.size)
@@ -113,7 +113,7 @@ class CovarianceRoot:
         Args:
             added: columns to add.
             scale: factor on the standard deviations.
-            change: matrix from the first unknowns to the parameters in the other coordinates.
+            change: matrix that converts the first unknowns to the other coordinates.
         """
         (parameters, active), (unknowns, columns) = change.shape, self.directions.shape
         directions = change.new_empty((parameters + unknowns - active, columns + added.shape[1]))

@@ -12,11 +12,12 @@ from pisigma.estimation.cholesky import covariance_factor, scaled_cholesky
 from pisigma.estimation.regression import SensorCount
 
 SIZES = torch.logspace(-6, -0.5, 56, dtype=torch.float64)
-"""Drift sizes to try: 1 µm to 0.3 m, 0.0001 to 18 deg; for corrections, shares of ten times their usual size."""
+"""Drift sizes that are tried: 1 µm to 0.3 m, 0.0001 to 18 deg; for corrections, shares of ten times their usual
+size."""
 LOG_PRIOR_PENALTY = 4.0
-"""Increase of the log evidence that a drift needs [nats]: prior odds of about 1 to 50 for a group of the arm."""
+"""Increase of the log evidence that a drift requires [nats]: prior odds of about 1 to 50 for a group of the arm."""
 WRONG_ROW_PENALTY = math.log(100)
-"""The same for one wrong configuration among any number of them [nats]: prior odds of 1 to 100."""
+"""Increase of the log evidence that a wrong configuration requires [nats]: prior odds of 1 to 100."""
 MAX_SWEEPS = 3
 NOISE_FACTORS = torch.linspace(-1.0, 1.6, 14, dtype=torch.float64).exp()
 """Factors on the noise of the calibration that are tried."""
@@ -26,7 +27,7 @@ NOISE_SPREAD = 0.3
 
 @dataclass(frozen=True, eq=False)
 class DriftGroup:
-    """Unknowns that drift together: independent, with the standard deviation `size · scale`.
+    """Unknowns that drift together, independently of each other, with the standard deviation `size · scale`.
 
     Attributes:
         what: name of the group, such as "joint 3", "base" or "correction".
@@ -34,7 +35,7 @@ class DriftGroup:
         scale: standard deviation of every unknown at size 1 [m or rad].
         size: size of the drift; 0 if the group has not drifted.
         fixed_size: whether the size is given rather than estimated, as for a base that was relocated.
-        log_prior_penalty: increase of the log evidence that is required for a drift of the group [nats].
+        log_prior_penalty: increase of the log evidence that a drift of the group requires [nats].
         single: whether the group is one motion rather than a set of many independent changes.
     """
 
@@ -54,7 +55,7 @@ class DriftGroup:
 
 @dataclass(frozen=True, eq=False)
 class LinearValues:
-    """Measured values, linear in the unknowns: `y = X u + e` with u relative to the most probable values of a model.
+    """Measured values `y = X u + e` with unknowns u relative to the most probable values of a model.
 
     Attributes:
         X: weighted derivatives.
@@ -73,12 +74,12 @@ class LinearValues:
     wrong: Mapping[int, float] = field(default_factory=dict)
 
     def select(self, values: Tensor) -> "LinearValues":
-        """Select some of the values."""
+        """Return a subset of the values, given by a mask or indices."""
         names = ("X", "y", "sensor", "configuration")
         return replace(self, **{name: getattr(self, name)[values] for name in names})
 
     def deviation(self, noise: Float64[Tensor, " sensors"]) -> Float64[Tensor, " values"]:
-        """Return the noise standard deviation of every value from those of the sensors."""
+        """Return the standard deviation of the noise of every value, given that of every sensor."""
         deviation = noise[self.sensor]
         for number, factor in self.wrong.items():
             wrong = (self.configuration == number) & ~self.exact
@@ -87,12 +88,12 @@ class LinearValues:
 
     @property
     def exact(self) -> Bool[Tensor, " values"]:
-        """For every value, whether its noise is exactly as stated."""
+        """Mask of the values whose noise is exactly as stated."""
         return torch.tensor([one.exact for one in self.counts])[self.sensor]
 
     @property
     def log_prior_penalty(self) -> float:
-        """Increase of the log evidence that the wrong configurations need together [nats]."""
+        """Increase of the log evidence that all wrong configurations together require [nats]."""
         count = len(torch.unique(self.configuration))
         return len(self.wrong) * (WRONG_ROW_PENALTY + math.log(max(count, 1)))
 
@@ -103,7 +104,7 @@ class Drift:
 
     Attributes:
         groups: groups with their sizes.
-        noise: noise of every sensor [m or rad], or a factor if the rows state it.
+        noise: noise of every sensor [m or rad], or a factor on the noise that the rows state.
         log_evidence: log evidence of the new rows, including the prior odds of drifts and wrong configurations.
     """
 
@@ -115,8 +116,8 @@ class Drift:
 class DriftSearch:
     """Search for the drift sizes that maximise the evidence of new rows under a model's posterior.
 
-    With A the derivatives along the directions of the posterior's root, Z_g those with respect to the unknowns of a
-    group times their scale, and u ~ N(0, R R^T + Σ_g drift), the values are normal with the covariance
+    With A the derivatives along the columns of the posterior's root, Z_g the derivatives with respect to the
+    unknowns of group g times their scale, and u ~ N(0, R R^T + Σ_g drift), the values are normal with the covariance
     `V = A A^T + Σ_g size_g² Z_g Z_g^T + noise²`. Sizes are optimised one at a time with all others fixed: for the
     eigenvalues λ and coordinates b of a group in the metric of the other terms, a size s raises the log evidence by
     `Σ (s² λ b² / (1 + s² λ) - log(1 + s² λ)) / 2` (Tipping and Faul 2003, Fast marginal likelihood maximisation for
@@ -135,7 +136,7 @@ class DriftSearch:
 
         Args:
             values: values of the new rows.
-            A: their derivatives along the directions of the root.
+            A: derivatives of the values along the columns of the posterior's covariance root.
             groups: groups with initial sizes.
             noise: initial noise of every sensor.
             usual_noise: noise of the calibration.
@@ -162,7 +163,7 @@ class DriftSearch:
 
     @property
     def drift(self) -> Drift:
-        """Present sizes and noise."""
+        """Current drift sizes and noise."""
         return Drift(tuple(self._groups), self._noise, self.log_evidence)
 
     @property
@@ -172,17 +173,17 @@ class DriftSearch:
 
     @property
     def deviation(self) -> Float64[Tensor, " values"]:
-        """Noise standard deviation of every value."""
+        """Standard deviation of the noise of every value."""
         return self.values.deviation(self._noise)
 
     def estimate_shift(
         self, number: int, held: bool = True
     ) -> tuple[Float64[Tensor, " members"], Float64[Tensor, "members members"]]:
-        """Estimate how far the unknowns of a group have moved, with all other groups at their sizes.
+        """Estimate how far the unknowns of a group have moved, with the sizes of all other groups unchanged.
 
         Args:
             number: index of the group.
-            held: whether the prior of the group with its size is used; otherwise the group is unconstrained.
+            held: whether to use the prior of the group; otherwise its unknowns are unconstrained.
 
         Returns:
             The shifts [m or rad] and their covariance.
@@ -219,7 +220,7 @@ class DriftSearch:
         self._groups[number] = replace(group, size=size)
 
     def _update_noise(self, sensor: int, least: float) -> None:
-        """Use the factor on the usual noise with the highest evidence under a log-normal prior."""
+        """Update the noise of a sensor by the factor of highest evidence on its usual noise (log-normal prior)."""
         variance, now = (
             self.values.deviation(torch.ones_like(self._noise)).square(),
             float(self._noise[sensor]),
@@ -263,7 +264,7 @@ def evidence_gains(
 
 
 def compressed_columns(Z: Float64[Tensor, "values members"]) -> Float64[Tensor, "values columns"]:
-    """Return columns with the same `Z Z^T`, at most as many as values."""
+    """Return columns with the same product `Z Z^T`, but no more columns than values."""
     if Z.shape[1] <= len(Z):
         return Z
     columns: Tensor = torch.linalg.qr(Z.t(), mode="r").R.t()
@@ -271,13 +272,13 @@ def compressed_columns(Z: Float64[Tensor, "values members"]) -> Float64[Tensor, 
 
 
 MAX_DIRECTIONS = 1.2
-"""Largest number of directions of a root, relative to the number of unknowns."""
+"""Largest ratio of the number of columns of a covariance root to the number of unknowns."""
 
 
 class PosteriorUpdate:
-    """Kalman's update of a root R of a covariance: with A = X R / noise, `R (I + A^T A)^-1/2` is that of the posterior.
+    """Kalman's update of a covariance root R: the root of the posterior is `R (I + A^T A)^-1/2` with A = X R / noise.
 
-    It is computed from the eigenvalues of `A A^T` for few values, else from the Cholesky factor of `I + A^T A`.
+    For few values it is computed from the eigenvalues of `A A^T`, otherwise from the Cholesky factor of `I + A^T A`.
     Source: Bierman 1977, Factorization Methods for Discrete Sequential Estimation, chapter II.
 
     Attributes:
@@ -288,12 +289,12 @@ class PosteriorUpdate:
     def __init__(
         self, root: Float64[Tensor, "unknowns directions"], values: LinearValues, drift: Drift
     ) -> None:
-        """Update the covariance `root root^T` plus that of the drift.
+        """Update the covariance `root root^T` plus the covariance of the drift.
 
         Args:
             root: covariance root before the values.
             values: new values.
-            drift: drift since then, and noise of the values.
+            drift: drift since the root was estimated, and noise of the values.
         """
         self._root = root
         drifted = [group for group in drift.groups if group.size > 0]

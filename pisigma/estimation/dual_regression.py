@@ -1,4 +1,4 @@
-"""Bayesian linear regression in dual form, by the covariance of the values as in Gaussian processes: for few values."""
+"""Bayesian linear regression in dual form for few values, by the covariance of the values as in Gaussian processes."""
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -36,7 +36,7 @@ class DualRegression(AbstractRegression):
         X: weighted columns, the parameters first.
         y: weighted values.
         sensor: index of every value's sensor.
-        prior: prior with the groups and base of the matrices K; its sizes do not matter.
+        prior: prior that defines the groups and base of the matrices K; its sizes are not used.
         active: number of parameters.
         K: matrix K of every group of weights, lower triangle.
         sensors: number of values of every sensor.
@@ -51,7 +51,7 @@ class DualRegression(AbstractRegression):
     sensors: tuple[SensorCount, ...]
 
     def solve(self, prior: GaussianPrior, noise: tuple[float, ...]) -> Posterior:
-        """See `AbstractRegression.solve`."""
+        """Compute the posterior for a prior and noise; see `AbstractRegression.solve`."""
         if self.is_ill_conditioned(prior, noise):
             return self.primal_regression.solve(prior, noise)
         P, parameters, covariance, log_det = self.projection(prior, noise)
@@ -65,7 +65,7 @@ class DualRegression(AbstractRegression):
         held = torch.zeros_like(x)
         held[:active] = 1 - precision[:active] * covariance.diagonal()
         determined = prior.sum_by_group(held)
-        # Both matrices are symmetric, so the trace of their product needs only one triangle.
+        # Both matrices are symmetric, so the trace of their product requires one triangle only.
         traces = self.K @ (P.flatten().index_select(0, self._pairs) * self._counts)
         determined[prior.classes :] = prior.sizes[prior.classes :].square() * traces
         # Parameters without a prior have precision 0; their constant term is left out.
@@ -79,7 +79,7 @@ class DualRegression(AbstractRegression):
         return Posterior(x, -0.5 * evidence, prior, noise, square, determined, misfit, used)
 
     def covariance_root(self, posterior: Posterior) -> CovarianceRoot:
-        """See `AbstractRegression.covariance_root`; weights depend on the parameters by `-Λ^-1 X^T V^-1 G`."""
+        """Return the covariance root of the unknowns; weights depend on the parameters by `-Λ^-1 X^T V^-1 G`."""
         if self.is_ill_conditioned(posterior.prior, posterior.noise):
             return self.primal_regression.covariance_root(posterior)
         active, precision = self.active, posterior.prior.precision
@@ -101,7 +101,7 @@ class DualRegression(AbstractRegression):
 
     @cached_property
     def primal_regression(self) -> PrimalRegression:
-        """The same regression as normal equations."""
+        """The regression in primal form, with the same values."""
         return PrimalRegression(*self.normal_equation_sums, self.sensors)
 
     @property
@@ -133,7 +133,7 @@ class DualRegression(AbstractRegression):
 
     @cached_property
     def _counts(self) -> Float64[Tensor, " pairs"]:
-        """Number of entries of a symmetric matrix for each pair: 1 on the diagonal, else 2."""
+        """Number of entries of a symmetric matrix for each pair of values: 1 on the diagonal, otherwise 2."""
         return torch.where(self._pairs % (len(self.y) + 1) == 0, 1.0, 2.0).to(self.y)
 
     def projection(
@@ -185,7 +185,7 @@ def without_nuisance(
 
 
 def group_gram(X: Tensor, prior: GaussianPrior, group: int, active: int) -> Tensor:
-    """Return K of one group of weights, whose columns come after those of the parameters."""
+    """Return the matrix K of one group of weights, whose columns in X follow the columns of the parameters."""
     columns = (prior.group == group).nonzero()[:, 0]
     columns = columns[columns >= active]
     Z = X[:, columns] * prior.base[columns].rsqrt()
@@ -200,7 +200,7 @@ def _upper_triangle(size: int) -> Int64[Tensor, " pairs"]:
 
 
 def pair_indices(values: Int64[Tensor, " values"]) -> Int64[Tensor, " pairs"]:
-    """Return the indices of the pairs of some values (ascending) among the pairs of all values."""
+    """Return the indices of all pairs of the given values (ascending) among the pairs of all values."""
     first, second = values[torch.tril_indices(len(values), len(values))]
     pairs: Tensor = first * (first + 1) // 2 + second
     return pairs

@@ -1,4 +1,4 @@
-"""Held-out errors of a linear fit: values are held out and predicted from the others."""
+"""Held-out errors of a linear fit: values that are left out are predicted from all other values."""
 
 import math
 from collections.abc import Sequence
@@ -11,7 +11,7 @@ from torch import Tensor
 from pisigma.estimation.regression import SensorCount
 
 SINGULAR = 1e-6
-"""Share of a held-out value's variance below which no other value determines it."""
+"""Share of a held-out value's variance below which the other values do not determine it."""
 MAX_SCALE = 1e4
 """Largest factor on variances."""
 
@@ -39,13 +39,13 @@ class HeldOutErrors:
     ) -> "HeldOutErrors":
         """Compute the errors of the values of a fold from a fit to all values: `M^-1 r` with the covariance `M^-1`.
 
-        If only these values determine an unknown, such as the position of a socket, M is singular. That unknown counts
-        as fitted to them, and the errors are scaled by the lost degrees of freedom (Cook and Weisberg 1982, section
-        2.2).
+        If only these values determine an unknown, such as the position of a socket, M is singular. That unknown
+        counts as fitted to them, and the errors are scaled by the lost degrees of freedom (Cook and Weisberg 1982,
+        section 2.2).
 
         Args:
-            M: block of `I - X C X^T` of the values, whitened.
-            residual: r, whitened.
+            M: block of `I - X C X^T` for the held-out values, whitened.
+            residual: residuals r of the held-out values, whitened.
             sensor: index of every value's sensor.
             counts: number of values of every sensor.
         """
@@ -68,11 +68,11 @@ class HeldOutErrors:
         return HeldOutErrors(*(torch.cat([getattr(part, name) for part in parts]) for name in names))
 
     def rms(self, noise: Sequence[float], unit: Sequence[float]) -> float:
-        """Return the RMS error in units of standard deviations other than the noise, such as those of another model."""
+        """Return the RMS error relative to given standard deviations, such as the noise of another model."""
         return float(self._squares(noise, unit).mean().sqrt())
 
     def gain(self, noise: Sequence[float], before: "HeldOutErrors", noise_before: Sequence[float]) -> float:
-        """Return by how many standard errors the squared errors are smaller than those of another fit."""
+        """Return the decrease of the squared errors relative to another fit, in standard errors."""
         return standard_errors(
             before._squares(noise_before, noise_before) - self._squares(noise, noise_before)
         )
@@ -89,7 +89,7 @@ def standard_errors(values: Float64[Tensor, " values"]) -> float:
 
 
 def held_out_scale(errors: HeldOutErrors) -> float:
-    """Return the factor on the unknowns' covariance for which held-out errors are as large as predicted, at least 1.
+    """Return the factor >= 1 on the covariance of the unknowns for which held-out errors are as large as predicted.
 
     With errors e and predicted standard deviations s in units of the noise, it solves
     `mean(e² / (1 + f (s² - 1))) = 1`. Effects that the model cannot express make it larger than 1.

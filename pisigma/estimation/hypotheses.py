@@ -1,4 +1,4 @@
-"""Find what moved before a session by the evidence of its rows, with one hypothesis per independent motion."""
+"""Determine what moved before a session from the evidence of its rows, with one hypothesis per independent motion."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -22,7 +22,7 @@ from pisigma.estimation.drift import (
 )
 
 TRIED = SIZES[SIZES >= 1e-4]
-"""Sizes of a motion, all equally probable: 0.1 mm to 0.3 m, 0.006 to 18 deg."""
+"""Sizes of a motion that are tried, all equally probable: 0.1 mm to 0.3 m, 0.006 to 18 deg."""
 CERTAIN = 0.01
 """Probability of "nothing (else) moved" below which something certainly moved."""
 NAMED = 0.8
@@ -32,7 +32,7 @@ MAX_MOTIONS = 3
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """A hypothesis about what moved, and its probability.
+    """A hypothesis that one group of unknowns moved, and its probability.
 
     Attributes:
         group: unknowns that moved.
@@ -50,12 +50,12 @@ class Explanation:
     """Posterior of the hypotheses for a session.
 
     Attributes:
-        motions: motions that happened, the clearest first.
-        candidates: all hypotheses, the most probable first, if something moved but it is not clear what; else empty.
+        motions: motions that certainly happened, most probable first.
+        candidates: all hypotheses, most probable first, if something moved but it is not clear what; otherwise empty.
         unchanged: probability that nothing moved.
         noise_factor: most probable factor on the usual noise.
-        log_evidence: log evidence of the rows given the motions, over all other hypotheses, minus the penalties of the
-            motions and of wrong rows.
+        log_evidence: log evidence of the rows given the motions, averaged over all other hypotheses, minus the prior
+            penalties of the motions and of wrong rows.
     """
 
     motions: tuple[Motion, ...]
@@ -68,12 +68,12 @@ class Explanation:
 class SessionEvidence:
     """Evidence of a session's rows under a model's posterior, for all hypotheses about what moved.
 
-    The values are normal with the covariance `V = A A^T + B B^T + (f σ)²`. A are their derivatives along the directions
-    of the posterior's root, so geometry, frames and correction have the uncertainty of the model; B are those with
-    respect to unknowns with a wide prior, such as the base of a tracker that was relocated. A hypothesis adds
-    `s² Z Z^T` for its unknowns; its evidence is the mean over sizes s and noise factors f, each in closed form (see
-    `pisigma.estimation.drift.DriftSearch`). Bayes factors times prior odds give the probabilities (Kass
-    and Raftery 1995, Bayes factors, J. Am. Stat. Assoc. 90(430)).
+    The values are normal with the covariance `V = A A^T + B B^T + (f σ)²`. A contains the derivatives along the
+    columns of the posterior's root, so geometry, frames and correction have the uncertainty of the model; B contains
+    the derivatives with respect to unknowns with a wide prior, such as the base of a tracker that was relocated. A
+    hypothesis adds `s² Z Z^T` for its unknowns; its evidence is the mean over sizes s and noise factors f, each in
+    closed form (see `pisigma.estimation.drift.DriftSearch`). Bayes factors times prior odds give the probabilities
+    (Kass and Raftery 1995, Bayes factors, J. Am. Stat. Assoc. 90(430)).
     """
 
     def __init__(
@@ -104,14 +104,14 @@ class SessionEvidence:
         self._Z = [compressed_columns(values.X[:, one.index] * one.scale) for one in self._groups]
 
     def with_wrong(self, wrong: Mapping[int, float]) -> "SessionEvidence":
-        """Return the evidence of the same rows with other wrong configurations, see `LinearValues`."""
+        """Return the evidence of the same rows with other configurations marked as wrong, see `LinearValues.wrong`."""
         other = copy(self)
         other.values = replace(self.values, wrong=wrong)
         other._sigma = other.values.deviation(self._usual_noise)
         return other
 
     def with_moved(self, groups: Sequence[DriftGroup]) -> "SessionEvidence":
-        """Return the evidence of the same rows if some groups have moved by about their sizes."""
+        """Return the evidence of the same rows if groups have moved, with their sizes as standard deviations."""
         other = copy(self)
         for one in groups:
             B = self.values.X[:, one.index] * one.deviation
@@ -135,7 +135,7 @@ class SessionEvidence:
     def estimate_shift(
         self, groups: Sequence[DriftGroup], noise_factor: float
     ) -> tuple[Float64[Tensor, " members"], Float64[Tensor, "members members"]]:
-        """Estimate how far the unknowns of some groups have moved, with all others as uncertain as in the model.
+        """Estimate how far the unknowns of the given groups have moved; all others have the uncertainty of the model.
 
         Args:
             groups: groups with the sizes of their priors; they may include relocated frames.
@@ -153,8 +153,8 @@ class SessionEvidence:
         """Return the sources of error of an estimate by `estimate_shift` if nothing has moved.
 
         Returns:
-            Its derivative with respect to the directions of the posterior's root, which sessions have in common, and
-            the covariance of the other errors, which are independent between sessions.
+            The derivative of the estimate along the columns of the posterior's root, an error that sessions have in
+            common, and the covariance of the other errors, which are independent between sessions.
         """
         gain, _ = self._gain(groups, noise_factor)
         own = self._K - self.known @ self.known.t() + self._noise(noise_factor).square().diag()
@@ -163,11 +163,11 @@ class SessionEvidence:
     def covariance(
         self, groups: Sequence[DriftGroup], noise_factor: float
     ) -> Float64[Tensor, "values values"]:
-        """Return the covariance of the values if some groups have moved by about their sizes."""
+        """Return the covariance of the values if groups have moved, with their sizes as standard deviations."""
         return self.with_moved(groups)._K + self._noise(noise_factor).square().diag()
 
     def error_score(self) -> float:
-        """Return the RMS of all values divided by their standard deviations if nothing moved; about 1 is usual."""
+        """Return the RMS of the values divided by their standard deviations if nothing moved; usually about 1."""
         factor = covariance_factor(self._K + self._noise(1.0).square().diag())
         a = torch.linalg.solve_triangular(factor, self.values.y[:, None], upper=False)
         return float(a.square().mean().sqrt())
@@ -213,7 +213,7 @@ class SessionEvidence:
         )
 
     def _raised(self, a: Tensor, W: Tensor) -> Float64[Tensor, "groups sizes"]:
-        """Return the gain of log evidence for every group and size; columns in the metric of all other variances."""
+        """Return the gain of log evidence for every group and size."""
         raised = torch.empty(len(self._groups), len(TRIED), dtype=torch.float64)
         widths = torch.tensor([Z.shape[1] for Z in self._Z])
         # Groups of one unknown are all evaluated in one product; the others need an eigendecomposition each.

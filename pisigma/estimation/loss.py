@@ -1,4 +1,4 @@
-"""Losses: weight of a row in least squares by its distance from the prediction in standard deviations."""
+"""Losses, which weight a row in least squares by its distance from the prediction in standard deviations."""
 
 import math
 from abc import ABC, abstractmethod
@@ -11,7 +11,7 @@ from torch import Tensor
 MEDIAN_DISTANCE = {1: 0.674490, 2: 1.177410, 3: 1.538172, 6: 2.312600}
 """Median length of a standard normal vector by its number of components."""
 DISTANCE_99 = {1: 2.575829, 2: 3.034854, 3: 3.368214, 6: 4.100231}
-"""99 % quantile of that length."""
+"""99 % quantile of the length of a standard normal vector by its number of components."""
 
 HAMPEL_VARIANCE = {1: 0.990933, 2: 0.995409, 3: 0.996914, 6: 0.998435}
 """Weighted variance of standard normal noise under Hampel's weights: `E[w d²] / (components · E[w])`."""
@@ -68,13 +68,13 @@ class SquaredLoss(AbstractLoss):
         return torch.ones_like(distance)
 
     def scale(self, distance: Float[Tensor, " rows"], components: int, used: Figure) -> Float[Tensor, ""]:
-        """Return the root mean square, corrected for the parameters."""
+        """Return the root mean square of the distances, corrected for the parameters."""
         return self.deviation(distance, components, used, 1.0)
 
     def deviation(
         self, distance: Float[Tensor, " rows"], components: int, used: Figure, scale: Figure
     ) -> Float[Tensor, ""]:
-        """Return the root mean square, corrected for the parameters."""
+        """Return the root mean square of the distances, corrected for the parameters."""
         return (distance.square().sum() / _left(distance, components, used)).sqrt()
 
 
@@ -89,7 +89,7 @@ class HampelLoss(AbstractLoss):
     """
 
     def cost(self, distance: Float[Tensor, " rows"], components: int) -> Float[Tensor, " rows"]:
-        """Return square, line, parabola or constant by distance."""
+        """Return the cost of every row: a square, line, parabola or constant, depending on the distance."""
         a = DISTANCE_99[components]
         b, c = 1.5 * a, 3 * a
         straight, bent = distance.clamp(a, c).sub_(a), distance.clamp(b, c).sub_(b)
@@ -97,14 +97,14 @@ class HampelLoss(AbstractLoss):
         return cost.addcmul_(bent, bent, value=-a / (c - b))
 
     def weight(self, distance: Float[Tensor, " rows"], components: int) -> Float[Tensor, " rows"]:
-        """Return 1, a / distance, a decreasing function or 0 by distance."""
+        """Return the weight of every row: 1, a / distance, a decreasing function or 0, depending on the distance."""
         a = DISTANCE_99[components]
         b, c = 1.5 * a, 3 * a
         falling: Tensor = torch.rsub(distance, c).div_(c - b).clamp_(0, 1)
         return falling.mul_(a).div_(distance.clamp(min=a))
 
     def scale(self, distance: Float[Tensor, " rows"], components: int, used: Figure) -> Float[Tensor, ""]:
-        """Return the median divided by that of a standard normal vector, corrected for the parameters."""
+        """Return the median distance divided by that of a standard normal vector, corrected for the parameters."""
         factor = math.sqrt(len(distance) * components) / MEDIAN_DISTANCE[components]
         return distance.median() * _left(distance, components, used).rsqrt() * factor
 

@@ -9,16 +9,16 @@ from scipy.stats import chi2
 from torch import Tensor
 
 MIN_ROBOTS = 5
-"""Minimum number of robots; with fewer, scatter between them cannot be distinguished from their uncertainties."""
+"""Minimum number of robots of a fleet; with fewer, their scatter cannot be distinguished from their uncertainties."""
 EM_STEPS = 60
 SEARCH_STEPS = 25
 """Expectation-maximisation steps while outliers are searched for; these need not converge."""
 CLASS_ROBOTS = 0.02
-"""Weight of the robot class in the variances of the fleet, in robots: small, because robots of one type are more alike,
-but enough to keep unknowns that no rows determine as uncertain as in the class."""
+"""Weight of the robot class in the variances of the fleet, as a number of robots: small, because robots of one type
+are more alike, but large enough that unknowns that no rows determine are as uncertain as in the class."""
 SEARCH_CLASS_ROBOTS = 0.2
-"""The same weight while outliers are searched for: if a few robots made the fleet too narrow, all others would be
-outliers."""
+"""Weight of the robot class, as a number of robots, while outliers are searched for; it is larger, because all other
+robots would be outliers if a few robots made the fleet too narrow."""
 ROBOTS_PER_CHUNK = 100
 """Number of robots whose inverse matrices are kept at a time (40 MB)."""
 MAX_CONCENTRATIONS = 10
@@ -32,7 +32,7 @@ class Information:
 
     Attributes:
         normal: information matrix (normal matrix) of the unknowns.
-        descent: its product with the most likely values.
+        descent: product of the information matrix and the most likely values, the right side of the normal equations.
     """
 
     normal: Float64[Tensor, "unknowns unknowns"]
@@ -56,8 +56,8 @@ class Population:
     def predictive_distribution(self, robots: int) -> "Population":
         """Return the predictive distribution of a robot that was not used for the estimate.
 
-        With n robots the mean has the covariance `Σ / n`, and the estimate of Σ is biased by `(n - 1) / n`: together a
-        factor `(n + 1) / (n - 1)`.
+        With n robots the mean has the covariance `Σ / n`, and the estimate of Σ is biased by `(n - 1) / n`: together
+        a factor `(n + 1) / (n - 1)`.
 
         Args:
             robots: number of robots that the population was estimated from.
@@ -65,10 +65,10 @@ class Population:
         return replace(self, covariance=(robots + 1) / (robots - 1) * self.covariance)
 
     def squared_distance(self, robot: Information) -> tuple[float, int]:
-        """Return the distance of a robot from the fleet: a sum of squares, chi-squared for its robots, and its degrees.
+        """Return a robot's squared distance from the fleet, chi-squared for its robots, and the degrees of freedom.
 
-        In coordinates in which the covariance is the identity and the information diagonal, `λ`, the descent minus its
-        expectation for the mean has the variance `λ + λ²`.
+        In coordinates in which the covariance is the identity and the information is diagonal with entries λ, the
+        right side of the normal equations minus its expectation for the mean has the variance `λ + λ²`.
         """
         root = torch.linalg.cholesky(self.covariance)
         information, axes = torch.linalg.eigh(root.t() @ robot.normal @ root)
@@ -79,7 +79,7 @@ class Population:
         return float(squares[identified].sum()), int(identified.sum())
 
     def log_evidence(self, robot: Information) -> float:
-        """Return the log probability of a robot's rows, up to a constant of the robot."""
+        """Return the log probability of a robot's rows, up to a constant that depends on the robot only."""
         root = torch.linalg.cholesky(self.covariance)
         # In units of the population, prior and information add up without inverting the covariance.
         factor = torch.linalg.cholesky(torch.eye(len(root)).to(root) + root.t() @ robot.normal @ root)
@@ -103,7 +103,7 @@ def without_outliers(
 
     Args:
         evidence: information on every robot.
-        start: population of usual robots.
+        start: population of typical robots, as a starting point.
         usual: variances of the robot class.
     """
     alike = _nearest_to_median(evidence, start)
@@ -133,7 +133,7 @@ def _nearest_to_median(evidence: Sequence[Information], start: Population) -> li
     inverses = torch.linalg.inv(torch.stack([one.normal for one in evidence]) + precision)
     x = torch.einsum("rij,rj->ri", inverses, torch.stack([one.descent for one in evidence]))
     median = x.median(0).values
-    # Scatter by the median deviation, which outliers do not move, plus what the rows leave undetermined.
+    # Scatter by the median deviation, which outliers do not change, plus the uncertainty that the rows leave.
     scatter = (x - median).abs().median(0).values.square() + inverses.diagonal(dim1=1, dim2=2).mean(0)
     population = Population(median, scatter.diag(), start.geometric)
     distances = [square / max(count, 1) for square, count in map(population.squared_distance, evidence)]
@@ -172,15 +172,15 @@ def _maximised(
 
     Args:
         evidence: information on every robot.
-        now: present population.
-        of_class: squares that the class contributes.
+        now: current population.
+        of_class: sums of squares that the robot class contributes.
         robots: number of robots including the weight of the class.
     """
     size, count = now.geometric, len(evidence)
     precision = torch.linalg.inv(now.covariance)
     at_mean, x, scatter = precision @ now.mean, [], torch.zeros_like(precision)
     for first in range(0, count, ROBOTS_PER_CHUNK):
-        # Expectation: posterior mean and covariance of every robot under the present population.
+        # Expectation: posterior mean and covariance of every robot under the current population.
         some = evidence[first : first + ROBOTS_PER_CHUNK]
         factors = torch.linalg.cholesky(torch.stack([one.normal for one in some]) + precision)
         inverses = torch.cholesky_inverse(factors)

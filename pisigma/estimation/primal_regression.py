@@ -23,14 +23,14 @@ from pisigma.estimation.regression import AbstractRegression, Posterior, SensorC
 
 @dataclass(frozen=True, eq=False)
 class SolvedRegression:
-    """The normal equations, divided by the noise's variance, with a prior: `D (Σ X^T X + precision) D = L L^T`.
+    """Solution of normal equations with a prior: `D (Σ X^T X / noise² + precision) D = L L^T`.
 
     Attributes:
         prior: prior of the unknowns.
         noise: standard deviation for every sensor.
         scale: diagonal of D.
         inverse: L^-1, lower triangular, so that the covariance is `D L^-T L^-1 D`.
-        log_det: logarithm of the determinant of `Σ X^T X + precision`.
+        log_det: logarithm of the determinant of `Σ X^T X / noise² + precision`.
         x: most probable values.
     """
 
@@ -43,7 +43,7 @@ class SolvedRegression:
 
     @property
     def variance(self) -> Float64[Tensor, " unknowns"]:
-        """Diagonal of the covariance."""
+        """Variance of every unknown, the diagonal of the covariance."""
         deviation: Tensor = self.scale * torch.linalg.vector_norm(self.inverse, dim=0)
         return deviation.square()
 
@@ -53,21 +53,21 @@ class SolvedRegression:
         for rows in row_blocks(len(self.x), BLOCK):
             block = self.inverse[rows.start :, rows].t() @ self.inverse[rows.start :, : rows.stop]
             scale = self.scale[: rows.stop].clone()
-            scale[: rows.start].mul_(2)  # the blocks above the diagonal as well
+            scale[: rows.start].mul_(2)  # counts the blocks above the diagonal as well
             trace += float(self.scale[rows] @ (block.mul_(matrix[rows, : rows.stop]) @ scale))
         return trace
 
 
 @dataclass(frozen=True, eq=False)
 class PrimalRegression(AbstractRegression):
-    """Normal equations of every sensor, before division by its noise variance.
+    """Normal equations of every sensor, not yet divided by its noise variance.
 
     Attributes:
         normal: `Σ X^T X` for every sensor, of weighted rows.
         descent: `Σ X^T y` for every sensor.
         square: `Σ y^T y` for every sensor.
         sensors: number of values of every sensor.
-        latest: cache of the last solution, which evidence, held-out values and covariance share.
+        latest: cache of the last solution, which evidence, held-out errors and covariance share.
     """
 
     normal: Float64[Tensor, "sensors unknowns unknowns"]
@@ -83,7 +83,7 @@ class PrimalRegression(AbstractRegression):
         x, held = solved.x, precision * solved.variance
         pairs = zip(self.normal[1:], noise[1:], strict=True)
         used = [solved.trace(N) / sigma**2 for N, sigma in pairs]
-        # All sensors together determine what the prior does not, which saves the trace of the first one.
+        # All sensors together determine what the prior does not determine, which saves the trace of the first sensor.
         used.insert(0, float((1 - held).sum()) - sum(used))
         misfit = self._misfits(x)
         log_prior = float(precision[precision > 0].log().sum())
@@ -94,13 +94,13 @@ class PrimalRegression(AbstractRegression):
         return Posterior(x, evidence, prior, noise, square, determined, misfit, tuple(used))
 
     def covariance_root(self, posterior: Posterior) -> CovarianceRoot:
-        """See `AbstractRegression.covariance_root`; with the names of `SolvedRegression` it is `D L^-T`."""
+        """Return the covariance root of the unknowns: `D L^-T` with the names of `SolvedRegression`."""
         solved = self.solved_with(posterior.prior, posterior.noise)
         self.latest.clear()
         return CovarianceRoot(solved.inverse.t().mul_(solved.scale[:, None]))
 
     def solved_with(self, prior: GaussianPrior, noise: tuple[float, ...]) -> SolvedRegression:
-        """Return the cached solution if prior and noise are the same, else solve."""
+        """Return the cached solution if prior and noise are unchanged, otherwise a new solution."""
 
         def normal() -> Tensor:
             torch.mul(self.normal[0], noise[0] ** -2, out=memory)
@@ -111,7 +111,7 @@ class PrimalRegression(AbstractRegression):
 
         if not self.latest or self.latest[0].prior is not prior or self.latest[0].noise != noise:
             return_free_memory(len(prior.base))
-            # The matrix may take gigabytes, so the memory of the previous factor is used again.
+            # The matrix may take gigabytes, so the memory of the previous factor is reused.
             memory = self.latest.pop().inverse.mT if self.latest else torch.empty_like(self.normal[0])
             descent = torch.zeros_like(self.descent[0])
             for b, sigma in zip(self.descent, noise, strict=True):

@@ -7,7 +7,7 @@ from jaxtyping import Float64, Int64
 from torch import Tensor
 
 SMALLEST_SIZE = 1e-9
-"""Prior size [rad] below which a group of weights is off."""
+"""Prior size [rad] below which a group of weights is excluded."""
 FIRST_SIZE = 2e-5
 """Initial prior size of weights [rad]."""
 RELAXATION = 1.5
@@ -20,11 +20,11 @@ class GaussianPrior:
 
     Attributes:
         base: 1 / variance at size 1; 0 without a prior.
-        group: index of every unknown's size.
-        sizes: standard deviations.
-        classes: number of leading groups that are classes of geometric parameters. Their sizes, factors on the stated
-            ones, remain as the geometric calibration estimated them: over a narrow joint range low harmonics resemble
-            geometry, and if they could replace it the arm would be wrong beyond that range.
+        group: index in `sizes` of every unknown.
+        sizes: standard deviation of every group at base 1.
+        classes: number of leading groups that are classes of geometric parameters. Their sizes, factors on the
+            stated sizes, remain as the geometric calibration estimated them: over a narrow joint range low harmonics
+            resemble geometry, and if they could replace it the arm would be wrong beyond that range.
     """
 
     base: Float64[Tensor, " unknowns"]
@@ -34,11 +34,11 @@ class GaussianPrior:
 
     @property
     def precision(self) -> Float64[Tensor, " unknowns"]:
-        """1 / variance."""
+        """Prior precision of every unknown, 1 / variance."""
         return self.base / self.sizes[self.group].square()
 
     def sum_by_group(self, values: Float64[Tensor, " unknowns"]) -> Float64[Tensor, " groups"]:
-        """Sum values over the unknowns with a prior in every group."""
+        """Return the sum of values over the unknowns of every group; unknowns without a prior are excluded."""
         return torch.zeros_like(self.sizes).index_add(0, self.group, values * (self.base > 0))
 
     def updated(

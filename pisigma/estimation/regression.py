@@ -19,13 +19,13 @@ MIN_EFFECTIVE = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Posterior:
-    """Posterior of the unknowns.
+    """Posterior distribution of the unknowns of a regression.
 
     Attributes:
         x: most probable values.
-        log_evidence: log evidence of the data under the prior, up to a constant of the data.
+        log_evidence: log evidence of the data under the prior, up to a constant that depends on the data only.
         prior: prior with estimated sizes.
-        noise: standard deviation for every sensor [m or rad], or a factor on the stated ones.
+        noise: standard deviation of the noise of every sensor [m or rad], or a factor on the stated noise.
         square: `Σ base x²` over the unknowns of every group.
         determined: effective number of unknowns of every group that the data determine; the prior determines the
             others.
@@ -54,7 +54,7 @@ class SensorCount:
 
     Attributes:
         values: number of independent values.
-        stated: whether its rows state their noise, which is then a lower bound.
+        stated: whether the rows of the sensor state their noise, which is then a lower bound.
         exact: whether the noise is exactly as stated.
         repetition: see `SensorValues.repetition`.
     """
@@ -83,7 +83,7 @@ class AbstractRegression(ABC):
         """Return the covariance root of the unknowns."""
 
     def effective_share(self, posterior: Posterior) -> float:
-        """Return the share of the values that the unknowns absorb; near 1, noise cannot be estimated."""
+        """Return the share of the values that the unknowns absorb; if it is near 1, the noise cannot be estimated."""
         values = sum(sensor.values for sensor in self.sensors if not sensor.exact)
         return posterior.effective_unknowns / max(values, 1.0)
 
@@ -91,7 +91,7 @@ class AbstractRegression(ABC):
         """Estimate the noise of every sensor from its misfit and degrees of freedom (Förstner 1979)."""
         noise = list(posterior.noise)
         for k, sensor in enumerate(self.sensors):
-            if not sensor.exact and sensor.values > 0.5:  # without values the noise is unchanged
+            if not sensor.exact and sensor.values > 0.5:  # the noise of a sensor without values is unchanged
                 sigma = math.sqrt(posterior.misfit[k] / max(sensor.values - posterior.used[k], 1.0))
                 noise[k] = max(sigma, 1.0 if sensor.stated else SMALLEST_NOISE)
         return tuple(noise)

@@ -12,12 +12,12 @@ from pisigma.estimation.cholesky import covariance_factor
 from pisigma.estimation.drift import LinearValues, evidence_gains
 
 FACTORS = torch.logspace(0.5, 4.5, 17, dtype=torch.float64)
-"""Factors on the noise of a wrong configuration that are tried."""
+"""Factors on the noise that are tried for a wrong configuration."""
 MAX_SUSPECTS = 3
 MIN_GAIN = 2.0
 """Smallest gain of log evidence [nats] of a suspect configuration while everything else is unchanged."""
 MAX_WRONG_SHARE = 0.25
-"""Largest share of wrong configurations: of four that disagree it is not known which one is wrong."""
+"""Largest share of wrong configurations; if four configurations disagree, it is unknown which one is wrong."""
 
 
 What = TypeVar("What")
@@ -28,8 +28,8 @@ class ExplainedRows(Generic[What]):
     """The best explanation of measured values.
 
     Attributes:
-        what: the explanation.
-        values: the values; those of wrong configurations have a larger noise.
+        what: what explains the values.
+        values: the measured values; values of wrong configurations have a larger noise.
         log_evidence: log evidence of the values, including the prior odds of the explanation.
         covariance: covariance of the values.
         deviation: standard deviation of the noise of every value.
@@ -45,14 +45,15 @@ class ExplainedRows(Generic[What]):
 def mark_wrong_rows(
     explained: ExplainedRows[What], explain: Callable[[Mapping[int, float]], ExplainedRows[What]]
 ) -> ExplainedRows[What]:
-    """Mark configurations as wrong as long as that raises the log evidence by more than its prior penalty.
+    """Mark configurations as wrong as long as this raises the log evidence by more than the prior penalty.
 
-    If a drift of many unknowns is estimated from all rows, a wrong row is hard to detect. Therefore the most suspicious
-    configurations get a larger noise one at a time, and the drift is estimated again for each; compare the externally
-    studentised residuals of Cook and Weisberg 1982, Residuals and Influence in Regression, section 2.2.
+    If a drift of many unknowns is estimated from all rows, a wrong row is hard to detect. Therefore the most
+    suspicious configurations get a larger noise one at a time, and the drift is estimated again for each; compare
+    the externally studentised residuals of Cook and Weisberg 1982, Residuals and Influence in Regression, section
+    2.2.
 
     Args:
-        explained: explanation of the values, with wrong configurations found so far.
+        explained: explanation of the values, with the wrong configurations found so far.
         explain: function that returns the best explanation for given wrong configurations, see `LinearValues`.
 
     Returns:
@@ -69,7 +70,7 @@ def mark_wrong_rows(
 
 
 def _suspects(explained: ExplainedRows[What]) -> list[dict[int, float]]:
-    """Return the known wrong configurations plus one of those that gain most from a larger noise, for each of these.
+    """Return, for each of the most suspicious configurations, the known wrong configurations plus this one.
 
     Adding a variance `f² σ²` to the values of a configuration raises the log evidence like a drift along their unit
     vectors, see `DriftSearch`; in the metric of all values these are `V^-1` of the configuration.
@@ -83,7 +84,7 @@ def _suspects(explained: ExplainedRows[What]) -> list[dict[int, float]]:
         if number in values.wrong or not bool(chosen.any()):
             continue
         sigma = explained.deviation[chosen]
-        # The block of V^-1 is the precision of these values given all others: they are judged as if held out.
+        # The block of V^-1 is the precision of these values given all others, as if they were held out.
         eigenvalues, U = torch.linalg.eigh(inverse[chosen][:, chosen] * sigma * sigma[:, None])
         squares = (U.t() @ (a[chosen] * sigma)).square() / eigenvalues.clamp(min=1e-300)
         raised = evidence_gains(FACTORS, eigenvalues.clamp(min=0.0), squares)
@@ -91,6 +92,6 @@ def _suspects(explained: ExplainedRows[What]) -> list[dict[int, float]]:
         if float(raised[best]) > MIN_GAIN:
             tried.append((float(raised[best]), number, float(FACTORS[best])))
     if len(tried) == len(torch.unique(values.configuration)):
-        return []  # an explanation that fits no row at all is itself wrong
+        return []  # an explanation that does not fit any row is itself wrong
     tried = sorted(tried, reverse=True)[:MAX_SUSPECTS]
     return [{**values.wrong, number: factor} for _, number, factor in tried]
