@@ -1,7 +1,7 @@
-"""Data sets of measurements, their CSV files, splits into training and held-out rows, and jigs.
+"""Measurements: data sets, CSV files, splits into training and held-out rows, sensors, cameras and jigs.
 
-Names are loaded on first use, so that settings of cameras are read without torch; `__init__.pyi` declares them for
-type checkers.
+Names are loaded on first use, so that settings of cameras can be read without importing torch; `__init__.pyi`
+declares them for type checkers.
 """
 
 from pisigma.files.lazy_names import lazy_getattr

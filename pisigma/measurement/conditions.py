@@ -10,9 +10,9 @@ from torch import Tensor
 from pisigma.measurement.dataset import Measurements
 
 CONDITIONS = ("payload_kg", "temperature_c")
-"""Columns of measurement files that any row may have."""
+"""Columns of conditions that any row of a measurement file may contain."""
 MIN_SPREAD = 1e-9
-"""[kg or deg C] A condition that varies less has no effect that could be identified."""
+"""Smallest range of a condition [kg or deg C] over which its effect can be identified."""
 APPROACH = "approach"
 """Key of `JointState.stated`: `(*batch, dof)`, +1 if the joint's value increased before it stopped, -1 if it decreased;
 0 or NaN if not given."""
@@ -24,8 +24,8 @@ class JointState:
 
     Attributes:
         q: joint values [rad or m].
-        stated: by name, conditions `(*batch,)` [kg, deg C] and `APPROACH` `(*batch, dof)`. Missing entries and NaN mean
-            the mean condition.
+        stated: conditions `(*batch,)` [kg, deg C] and `APPROACH` `(*batch, dof)` by name. A missing entry or NaN
+            stands for the mean condition.
     """
 
     q: Float[Tensor, "*batch dof"]
@@ -44,7 +44,7 @@ class JointState:
         )
 
     def __getitem__(self, rows: slice | Tensor) -> "JointState":
-        """Return rows by slice, index or mask of the first axis."""
+        """Return the rows that a slice, index or mask of the first axis selects."""
         return JointState(self.q[rows], {name: values[rows] for name, values in self.stated.items()})
 
     def split_rows(self, size: int) -> Iterator["JointState"]:
@@ -70,7 +70,7 @@ def conditions_of(measurements: Measurements, names: Sequence[str]) -> Float64[T
 
 
 def repeat_key(measurements: Measurements) -> Float64[Tensor, "rows _key"]:
-    """Return the values in which repeats of one pose agree: joint values, payload and approach (0 if not given).
+    """Return the values that repeats of a pose have in common: joint values, payload and approach (0 if not given).
 
     The payload is included if every row states one and it varies.
     """

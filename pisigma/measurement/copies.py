@@ -18,32 +18,33 @@ from pisigma.robot.se3 import rpy_from_rotation
 
 DEGREE = math.pi / 180
 LENGTH_STEPS = sorted((*(10.0**-k for k in range(3, 10)), *(0.0254 * 10.0**-k for k in range(2, 7))))[::-1]
-"""[m] Lengths are rounded to one of these: decimals of a metre and of an inch."""
+"""Rounding steps of lengths [m]: decimals of a metre and of an inch."""
 ANGLE_STEPS = sorted((*(DEGREE * 10.0**-k for k in range(1, 9)), *(10.0**-k for k in range(3, 10))))[::-1]
-"""[rad] Angles are rounded to one of these: decimals of a degree and of a radian."""
+"""Rounding steps of angles [rad]: decimals of a degree and of a radian."""
 GRID_TOLERANCE = 1e-3
-"""Deviation of rounded values from a multiple of the step, as a share of it: they were converted and rounded again."""
+"""Largest deviation of a rounded value from a multiple of its step, as a share of the step; values may have been
+converted and rounded again."""
 ROTATION_STEP = 1e-3
-"""[rad] Rounding assumed for orientations whose rounding is unknown, such as quaternions."""
+"""Rounding step [rad] assumed for orientations whose rounding is unknown, such as quaternions."""
 IMAGE_STEP = 1e-5
-"""[m or rad] Rounding assumed for poses from corners of images, whose pixels may have been rounded."""
+"""Rounding step [m or rad] assumed for poses from corners of images, whose pixels may have been rounded."""
 STANDING, RETURNING = 2e-6, 2e-5
-"""[m or rad] Smallest standard deviations of repeated readings: of a robot that stands still, and of one that returned
-to a pose. Larger ones make equal readings less likely."""
+"""Smallest standard deviations of repeated readings [m or rad], for a robot at standstill and for a robot that
+returned to a pose."""
 MIN_EVIDENCE = math.log(1e4)
-"""Logarithm of the odds against chance above which equal rows are copies."""
+"""Natural logarithm of the odds against chance above which equal rows are treated as copies."""
 MIN_EXCESS, MIN_SHARE = 10.0, 0.95
-"""Rows are copies only if rows are equal this many times as often as by chance, or if this share of them is equal."""
+"""Rows are treated as copies only if equal rows are this many times as frequent as by chance, or have this share."""
 ROW_READINGS, ROW_STEPS = 9, 4
-"""Number of values of a row after its joint values, and number of its roundings."""
+"""Number of values of a row after the joint values, and number of rounding steps of a row."""
 MAX_NAMED = 5
-"""Number of rows that a sentence names."""
+"""Largest number of rows that a sentence lists."""
 _CHUNK = 1 << 22
 
 
 @dataclass(frozen=True)
 class CopiedRow(UnusableRow):
-    """A row that is left out because another one is the same measurement.
+    """A row that is left out because another row contains the same measurement.
 
     Attributes:
         place: place of the row.
@@ -56,14 +57,14 @@ class CopiedRow(UnusableRow):
 
 @dataclass(frozen=True, eq=False)
 class RowValues:
-    """Values of rows that are compared, and the steps to which they were rounded.
+    """Values of rows to compare, and the steps to which they were rounded.
 
     Attributes:
         numbers: values of the controller's axes [rad or m]; the measured length in up to three coordinates [SI]; and
             the first two columns of the measured rotation. NaN where nothing was measured.
         steps: rounding steps of revolute axes [rad], prismatic axes [m], length [m] and rotation [rad].
         kind: for every column of `numbers`, its column of `steps`.
-        file: number of the file that a row comes from.
+        file: index of the file that a row comes from.
     """
 
     numbers: Float64[Tensor, "rows numbers"]
@@ -73,7 +74,7 @@ class RowValues:
 
     @staticmethod
     def from_rows(rows: MeasuredFields, robot: Robot) -> "RowValues":
-        """Return the values of a robot's rows."""
+        """Return the values of measured rows of a robot."""
         q = torch.from_numpy(robot.to_controller(rows.numbers["q"].detach().cpu().double().numpy()))
         length = _lengths(rows)
         rotation = (
@@ -93,15 +94,15 @@ class RowValues:
     def stored_values(
         numbers: Float64[Tensor, "rows numbers"], steps: Float64[Tensor, "rows 4"], robot: Robot
     ) -> "RowValues":
-        """Return the stored values of rows of one file."""
+        """Return values of rows of one file from stored numbers and steps."""
         return RowValues(numbers, steps, _kinds(robot), torch.zeros(len(numbers), dtype=torch.int64))
 
     def select(self, rows: Tensor) -> "RowValues":
-        """Return the rows of an index."""
+        """Return the rows that an index selects."""
         return RowValues(self.numbers[rows], self.steps[rows], self.kind, self.file[rows])
 
     def __add__(self, other: "RowValues") -> "RowValues":
-        """Append rows of other files."""
+        """Return the rows followed by rows of other files."""
         return RowValues(
             torch.cat([self.numbers, other.numbers]),
             torch.cat([self.steps, other.steps]),
@@ -111,22 +112,22 @@ class RowValues:
 
     @property
     def column_steps(self) -> Float64[Tensor, "rows numbers"]:
-        """The step of every number; entries of a rotation change by as much as its three angles together."""
+        """Rounding step of every number; entries of a rotation vary with the steps of all three angles together."""
         return (self.steps * torch.tensor([1, 1, 1, 3**0.5]))[:, self.kind]
 
     @property
     def q(self) -> Float64[Tensor, "rows dof"]:
-        """Values of the axes."""
+        """Values of the controller's axes [rad or m]."""
         return self.numbers[:, :-ROW_READINGS]
 
     @property
     def length(self) -> Float64[Tensor, "rows 3"]:
-        """The measured length."""
+        """Measured length in up to three coordinates [SI units]."""
         return self.numbers[:, -ROW_READINGS:-6]
 
 
 def _kinds(robot: Robot) -> Int64[Tensor, " numbers"]:
-    """Return, for every number of a robot's row, its column of the steps."""
+    """Return the column of the rounding steps for every number of a row."""
     return torch.tensor([0 if axis.type == "revolute" else 1 for axis in robot.axes] + 3 * [2] + 6 * [3])
 
 
@@ -151,12 +152,12 @@ def _lengths(rows: MeasuredFields) -> Float64[Tensor, "rows 3"]:
 def _steps(
     values: Float64[Tensor, "rows values"], steps: Sequence[float], otherwise: float = 0.0
 ) -> Float64[Tensor, " rows"]:
-    """Return the rounding of every row's values: the coarsest step of which all are multiples.
+    """Return the rounding step of every row: the coarsest step of which all values are multiples.
 
     Args:
         values: the values; NaN is a multiple of any step.
         steps: the steps, coarsest first.
-        otherwise: result for values that are multiples of none; 0 for the finest step.
+        otherwise: result for values that are multiples of no step; 0 for the finest step.
     """
     found = torch.full((len(values),), otherwise or steps[-1], dtype=torch.float64)
     for step in reversed(steps):
@@ -166,11 +167,11 @@ def _steps(
 
 
 def original_rows(values: RowValues, known: int = 0) -> Int64[Tensor, " rows"]:
-    """Return, for every row, the number of the row that it is a copy of, or its own number.
+    """Return, for every row, the index of the row of which it is a copy; the row's own index if it is not a copy.
 
-    A copy has the joint values and all readings of another row to the coarser of both roundings. How many rows agree by
-    chance depends on the repeatability of the robot: equal rows are copies if chance explains them with a probability
-    of less than 1e-4.
+    A copy has the joint values and all readings of another row up to the coarser of both roundings. How many rows
+    agree by chance depends on the repeatability of the robot: equal rows are copies if chance explains them with a
+    probability of less than 1e-4.
 
     Args:
         values: values of all rows.
@@ -191,7 +192,7 @@ def original_rows(values: RowValues, known: int = 0) -> Int64[Tensor, " rows"]:
     same_joints = _SameJoints.from_values(values)
     standing = same_joints.run[better] == same_joints.run[worse]
     best = rank.clone()
-    # consecutive rows at one pose repeat better than returns to it, so each has its own probability of equal readings
+    # consecutive rows at a pose repeat better than returns to it, so their probabilities of equal readings differ
     for scope, deviation in ((standing, STANDING), (~standing, RETURNING)):
         equal = torch.zeros(count, dtype=torch.bool)
         equal[worse[scope]] = True
@@ -208,9 +209,9 @@ def _are_copies(
     """Return whether more rows are equal than by chance (Chernoff's bound for independent trials).
 
     Args:
-        equal: which rows equal another one.
+        equal: mask of the rows that equal another row.
         partners: number of rows at the same joint values, to which a row might be equal.
-        chance: probability that a row equals one of these.
+        chance: probability that a row equals one of its partners.
     """
     tried = equal | (partners > 0)
     found, count = int(equal.sum()), int(tried.sum())
@@ -228,11 +229,11 @@ def _are_copies(
 
 @dataclass(frozen=True, eq=False)
 class _SameJoints:
-    """Rows at the same joint values.
+    """Groups of rows at the same joint values.
 
     Attributes:
-        group: number of a row's joint values.
-        run: number of the sequence of consecutive rows at the same joint values.
+        group: index of the group of equal joint values, for every row.
+        run: index of the sequence of consecutive rows at the same joint values, for every row.
     """
 
     group: Int64[Tensor, " rows"]
@@ -249,7 +250,7 @@ class _SameJoints:
     def count_partners(
         self, rank: Int64[Tensor, " rows"], known: int, standing: bool
     ) -> Int64[Tensor, " rows"]:
-        """Return to how many other rows a row might be equal: of its own run if `standing`, else of other runs."""
+        """Return to how many rows every row might be equal: in its run if `standing`, otherwise in other runs."""
         if known:
             there = torch.bincount(self.group[:known], minlength=len(rank))[self.group]
             return torch.where(torch.arange(len(rank)) < known, 0, 0 if standing else there)
@@ -265,8 +266,8 @@ class _SameJoints:
     def repeat_probability(self, values: RowValues, deviation: float) -> Float64[Tensor, " rows"]:
         """Return the probability that a repeated measurement gives the same reading.
 
-        The rounding is the coarsest one among the rows with the same joint values. Rows without a reading, as at
-        sockets, are compared by their joint values.
+        The rounding is the coarsest one among the rows with the same joint values. Rows without a reading, such as
+        rows at sockets, are compared by their joint values.
         """
         steps = torch.stack(
             [one.scatter_reduce(0, self.group, one, "amax")[self.group] for one in values.steps.unbind(1)], 1
@@ -297,7 +298,9 @@ def _equal_pairs(values: RowValues) -> tuple[Int64[Tensor, " pairs"], Int64[Tens
     """
     numbers, steps = values.numbers, values.column_steps
     scale = steps.amax(0)
-    weight = torch.arange(2.0, 2 + numbers.shape[1]).double().sqrt() % 1 + 0.5  # no simple ratios
+    weight = (
+        torch.arange(2.0, 2 + numbers.shape[1]).double().sqrt() % 1 + 0.5
+    )  # weights without simple ratios
     key, order = ((numbers / scale).nan_to_num(nan=0.0) @ weight).sort()
     last = torch.searchsorted(key, key + 1.1 * float(weight.sum()), right=True)
     ahead = last - torch.arange(len(key)) - 1
@@ -325,14 +328,14 @@ def _agree(values: Float64[Tensor, "2 pairs"], steps: Float64[Tensor, "2 pairs"]
 
 
 def _chunks(ahead: Int64[Tensor, " rows"]) -> list[tuple[int, int]]:
-    """Return ranges of rows whose neighbours fit into memory."""
+    """Yield ranges of rows that have few enough neighbours to fit into memory."""
     part = (ahead.cumsum(0) // _CHUNK).numpy()
     borders = [0, *(np.flatnonzero(np.diff(part)) + 1).tolist(), len(part)]
     return list(itertools.pairwise(borders))
 
 
 def _whole_pairs(rows: MeasuredFields, copied: Bool[Tensor, " rows"]) -> Bool[Tensor, " rows"]:
-    """Return the copies, except rows of a pair whose other row is not a copy."""
+    """Return the mask of copies without the rows of pairs whose other row is not a copy."""
     pairs = numbers_of_names(list(zip(rows.origin or ("",) * rows.rows, rows.text("pair"), strict=True)))
     paired = torch.tensor([bool(name) for name in rows.text("pair")])
     half = torch.zeros(rows.rows, dtype=torch.bool)
@@ -341,7 +344,7 @@ def _whole_pairs(rows: MeasuredFields, copied: Bool[Tensor, " rows"]) -> Bool[Te
 
 
 def copies_of_known(rows: MeasuredFields, robot: Robot, known: RowValues) -> Bool[Tensor, " rows"]:
-    """Return which rows are copies of known rows, perhaps rounded differently or in another order."""
+    """Return the mask of the rows that are copies of known rows, perhaps rounded differently or in another order."""
     if rows.rows == 0 or not len(known.numbers) or rows.numbers["q"].shape[1] != robot.dof:
         return torch.zeros(rows.rows, dtype=torch.bool)
     count = len(known.numbers)
@@ -351,9 +354,9 @@ def copies_of_known(rows: MeasuredFields, robot: Robot, known: RowValues) -> Boo
 
 
 def without_copies(rows: MeasuredFields, robot: Robot) -> MeasuredFields:
-    """Leave out copies of other rows, keeping the one with the most digits; see `CopiedRow`.
+    """Return the rows without copies of other rows; the row with the most digits is kept, see `CopiedRow`.
 
-    The rows of a pair are left out together.
+    The two rows of a pair are left out together.
     """
     if rows.rows < 2 or rows.numbers["q"].shape[1] != robot.dof:
         return rows
@@ -375,14 +378,14 @@ def without_copies(rows: MeasuredFields, robot: Robot) -> MeasuredFields:
 
 
 def places_text(rows: MeasuredFields, chosen: Bool[Tensor, " rows"]) -> str:
-    """Return the places of the chosen rows as a text, at most the first `MAX_NAMED`."""
+    """Return a text with the places of the chosen rows, at most `MAX_NAMED` of them."""
     numbers = chosen.nonzero()[:, 0].tolist()
     named = ", ".join(rows.place_text(number) for number in numbers[:MAX_NAMED])
     return f"{named} and {len(numbers) - MAX_NAMED} more" if len(numbers) > MAX_NAMED else named
 
 
 def copy_warnings(left_out: Sequence[UnusableRow]) -> tuple[str, ...]:
-    """Return a warning of the rows that were left out as copies, or nothing."""
+    """Return a warning about the rows that were left out as copies; empty if there are none."""
     copies = [one for one in left_out if isinstance(one, CopiedRow)]
     if not copies:
         return ()

@@ -1,4 +1,4 @@
-"""Measurements: commanded joint values, and what a sensor measured there."""
+"""Measurements: commanded joint values, and the readings of a sensor at these joint values."""
 
 import hashlib
 import json
@@ -27,14 +27,14 @@ from pisigma.robot.se3 import transform
 
 @dataclass(frozen=True, eq=False)
 class Measurements:
-    """Rows of measurements, one per measurement, in SI units.
+    """Measurements of a robot in SI units, one per row.
 
     Values that were not measured in a row are NaN, and names that are not given are ""; a field that no row has is
     None. A row contains at most one length: a position, a touch, a socket or a distance. It may contain an orientation
     in addition. A second sensor's reading at the same joint values is a second row.
 
     Attributes:
-        q: commanded joint values [rad or m], as the controller counts them.
+        q: commanded joint values [rad or m], with the sign and zero of the controller.
         position: measured position of the target in the row's frame [m].
         rotation: measured rotation of the tool in the row's frame.
         frame: per row, the frame in which the sensor measures; "" if the file names none.
@@ -57,13 +57,13 @@ class Measurements:
         approach: per row and joint, direction in which the joint moved to its value: +1 if the value increased, -1 if
             it decreased, NaN if not given.
         date: per row, the day of the measurement (ISO 8601, such as "2026-11-22"); "" if not given.
-        image: per row, the name of the image from which it was measured; "" if it was measured from none.
+        image: per row, the name of the image from which it was measured; "" if there is no image.
         readings: readings of registered sensors (see `pisigma.measurement.sensors.register_sensor`), by column: one
             number [SI] or one name per row.
         line: per row, the line of the file that it was read from; 0 for rows that were not read from a file.
-        source: the file, or a name of what made the rows.
+        source: the file, or a name for the origin of the rows.
         left_out: rows of the file that could not be used, and why.
-        origin: per row, the file that it was read from, where rows come from several files; else empty.
+        origin: per row, the file that it was read from, if rows come from several files; otherwise empty.
 
     Raises:
         MeasurementError: the fields do not fit together, or a value is impossible; `column` is the field, `line` or the
@@ -97,7 +97,7 @@ class Measurements:
     origin: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        """Fill in missing names and check that everything fits together."""
+        """Fill in missing names, and check that the fields fit together."""
         if self.q.ndim != 2 or self.q.shape[1] == 0:
             raise MeasurementError(
                 option="q",
@@ -156,7 +156,7 @@ class Measurements:
 
     @property
     def file_names(self) -> str:
-        """Names of the files without their folders, joined by " + "; the source of rows from no file."""
+        """Names of the files without folders, joined by " + "; the source for rows that were not read from a file."""
         return " + ".join(Path(name).name for name in dict.fromkeys(self.origin or (self.source,)))
 
     @property
@@ -170,7 +170,7 @@ class Measurements:
         return self.q.shape[1]
 
     def is_measured(self, kind: Kind) -> Bool[Tensor, " rows"]:
-        """Return which rows contain a measurement of a kind; see `pisigma.measurement.fields.Kind`.
+        """Return the mask of the rows that contain a measurement of a kind; see `pisigma.measurement.fields.Kind`.
 
         A row with a position and an orientation is a "pose" only, neither a "position" nor a "rotation".
         """
@@ -178,12 +178,12 @@ class Measurements:
 
     @property
     def kinds(self) -> frozenset[Kind]:
-        """Kinds that were measured in any of the rows; empty if nothing was measured."""
+        """Kinds of measurement in any of the rows; empty if nothing was measured."""
         return frozenset(kind for kind in (*KINDS, *READINGS) if bool(self.is_measured(kind).any()))
 
     @property
     def T(self) -> Float64[Tensor, "rows 4 4"]:
-        """Measured poses in the frames of the rows; NaN in rows without one.
+        """Measured poses in the frames of the rows; NaN in rows without a pose.
 
         Raises:
             MeasurementError: no row has both position and orientation.
@@ -220,7 +220,7 @@ class Measurements:
             return self, None
         if test.all():
             raise MeasurementError(
-                f"all {self.rows} rows are marked as 'test', so none is left to train on",
+                f"all {self.rows} rows are marked as 'test', so no row remains for training",
                 value="test",
                 at=Place(self.source, column="set"),
                 remedy="mark some as 'train' or remove the column",
@@ -228,13 +228,14 @@ class Measurements:
         return self.select(~test), self.select(test)
 
     def select(self, index: Tensor) -> "Measurements":
-        """Return the rows of an index, in the order of the index, or of a mask, with all their fields.
+        """Return the rows that an index, in its order, or a mask selects, with all their fields.
 
         Args:
             index: int64 numbers of rows, or one bool per row.
 
         Raises:
-            MeasurementError: the index is out of range, the mask has another length, or one row of a pair is missing.
+            MeasurementError: the index is out of range, the mask has a different length, or one row of a pair is
+                missing.
         """
         if index.ndim != 1 or index.dtype not in (torch.int64, torch.bool):
             given = f"{index.dtype} of shape {tuple(index.shape)}"
@@ -252,7 +253,7 @@ class Measurements:
         return MeasurementError(option="index", expected=expected, value=value, at=Place(self.source))
 
     def content_hash(self) -> str:
-        """Return the SHA-256 (hexadecimal) of all values; it does not depend on source and lines."""
+        """Return the SHA-256 (hexadecimal) of all values; it does not depend on the source and the line numbers."""
         digest = hashlib.sha256()
         data = self.as_fields()
         order = [item.name for item in fields(self)] + sorted(self.readings)
@@ -269,12 +270,12 @@ class Measurements:
     def read_csv(
         path: str | os.PathLike[str], robot: Robot | None = None, on_bad_row: OnBadRow = "error"
     ) -> "Measurements":
-        """Read a CSV file; the column names state the units. See `pisigma.measurement.csv.reading.read_fields`.
+        """Read a CSV file whose column names state the units; see `pisigma.measurement.csv.reading.read_fields`.
 
         Args:
             path: the file.
-            robot: checks number, units and limits of the joints and converts the controller's values of coupled joints
-                to joint values; None takes the values as they are.
+            robot: robot against which number, units and limits of the joints are checked, and which converts the
+                controller's values of coupled joints to joint values; None for neither.
             on_bad_row: "error", or "leave_out" to continue without such rows and to list them in `left_out`.
 
         Raises:
@@ -294,11 +295,11 @@ class Measurements:
             path: the file; written completely or not at all.
             robot: states which joints are revolute (degrees) and prismatic (millimetres); the controller's values of
                 coupled joints are written.
-            revolute: the same per joint, without a robot; without both, all joints are revolute.
+            revolute: whether every joint is revolute, if no robot is given; without both, all joints are revolute.
 
         Raises:
-            MeasurementError: the measurements would not read back: there is no row, nothing was measured in a row, a
-                CSV cell cannot contain a name, or the number of joints is another one.
+            MeasurementError: the file could not be read back: there is no row, nothing was measured in a row, a CSV
+                cell cannot contain a name, or the number of joints differs from the robot's.
             OutputError: the file cannot be written there.
         """
         origin = "'revolute'" if robot is None else f"robot '{robot.name}'"
@@ -331,7 +332,7 @@ def join(
 
     Args:
         data: one or more data sets with the same number of joints.
-        cleared: returns the rows to keep of all rows, before it is checked that they fit together.
+        cleared: function that returns the rows to keep, called before the check that rows fit together.
 
     Raises:
         MeasurementError: there is no data set, the numbers of joints differ, only some data sets have a split, or rows
@@ -345,14 +346,14 @@ def join(
             option="data",
             expected="data sets with the same number of joints",
             value=f"{dofs[0]} and {dofs[-1]}",
-            remedy="give those of one robot",
+            remedy="give data sets of one robot",
         )
     if len({one.split is None for one in data if one.rows}) > 1:
         raise MeasurementError(
-            "some data sets have a split (column 'set') and some have none",
+            "some data sets have a split (column 'set'), others do not",
             option="data",
             value="split",
-            remedy="give it in all or in none",
+            remedy="give the column in all data sets or in none",
         )
     return Measurements.from_fields(cleared(joined_fields([one.as_fields() for one in data])))
 

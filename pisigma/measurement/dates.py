@@ -6,15 +6,15 @@ import re
 from pisigma.files.errors import MeasurementError, Place
 
 EXPECTED_DATE = "a day from 1970-01-01 to today, such as 2026-11-22"
-"""Expected dates, for messages."""
+"""Description of valid dates, for messages."""
 
 _FIRST = datetime.date(1970, 1, 1)
-"""No joint values were logged before: an earlier year is a typing error."""
+"""Earliest date; joint values were not logged before it, so an earlier year is a typing error."""
 _TIME_ZONES = datetime.timedelta(days=1)
-"""It may already be tomorrow in the time zone of the instrument."""
+"""Number of days that a date may be in the future: it may already be tomorrow in the instrument's time zone."""
 _IN_NAME = re.compile(r"(?<!\d)(\d{4})([-_.]?)(\d{2})[-_.]?(\d{2})(?!\d)")
 _WRITTEN = re.compile(r"(?:19|20)\d\d")
-"""Digits that, followed by a separator, can only be a year."""
+"""Pattern of a date in a file name: digits followed by a separator that can only be a year."""
 
 
 def is_date(text: str, days_ahead: int = 0) -> bool:
@@ -22,7 +22,7 @@ def is_date(text: str, days_ahead: int = 0) -> bool:
 
     Args:
         text: date in the form of ISO 8601.
-        days_ahead: how far in the future it may be [days].
+        days_ahead: number of days that the date may be in the future.
     """
     latest = datetime.date.today() + _TIME_ZONES + datetime.timedelta(days=days_ahead)
     day = _day(text)

@@ -1,4 +1,4 @@
-"""Faults of rows of measurements, and places of rows."""
+"""Faults and places of rows of measurements."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -11,8 +11,8 @@ class RowPlace(Place):
     """The place of a row of measurements.
 
     Attributes:
-        row: number of the row, from 0, if it does not come from a line of a file.
-        image: the image from which it was measured; "" if there is none.
+        row: index of the row, from 0, if it does not come from a line of a file.
+        image: the image from which the row was measured; "" if there is no image.
     """
 
     row: int | None = None
@@ -32,11 +32,12 @@ class Fault:
     """A fault of a row; see `PisigmaError` for the fields.
 
     Attributes:
-        problem: what is wrong, a clause without a full stop; without it the message is ``expected ..., got ...``.
-        column: name of the (first) column at fault, or its number from 1; None for the whole row.
+        problem: a clause without a full stop that states what is wrong; if empty, the message is ``expected ..., got
+            ...``.
+        column: name of the first faulty column, or its number from 1; None for the whole row.
         expected: what was expected.
         value: what was given instead.
-        remedy: what to do, an imperative clause without a full stop.
+        remedy: how to correct the fault, an imperative clause without a full stop.
     """
 
     problem: str = ""
@@ -46,7 +47,7 @@ class Fault:
     remedy: str = ""
 
     def error(self, at: Place) -> MeasurementError:
-        """Return the exception for a row at `at`."""
+        """Return the exception for this fault at the place `at`."""
         return MeasurementError(
             self.problem,
             expected=self.expected,

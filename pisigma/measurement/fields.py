@@ -1,4 +1,4 @@
-"""The fields of a data set, and rows of them."""
+"""Fields of a data set, and rows as fields."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -27,16 +27,16 @@ NUMBERS: dict[str, tuple[int, ...]] = {
     "anchor_place": (3,),
     "approach": (-1,),
 }
-"""Numeric fields and the shape of one row; -1 is the number of joints."""
+"""Shape of one row of every numeric field; -1 stands for the number of joints."""
 TEXTS = ("target", "frame", "split", "socket", "touch_axis", "anchor", "pair", "date", "image")
-"""Text fields."""
+"""Names of the text fields."""
 
 OnBadRow = Literal["error", "leave_out"]
 Kind = str
 """Kind of measurement in a row: "pose", "position", "rotation", "touch", "socket", "distance", or the name of a
 registered sensor. An orientation alone is a "rotation"; with a position it is a "pose"."""
 KINDS = ("pose", "position", "rotation", "touch", "socket", "distance")
-"""The built-in kinds."""
+"""The built-in kinds of measurement."""
 
 
 @dataclass(frozen=True)
@@ -44,9 +44,9 @@ class UnusableRow:
     """A row of a file that could not be used.
 
     Attributes:
-        line: its line in the file.
+        line: line number of the row in the file.
         reason: what is wrong, in which column, and what to do.
-        fault: the same by field, where one value of the row is at fault.
+        fault: the reason as a `Fault`, if one value of the row is faulty.
     """
 
     line: int
@@ -55,11 +55,11 @@ class UnusableRow:
 
     @staticmethod
     def from_fault(line: int, fault: Fault) -> "UnusableRow":
-        """Return the row with the reason that a fault states."""
+        """Return the row whose reason is the text of a fault."""
         return UnusableRow(line, str(fault), fault)
 
     def error(self, file: str) -> MeasurementError:
-        """Return the exception for this row of a file."""
+        """Return the exception for this row of the given file."""
         return (self.fault or Fault(self.reason)).error(Place(file, self.line))
 
 
@@ -70,13 +70,13 @@ class MeasuredFields:
     Files are read and written, and rows are checked, selected and joined, in this form.
 
     Attributes:
-        numbers: "q" and those of `NUMBERS` and of the registered sensors' columns that were measured, one entry per
-            row.
-        texts: those of `TEXTS` and of the registered sensors' columns that are given, one entry per row.
+        numbers: numeric fields, one entry per row: "q", and those of `NUMBERS` and of registered sensors that were
+            measured.
+        texts: text fields, one entry per row: those of `TEXTS` and of registered sensors that are given.
         line: per row, the line of the file that it was read from; 0 for rows that were not read from a file.
-        source: the file, or a name of what made the rows.
+        source: the file, or a name for the origin of the rows.
         left_out: rows of the file that could not be used, and why.
-        origin: per row, the file that it was read from, where rows come from several files; else empty.
+        origin: per row, the file that it was read from, if rows come from several files; otherwise empty.
     """
 
     numbers: Mapping[str, Tensor]
@@ -96,7 +96,7 @@ class MeasuredFields:
         return self.texts.get(name) or ("",) * self.rows
 
     def array(self, name: str, *shape: int) -> Float64[np.ndarray, "rows *shape"]:
-        """Return a numeric field; NaN in every row if the data set does not have it. `shape` is that of one row."""
+        """Return a numeric field with rows of the given shape; NaN in every row if the data set does not have it."""
         values = self.numbers.get(name)
         if values is None:
             return np.full((self.rows, *shape), np.nan)
@@ -114,7 +114,7 @@ class MeasuredFields:
         return str(self.place_of(row))
 
     def is_measured(self, kind: Kind) -> Bool[Tensor, " rows"]:
-        """Return which rows contain a measurement of a kind.
+        """Return the mask of the rows that contain a measurement of a kind.
 
         A row with a position and an orientation is a "pose" only, neither a "position" nor a "rotation".
         """
@@ -151,7 +151,7 @@ class MeasuredFields:
         return {}
 
     def select(self, rows: Tensor) -> "MeasuredFields":
-        """Return the rows of an int64 index, in the order of the index."""
+        """Return the rows that an int64 index selects, in the order of the index."""
         chosen = rows.tolist()
         return replace(
             self,
@@ -163,7 +163,7 @@ class MeasuredFields:
 
 
 def joined_fields(data: Sequence[MeasuredFields]) -> MeasuredFields:
-    """Concatenate data sets; fields that one of them does not have are NaN or "" in its rows.
+    """Concatenate data sets; fields that a data set does not have are NaN or "" in its rows.
 
     Args:
         data: one or more data sets with the same number of joints.

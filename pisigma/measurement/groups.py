@@ -1,4 +1,4 @@
-"""Rows that belong together: equal joint values, the two rows of a pair, and those of one placement."""
+"""Groups of rows that belong together: equal joint values, the two rows of a pair, and one placement."""
 
 from collections.abc import Hashable, Sequence
 
@@ -10,17 +10,18 @@ from pisigma.files.errors import MeasurementError, Place
 from pisigma.measurement.dataset import Measurements
 
 MIN_GROUPS = 3
-"""Number of placements, sockets or anchors below which they are not held out whole: too few rows would remain."""
+"""Smallest number of placements, sockets or anchors that are held out as a whole; with fewer, too few rows would
+remain."""
 
 
 def groups_of_equal_joints(q: Float64[Tensor, "rows dof"]) -> Int64[Tensor, " rows"]:
-    """Number the different joint vectors in the order of their first row.
+    """Return the index of every row's joint values among the distinct ones, numbered by their first row.
 
     Args:
-        q: joint values [rad or m]; rows belong together if they are exactly equal.
+        q: joint values [rad or m]; rows belong together if their joint values are exactly equal.
 
     Returns:
-        For every row, the number of its group, from 0.
+        For every row, the index of its group, from 0.
     """
     if q.shape[0] == 0:
         return torch.zeros(0, dtype=torch.int64, device=q.device)
@@ -28,17 +29,17 @@ def groups_of_equal_joints(q: Float64[Tensor, "rows dof"]) -> Int64[Tensor, " ro
 
 
 def numbers_of_names(names: Sequence[Hashable]) -> Int64[Tensor, " rows"]:
-    """Number the different names in the order of their first row.
+    """Return the index of every row's name among the distinct names, numbered by their first row.
 
     Returns:
-        For every row, the number of its name, from 0.
+        For every row, the index of its name, from 0.
     """
     index = {name: number for number, name in enumerate(dict.fromkeys(names))}
     return torch.tensor([index[name] for name in names], dtype=torch.int64)
 
 
 def groups_to_keep_whole(measurements: Measurements) -> Int64[Tensor, " rows"]:
-    """Number the groups of rows that a split must keep together, in the order of their first row.
+    """Return the index of the group that a split must keep together, for every row.
 
     Rows of equal joint values belong together, and so do the two rows of a pair with all rows that belong to either of
     them.
@@ -47,21 +48,21 @@ def groups_to_keep_whole(measurements: Measurements) -> Int64[Tensor, " rows"]:
         measurements: the rows.
 
     Returns:
-        For every row, the number of its group, from 0.
+        For every row, the index of its group, from 0.
     """
     group = groups_of_equal_joints(measurements.q)
     return group if measurements.pair is None else _joined(group, measurements.pair)
 
 
 def held_out_groups(measurements: Measurements) -> Int64[Tensor, " rows"]:
-    """Number the groups of rows that are held out together for model selection.
+    """Return the index of the group that is held out together for model selection, for every row.
 
-    Rows of one socket or anchor share its unknown position, so they predict each other better than other rows, and so
-    do the sockets of one placement. Groups are therefore whole placements if there are `MIN_GROUPS` of them, else
-    whole sockets and anchors, else those of `groups_to_keep_whole`.
+    Rows of one socket or anchor share its unknown position, so they predict each other better than other rows; the
+    same holds for the sockets of one placement. Groups are therefore whole placements if there are `MIN_GROUPS` of
+    them, otherwise whole sockets and anchors, otherwise the groups of `groups_to_keep_whole`.
 
     Returns:
-        For every row, the number of its group, from 0.
+        For every row, the index of its group, from 0.
     """
     whole = groups_to_keep_whole(measurements)
     owners = [
@@ -88,7 +89,7 @@ def placements(measurements: Measurements) -> tuple[str, ...]:
     Without sockets, every frame is a placement.
 
     Returns:
-        A name per row; "" in rows without a socket if others have one.
+        A name per row; "" in rows without a socket if other rows have a socket.
 
     Raises:
         MeasurementError: there are fewer than two placements.
@@ -108,7 +109,7 @@ def placements(measurements: Measurements) -> tuple[str, ...]:
 
 
 def placement_groups(measurements: Measurements) -> Int64[Tensor, " rows"]:
-    """Number the placements in the order of their first row; -1 in rows that belong to none.
+    """Return the index of every row's placement, numbered by their first row; -1 in rows without a placement.
 
     Placements that share joint values or a pair of rows are one group.
 
@@ -144,7 +145,7 @@ def _joined(group: Int64[Tensor, " rows"], names: Sequence[str]) -> Int64[Tensor
 
 
 def _numbered(label: Int64[Tensor, " rows"]) -> Int64[Tensor, " rows"]:
-    """Replace equal labels by numbers from 0, in the order in which they appear."""
+    """Return labels replaced by indices from 0, in the order in which they first appear."""
     values, group = torch.unique(label, return_inverse=True)
     rows = torch.arange(len(label), device=label.device)
     first = torch.full((len(values),), len(label), device=label.device).scatter_reduce(0, group, rows, "amin")

@@ -18,11 +18,11 @@ from pisigma.measurement.fields import MeasuredFields, UnusableRow
 from pisigma.robot import Robot
 
 _DIGITS = 9
-"""Number of decimals [SI] to which values of equal rows agree: programs that save a file again round them."""
+"""Number of decimals [SI] to which equal rows agree; programs that save a file again round values."""
 
 
 Reader = Callable[[Table, bool], MeasuredFields]
-"""Converts rows of a table to measurements; the second argument is true once the file is complete."""
+"""Function that converts rows of a table to measurements; the second argument is true once the file is complete."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,10 +30,10 @@ class FileGrowth:
     """Changes of a file since it was last read.
 
     Attributes:
-        rows: new rows in the file's order; None if there are none.
+        rows: new rows in the order of the file; None if there are none.
         left_out: new rows that cannot be used, and why.
-        notices: sentences on a file that was truncated or replaced.
-        waiting: what is missing: the file, its header, or the end of its last line; "" if nothing is.
+        notices: sentences about a file that was truncated or replaced.
+        waiting: what is missing: the file, its header, or the end of its last line; "" if nothing is missing.
     """
 
     rows: Measurements | None = None
@@ -48,10 +48,10 @@ class FileGrowth:
 
 
 class GrowingFile:
-    """Reads the rows that are appended to a measurement file, each once; see `Measurements.read_csv` for its columns.
+    """Reader of rows that are appended to a measurement file; see `Measurements.read_csv` for the columns.
 
-    A line is read once its end is written. If the file is truncated or replaced, rows that were read still count, and
-    rows of the new file that equal one of them are not read again.
+    Every row is read once, after the end of its line was written. If the file is truncated or replaced, rows that
+    were read remain valid, and equal rows of the new file are not read again.
     """
 
     def __init__(self, path: str | os.PathLike[str], robot: Robot, reader: Reader | None = None):
@@ -60,7 +60,8 @@ class GrowingFile:
         Args:
             path: the file, which need not exist yet.
             robot: the measured robot.
-            reader: reads rows that are meaningful only together (corners of an image); None for measurement files.
+            reader: function that converts rows that are meaningful only together (corners of an image); None for
+                measurement files.
         """
         self.path = Path(path)
         self._robot = robot
@@ -73,13 +74,14 @@ class GrowingFile:
         self._refused: set[UnusableRow] = set()
 
     def read(self, final: bool = False) -> FileGrowth:
-        """Read the new rows.
+        """Return the rows that were added to the file since the last call.
 
         Args:
-            final: whether the file is complete, so that the last line counts without its end.
+            final: whether the file is complete, so that the last line is read without a line end.
 
         Raises:
-            MeasurementError: the file cannot be read or its header cannot be used; or `final` and there is no file.
+            MeasurementError: the file cannot be read, its header cannot be used, or the file is missing at the end
+                (`final`).
         """
         try:
             state = os.stat(self.path)
@@ -122,8 +124,8 @@ class GrowingFile:
         )
 
     def _new_rows(self, data: MeasuredFields) -> list[int]:
-        """Return the numbers of the rows that were not read before, and record them as read."""
-        # equal rows are new as often as the file has more of them than were read
+        """Return the indices of the rows that were not read before, and record them as read."""
+        # of equal rows, those are new by which the file has more than were read
         in_file: Counter[str] = Counter()
         new = []
         for row in range(data.rows):

@@ -1,4 +1,4 @@
-"""Jigs: stepped blocks with faces at known coordinates of the jig's frame, which a tip touches."""
+"""Jigs: stepped blocks whose faces, at known coordinates in the jig's frame, are touched with a tip."""
 
 import os
 from dataclasses import dataclass
@@ -18,14 +18,14 @@ Side = Literal["-x", "+x", "-y", "+y", "-z", "+z"]
 Millimetres = tuple[float, float, float]
 
 _SKIN = 1e-7
-"""[m] Distance from a block above which a point is outside of it."""
+"""Distance from a block [m] above which a point is outside the block."""
 
 
 class BlockSection(Section):
-    """A block with edges along the axes of the jig's frame.
+    """Section of a jig file with a block whose edges are along the axes of the jig's frame.
 
     Attributes:
-        name: name, unique in the jig.
+        name: name of the block, unique in the jig.
         corner_mm: corner with the smallest coordinates [mm].
         size_mm: extent along x, y and z [mm].
         faces: faces that may be touched, by their outward direction.
@@ -47,12 +47,12 @@ class BlockSection(Section):
 
 
 class JigDocument(Section):
-    """The jig file.
+    """Contents of a jig file.
 
     Attributes:
         name: name of the jig.
-        source: source of its dimensions.
-        blocks: its blocks, which may touch but not overlap.
+        source: source of the dimensions.
+        blocks: blocks of the jig, which may touch but not overlap.
     """
 
     name: str = Field(min_length=1)
@@ -98,13 +98,13 @@ class Jig:
 
     Attributes:
         name: name of the jig.
-        source: source of its dimensions.
+        source: source of the dimensions.
         block_names: names of the blocks.
         lower: corner of every block with the smallest coordinates [m].
-        upper: the opposite corner [m].
+        upper: corner of every block with the largest coordinates [m].
         block: index of every face's block.
         axis: index of every face's normal axis.
-        sign: +1 or -1, outward direction along that axis.
+        sign: outward direction of every face along its axis, +1 or -1.
     """
 
     name: str
@@ -118,11 +118,11 @@ class Jig:
 
     @staticmethod
     def load(jig: str | os.PathLike[str] = "stepped") -> "Jig":
-        """Load a jig of pisigma's catalogue by its name, or one from a YAML file.
+        """Load a jig by its name in pisigma's catalogue, or from a YAML file.
 
         Raises:
-            MeasurementError: there is neither such a jig nor a file, or the file is not a valid jig; `file`, `line`
-                and `column` state which.
+            MeasurementError: there is neither such a jig nor such a file, or the file is not a valid jig; `file`,
+                `line` and `column` state which.
         """
         name = os.fspath(jig)
         if name in catalogue():
@@ -176,7 +176,7 @@ class Jig:
     def is_on_face(
         self, face: Int64[Tensor, "*batch"], point: Float64[Tensor, "*batch 3"], margin: float = 0.0
     ) -> Bool[Tensor, "*batch"]:
-        """Return whether points are on a face, away from its edges, and not covered by another block.
+        """Return whether points are on a face, away from its edges and not covered by another block.
 
         Args:
             face: index of the face.
@@ -199,7 +199,7 @@ class Jig:
     ) -> Bool[Tensor, "*batch"]:
         """Return whether the straight line from `start` to `end` [m] intersects a block.
 
-        Source: the slabs of Kay and Kajiya 1986, "Ray tracing complex scenes".
+        Source: the slab method of Kay and Kajiya 1986, "Ray tracing complex scenes".
         """
         step = (end - start)[..., None, :]
         parallel = step.abs() < 1e-15

@@ -1,4 +1,4 @@
-"""Warn of joint values beyond the nominal joint limits, and widen the limits to them."""
+"""Warn of joint values beyond the nominal joint limits, and widen the limits to include them."""
 
 from dataclasses import dataclass, replace
 
@@ -13,17 +13,17 @@ from pisigma.robot.kinematics.joint_limits import beyond_limits, far_beyond_limi
 from pisigma.robot.row import Row
 
 _MAX_NAMED = 5
-"""Number of rows that a warning names."""
+"""Largest number of rows that a warning lists."""
 
 
 @dataclass(frozen=True, eq=False)
 class JointRange:
-    """The values of one axis that are beyond its limits.
+    """Values of one axis, some of which are beyond its limits.
 
     Attributes:
         axis: the nominal axis.
-        q: the values of all rows [rad or m].
-        rows: numbers of the rows beyond the limits.
+        q: values of the axis in all rows [rad or m].
+        rows: indices of the rows beyond the limits.
     """
 
     axis: Row
@@ -32,7 +32,7 @@ class JointRange:
 
     @property
     def widened_axis(self) -> Row:
-        """The axis with limits that include the rows."""
+        """The axis with limits that are widened to include all rows."""
         outside = self.q[list(self.rows)]
         lower, upper = min(self.axis.lower, outside.min()), max(self.axis.upper, outside.max())
         return replace(self.axis, lower=float(lower), upper=float(upper))
@@ -60,7 +60,7 @@ class JointRange:
 
 
 def joint_ranges(robot: Robot, rows: Measurements) -> tuple[JointRange, ...]:
-    """Return the axes of a robot whose limits are exceeded by rows."""
+    """Return the ranges of the axes of a robot whose limits rows exceed."""
     values = robot.to_controller(rows.q.detach().cpu().double().numpy())
     found = []
     for axis, q in zip(robot.axes, np.moveaxis(values, -1, 0), strict=True):
@@ -70,17 +70,17 @@ def joint_ranges(robot: Robot, rows: Measurements) -> tuple[JointRange, ...]:
 
 
 def limit_warnings(robot: Robot, rows: Measurements) -> tuple[str, ...]:
-    """Return a warning for every joint whose limits are exceeded by rows."""
+    """Return a warning for every joint whose limits rows exceed."""
     return tuple(one.sentence(rows, robot) for one in joint_ranges(robot, rows))
 
 
 def row_warnings(robot: Robot, rows: Measurements) -> tuple[str, ...]:
-    """Return a warning of duplicate rows, and one for every joint whose limits are exceeded by rows."""
+    """Return warnings about duplicate rows, and about every joint whose limits rows exceed."""
     return (*copy_warnings(rows.left_out), *limit_warnings(robot, rows))
 
 
 def with_limits_of_rows(robot: Robot, rows: Measurements) -> Robot:
-    """Return the robot with joint limits that include all rows; the robot itself if its limits do."""
+    """Return the robot with joint limits widened to include all rows, or the robot itself if no row exceeds them."""
     wider = {one.axis.name: one.widened_axis for one in joint_ranges(robot, rows)}
     if not wider:
         return robot

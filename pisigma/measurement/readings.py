@@ -1,4 +1,4 @@
-"""Columns that sensors add to measurement files: a registry that `pisigma.measurement.sensors` fills."""
+"""Registry of the columns that sensors add to measurement files; `pisigma.measurement.sensors` fills it."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -10,10 +10,10 @@ from jaxtyping import Bool, Float64
 from pisigma.measurement.faults import Fault
 
 RowFault = tuple[Bool[np.ndarray, " rows"], Callable[[int], str | Fault]]
-"""Mask of the rows at fault, and a function that returns what is wrong with one of them."""
+"""Mask of the faulty rows, and a function that returns the fault of a row."""
 
 Readings = Mapping[str, Float64[np.ndarray, " rows"] | Sequence[str]]
-"""The cells of a sensor by column, in SI units; NaN and "" for empty cells."""
+"""Values of a sensor by column, in SI units; NaN and "" for empty cells."""
 
 Unit = Literal["deg", "rad", "mm", "m", "kg", "c", ""]
 _PER_SI = {"deg": 180 / np.pi, "mm": 1e3}
@@ -34,11 +34,11 @@ class ReadingColumn:
     """A column that a sensor adds to measurement files.
 
     Attributes:
-        name: its quantity, such as "tilt_roll"; unique among all columns.
-        units: its valid units, each of which is a separate column, such as "tilt_roll_deg"; "" is a number without a
-            unit, whose column has the name of the quantity.
-        is_text: whether its cells are names instead of numbers; then `units` is ("",).
-        is_optional: whether a file may have the sensor's other columns without it.
+        name: quantity of the column, such as "tilt_roll"; unique among all columns.
+        units: valid units, each of which gives a separate column, such as "tilt_roll_deg"; "" stands for a number
+            without unit, whose column has the name of the quantity.
+        is_text: whether the cells are names instead of numbers; `units` is then ("",).
+        is_optional: whether a file may omit the column although it has the sensor's other columns.
     """
 
     name: str
@@ -48,21 +48,21 @@ class ReadingColumn:
 
 
 def no_faults(readings: Readings) -> Iterator[RowFault]:
-    """Find no faults."""
+    """Yield no faults, for sensors without special rules."""
     yield from ()
 
 
 @dataclass(frozen=True)
 class SensorReadings:
-    """The readings of a sensor in measurement files.
+    """Columns and rules for the readings of a sensor in measurement files.
 
-    A row contains a reading of the sensor if it contains all of its numbers; rows with some of them are refused.
+    A row contains a reading of the sensor if it contains all numbers of the sensor; rows with only some are refused.
 
     Attributes:
         sensor: name of the sensor.
         columns: one or more columns, at least one of them with numbers.
-        is_length: whether it measures a length; rows contain at most one measured length.
-        row_faults: finds rows with impossible readings.
+        is_length: whether the sensor measures a length; a row contains at most one measured length.
+        row_faults: function that finds rows with impossible readings.
     """
 
     sensor: str

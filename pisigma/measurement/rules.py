@@ -1,4 +1,4 @@
-"""The rules for rows of measurements, alone and together, in files and in memory."""
+"""Rules that rows of measurements must meet, individually and together, in files and in memory."""
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -19,13 +19,13 @@ AXES = ("x", "y", "z")
 """Names of the axes of a frame, for touches."""
 SPLITS = ("train", "test")
 MIN_SIGMA = 1e-12
-"""[m or rad] No sensor is more accurate."""
+"""Smallest standard deviation of a sensor [m or rad]; no sensor is more accurate."""
 PAYLOADS = (0.0, 2500.0)
-"""[kg] The strongest arms that are sold lift 2,300 kg."""
+"""Range of payloads [kg]; the strongest arms on the market lift 2,300 kg."""
 TEMPERATURES = (-50.0, 150.0)
-"""[deg C] No robot works outside this range; it excludes room temperatures in kelvins (293)."""
+"""Range of temperatures [deg C] in which robots work; it excludes room temperatures in kelvins (293)."""
 
-_MAY_BE_PARTIAL = ("anchor_place", "approach")  # rows may have some of the values only
+_MAY_BE_PARTIAL = ("anchor_place", "approach")  # rows may have only some of the values
 _ROTATION_TOLERANCE = 1e-6
 
 
@@ -34,15 +34,15 @@ class FieldLabels:
     """Names of fields and units of values in messages.
 
     Attributes:
-        names: by field or sensor, the column that messages name; the field's name for the others.
-        units: by field, the unit in which messages show values; SI for the others.
+        names: column that messages name, by field or sensor; the field's name if a field is missing here.
+        units: unit in which messages show values, by field; SI units if a field is missing here.
     """
 
     names: Mapping[str, str] = field(default_factory=dict)
     units: Mapping[str, Unit] = field(default_factory=dict)
 
     def __call__(self, name: str) -> str:
-        """Return the name of a field or a sensor."""
+        """Return the name of a field or a sensor in messages."""
         return self.names.get(name, name)
 
     def format_value(self, name: str, value: float) -> float:
@@ -141,7 +141,7 @@ def _check_rotations(data: MeasuredFields) -> None:
 
 
 def _refuse(data: MeasuredFields, bad: Bool[Tensor, " rows"], name: str, expected: str, remedy: str) -> None:
-    """Raise for the first bad row, if there is one."""
+    """Raise an error for the first faulty row, if any."""
     if bad.any():
         row = int(bad.nonzero()[0])
         value = data.numbers[name][row].tolist()
@@ -149,14 +149,14 @@ def _refuse(data: MeasuredFields, bad: Bool[Tensor, " rows"], name: str, expecte
 
 
 RowAndFault = tuple[int, Fault]
-"""The number of a row, and what is wrong with it."""
+"""Index of a row, and its fault."""
 
 
 def row_faults(data: MeasuredFields, labels: FieldLabels) -> Iterator[RowAndFault]:
-    """Find rows with impossible values and rows that contradict themselves.
+    """Yield the faults of rows with impossible or contradictory values.
 
     A row contains one measured length: a position, the coordinate of a touch, a socket, or a distance. A second
-    sensor's reading at the same joint values is a second row. A row may be found several times.
+    sensor's reading at the same joint values is a second row. A row may appear several times.
     """
     yield from _value_faults(data, labels)
     yield from _reading_faults(data, labels)
@@ -179,13 +179,13 @@ def row_faults(data: MeasuredFields, labels: FieldLabels) -> Iterator[RowAndFaul
                 column=names[0],
                 expected="one measured length per row",
                 value=" and ".join(names),
-                remedy="put each in a row of its own, with equal joint values",
+                remedy="put each length in a separate row with equal joint values",
             ),
         )
 
 
 def rows_where(bad: Bool[np.ndarray, " rows"]) -> list[int]:
-    """Return the numbers of the rows where a mask is true."""
+    """Return the indices of the rows in which a mask is true."""
     rows: list[int] = np.flatnonzero(bad).tolist()
     return rows
 
@@ -247,7 +247,7 @@ def _reading_faults(data: MeasuredFields, labels: FieldLabels) -> Iterator[RowAn
 
 
 def _with_column(what: str | Fault, column: str) -> Fault:
-    """Return the fault that a sensor reports for a row, in a default column if it names none."""
+    """Return the fault that a sensor reports for a row, with a default column if the sensor does not name one."""
     fault = Fault(what) if isinstance(what, str) else what
     return fault if fault.column is not None else replace(fault, column=column)
 
@@ -270,7 +270,7 @@ def _touch_faults(
         problem = f"the touch along {axes[row]} has no coordinate"
         yield row, Fault(problem, labels("touch"), remedy="give it, or remove the axis too")
     for row in rows_where(touch & ~_named(data.text("frame"))):
-        remedy = "write which placement of the jig was touched, such as left"
+        remedy = "write the name of the placement of the jig that was touched, such as left"
         yield row, Fault("", labels("frame"), "the frame of the touch", "", remedy)
 
 
@@ -321,13 +321,13 @@ def _distance_faults(
 def group_faults(
     data: MeasuredFields, labels: FieldLabels, sound: Bool[np.ndarray, " rows"], place: Callable[[int], str]
 ) -> Iterator[RowAndFault]:
-    """Find rows that contradict other rows of the same pair, anchor or socket.
+    """Yield the faults of rows that contradict other rows of the same pair, anchor or socket.
 
     Args:
         data: the rows.
         labels: names of fields in messages.
-        sound: which rows have no fault of their own.
-        place: returns the place of a row for messages.
+        sound: mask of the rows that have no fault by themselves.
+        place: function that returns the place of a row for messages.
     """
     frame, anchor_place = data.text("frame"), data.array("anchor_place", 3)
     for name, rows in _groups(data.text("pair")).items():
@@ -353,7 +353,7 @@ def group_faults(
 
 
 def _groups(names: Sequence[str]) -> dict[str, list[int]]:
-    """Return the rows of every name, in their order."""
+    """Return the indices of the rows of every name, in order."""
     rows: dict[str, list[int]] = {}
     for row, name in enumerate(names) if any(names) else ():
         if name:
@@ -369,7 +369,7 @@ def _pair_fault(
     sound: Bool[np.ndarray, " rows"],
     place: Callable[[int], str],
 ) -> Fault | None:
-    """Return what is wrong with a pair, None if nothing is."""
+    """Return the fault of a pair of rows; None if it has no fault."""
     column = labels("pair")
     if len(rows) != 2:
         remedy = "give the two poses between which the distance was measured"
@@ -385,7 +385,7 @@ def _pair_fault(
     if frame[first] != frame[second]:
         frames = f"'{frame[first]}' and '{frame[second]}'"
         problem = f"expected one frame of pair '{name}', got {frames}"
-        return Fault(problem, column, value=frames, remedy="measure it in one frame")
+        return Fault(problem, column, value=frames, remedy="measure both rows in one frame")
     for quantity in ("distance", "sigma_position"):
         a, b = data.array(quantity)[rows].tolist()
         if a != b and not (np.isnan(a) and np.isnan(b)):

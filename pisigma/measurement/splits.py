@@ -1,4 +1,4 @@
-"""Split measurements into training and held-out rows; rows of equal joint values, or of a pair, stay together."""
+"""Split measurements into training and held-out rows; rows of equal joint values or of a pair are kept together."""
 
 import heapq
 from collections.abc import Sequence
@@ -15,18 +15,18 @@ from pisigma.measurement.groups import groups_of_equal_joints as groups_of_equal
 from pisigma.measurement.groups import groups_to_keep_whole, placement_groups
 
 SplitBy = Literal["joints", "interleaved", "time", "space", "placement"]
-"""Assignment to folds. By joints: at random; interleaved: alternating, in the file's order; by time: contiguous blocks
-of that order; by space: blocks of the measured positions; by placement: all sockets of a placement, or all rows of a
-frame, together."""
+"""Assignment to folds. By joints: at random; interleaved: alternating, in the file's order; by time: contiguous
+blocks in the file's order; by space: blocks of the measured positions; by placement: all sockets of a placement, or
+all rows of a frame, together."""
 
 RANDOM_SPLITS: tuple[SplitBy, ...] = ("joints", "placement")
-"""Splits that assign groups to folds at random, so that repeats differ."""
+"""Kinds of splits that assign groups to folds at random, so that repeats differ."""
 HELD_OUT_GROUPS, MAX_REPEATS = 200, 10
 """Number of held-out groups, summed over repeats, at which the random assignment has little influence; and the largest
 number of repeats."""
 
 FOLDS = 5
-"""Number of folds of a cross-validation that is not by placement."""
+"""Default number of folds of a cross-validation that is not by placement."""
 
 TrainTest = tuple[Int64[Tensor, " _train"], Int64[Tensor, " _test"]]
 """Training rows and held-out rows, both in the order of the measurements."""
@@ -39,7 +39,7 @@ class Splitting:
     Attributes:
         by: how rows are assigned, see `SplitBy`.
         seed: random seed.
-        folds: number of folds of a cross-validation; 0 for none, None for `FOLDS` or one per placement.
+        folds: number of folds of a cross-validation; 0 for no cross-validation, None for `FOLDS` or one per placement.
         hold_out: share of the rows that is held out once, instead of folds.
     """
 
@@ -56,7 +56,7 @@ class Splitting:
         Args:
             measurements: the rows.
             times: see `repeats`.
-            train_rows: number of training rows that are sampled in every fold; None for all.
+            train_rows: number of training rows that are sampled in every fold; None for all rows.
 
         Raises:
             MeasurementError: the measurements cannot be split in this way.
@@ -92,16 +92,16 @@ def k_folds(
         folds: number of folds, 2 or more; None for as many as there are groups to keep whole.
         seed: random seed by joints and by placement; unused otherwise.
         by: "joints": groups of equal joint values, shuffled and assigned such that folds are as equal as the groups
-            allow; "interleaved": the same unshuffled, so groups of one size alternate between the folds, as in
-            scikit-learn's GroupKFold; "time": contiguous blocks in the order of the groups' first rows; "space":
-            blocks from cutting the measured positions recursively across their widest axis; "placement": assigned
-            like joints, but whole placements (see `placements`); rows of none are never held out.
+            allow; "interleaved": the same without shuffling, so that groups of equal size alternate between the
+            folds, as in scikit-learn's GroupKFold; "time": contiguous blocks in the order of the groups' first rows;
+            "space": blocks from cutting the measured positions recursively across their widest axis; "placement":
+            assigned like joints, but whole placements (see `placements`); rows without a placement are never held out.
 
     Returns:
         The training rows and the held-out rows of every fold.
 
     Raises:
-        MeasurementError: there are fewer groups than folds, or positions or names that are needed are missing.
+        MeasurementError: there are fewer groups than folds, or required positions or names are missing.
     """
     group, sizes = _groups(measurements, by)
     _check_several(measurements, sizes, by)
@@ -130,22 +130,22 @@ def repeated_k_folds(
 ) -> tuple[tuple[TrainTest, ...], ...]:
     """Split the measurements into folds several times, differently each time.
 
-    With few groups, the error of held-out rows depends on which of them share a fold; several repeats average this out
+    With few groups, the error of held-out rows depends on which groups share a fold; several repeats average this out
     (Burman 1989, Biometrika 76(3), 503-514).
 
     Args:
         measurements: the rows to split.
         folds: number of folds, 2 or more; None for as many as there are groups.
-        seed: random seed of the first repeat; the others follow from it.
+        seed: random seed of the first repeat; the seeds of the other repeats follow from it.
         by: see `k_folds`.
-        times: number of repeats; None for as many as hold out `HELD_OUT_GROUPS` groups, at most `MAX_REPEATS`, and one
-            if groups are held out one by one or not assigned at random by joints.
+        times: number of repeats; None for the number that holds out `HELD_OUT_GROUPS` groups, at most `MAX_REPEATS`,
+            and for one repeat if groups are held out one by one or are not assigned at random by joints.
 
     Returns:
         The folds of every repeat, see `k_folds`; the first repeat is that of `k_folds` with the same seed.
 
     Raises:
-        MeasurementError: several repeats would be equal; see `k_folds` for others.
+        MeasurementError: several repeats would be equal, or a split is impossible, see `k_folds`.
     """
     generator = torch.Generator().manual_seed(seed)
     first = k_folds(measurements, folds, generator, by)
@@ -180,8 +180,8 @@ def holdout(
             at random.
 
     Raises:
-        MeasurementError: the share is not between 0 and 1, there is only one group, or positions or names that are
-            needed are missing.
+        MeasurementError: the share is not between 0 and 1, there is only one group, or required positions or names
+            are missing.
     """
     if not 0 < share < 1:
         raise MeasurementError(
@@ -207,7 +207,7 @@ def holdout(
 
 
 def draw_rows(measurements: Measurements, rows: int, seed: int) -> Int64[Tensor, " _sampled"]:
-    """Draw rows at random; those of equal joint values, or of a pair, are sampled together.
+    """Draw rows at random; rows of equal joint values or of a pair are drawn together.
 
     With the same seed, a smaller draw is a subset of every larger one.
 
@@ -217,10 +217,10 @@ def draw_rows(measurements: Measurements, rows: int, seed: int) -> Int64[Tensor,
         seed: random seed.
 
     Returns:
-        Numbers of the rows in the order of the measurements.
+        Indices of the rows, in the order of the measurements.
 
     Raises:
-        MeasurementError: `rows` is less than 1 or more than there are.
+        MeasurementError: `rows` is less than 1 or more than the number of measurements.
     """
     if not 1 <= rows <= measurements.rows:
         raise MeasurementError(
@@ -239,7 +239,7 @@ def draw_rows(measurements: Measurements, rows: int, seed: int) -> Int64[Tensor,
 def with_fewer_training_rows(
     measurements: Measurements, splits: Sequence[TrainTest], rows: int, seed: int
 ) -> tuple[TrainTest, ...]:
-    """Draw training rows in every fold of a cross-validation, and keep its held-out rows. See `draw_rows`.
+    """Draw training rows in every fold of a cross-validation by `draw_rows`; held-out rows are unchanged.
 
     Raises:
         MeasurementError: a fold has fewer training rows.
@@ -250,7 +250,7 @@ def with_fewer_training_rows(
 def _groups(
     measurements: Measurements, by: SplitBy
 ) -> tuple[Int64[Tensor, " rows"], Int64[Tensor, " groups"]]:
-    """Return the number of every row's group, -1 for rows that are never held out, and the groups' sizes."""
+    """Return the index of every row's group (-1 for rows that are never held out), and the sizes of the groups."""
     check_choice(MeasurementError, "by", by, get_args(SplitBy))
     group = (placement_groups if by == "placement" else groups_to_keep_whole)(measurements).cpu()
     return group, torch.bincount(group[group >= 0])
@@ -289,7 +289,7 @@ def _assign(
     order: Int64[Tensor, " groups"],
     folds: int,
 ) -> None:
-    """Assign the groups, large ones first, each to the fold with the fewest rows."""
+    """Assign groups in the order of decreasing size, each to the fold with the fewest rows."""
     order = order[sizes[order].argsort(descending=True, stable=True)]
     heap = [(0, number) for number in range(folds)]
     for group, size in zip(order.tolist(), sizes[order].tolist(), strict=True):
@@ -332,7 +332,7 @@ def _cut_into_folds(
 
 
 def _cut(sizes: Int64[Tensor, " _members"], share: float, least_before: int, least_after: int) -> int:
-    """Return the number of groups before the cut, such that their share of the rows is as close as possible."""
+    """Return the number of groups before a cut for which their share of the rows is closest to `share`."""
     rows_before = sizes.cumsum(0)
     deviation = (rows_before - share * rows_before[-1]).abs()
     allowed = deviation[least_before - 1 : len(sizes) - least_after]
@@ -342,7 +342,7 @@ def _cut(sizes: Int64[Tensor, " _members"], share: float, least_before: int, lea
 def _along_widest_axis(
     positions: Float64[Tensor, "groups 3"], members: Int64[Tensor, " members"]
 ) -> Int64[Tensor, " members"]:
-    """Return the members in order of the coordinate with the largest range."""
+    """Return the members sorted by the coordinate with the largest range."""
     points = positions[members]
     axis = int((points.amax(0) - points.amin(0)).argmax())
     return members[points[:, axis].argsort(stable=True)]

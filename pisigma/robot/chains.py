@@ -11,7 +11,7 @@ from pisigma.robot.urdf_rows import NEARLY_PARALLEL, rows_of_chain
 
 
 def joint_origins(robot: Robot) -> tuple[list[Frame], Frame]:
-    """Return the frames of the joints at zero, each in that of the joint before, and the transform after the last one.
+    """Return the joint frames at zero, each in the preceding joint's frame, and the transform after the last joint.
 
     The frame of a joint is that of its row after `RotZ(theta) · Trans(0, 0, d)`. The joint moves about or along its z
     axis, in the opposite sense if its direction is -1. Base and tool are not included.
@@ -29,7 +29,7 @@ def joint_origins(robot: Robot) -> tuple[list[Frame], Frame]:
 def robot_of_origins(
     like: Robot, origins: list[Frame], end: Frame, nearly_parallel: float = NEARLY_PARALLEL
 ) -> Robot:
-    """Return the robot with these joint frames, and base, tool, names and limits of another robot.
+    """Return a robot with the given joint frames, and with base, tool, names and limits of another robot.
 
     Args:
         like: the other robot, with the same number of joints.
@@ -58,5 +58,5 @@ def robot_of_origins(
 
 
 def with_one_row_per_joint(robot: Robot) -> Robot:
-    """Return the same robot with one row per joint and no inflated lengths: nearly parallel axes get Hayati's rows."""
+    """Return an equivalent robot with one row per joint, and Hayati's rows for nearly parallel axes."""
     return robot_of_origins(robot, *joint_origins(robot))

@@ -1,4 +1,4 @@
-"""Conversion between the controller's values and the joint values of the DH rows; no other file converts them.
+"""Conversion between the controller's values and the joint values of the DH rows.
 
     q_dh = f(C · q_controller + b)
 
@@ -64,7 +64,7 @@ class FourBar:
         return first, second, third
 
     def _other_end(self, turn: Any, length: float, other: float, side: float) -> Any:
-        """Return the rotation of the bar at the other pivot, which is at `side · ground` along x."""
+        """Return the rotation [rad] of the bar at the other pivot, which is at `side · ground` along x."""
         xp, angle = _functions(turn), turn + self.zero
         x, y = length * xp.cos(angle) - side * self.ground, length * xp.sin(angle)
         square = x * x + y * y
@@ -86,7 +86,7 @@ class Coupling:
         driven: `(dof, axes)`: which axes the file's entry of a coupled joint names, possibly with the factor 0; all
             False for a joint without an entry.
         four_bars: index and linkage of every joint that is driven by a linkage.
-        stops: index and mechanical limits [rad or m] of every joint that has its own in addition to those of the axes.
+        stops: index and mechanical limits [rad or m] of every joint that has limits in addition to those of the axes.
     """
 
     axes: tuple[Row, ...]
@@ -186,14 +186,14 @@ class Coupling:
         return np.where(reached[:, None], every[np.arange(len(q)), best], q), reached
 
     def _turns(self) -> Float64[np.ndarray, "turns dof"]:
-        """Return all combinations of -1, 0 or 1 full turns of coupled revolute joints; others have separate limits."""
+        """Return all combinations of -1, 0 or 1 full turns [rad] of the coupled revolute joints."""
         shared = (self.matrix != 0).sum(0) > 1
         coupled = ((self.matrix != 0).sum(1) > 1) | (self.matrix[:, shared] != 0).any(1)
         choices = [(-1, 0, 1) if both else (0,) for both in np.logical_and(coupled, self.turning).tolist()]
         return np.array(list(itertools.product(*choices)), dtype=np.float64)
 
     def _by_four_bars(self, values: Any, change: Any) -> Any:
-        """Apply a function of the linkage to the values of the joints that have one."""
+        """Replace the values of joints that a linkage drives by a function of linkage and value."""
         if not self.four_bars:
             return values
         bars = dict(self.four_bars)
@@ -226,14 +226,14 @@ def dh_limits(coupling: Coupling) -> Float64[np.ndarray, "dof 2"]:
 
 def _driven(bar: FourBar, turn: np.ndarray, stops: tuple[float, float], joint: int) -> tuple[float, float]:
     """Return the smallest and largest value [rad] of a joint with a linkage, which has to close everywhere between."""
-    with np.errstate(invalid="ignore"):  # NaN is reported below
+    with np.errstate(invalid="ignore"):  # an arccosine out of range is NaN, which is reported below
         ends = bar.crank_rotation(np.array(stops))
         x = np.linspace(np.fmax(turn[0], ends[0]), np.fmin(turn[1], ends[1]), 181)
         u = bar.joint_value(x)
     if not (np.isfinite(u).all() and (np.diff(np.sign(np.sin(x + bar.zero))) == 0).all()):
         raise RobotError(
             f"the four-bar linkage of joint {joint + 1} does not close, or is stretched, at a value within the limits",
-            expected="a linkage that closes",
+            expected="a linkage that closes within the limits",
             value=joint + 1,
             option="coupling",
             remedy="give the joint stops (limits_deg in its entry), or correct its lengths",
@@ -251,7 +251,7 @@ def _functions(values: Any) -> Any:
 
 
 def _like(values: Any, constants: np.ndarray) -> Any:
-    """Return constants as an array, or as a tensor of the dtype and device of the values."""
+    """Return constants as an array, or as a tensor with the dtype and device of the values."""
     return values.new_tensor(constants) if hasattr(values, "new_tensor") else constants
 
 

@@ -1,4 +1,4 @@
-"""Coupled joints in robot files, in millimetres and degrees."""
+"""Sections of robot files for coupled joints, in millimetres and degrees."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -30,7 +30,7 @@ class FourBarSection(Section):
     zero_deg: Bounded
 
     def to_si(self) -> FourBar:
-        """Convert to SI units."""
+        """Return the linkage in SI units."""
         lengths = (self.ground_mm, self.crank_mm, self.coupler_mm, self.rocker_mm)
         ground, crank, coupler, rocker = (length / 1e3 for length in lengths)
         return FourBar(ground, crank, coupler, rocker, float(np.deg2rad(self.zero_deg)))
@@ -65,15 +65,15 @@ def rows_and_coupling(
 ) -> tuple[tuple[Row, ...], Coupling | None]:
     """Return the rows with the limits of their DH values, and the coupling of DH values and controller values.
 
-    The value of a joint without a section is the controller's. A joint that has a section but no factor in any section
-    is passive: the controller has no value for it.
+    The value of a joint without a section equals the controller's value. A joint that has a section but no factor in
+    any section is passive: the controller has no value for it.
 
     Args:
         rows: rows of the robot, with the limits of the controller's values.
         sections: sections of the file.
 
     Raises:
-        RobotError: a name, unit or factor does not fit.
+        RobotError: a section names an unknown joint, or has a unit or factor that does not fit its joint.
     """
     if not sections:
         return tuple(rows), None
@@ -120,7 +120,7 @@ def _check_names(sections: Sequence[CoupledJointSection], names: Sequence[str]) 
     joints = [section.joint for section in sections]
     if twice := [name for name in names if joints.count(name) > 1]:
         problem = f"the joint '{twice[0]}' has two entries"
-        raise RobotError(problem, value=twice[0], option="coupling", remedy="merge them, one per joint")
+        raise RobotError(problem, value=twice[0], option="coupling", remedy="merge them into one entry")
 
 
 def _factor(section: CoupledJointSection, joint: Row, axis: Row) -> float:

@@ -32,11 +32,11 @@ class Robot:
     Attributes:
         name: short name, as in the catalogue.
         maker: manufacturer.
-        source: origin of the parameter values.
+        source: source of the parameter values, such as a data sheet.
         rows: joints and fixed rows, from the base to the tool.
         dh: `(rows, 5)`: theta [rad], d [m], a [m], alpha [rad], beta [rad].
         base: x, y, z [m], roll, pitch, yaw [rad] of `Trans(x, y, z) · RotZ(roll) · RotY(pitch) · RotX(yaw)`.
-        tool: pose of the tool in the frame after the last row, in the same form.
+        tool: pose of the tool in the frame after the last row, in the same form as `base`.
         coupling: relation between the joint values of the rows (DH values) and the controller's values; None if they
             are equal. Joint values are DH values everywhere except in files, in results of `CorrectedIK` and where a
             name or docstring says that they are the controller's.
@@ -97,14 +97,14 @@ class Robot:
             tip: link of a URDF file that is the tool; None if only one link has no child.
 
         Raises:
-            UnknownRobotError: neither a catalogue name nor a file; the message lists the catalogue.
+            UnknownRobotError: neither a catalogue name nor a file; the message lists the names of the catalogue.
             RobotError: the file does not describe a robot, or links are given for a file that is not URDF.
         """
         return Robot(*read_robot(robot, base, tip))
 
     @cached_property
     def joints(self) -> tuple[Row, ...]:
-        """Rows that move, in order."""
+        """Rows of the joints that move, from base to tool."""
         return tuple(row for row in self.rows if row.type != "fixed")
 
     @property
@@ -119,7 +119,7 @@ class Robot:
 
     @property
     def axes(self) -> tuple[Row, ...]:
-        """Axes that the controller commands, in order; the joints if they are not coupled."""
+        """Axes that the controller commands, from base to tool; the joints if they are not coupled."""
         return self.joints if self.coupling is None else self.coupling.axes
 
     @property
@@ -142,7 +142,7 @@ class Robot:
 
     @property
     def without_limits(self) -> "Robot":
-        """The robot without joint limits, which values of swapped columns or of other units exceed."""
+        """The robot without joint limits, for joint values that may be swapped or in another unit."""
 
         def without_limits(rows: Sequence[Row]) -> tuple[Row, ...]:
             return tuple(replace(row, lower=-np.inf, upper=np.inf) for row in rows)
@@ -152,12 +152,12 @@ class Robot:
 
     @property
     def directions(self) -> Float64[np.ndarray, " dof"]:
-        """+1 or -1 for every joint."""
+        """Sign of the controller's value of every joint, +1 or -1."""
         return np.array([float(joint.direction) for joint in self.joints])
 
     @cached_property
     def revolute(self) -> tuple[bool, ...]:
-        """Whether each joint is revolute."""
+        """Mask of the revolute joints."""
         return tuple(joint.type == "revolute" for joint in self.joints)
 
     @cached_property
@@ -180,7 +180,7 @@ class Robot:
         base: Float64[np.ndarray, " 6"] | None = None,
         tool: Float64[np.ndarray, " 6"] | None = None,
     ) -> "Robot":
-        """Return the robot with other geometric parameters; None keeps the present values."""
+        """Return the robot with other geometric parameters; None keeps the current values."""
         return replace(
             self,
             dh=self.dh if dh is None else dh,

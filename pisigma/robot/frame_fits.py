@@ -10,12 +10,12 @@ from torch import Tensor
 from pisigma.robot.se3 import nearest_rotation, rotation_from_vector, rotation_vector, skew, transform
 
 LEVER_SHARE = 0.2
-"""Lever arm of rotation errors as a share of the reach; see `MeasuredPoses.lever`."""
+"""Lever arm that converts rotation errors to position errors, as a share of the robot's reach."""
 ALTERNATIONS = 10
-"""Alternating projections onto rotations that refine the initial guess of base and tool."""
+"""Number of alternating projections onto rotations that refine the initial guess of base and tool."""
 MAX_ITERATIONS = 20
 AFFINE_UNKNOWNS = 13
-"""Unknowns per coordinate of an affine base and tool; this many positions or fewer do not determine them."""
+"""Number of unknowns per coordinate of an affine base and tool; as many positions or fewer do not determine them."""
 CONVERGENCE_TOLERANCE = 1e-6
 """Relative decrease of the cost below which the fit of base and tool has converged."""
 INITIAL_DAMPING = 1e-6
@@ -28,7 +28,7 @@ class MeasuredPoses:
     Attributes:
         position: measured positions [m].
         rotation: measured rotations; the identity where none was measured.
-        has_rotation: which rows have a rotation.
+        has_rotation: mask of the rows with a measured rotation.
         lever: lever arm that converts rotation errors [rad] to position errors [m].
     """
 
@@ -41,7 +41,7 @@ class MeasuredPoses:
     def from_tensors(
         position: Float64[Tensor, "rows 3"] | None, rotation: Float64[Tensor, "rows 3 3"] | None, lever: float
     ) -> "MeasuredPoses":
-        """Make measured poses of positions [m] of all rows and rotations of some; rows without one are not finite."""
+        """Return measured poses from positions [m] and from rotations, which are not finite where none was measured."""
         assert position is not None
         rows, eye = len(position), torch.eye(3, dtype=torch.float64)
         if rotation is None:
@@ -53,12 +53,12 @@ class MeasuredPoses:
         )
 
     def select(self, rows: Tensor) -> "MeasuredPoses":
-        """Select the rows of a mask or an index."""
+        """Return the rows that a mask or an index selects."""
         return MeasuredPoses(self.position[rows], self.rotation[rows], self.has_rotation[rows], self.lever)
 
     @staticmethod
     def stack(several: Sequence["MeasuredPoses"]) -> "MeasuredPoses":
-        """Stack measured poses that have rotations in the same rows."""
+        """Return measured poses as a batch; all must have rotations in the same rows."""
         return replace(
             several[0],
             position=torch.stack([one.position for one in several]),
@@ -66,16 +66,16 @@ class MeasuredPoses:
         )
 
     def select_batches(self, index: Tensor) -> "MeasuredPoses":
-        """Select members of the batch by a mask or an index."""
+        """Return the members of the batch that a mask or an index selects."""
         return replace(self, position=self.position[index], rotation=self.rotation[index])
 
     def scale_positions(self, factor: float) -> "MeasuredPoses":
-        """Multiply the positions by a factor."""
+        """Return the poses with positions multiplied by a factor."""
         return replace(self, position=self.position * factor)
 
     @property
     def values(self) -> int:
-        """Number of independent measured values."""
+        """Number of independent measured values: three per position and three per rotation."""
         return 3 * len(self.position) + 3 * int(self.has_rotation.sum())
 
     @property
@@ -88,7 +88,7 @@ class MeasuredPoses:
         return float((off + self.lever**2 * turn * self.has_rotation.double().mean()).sqrt())
 
     def squared_errors(self, T: Float64[Tensor, "*batch rows 4 4"]) -> Float64[Tensor, "*batch rows"]:
-        """Compute squared errors `|dp|² + lever² |dR|² / 2` [m²] of poses; |dR|²/2 is about the angle squared."""
+        """Compute squared errors `|dp|² + lever² |dR|² / 2` [m²] of poses; |dR|²/2 is about the squared angle."""
         off = (self.position - T[..., :3, 3]).square().sum(-1)
         turn = (self.rotation - T[..., :3, :3]).square().sum((-2, -1)) / 2
         return off + self.lever**2 * torch.where(self.has_rotation, turn, 0.0)
@@ -97,7 +97,7 @@ class MeasuredPoses:
 def best_base(
     T: Float64[Tensor, "*batch rows 4 4"], measured: MeasuredPoses
 ) -> Float64[Tensor, "*batch 4 4"]:
-    """Find the transform X that minimises the distance of `X T` to measured poses (weighted orthogonal Procrustes)."""
+    """Find the transform X that minimises the distance of `X T` from measured poses (orthogonal Procrustes)."""
     # The best shift makes the mean positions equal, so only the rotation remains to be found.
     middle, wanted = T[..., :3, 3].mean(-2, keepdim=True), measured.position.mean(-2, keepdim=True)
     M = (measured.position - wanted).mT @ (T[..., :3, 3] - middle)
@@ -112,7 +112,7 @@ def best_base(
 def best_tool(
     T: Float64[Tensor, "*batch rows 4 4"], measured: MeasuredPoses
 ) -> Float64[Tensor, "*batch 4 4"]:
-    """Find the transform X that minimises the distance of `T X` to measured poses; a translation without rotations."""
+    """Find the transform X (without rotations a translation) that minimises the distance of `T X` from poses."""
     R = T[..., :3, :3]
     # `T X` is separable: its position depends on the tool's translation only, its rotation on the tool's rotation.
     offset = (R.mT @ (measured.position - T[..., :3, 3])[..., None])[..., 0].mean(-2)
@@ -150,7 +150,7 @@ def affine_error(
 def best_base_and_tool(
     T: Float64[Tensor, "*batch rows 4 4"], measured: MeasuredPoses
 ) -> tuple[Float64[Tensor, "*batch 4 4"], Float64[Tensor, "*batch 4 4"]]:
-    """Find transforms X, Y that minimise the distance of `X T Y` to measured poses.
+    """Find transforms X, Y that minimise the distance of `X T Y` from measured poses.
 
     Without measured rotations Y is a translation.
 
@@ -185,14 +185,14 @@ def moved_base_and_tool(
     tool: Float64[Tensor, "*batch 4 4"],
     step: Float64[Tensor, "*batch 12"],
 ) -> tuple[Float64[Tensor, "*batch 4 4"], Float64[Tensor, "*batch 4 4"]]:
-    """Move base and tool by a step of `base_and_tool_step`."""
+    """Return base and tool moved by a step as returned by `base_and_tool_step`."""
     return moved_frame(base, step[..., :6]), moved_frame(tool, step[..., 6:])
 
 
 def moved_frame(
     frame: Float64[Tensor, "*batch 4 4"], step: Float64[Tensor, "*batch 6"]
 ) -> Float64[Tensor, "*batch 4 4"]:
-    """Translate [m] and rotate [rad] a frame about its origin."""
+    """Return a frame translated by a step's first entries [m] and rotated about its origin by the others [rad]."""
     return transform(
         rotation_from_vector(step[..., 3:]) @ frame[..., :3, :3], frame[..., :3, 3] + step[..., :3]
     )
@@ -212,7 +212,7 @@ def _rotation_products(
 def _affine_solution(
     T: Float64[Tensor, "*batch rows 4 4"], position: Float64[Tensor, "*#batch rows 3"]
 ) -> tuple[Float64[Tensor, "*batch rows 13"], Float64[Tensor, "*batch 13 3"]]:
-    """Solve `position = A X` for the regressors `A = (vec(R), p, 1)`; returns both."""
+    """Solve `position = A X` for the regressors `A = (vec(R), p, 1)`; return A and X."""
     A = torch.cat([T[..., :3, :3].flatten(-2), T[..., :3, 3], torch.ones_like(T[..., :1, 0])], -1)
     # Columns of equal size make the ridge below independent of units.
     size = A.square().sum(-2, keepdim=True).sqrt().clamp(min=1e-12)
@@ -276,7 +276,7 @@ def frame_columns(
     eye, none = torch.eye(3).to(T).expand(R_flange.shape), torch.zeros_like(R_flange)
     weight = measured.lever * measured.has_rotation.to(T)[..., None]
     turn = rotation_vector(measured.rotation @ (R_flange @ tool[..., :3, :3]).mT)
-    # The tool turns about its origin, in the axes of the flange, which does not move the position.
+    # The tool rotates about its origin, in the axes of the flange, which does not move the position.
     J = torch.cat([eye, -skew(arm), R_flange, none], -1)
     J = torch.cat([J, weight[..., None] * torch.cat([none, eye, none, R_flange], -1)], -2)
     return J, torch.cat([measured.position - arm - base[..., :3, 3], weight * turn], -1)

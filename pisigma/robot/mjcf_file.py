@@ -1,4 +1,4 @@
-"""Read MJCF files as far as they concern kinematics: bodies, and the joints that move them."""
+"""Read the kinematics of MJCF files: bodies, and the joints that move them."""
 
 import math
 import os
@@ -17,7 +17,7 @@ from pisigma.robot.urdf_frames import Frame, rotation, translation
 from pisigma.robot.urdf_rows import turned_to
 
 TYPES = {"hinge": "revolute", "slide": "prismatic"}
-"""Types of rows by the types of joints."""
+"""Type of the DH row by type of the MJCF joint."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,9 +26,9 @@ class MovedBody:
 
     Attributes:
         element: the body.
-        joint: attributes of its joint, including those of its classes.
+        joint: attributes of the joint, including defaults of its classes.
         name: name of the joint.
-        between: pose of its parent in the preceding moved body, or in the body before the first one.
+        between: pose of the body's parent in the preceding moved body, or in the base.
         pose: pose of the body in its parent.
         attached: frame of the row's axis in the body: z is the joint's axis, in the direction of the robot's row.
     """
@@ -49,7 +49,7 @@ class MjcfDrawing:
         path: the file.
         root: its root element.
         compiler: attributes of all `compiler` elements.
-        defaults: attributes of joints by class; "" for joints without one.
+        defaults: default attributes of joints by class; "" for joints without a class.
     """
 
     path: str | os.PathLike[str]
@@ -102,7 +102,7 @@ class MjcfDrawing:
 
     @property
     def degree(self) -> float:
-        """Angle of the file's unit of angles [rad]."""
+        """Unit of angles of the file [rad]."""
         return 1.0 if self.compiler.get("angle", "degree") == "radian" else math.pi / 180
 
     def moved_bodies(self, nominal: Robot, tip: str | None) -> list[MovedBody]:
@@ -188,7 +188,7 @@ class MjcfDrawing:
         elif body.get("zaxis") is not None:
             z = np.array(numbers(body.get("zaxis")))
             z = z / np.linalg.norm(z)
-            # The shortest turn from z to the axis: twice the quaternion of half of it.
+            # Shortest rotation from z to the axis; the quaternion need not have unit length.
             half_turn = (
                 np.array([1 + z[2], -z[1], z[0], 0.0]) if z[2] > -1 + 1e-12 else np.array([0.0, 1, 0, 0])
             )
@@ -205,5 +205,5 @@ def _rotation(quaternion: Float64[np.ndarray, " 4"]) -> Float64[np.ndarray, "3 3
 
 
 def numbers(text: str) -> list[float]:
-    """Read the numbers of an attribute."""
+    """Return the numbers in an attribute."""
     return [float(value) for value in text.split()]

@@ -1,4 +1,4 @@
-"""Tool poses of a robot description with one axis moved at a time, for comparison with the teach pendant."""
+"""Tool poses with one axis moved at a time, for comparison of a robot description with the teach pendant."""
 
 import math
 import os
@@ -12,7 +12,7 @@ from pisigma.robot.row import FRAME_COLUMNS, Row, in_file_units
 from pisigma.robot.urdf_frames import Frame, frame_of, row_frame, xyzrpy_of
 
 ROTATION, STROKE = math.pi / 2, 0.1
-"""Motion of a revolute axis [rad] and of a prismatic axis [m]."""
+"""Values to which a revolute axis [rad] and a prismatic axis [m] are moved."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,7 +24,7 @@ class PendantPose:
         value: the controller's value of that axis [rad or m].
         tool: pose of the tool in the base frame: x, y, z [m], roll, pitch, yaw [rad] of
             `Trans(x, y, z) · RotZ(roll) · RotY(pitch) · RotX(yaw)`.
-        inside: whether all of the controller's values are within its limits.
+        inside: whether all controller values are within the limits.
     """
 
     axis: Row | None
@@ -34,12 +34,12 @@ class PendantPose:
 
     @property
     def in_file_unit(self) -> float:
-        """The controller's value of the moved axis [deg or mm]."""
+        """Controller value of the moved axis [deg or mm]."""
         return 0.0 if self.axis is None else self.axis.in_file_unit(self.value)
 
     @property
     def tool_in_file_units(self) -> dict[str, float]:
-        """Pose of the tool by column [mm, deg]."""
+        """Pose of the tool by column name [mm, deg]."""
         return in_file_units(FRAME_COLUMNS, self.tool)
 
     def to_json(self) -> dict[str, object]:
@@ -52,7 +52,7 @@ class PendantPose:
 def pendant_poses(
     robot: Robot | str | os.PathLike[str], base: str | None = None, tip: str | None = None
 ) -> tuple[PendantPose, ...]:
-    """Return the tool's pose with all axes at 0, and with each at 90 deg (100 mm) or as far as its limits allow.
+    """Return the tool pose with all axes at 0, and with each axis at 90 deg (100 mm) or at its nearest limit.
 
     Args:
         robot: a robot, a name of the catalogue, or a robot file (YAML or URDF).

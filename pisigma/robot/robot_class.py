@@ -1,4 +1,4 @@
-"""Robot classes: usual and largest sizes of their errors, and changes by wear or a collision."""
+"""Classes of robots: typical and largest sizes of geometric errors, and changes by wear or a collision."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -22,7 +22,7 @@ HOBBY_MAKERS: Final = ("Trossen", "ROBOTIS", "Niryo", "AR4", "Elephant Robotics"
 
 @dataclass(frozen=True)
 class GeometricSizes:
-    """Error sizes by kind of geometric parameter.
+    """Sizes of errors by kind of geometric parameter.
 
     The order is that of `pisigma.calibration.geometric.problem.prior_sizes.PriorGroup`.
 
@@ -39,22 +39,22 @@ class GeometricSizes:
     between_axes: float
 
     def size_of(self, group: int) -> float:
-        """Return the size for a group of parameters [m or rad]."""
+        """Return the size of the errors of a group of parameters [m or rad]."""
         return (self.joint_offset, self.length, self.no_length, self.between_axes)[group]
 
 
 @dataclass(frozen=True)
 class ChangeLimits:
-    """Largest changes by wear or a collision in an arm that still works, by kind of parameter.
+    """Largest changes of parameters by wear or a collision, in an arm that still works.
 
     A belt that jumps a tooth or a brake that slips moves the zero of a joint by some degrees; a casting that is bent
     by more than these lengths and angles is visibly broken. The base, the tool or the zero of a single joint may change
     by any amount, because people move and zero them.
 
     Attributes:
-        joint_zero: change of the zeros of several joints at once [rad].
-        length: change of d, a and the zero of a prismatic joint [m].
-        angle: change of alpha and beta [rad].
+        joint_zero: largest change of the zeros of several joints at once [rad].
+        length: largest change of d, a and the zero of a prismatic joint [m].
+        angle: largest change of alpha and beta [rad].
     """
 
     joint_zero: float
@@ -64,10 +64,10 @@ class ChangeLimits:
 
 @dataclass(frozen=True)
 class RobotClass:
-    """Prior standard deviations of the errors of a class of robots, and their limits.
+    """Prior standard deviations and limits of the errors of a class of robots.
 
     Attributes:
-        name: name of the class, as for the setting `robot_class`.
+        name: name of the class, a value of the setting `robot_class`.
         usual: prior standard deviations of geometric errors.
         gravity: prior standard deviation of the weights of `GravityTorques` [rad].
         bands: prior standard deviations of the weights of `FourierSeries` [rad], by band of `BAND_STARTS`.
@@ -86,7 +86,7 @@ class RobotClass:
 
     @staticmethod
     def from_robot(robot: Robot) -> "RobotClass":
-        """Return the class of the robots of a maker, `INDUSTRIAL` if the maker is not known."""
+        """Return the class of a robot by its maker; `INDUSTRIAL` if the maker is not known."""
         if robot.maker.startswith("Universal Robots"):
             return UNIVERSAL_ROBOTS
         if robot.maker.startswith(COBOT_MAKERS):
@@ -109,7 +109,7 @@ INDUSTRIAL: Final = RobotClass(
 )
 """Arms whose joints have one eccentricity, one ovality and one gear ripple each.
 
-The sizes are 1.5 times the medians of those that maximise the evidence of hybrid calibrations of simulated kr10,
+The sizes are 1.5 times the medians of the sizes that maximise the evidence of hybrid calibrations of simulated kr10,
 irb120, arm7 and scara arms (two each, 400 positions) and of the measured FANUC R-2000iC (720 positions). The factor
 makes predicted errors correct for few poses, from which a calibration has to estimate the sizes too: for 15 such arms
 the median of predicted over true RMS is 1.05 after 15 planned poses, 1.1 after 30 and 1.1 after 60; without the factor
@@ -121,8 +121,8 @@ COBOT: Final = replace(
     largest=replace(INDUSTRIAL.largest, joint_offset=20e-3),
     change=ChangeLimits(joint_zero=0.1, length=0.008, angle=0.02),
 )
-"""Light arms with harmonic drives, whose zeros are set by hand after a repair and slip in a collision. Gear errors are
-those of industrial arms unless arms of the maker were measured."""
+"""Light arms with harmonic drives, whose zeros are set by hand after a repair and slip in a collision. Gear errors
+are taken from industrial arms unless arms of the maker were measured."""
 
 UNIVERSAL_ROBOTS: Final = replace(
     COBOT,
@@ -131,8 +131,9 @@ UNIVERSAL_ROBOTS: Final = replace(
     bands=(2e-4, 2e-4, 6e-5, 3e-5, 5e-5, 5e-5, 5e-5, 4e-5, 3e-5),
     harmonics=31,
 )
-"""Sizes between those that maximise the evidence of hybrid calibrations of the measured UR5 (1,000 positions) and UR10
-(1,941 poses). Their gear errors have many harmonics, which the pose sets of other robots cannot distinguish."""
+"""Arms of Universal Robots, with sizes between the two that maximise the evidence of hybrid calibrations of the
+measured UR5 (1,000 positions) and UR10 (1,941 poses). Their gear errors have many harmonics, which the pose sets of
+other robots cannot distinguish."""
 
 HOBBY: Final = replace(
     COBOT,
@@ -145,4 +146,4 @@ HOBBY: Final = replace(
 that were reassembled. Their zeros are wrong by 20 to 50 mrad."""
 
 CLASSES: Final[dict[str, RobotClass]] = {one.name: one for one in (INDUSTRIAL, COBOT, HOBBY)}
-"""Classes by name, the one with the smallest errors first."""
+"""Classes of robots by name, in the order of increasing errors."""

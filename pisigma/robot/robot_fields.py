@@ -1,4 +1,4 @@
-"""Contents of a robot file, not yet checked as a whole."""
+"""Fields of a robot file before they are checked together."""
 
 from typing import NamedTuple
 

@@ -20,7 +20,7 @@ Limits = Annotated[tuple[Bounded, Bounded], Field(description="lower and upper")
 
 
 class ParameterSection(Section):
-    """DH and Hayati parameters of a row.
+    """Section of a robot file with the DH and Hayati parameters of a row.
 
     Attributes:
         theta_deg: rotation about the joint axis z, before the joint value [deg].
@@ -43,7 +43,7 @@ class ParameterSection(Section):
 
 
 class RowSection(ParameterSection):
-    """A joint or a fixed row."""
+    """Section of a robot file with a joint or a fixed row."""
 
     name: str = Field(min_length=1)
     type: JointType
@@ -73,7 +73,7 @@ class RowSection(ParameterSection):
         return self
 
     def to_row(self) -> Row:
-        """Convert to a row in SI units, without the parameters."""
+        """Return the row in SI units, without the DH parameters."""
         if self.limits_deg is not None:
             lower, upper = np.deg2rad(self.limits_deg)
         elif self.limits_mm is not None:
@@ -86,7 +86,7 @@ class RowSection(ParameterSection):
 
 
 class FrameSection(Section):
-    """Base or tool: `Trans(x, y, z) · RotZ(roll) · RotY(pitch) · RotX(yaw)`.
+    """Section of a robot file with base or tool: `Trans(x, y, z) · RotZ(roll) · RotY(pitch) · RotX(yaw)`.
 
     Attributes:
         x_mm: translation along x [mm].
@@ -111,7 +111,7 @@ class FrameSection(Section):
 
 
 class RobotDocument(Section):
-    """A robot file.
+    """Contents of a robot file.
 
     Attributes:
         convention: "standard" for rows `RotZ(theta) · Trans(a, 0, d) · RotX(alpha) · RotY(beta)`; "modified" for rows
@@ -141,7 +141,7 @@ class RobotDocument(Section):
         return self
 
     def to_fields(self) -> RobotFields:
-        """Convert the robot to SI units.
+        """Return the fields of the robot in SI units.
 
         Raises:
             RobotError: the coupling does not fit the rows, or a row of the modified convention has a beta.
@@ -199,7 +199,7 @@ def from_modified_dh(
 ) -> tuple[Float64[np.ndarray, "rows 5"], Float64[np.ndarray, " 6"]]:
     """Convert modified rows `RotX(alpha) · Trans(a, 0, 0) · RotZ(theta) · Trans(0, 0, d)` to standard rows exactly.
 
-    Alpha and a of a modified row move to the standard row before; those of the first row move to the base.
+    Alpha and a of a modified row become part of the preceding standard row, or of the base for the first row.
 
     Args:
         dh: theta [rad], d, a [m], alpha, beta [rad] of modified rows.

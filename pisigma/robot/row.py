@@ -11,16 +11,16 @@ from pydantic import Field
 JointType = Literal["revolute", "prismatic", "fixed"]
 
 DH_COLUMNS = ("theta", "d", "a", "alpha", "beta")
-"""Order of the parameters of a row, everywhere; theta, alpha, beta [rad], d, a [m]."""
+"""Names and order of the parameters of a row; theta, alpha, beta [rad], d, a [m]."""
 
 FRAME_COLUMNS = ("x", "y", "z", "roll", "pitch", "yaw")
-"""Order of the parameters of base and tool, everywhere; x, y, z [m], roll, pitch, yaw [rad]."""
+"""Names and order of the parameters of base and tool; x, y, z [m], roll, pitch, yaw [rad]."""
 
 MAX_MAGNITUDE = 1e9
-"""Largest magnitude of any value of a robot, pose or measurement, in the unit of its file (mm or deg)."""
+"""Largest magnitude of any number of a robot, pose or measurement, in the unit of the file (mm or deg)."""
 
 Bounded = Annotated[float, Field(ge=-MAX_MAGNITUDE, le=MAX_MAGNITUDE)]
-"""A number in a robot file."""
+"""A number in a robot file, finite and of limited magnitude."""
 
 MAX_ROWS = 1000
 """Largest number of rows of a robot."""
@@ -29,7 +29,7 @@ _LENGTHS = frozenset(("d", "a", "x", "y", "z"))
 
 
 def in_file_units(names: Sequence[str], values: Float64[np.ndarray, " names"]) -> dict[str, float]:
-    """Convert parameters to the units of files, by file column: `d` [m] to `d_mm`, `theta` [rad] to `theta_deg`.
+    """Return parameters in the units of files by column name, such as `d_mm` for `d` [m], `theta_deg` for `theta`.
 
     Args:
         names: names of the parameters, from `DH_COLUMNS` or `FRAME_COLUMNS`.
@@ -55,8 +55,8 @@ class Row:
         direction: +1 or -1, the sign of the controller's values; the joint moves by `direction · q`.
         lower: smallest joint value [rad or m], with the sign of the controller; -inf without a limit.
         upper: largest joint value [rad or m].
-        urdf_origin: position of the joint's origin in a URDF file, in the frame before the row [m]; the motion does not
-            depend on it.
+        urdf_origin: position of the joint's origin in a URDF file, in the frame before the row [m]; kinematics does
+            not depend on it.
     """
 
     name: str
@@ -72,9 +72,9 @@ class Row:
         return "mm" if self.type == "prismatic" else "deg"
 
     def in_file_unit(self, value: float) -> float:
-        """Convert a joint value [rad or m] to the unit of files."""
+        """Return a joint value [rad or m] in the unit of files."""
         return float(value * 1e3 if self.type == "prismatic" else np.rad2deg(value))
 
     def from_file_unit(self, value: float) -> float:
-        """Convert a joint value in the unit of files to [rad or m]."""
+        """Return a joint value [rad or m] from its value in the unit of files."""
         return float(value / 1e3 if self.type == "prismatic" else np.deg2rad(value))

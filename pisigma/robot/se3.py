@@ -1,4 +1,4 @@
-"""Batched rotations and rigid transforms; leading dimensions are batch dimensions.
+"""Rotations and rigid transforms, with leading batch dimensions.
 
 Angles are in rad, lengths in m. `T_a_b` maps coordinates in b to coordinates in a.
 """
@@ -12,7 +12,7 @@ from pisigma.files.errors import PoseError
 
 
 def rotation_from_rpy(rpy: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
-    """Return the rotation `RotZ(roll) · RotY(pitch) · RotX(yaw)`, the order of the three papers.
+    """Return the rotation `RotZ(roll) · RotY(pitch) · RotX(yaw)`: roll is about z, pitch about y, yaw about x.
 
     Args:
         rpy: roll, pitch, yaw [rad].
@@ -46,7 +46,7 @@ def rpy_from_rotation(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3
 def _where_regular(
     regular: Bool[Tensor, "*batch"], cosine: Float[Tensor, "*batch"], sine: Float[Tensor, "*batch"]
 ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
-    """Return cosine and sine where regular, else 1 and 0, so that the gradient of their angle is finite."""
+    """Return cosine and sine where regular, otherwise 1 and 0, so that the gradient of the angle is finite."""
     return torch.where(regular, cosine, torch.ones_like(cosine)), torch.where(
         regular, sine, torch.zeros_like(sine)
     )
@@ -87,7 +87,7 @@ def quaternion_from_rotation(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*
 def rotation_from_vector(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
     """Return the rotation of a rotation vector [rad] (Rodrigues), with finite gradients at zero."""
     square = (vector * vector).sum(-1)
-    # Below it the next terms of the series are less than rounding; a safe square keeps both gradients finite.
+    # Below this limit the next terms of the series are less than rounding; a safe square keeps gradients finite.
     small = square < 1e-8
     safe = torch.where(small, torch.ones_like(square), square)
     angle = safe.sqrt()
@@ -137,7 +137,7 @@ def _rotation_vector_near_pi(
 
 
 def skew(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
-    """Return the matrix of the cross product: `skew(a) @ b = a × b`."""
+    """Return the matrix of the cross product with a vector: `skew(a) @ b = a × b`."""
     x, y, z = vector.unbind(-1)
     zero = torch.zeros_like(x)
     rows = [torch.stack([zero, -z, y], -1), torch.stack([z, zero, -x], -1), torch.stack([-y, x, zero], -1)]
@@ -165,7 +165,7 @@ def xyzrpy_from_transform(T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*bat
 
 
 def invert(T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:
-    """Invert rigid transforms by transposition."""
+    """Return the inverse of rigid transforms, by transposition of the rotation."""
     R_inverse = T[..., :3, :3].mT
     return transform(R_inverse, -(R_inverse @ T[..., :3, 3:])[..., 0])
 
@@ -220,14 +220,14 @@ def check_transforms(T: Tensor, name: str, tolerance: float = 1e-6) -> None:
 def transform_faults(
     T: Float[Tensor, "*batch 4 4"], tolerance: float
 ) -> tuple[tuple[Bool[Tensor, "*batch"], str, str], ...]:
-    """Return, for every possible fault of a rigid transform, which matrices have it, and texts for an error.
+    """Return the matrices with every possible fault of a rigid transform, and texts for an error.
 
     Args:
         T: the matrices.
         tolerance: see `check_transforms`.
 
     Returns:
-        Mask, what was expected, and a remedy, for every fault.
+        For every fault, the mask of the matrices that have it, a text that says what was expected, and a remedy.
     """
     eye = torch.eye(4, dtype=T.dtype, device=T.device)
     finite = torch.isfinite(T).all(-1).all(-1)
@@ -249,7 +249,7 @@ def transform_faults(
 def nearest_rotation(M: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
     """Return the rotation nearest to a matrix in the Frobenius norm (orthogonal Procrustes, Kabsch's sign).
 
-    It is computed on the CPU, because there are few such matrices and each operation on a device costs more.
+    It is computed on the CPU, because the matrices are few and every operation on a device takes longer.
     """
     U, _, Vh = np.linalg.svd(M.cpu().numpy())
     U[..., 2] *= np.sign(np.linalg.det(U @ Vh))[..., None]

@@ -19,12 +19,13 @@ AXIS_LENGTH_TOLERANCE = 1e-2
 
 @dataclass(frozen=True, eq=False)
 class ChainJoint:
-    """A joint that moves.
+    """A moving joint of a chain.
 
     Attributes:
-        name: name in the file.
+        name: name of the joint in the file.
         type: "revolute" (also for a continuous joint) or "prismatic".
-        origin: frame of the joint at rest in the frame of the joint before (of the first joint: in the base link).
+        origin: frame of the joint at joint value 0, in the frame of the preceding joint (of the first joint: in the
+            base link).
         axis: unit vector of the joint axis in the joint's frame.
         lower: smallest joint value [rad or m]; -inf for a continuous joint and for one that mimics another.
         upper: largest joint value [rad or m].
@@ -130,7 +131,7 @@ def _root(urdf: Any, at: Place) -> str:
     """Return the only link without a parent.
 
     Raises:
-        RobotError: there is none or more than one.
+        RobotError: no link, or more than one, has no parent.
     """
     roots = [link for link in urdf.link_map if link not in urdf.parent_map]
     if len(roots) == 1:
@@ -149,7 +150,7 @@ def _only_tip(urdf: Any, base: str, at: Place) -> str:
     """Return the only link below the base that has no child.
 
     Raises:
-        RobotError: there is more than one.
+        RobotError: more than one link below the base has no child.
     """
     ends, open_links, passed = [], [base], {base}
     while open_links:
@@ -195,7 +196,7 @@ def origin_of(joint: Any) -> Frame:
 
 
 def _moving(joint: Any, origin: Frame, at: Place, commanded: Collection[str]) -> ChainJoint:
-    """Convert a joint that moves.
+    """Convert a moving joint of the URDF file to a `ChainJoint`.
 
     Raises:
         RobotError: the joint mimics one outside the chain, or has another type, an invalid axis or invalid limits.

@@ -166,7 +166,7 @@ def _copy_joint(element: Any, copied: Any, path: str | os.PathLike[str]) -> None
             problem = f"joint '{name}': <{tag}> has no attribute {key}"
             raise RobotError(problem, expected=f"<{tag} {key}>", at=at, remedy="add it")
     limit = copied.find("limit")
-    if limit is not None:  # the parser requires two more attributes, which kinematics does not need
+    if limit is not None:  # the parser requires effort and velocity, which kinematics does not need
         limit.set("effort", "0")
         limit.set("velocity", "0")
 
@@ -181,7 +181,9 @@ def _check_value(element: Any, tag: str, key: str, joint: str, at: Place) -> Non
         numbers = [float(word) for word in text.split()]
     except ValueError:
         numbers = []
-    largest = MAX_MAGNITUDE**2 if tag == "limit" else MAX_MAGNITUDE / 1e3  # some write 1e16 for no limit
+    largest = (
+        MAX_MAGNITUDE**2 if tag == "limit" else MAX_MAGNITUDE / 1e3
+    )  # some files state 1e16 for no limit
     if len(numbers) != count or not all(abs(number) <= largest for number in numbers):
         expected = "three finite numbers separated by spaces" if count == 3 else "a finite number"
         expected += f" up to {largest:.0e}"
@@ -194,6 +196,6 @@ def _parse_urdf(reduced: Any) -> Any:
     from lxml import etree
 
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # warnings of the import, which users cannot act on
+        warnings.simplefilter("ignore")  # users cannot act on the warnings of this import
         from pytorch_kinematics.urdf_parser_py.urdf import URDF
     return URDF.from_xml_string(etree.tostring(reduced))

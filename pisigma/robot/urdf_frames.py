@@ -1,7 +1,7 @@
 """Rigid transforms of single frames as NumPy matrices, and their exact conversion to and from six numbers.
 
 Lengths are in m, angles in rad. Multiples of 90 deg are exact in both directions, so that a robot with right angles
-keeps them.
+keeps these exactly.
 """
 
 import math
@@ -13,7 +13,7 @@ from jaxtyping import Float64
 Frame = Float64[np.ndarray, "4 4"]
 
 ROUNDING = 2e-14
-"""Deviations of lengths from 0 [m] and of angles from multiples of 90 deg [rad] up to this are rounding errors."""
+"""Largest deviation of a length from 0 [m] and of an angle from a multiple of 90 deg [rad] that is a rounding error."""
 
 
 def rotation(axis: int, angle: float) -> Frame:
@@ -40,16 +40,17 @@ def row_frame(theta: float, d: float, a: float, alpha: float, beta: float) -> Fr
 
 
 def frame_of(xyzrpy: Sequence[float] | Float64[np.ndarray, " 6"]) -> Frame:
-    """Return `Trans(x, y, z) · RotZ(roll) · RotY(pitch) · RotX(yaw)`, the form of base and tool."""
+    """Return the transform `Trans(x, y, z) · RotZ(roll) · RotY(pitch) · RotX(yaw)` of a base or tool."""
     x, y, z, roll, pitch, yaw = (float(value) for value in xyzrpy)
     T: Frame = translation(x, y, z) @ rotation(2, roll) @ rotation(1, pitch) @ rotation(0, yaw)
     return T
 
 
 def xyzrpy_of(T: Frame) -> Float64[np.ndarray, " 6"]:
-    """Invert `frame_of` with pitch within ±90 deg, accurate to rounding near ±90 deg too.
+    """Return x, y, z [m], roll, pitch, yaw [rad] of a transform, the inverse of `frame_of`; pitch is within ±90 deg.
 
-    There only the sum or difference of roll and yaw is determined: yaw is computed from the rotation without roll.
+    Near a pitch of ±90 deg only the sum or difference of roll and yaw is determined, so yaw is computed from the
+    rotation without roll.
     """
     R = T[:3, :3]
     lying = math.hypot(R[0, 0], R[1, 0]) > ROUNDING
@@ -63,7 +64,7 @@ def xyzrpy_of(T: Frame) -> Float64[np.ndarray, " 6"]:
 
 
 def inverse(T: Frame) -> Frame:
-    """Invert a rigid transform."""
+    """Return the inverse of a rigid transform."""
     result = np.eye(4)
     result[:3, :3] = T[:3, :3].T
     result[:3, 3] = -T[:3, :3].T @ T[:3, 3]
@@ -71,7 +72,7 @@ def inverse(T: Frame) -> Frame:
 
 
 def zero_if_rounding(value: float) -> float:
-    """Replace a length that is a rounding error by 0."""
+    """Return a length [m], or 0 if it is a rounding error."""
     return 0.0 if abs(value) <= ROUNDING else float(value)
 
 

@@ -38,7 +38,7 @@ Parameters = tuple[float, float, float, float, float]
 
 @dataclass(frozen=True, eq=False)
 class ChainRows:
-    """A chain as rows, with the frames of the rows in its joints.
+    """A chain converted to rows, with the frames of the rows in the frames of its joints.
 
     Attributes:
         fields: rows, base, tool and names.
@@ -138,16 +138,16 @@ def turned_to(axis: Vector) -> Frame:
 
 
 def _point_of_axis(joints: tuple[ChainJoint, ...], axes: list[Vector], index: int, T: Frame) -> Vector:
-    """Return a point on a joint's axis in the frame of the row before.
+    """Return a point on a joint's axis, in the frame of the preceding row.
 
     The motion of a prismatic joint depends on the direction of its axis only. The axis is therefore placed on that of
-    the next joint if they are parallel, otherwise through the origin of the row before.
+    the next joint if they are parallel, otherwise through the origin of the preceding row.
 
     Args:
         joints: all joints.
         axes: all axes, in the frames of the joints.
         index: index of the joint.
-        T: frame of the joint at rest in that of the row before.
+        T: frame of the joint at joint value 0, in the frame of the preceding row.
     """
     point: Vector = T[:3, 3]
     if joints[index].type == "revolute":
@@ -182,7 +182,7 @@ def _row_to(z: Vector, point: Vector, nearly_parallel: float) -> Parameters:
 
 
 def _last_row(T_row_tip: Frame) -> Parameters:
-    """Return the row that leads to the tip if that is on the last axis, else an empty row."""
+    """Return the row that leads to the tip if the tip is on the last axis, otherwise an empty row."""
     off_axis = max(math.hypot(*T_row_tip[:2, 2]), math.hypot(*T_row_tip[:2, 3]))
     if off_axis > ROUNDING:
         return 0.0, 0.0, 0.0, 0.0, 0.0

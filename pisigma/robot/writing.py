@@ -67,7 +67,7 @@ TOOL_LINK = "tool0"
 MASS, INERTIA, EFFORT, VELOCITY = "1", "0.01", "1000", "10"
 PLACEHOLDERS = (
     f"Masses ({MASS} kg), inertias ({INERTIA} kg m2), efforts ({EFFORT}) and velocities ({VELOCITY}) are placeholders, "
-    "not values of the robot: only the kinematics was calibrated. Enter those of the maker to simulate forces."
+    "not values of the robot: only the kinematics was calibrated. Enter the values of the maker to simulate forces."
 )
 
 
@@ -76,10 +76,11 @@ def robot_to_urdf(robot: Robot, comments: tuple[str, ...] = ()) -> str:
 
     The frame of a joint is that of its row after `RotZ(theta) · Trans(0, 0, d)`. The joint moves about or along its z
     axis, in the opposite sense if its direction is -1; `Trans(a, 0, 0) · RotX(alpha) · RotY(beta)` leads to the next
-    joint. No common normal is needed, so parallel axes keep their positions. Base and tool are fixed joints, links are
-    named `link_1` and so on, joints like the rows. `effort` and `velocity`, which the format requires, and masses and
-    inertias, without which MuJoCo rejects the file, are `PLACEHOLDERS`, as a comment says. A coupled joint is followed
-    by one joint on the same axis for each other axis of the controller that moves it, which mimics that axis.
+    joint. The description needs no common normals, so parallel axes keep their positions. Base and tool are fixed
+    joints, links are named `link_1` and so on, joints like the rows. `effort` and `velocity`, which the format
+    requires, and masses and inertias, without which MuJoCo rejects the file, are `PLACEHOLDERS`, as a comment in the
+    file states. A coupled joint is followed by one joint on the same axis for each other axis of the controller that
+    moves it, which mimics that axis.
 
     Args:
         robot: the robot.
@@ -115,7 +116,7 @@ def robot_to_urdf(robot: Robot, comments: tuple[str, ...] = ()) -> str:
 
 
 _Mimic = tuple[str, float]
-"""The mimicked joint, and the motion [rad or m] per [rad or m] of that joint."""
+"""Name of a mimicked joint, and motion [rad or m] per [rad or m] of that joint."""
 
 
 def _at_rest(robot: Robot) -> Float64[np.ndarray, "rows 5"]:

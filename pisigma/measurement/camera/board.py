@@ -1,4 +1,4 @@
-"""Printed boards and the positions of their corners."""
+"""Printed boards, and the positions of their corners."""
 
 import os
 from dataclasses import dataclass
@@ -16,12 +16,12 @@ Dictionary = Literal[
     "4x4_50", "4x4_100", "4x4_250", "4x4_1000", "5x5_50", "5x5_100", "5x5_250", "5x5_1000",
     "6x6_50", "6x6_100", "6x6_250", "6x6_1000", "7x7_50", "7x7_100", "7x7_250", "7x7_1000",
 ]  # fmt: skip
-"""OpenCV's dictionary of the markers in the white squares of a ChArUco board."""
+"""Name of OpenCV's dictionary of the markers in the white squares of a ChArUco board."""
 TagFamily = Literal["tag16h5", "tag25h9", "tag36h10", "tag36h11"]
 TAG_CELLS = {"tag16h5": 6, "tag25h9": 7, "tag36h10": 8, "tag36h11": 8}
 """Number of cells along the side of a tag, including its border."""
 Length = Annotated[float, Field(ge=0.2)]
-"""[mm] A length of a board; shorter ones are probably in metres."""
+"""Length of a board [mm]; shorter lengths are probably in metres."""
 _LENGTHS: dict[BoardKind, tuple[str, ...]] = {
     "checkerboard": ("square_mm",),
     "charuco": ("square_mm", "marker_mm"),
@@ -30,7 +30,7 @@ _LENGTHS: dict[BoardKind, tuple[str, ...]] = {
 
 
 class BoardDocument(Section):
-    """A board file.
+    """Contents of a board file.
 
     Attributes:
         kind: kind of board.
@@ -41,10 +41,10 @@ class BoardDocument(Section):
         square_sigma_mm: standard deviation of the side, common to all squares [mm].
         flatness_mm: flatness tolerance [mm].
         marker_mm: side of the markers of a ChArUco board [mm].
-        dictionary: dictionary of these markers.
+        dictionary: dictionary of the markers of a ChArUco board.
         tag_mm: side of an AprilTag [mm].
         spacing_mm: gap between neighbouring AprilTags [mm].
-        family: family of these tags.
+        family: family of the AprilTags.
     """
 
     kind: BoardKind = "checkerboard"
@@ -73,7 +73,7 @@ class BoardDocument(Section):
         return self
 
     def board(self) -> "Board":
-        """Return the board."""
+        """Return the board in SI units."""
         marker = self.marker_mm or self.tag_mm or 0.0
         pitch = self.square_mm or marker + (self.spacing_mm or 0.0)
         names = {"checkerboard": "", "charuco": self.dictionary, "apriltag": self.family}
@@ -96,12 +96,14 @@ class Board:
         name: name of the board.
         rows: number of rows of corners, or of AprilTags.
         columns: number of corners, or of AprilTags, in a row.
-        square: distance between neighbouring corners, or from tag to tag [m]; it sets the scale of the calibration.
+        square: distance between neighbouring corners, or from tag to tag [m]; it determines the scale of the
+            calibration.
         kind: kind of board.
         marker: side of the markers of a ChArUco board, or of AprilTags [m].
-        dictionary: dictionary of its markers: a `Dictionary` or a `TagFamily`.
-        scale_deviation: relative standard deviation common to all its lengths; None if not given.
-        flatness: distance between two planes that enclose its surface [m]; 0 for a perfectly flat board.
+        dictionary: dictionary of the markers: a `Dictionary` or a `TagFamily`.
+        scale_deviation: relative standard deviation of the scale, common to all lengths of the board; None if not
+            given.
+        flatness: distance between two parallel planes that enclose the surface [m]; 0 for a perfectly flat board.
     """
 
     name: str
@@ -146,15 +148,15 @@ class Board:
 
     @property
     def clearance(self) -> float:
-        """Width of the uniformly black or white areas on both sides of an edge, relative to its length."""
+        """Width of the uniformly black or white areas on both sides of an edge, relative to the edge's length."""
         if self.kind == "apriltag":
             return 1.0 / TAG_CELLS[self.dictionary]
         return 0.4 if self.kind == "checkerboard" else (1 - self.marker / self.square) / 2
 
     @property
     def is_symmetric(self) -> bool:
-        """Whether the board looks the same rotated by 180 deg, so an image does not determine its numbering.
+        """Whether the board looks the same after a rotation by 180 deg, so that its numbering is ambiguous.
 
-        This is so for checkerboards whose number of rows plus columns of corners is even.
+        Checkerboards are symmetric if the sum of their rows and columns of corners is even.
         """
         return self.kind == "checkerboard" and (self.rows + self.columns) % 2 == 0

@@ -11,32 +11,32 @@ from pisigma.measurement.camera.camera import Camera
 from pisigma.robot.se3 import nearest_rotation, rotation_from_vector, skew
 
 MIN_CORNERS = 6
-"""Smallest number of corners in an image: four determine the pose, two more show whether one is wrong."""
+"""Smallest number of corners in an image: four determine the pose, and two more reveal a wrong corner."""
 MAX_ITERATIONS = 20
 STEP_TOLERANCE = 1e-10
-"""[m or rad] Gauss-Newton step at which iterations stop."""
+"""Size of a Gauss-Newton step [m or rad] below which the iteration ends."""
 MIN_NOISE = 1e-6
-"""[px] Lower bound of the noise of corners, for exact ones."""
+"""Lower bound of the estimated noise of corners [px], for corners without noise."""
 POSE = 6
 """Number of parameters of a pose."""
 
 
 @dataclass(frozen=True, eq=False)
 class BoardPose:
-    """The pose of a board in front of a camera, with its covariance.
+    """The pose of a board relative to a camera, with its covariance.
 
     Attributes:
-        R: R_camera_board.
+        R: rotation R_camera_board.
         t: origin of the board in the camera's frame [m].
-        cofactor: covariance of the pose error (shift of t [m], rotation vector of R in the camera's frame [rad]) for a
-            noise of the corners of 1 px.
-        distance: residual of every corner, as a distance relative to its standard deviation [px].
-        weight: weight of every corner by the loss.
+        cofactor: covariance of the pose error (shift of t [m], rotation vector of R in the camera's frame [rad]) if
+            the noise of the corners is 1 px.
+        distance: length of every corner's residual, divided by the relative standard deviation of the corner [px].
+        weight: weight of every corner by the robust loss.
         by_intrinsics: derivative of the solved pose (shift of t [m], rotation vector of R in the camera's frame [rad])
             by the intrinsics.
-        root: information of the corners on the intrinsics k with the pose eliminated, for a noise of 1 px:
-            `root (k - present) = residual`.
-        residual: see `root` [px].
+        root: square root of the corners' information on the intrinsics k, with the pose eliminated and a noise of 1
+            px: `root (k - present) = residual`.
+        residual: right side of the equation of `root` [px].
     """
 
     R: Float64[np.ndarray, "3 3"]
@@ -81,7 +81,7 @@ def solve_board_pose(
     weight = _weights(residual, loss)
     by_intrinsics = camera.by_intrinsics(corners @ R.T + t) / sigma[:, None, None]
     columns = np.concatenate([J, by_intrinsics, residual[..., None]], -1)
-    # blocks of the factor: pose, intrinsics with the pose eliminated, and the residual as last column
+    # blocks of the factor: pose, intrinsics after elimination of the pose, and the residual as last column
     factor = triangular_factor((np.sqrt(weight)[:, None, None] * columns).reshape(-1, columns.shape[-1]))
     inverse = np.linalg.inv(factor[:POSE, :POSE])
     return BoardPose(
@@ -99,7 +99,7 @@ def solve_board_pose(
 def triangular_factor(
     columns: Float64[np.ndarray, "values columns"],
 ) -> Float64[np.ndarray, "columns columns"]:
-    """Return the triangular factor R of a QR decomposition, square even with fewer rows than columns.
+    """Return the triangular factor R of a QR decomposition, which is square even if there are fewer rows than columns.
 
     With the pose in the first columns, the rows after `POSE` are the equations of the other unknowns with the pose
     eliminated.
@@ -113,7 +113,7 @@ def triangular_factor(
 def linearise_pixels(
     camera: Camera, corners: np.ndarray, pixels: np.ndarray, sigma: np.ndarray, R: np.ndarray, t: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return measured minus predicted pixels, and derivatives with respect to pose and point, over sigma."""
+    """Return measured minus predicted pixels, and derivatives with respect to pose and point, all divided by sigma."""
     rotated = corners @ R.T
     predicted, by_point = camera.project(rotated + t)
     by_rotation = -by_point @ skew(torch.from_numpy(rotated)).numpy()

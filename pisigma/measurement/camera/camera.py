@@ -1,4 +1,4 @@
-"""A camera: its intrinsics, the projection of points, and its files."""
+"""Cameras: intrinsics, projection of points, and camera files."""
 
 import os
 import re
@@ -16,17 +16,17 @@ from pisigma.measurement.sensors.intrinsics import CAMERA_UNITS
 
 INTRINSICS = tuple(CAMERA_UNITS)
 USUAL_DEVIATIONS = (0.5, 0.5, 1.0, 1.0, 0.002, 0.01, 2e-4, 2e-4, 0.0)
-"""Standard deviations of the intrinsics after a usual calibration, with 0 for k3, which is seldom estimated."""
+"""Standard deviations of the intrinsics after a typical calibration, with 0 for k3, which is seldom estimated."""
 
 Positive = Annotated[float, Field(gt=0)]
 UNDISTORTED = 1e-14
-"""Newton step at which the undistorted point has converged to rounding."""
+"""Newton step below which the undistorted point has converged up to rounding."""
 MAX_UNDISTORT_ITERATIONS = 20
-"""Newton iterations from a distorted to the undistorted point; ordinary lenses take four."""
+"""Largest number of Newton iterations from a distorted to the undistorted point; ordinary lenses need four."""
 
 
 class IntrinsicsSection(Section):
-    """Standard deviations of a camera's intrinsics (or other numbers per intrinsic); 0 if not given.
+    """One number per intrinsic parameter of a camera, such as its standard deviation; 0 if not given.
 
     Attributes:
         fx: value of the focal length along u [px].
@@ -57,7 +57,7 @@ class IntrinsicsSection(Section):
 
 
 class CameraDocument(Section):
-    """A camera file of pisigma, with OpenCV's distortion model.
+    """Contents of a camera file of pisigma, with OpenCV's distortion model.
 
     Attributes:
         name: name of the camera.
@@ -73,7 +73,7 @@ class CameraDocument(Section):
         p2: second tangential distortion coefficient.
         k3: third radial distortion coefficient.
         sigma: standard deviations of the intrinsics.
-        is_fixed: whether the camera is fixed and the board is on the flange; else the other way round.
+        is_fixed: whether the camera is fixed and the board is on the flange; otherwise the camera is on the flange.
     """
 
     name: str = "camera"
@@ -107,17 +107,17 @@ class CameraDocument(Section):
 
 
 class MatrixSection(BaseModel):
-    """A matrix of a ROS or OpenCV file, row by row; its other keys are ignored."""
+    """A matrix in a ROS or OpenCV file, row by row; other keys of the matrix are ignored."""
 
     model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
     data: tuple[float, ...]
 
 
 class MatrixDocument(BaseModel):
-    """A camera file of ROS (`camera_info`) or of OpenCV's calibration sample.
+    """Contents of a camera file of ROS (`camera_info`) or of OpenCV's calibration sample.
 
-    Fisheye lenses are refused because their coefficients have another meaning, and binned images because their pixels
-    do.
+    Fisheye lenses are refused because their coefficients have another meaning; binned images are refused because
+    their pixels are larger.
     """
 
     model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
@@ -152,7 +152,7 @@ class Camera:
         p2: second tangential distortion coefficient.
         k3: third radial distortion coefficient.
         sigma: standard deviations of fx, fy, cx, cy [px], k1, k2, p1, p2, k3; None if not given.
-        is_fixed: whether the camera is fixed and the board is on the flange; else the other way round.
+        is_fixed: whether the camera is fixed and the board is on the flange; otherwise the camera is on the flange.
     """
 
     name: str
@@ -223,7 +223,7 @@ class Camera:
     def project(
         self, points: Float64[np.ndarray, "*batch 3"]
     ) -> tuple[Float64[np.ndarray, "*batch 2"], Float64[np.ndarray, "*batch 2 3"]]:
-        """Return the pixels of points in the camera's frame [m], and the derivative with respect to these [px/m]."""
+        """Return the pixels of points in the camera's frame [m], and derivatives with respect to the points [px/m]."""
         xy = points[..., :2] / points[..., 2:]
         distorted, derivative = self._distorted(xy)
         scale = np.array([self.fx, self.fy])
@@ -236,8 +236,8 @@ class Camera:
     def by_intrinsics(self, points: Float64[np.ndarray, "*batch 3"]) -> Float64[np.ndarray, "*batch 2 9"]:
         """Return the derivative of the pixels of points in the camera's frame [m] with respect to the intrinsics.
 
-        The pixels are linear in the focal lengths times a polynomial that is linear in the distortion, so the columns
-        are these factors themselves.
+        Pixels are focal lengths times a polynomial that is linear in the distortion, so the derivatives are the
+        factors themselves.
         """
         xy = points[..., :2] / points[..., 2:]
         x, y = xy[..., 0], xy[..., 1]
@@ -266,7 +266,7 @@ class Camera:
         return xy
 
     def _distorted(self, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return distorted x / z and y / z, and their derivative with respect to the undistorted ones."""
+        """Return distorted x / z and y / z, and their derivatives with respect to the undistorted values."""
         x, y = xy[..., 0], xy[..., 1]
         square = x * x + y * y
         radial = 1 + square * (self.k1 + square * (self.k2 + square * self.k3))

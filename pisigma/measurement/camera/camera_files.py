@@ -1,4 +1,4 @@
-"""Description of files of corners: cameras, boards, and the repeatability of the robot."""
+"""Cameras, boards and repeatability of the robot, which files of corners require."""
 
 import math
 from dataclasses import dataclass, field
@@ -10,12 +10,12 @@ from pisigma.files.setting import KEY, Option, as_texts
 
 IntrinsicsChoice = Literal["fixed", "prior", "free"]
 MAX_REPEATABILITY = 0.01, 0.105
-"""[m] and [rad] No robot is worse; larger values are in another unit."""
+"""Largest repeatability [m] and [rad]; larger values must be in another unit."""
 
 
 @dataclass(frozen=True)
 class Repeatability:
-    """Repeatability of the robot: deviation of its pose from that of its joint values, independent in each image.
+    """Repeatability of a robot: deviation of the pose at given joint values, independent in each image.
 
     Attributes:
         length: standard deviation of the robot's position repeatability, per axis [m], for images.
@@ -72,12 +72,12 @@ class CameraFiles:
 
     @property
     def files(self) -> tuple[str, ...]:
-        """The files of cameras and boards."""
+        """Paths of all camera files and board files."""
         return (*self.cameras, *self.boards)
 
     @property
     def options(self) -> list[str]:
-        """The command line options that state the same."""
+        """Command-line options that state the cameras and boards."""
         words = [word for path in self.cameras for word in ("--camera", path)]
         words += [word for path in self.boards for word in ("--board", path)]
         usual, stated = Repeatability(), self.repeatability

@@ -26,9 +26,9 @@ from pisigma.measurement.sensors.intrinsics import NOISE_COLUMN
 from pisigma.robot.description import Robot
 
 SAME_JOINTS = 1e-9
-"""[rad or m] Largest difference of the joint values of one image."""
+"""Largest difference between the joint values in the rows of one image [rad or m]."""
 RESOLUTION_IMAGES = 8
-"""Number of images of which some show corners outside the upper left quarter of the field of view."""
+"""Smallest number of images of which some must show corners outside the upper left quarter of the field of view."""
 CONDITIONS = ("split", "payload", "temperature", "approach", "date")
 """Fields that rows of corners may have in addition to joint values and pixels."""
 IMAGE_COLUMNS = (*CORNERS, "sigma_px", "camera", "board")
@@ -97,7 +97,7 @@ def read_rows(
         cameras: cameras and boards of the files of corners.
 
     Raises:
-        MeasurementError: a file cannot be used, the files do not fit together, or cameras are given and there are no
+        MeasurementError: a file cannot be used, the files do not fit together, or cameras are given but no file has
             corners.
     """
 
@@ -128,7 +128,7 @@ def read_rows(
 
 
 def with_common_noise(rows: Measurements) -> Measurements:
-    """Return the rows with the same noise for all corners; their weights state how cameras differ."""
+    """Return the rows with a common noise of all corners; the weights contain the differences between cameras."""
     noise = rows.readings.get(NOISE_COLUMN)
     if not isinstance(noise, torch.Tensor):
         return rows
@@ -139,7 +139,7 @@ def with_common_noise(rows: Measurements) -> Measurements:
 def _by_name(
     load: Callable[[str], CameraOrBoard], paths: Sequence[str], what: str
 ) -> dict[str, CameraOrBoard]:
-    """Load cameras or boards and return them by name."""
+    """Return cameras or boards, loaded from files, by name."""
     loaded: dict[str, CameraOrBoard] = {}
     for path in paths:
         one = load(path)
@@ -155,7 +155,7 @@ def _by_name(
 
 
 def _stated(table: Table, column: str, choices: Collection[str]) -> list[str]:
-    """Return the camera or board of every row; with one choice its name may be omitted."""
+    """Return the camera or board of every row; if there is only one, its name may be omitted."""
     several = len(choices) > 1
     names = [""] * len(table.records)
     if several or column in table.header:
@@ -172,7 +172,7 @@ def _stated(table: Table, column: str, choices: Collection[str]) -> list[str]:
 
 
 def _are_corners(table: Table) -> list[bool]:
-    """Return which rows contain a corner: those with an image.
+    """Return the mask of the rows that contain a corner, which are the rows with an image.
 
     Raises:
         MeasurementError: a column is missing, a row is not valid CSV, or its number of fields is not that of the
@@ -194,7 +194,7 @@ def _are_corners(table: Table) -> list[bool]:
 
 
 def _some(table: Table, chosen: Sequence[bool]) -> Table:
-    """Return the chosen rows."""
+    """Return the chosen rows of a table."""
     rows = np.flatnonzero(chosen).tolist()
     records, lines = [table.records[row] for row in rows], tuple(table.lines[row] for row in rows)
     return replace(table, records=records, lines=lines, broken={})
@@ -203,7 +203,7 @@ def _some(table: Table, chosen: Sequence[bool]) -> Table:
 def _without_corners(table: Table, is_corner: Sequence[bool]) -> Table:
     """Return the table as a measurement file, so that joint values and conditions are read and checked in the same way.
 
-    Rows of corners contain their number instead of the position, which is not known yet.
+    Rows of corners contain the row number instead of the position, which is not known yet.
     """
     unit = "m" if "x_m" in table.header else "mm"
     position = tuple(f"{axis}_{unit}" for axis in POSITION)
@@ -224,7 +224,7 @@ def _images(
     """Group the corners of one camera and one board by image.
 
     Returns:
-        The images, and the number of the first row of each.
+        The images, and the row number of the first corner of each.
     """
     number, u, v = (number_column(table, name) for name in CORNERS)
     pixels = np.stack([u, v], -1)
@@ -291,7 +291,7 @@ _RESOLUTION_REMEDY = "give the camera's intrinsics at the resolution of the imag
 
 
 def _check_resolution(table: Table, pixels: Float64[np.ndarray, "rows 2"], camera: Camera) -> None:
-    """Refuse images of which none shows a corner outside the upper left quarter of the field of view.
+    """Refuse images if none shows a corner outside the upper left quarter of the field of view.
 
     Raises:
         MeasurementError: the images of a camera show corners in the upper left quarter only.
@@ -315,7 +315,7 @@ def _check_image(
     """Refuse an image with invalid corners.
 
     Raises:
-        MeasurementError: it has too few corners, a corner twice, or different joint values.
+        MeasurementError: the image has too few corners, a duplicate corner, or different joint values.
     """
     at = RowPlace(table.source, table.lines[rows[0]], image=name)
     if len(rows) < MIN_CORNERS:

@@ -37,11 +37,11 @@ from pisigma.measurement.sensors.intrinsics import (
 from pisigma.robot.se3 import skew
 
 MAX_BEND_ITERATIONS = 4
-"""Iterations of the board's shape at one set of intrinsics; without wrong corners, the second step is near rounding."""
+"""Largest number of iterations of the board's shape for given intrinsics; usually the second step is near rounding."""
 BEND_TOLERANCE = 1e-6
-"""[m] Change of the board's shape at which iterations stop."""
+"""Change of the board's shape [m] below which the iteration ends."""
 MAX_MEDIAN_RESIDUAL = 10.0
-"""[px] Median residual of an image's corners above which they are not those of the board."""
+"""Median residual of an image's corners [px] above which they cannot be corners of the board."""
 SHAPES = 3
 """Number of shapes of a bent board, see `bend_shapes`."""
 
@@ -51,12 +51,12 @@ class Images:
     """The corners in images that one camera took of one board.
 
     Attributes:
-        source: the file.
+        source: the file that contains the corners.
         names: names of the images, in the file's order.
         q: joint values of every image [rad or m].
         lines: line of the first corner of every image.
         corners: numbers of the corners in every image.
-        pixels: their pixels [px].
+        pixels: pixels of the corners in every image [px].
         sigma: standard deviation of every corner, up to a common factor that is estimated; empty if all are equal.
     """
 
@@ -93,7 +93,7 @@ def image_measurements(
         board: the board, with its numbering of the corners.
         is_fixed: whether the camera is fixed and the board is on the flange.
         repeatability: repeatability of the robot.
-        intrinsics: whether the camera's intrinsics are fixed, under their prior, or free; see `prior_deviations`.
+        intrinsics: whether the camera's intrinsics are fixed, have their prior, or are free; see `prior_deviations`.
 
     Returns:
         One row per image, in the frame of the board with the camera as target (of a fixed camera the other way
@@ -129,7 +129,7 @@ def image_measurements(
 def _readings(
     solved: SolvedImages, changes: Sequence[np.ndarray], board: Board, repeatability: Repeatability
 ) -> dict[str, torch.Tensor | tuple[str, ...]]:
-    """Return the columns of `CornerSensor`; `changes` are derivatives with respect to the board's poses."""
+    """Return the columns of `CornerSensor`; `changes` are derivatives of target poses with respect to board poses."""
     at_board = solved.noise / solved.camera.fx * float(np.median([pose.t[2] for pose in solved.poses]))
     of_robot = np.diag([repeatability.length**2] * 3 + [repeatability.angle**2] * 3)
     of_corners = [
@@ -208,7 +208,7 @@ def _refuse_other_boards(images: Images, board: Board, poses: Sequence[BoardPose
 
 
 def _target_pose(pose: BoardPose, is_fixed: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the target's pose, and its derivative (in axes of the frame) with respect to the board's pose.
+    """Return the pose of the target, and its derivative, in axes of the frame, with respect to the board's pose.
 
     For a shift and a rotation vector of the board's pose, the position `-R^T t` of the inverse pose changes by
     `-R^T (shift + t × rotation)`, and its rotation by `-R^T rotation`.
@@ -231,7 +231,7 @@ def _inverse_root(covariance: np.ndarray) -> np.ndarray:
 
 
 def bend_shapes(board: Board) -> Float64[np.ndarray, "corners 3"]:
-    """Return the relative heights of three smooth shapes above the board's plane at its corners, 1 at most.
+    """Return the relative heights, at most 1, of three smooth shapes above the board's plane at its corners.
 
     They are the squares and the product of the two coordinates in the plane, minus their best-fitting plane, so that
     the pose of the board remains that of its mean plane.
@@ -264,7 +264,7 @@ def update_bend(
         board: the board, with its flatness.
         camera: the camera.
         numbers: numbers of the corners in every image.
-        pixels: their pixels [px].
+        pixels: pixels of the corners in every image [px].
         sigma: standard deviation of every corner relative to the median.
         poses: poses of the board in every image.
         noise: standard deviation of u and v of a corner of median deviation [px].

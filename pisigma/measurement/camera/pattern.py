@@ -1,4 +1,4 @@
-"""The printed pattern of a board: black rectangles on a white sheet, in the board's frame."""
+"""Printed patterns of boards: black rectangles on a white sheet, in the frame of the board."""
 
 from dataclasses import dataclass
 
@@ -13,8 +13,8 @@ class Pattern:
     """A printed board, seen along its z axis (x to the right, y down).
 
     Attributes:
-        black: black rectangles that do not overlap: left, top, right and bottom edge [m].
-        sheet: left, top, right and bottom edge of the white sheet with its margin [m].
+        black: left, top, right and bottom edge [m] of black rectangles that do not overlap.
+        sheet: left, top, right and bottom edge of the white sheet, including its margin [m].
     """
 
     black: Float64[np.ndarray, "rectangles 4"]
@@ -44,7 +44,7 @@ def board_pattern(board: Board) -> Pattern:
 
 
 def board_sheet(board: Board) -> Float64[np.ndarray, " 4"]:
-    """Return left, top, right and bottom edge of the white sheet of a board with its margin [m]."""
+    """Return left, top, right and bottom edge of the white sheet of a board, including its margin [m]."""
     if board.kind == "apriltag":
         margin = board.square / 2
         return np.array([-margin, -margin, *board.corners.max(0)[:2] + margin])
@@ -53,7 +53,7 @@ def board_sheet(board: Board) -> Float64[np.ndarray, " 4"]:
 
 def _markers(board: Board, left_top: np.ndarray) -> Float64[np.ndarray, "rectangles 4"]:
     """Return the black rectangles of markers (runs of black cells in a row), given their upper left corners."""
-    from pisigma.measurement.camera.detection.markers import marker_cells  # of the extra `camera`
+    from pisigma.measurement.camera.detection.markers import marker_cells  # a package of the extra `camera`
 
     rectangles = []
     for number, at in enumerate(left_top):

@@ -1,4 +1,4 @@
-"""Solve the poses of a board in the images of one camera, and its intrinsics without a robot."""
+"""Solve the poses of a board in the images of one camera, and the camera's intrinsics without a robot."""
 
 import math
 from collections.abc import Callable, Collection, Sequence
@@ -23,14 +23,15 @@ from pisigma.measurement.sensors.intrinsics import ImageIntrinsics, intrinsics_i
 
 MAX_ITERATIONS = 20
 CONVERGENCE_TOLERANCE = 0.1
-"""[standard deviations] Change of the intrinsics below which they need not be linearised again."""
+"""Change of the intrinsics, in standard deviations, below which they are not linearised again."""
 FREE_FOCAL, FREE_CENTRE = 0.05, 0.05
-"""Prior standard deviations of free intrinsics relative to focal lengths and width: larger than lenses vary."""
+"""Prior standard deviations of free focal lengths and principal points, relative to focal length and image width;
+lenses vary less."""
 FREE_DISTORTION = (0.3, 1.0, 0.01, 0.01, 3.0)
-"""Prior standard deviations of k1, k2, p1, p2 and k3 if free."""
+"""Prior standard deviations of k1, k2, p1, p2 and k3 if they are free."""
 MIN_IMAGES = 3
 UNINFORMATIVE = 10.0
-"""Factor on the prior standard deviations of free intrinsics with which only the images matter."""
+"""Factor on the prior standard deviations of free intrinsics that makes the prior negligible relative to the images."""
 FIRST = ("fx", "fy", "k1")
 """Intrinsics that are estimated first."""
 CELLS = 8
@@ -38,12 +39,12 @@ CELLS = 8
 
 
 def prior_deviations(camera: Camera, choice: IntrinsicsChoice) -> Float64[np.ndarray, " 9"]:
-    """Return prior standard deviations of a camera's intrinsics [px; distortion without unit], 0 for fixed ones.
+    """Return prior standard deviations of a camera's intrinsics [px; distortion without unit], 0 if fixed.
 
     Args:
-        camera: the camera, with the standard deviations of its file or else those of a usual calibration.
-        choice: "fixed": all are fixed; "prior": standard deviations of the camera; "free": so large that the images
-            decide. Intrinsics that "prior" fixes are fixed with "free", too.
+        camera: the camera, with the standard deviations of its file or, without them, of a typical calibration.
+        choice: "fixed": all intrinsics are fixed; "prior": standard deviations of the camera; "free": standard
+            deviations so large that the images decide. Intrinsics that "prior" fixes are fixed with "free", too.
     """
     stated = np.array(camera.sigma or USUAL_DEVIATIONS)
     wide = [
@@ -61,7 +62,7 @@ class SolvedImages:
     """The poses of the board in all images of a camera.
 
     Attributes:
-        camera: the camera of the file, the prior.
+        camera: the camera of the file, whose intrinsics are the prior mean.
         present: the camera with the intrinsics with which the poses were solved.
         sigma: prior standard deviations, see `prior_deviations`.
         poses: pose of the board in every image.
@@ -102,7 +103,7 @@ def solve_images(
     Args:
         camera: the camera of the file.
         sigma: prior standard deviations, see `prior_deviations`.
-        solve: returns the poses at given intrinsics.
+        solve: function that returns the poses for given intrinsics.
         loss: robust loss of the corners, for their noise.
         source: name of the images in messages.
 
@@ -140,11 +141,11 @@ def corner_noise(poses: Sequence[BoardPose], loss: AbstractLoss) -> float:
 
 @dataclass(frozen=True, eq=False)
 class BoardView:
-    """A board in an image.
+    """Corners of a board, and their pixels in an image.
 
     Attributes:
         points: corners in the board's frame, z = 0 [m].
-        pixels: their pixels in the image [px].
+        pixels: pixels of the corners in the image [px].
     """
 
     points: Float64[np.ndarray, "corners 3"]
@@ -153,16 +154,16 @@ class BoardView:
 
 @dataclass(frozen=True, eq=False)
 class IntrinsicCalibration:
-    """A camera calibrated with images of a board.
+    """Result of the calibration of a camera with images of a board.
 
     Attributes:
-        camera: the camera, with standard deviations.
+        camera: the calibrated camera, with standard deviations of its intrinsics.
         noise: standard deviation of u and v of a corner [px].
         tilts: angle between the board's normal and the camera's axis in every image [rad].
-        disagreement: ratio of the images' scatter about common intrinsics to their noise (Birge 1932): 1 if the model
-            fits, more for a bowed board. Standard deviations are multiplied by it.
+        disagreement: ratio of the images' scatter about common intrinsics to their noise (Birge 1932): it is 1 if
+            the model fits, and larger for a bowed board. Standard deviations are multiplied by it.
         disagrees: whether the ratio is larger than by chance (three standard deviations).
-        covered: cells of the image, row by row, in which some image has a corner.
+        covered: for every cell of the image, row by row, whether a corner was seen in it.
     """
 
     camera: Camera
@@ -185,7 +186,7 @@ def calibrate_intrinsics(
         views: the board in every image.
         name: name of the camera.
         size: width and height of the images [px].
-        free_k3: whether k3 is estimated; else it is 0.
+        free_k3: whether to estimate k3; otherwise k3 is 0.
 
     Raises:
         MeasurementError: the images do not determine the intrinsics.
@@ -225,13 +226,15 @@ def initial_camera(views: Sequence[BoardView], name: str, size: tuple[int, int])
     the focal length.
 
     Raises:
-        MeasurementError: all images are perpendicular to the board, so they do not determine it.
+        MeasurementError: all images are perpendicular to the board, so they do not determine the focal length.
     """
     middle, width = (np.array(size) - 1) / 2, float(size[0])
     slopes, constants = list[float](), list[float]()
     for view in views:
         H = homography(view.points[:, :2], (view.pixels - middle) / width)
-        h1, h2 = H[:, :2].T / np.linalg.norm(H[:2, :2])  # scaled, so that all images have similar weights
+        h1, h2 = H[:, :2].T / np.linalg.norm(
+            H[:2, :2]
+        )  # rows are scaled so that all images have similar weights
         slopes += [h1[:2] @ h2[:2], h1[:2] @ h1[:2] - h2[:2] @ h2[:2]]
         constants += [h1[2] * h2[2], h1[2] ** 2 - h2[2] ** 2]
     squared = -(np.dot(slopes, constants) / np.dot(slopes, slopes))
@@ -248,7 +251,7 @@ def initial_camera(views: Sequence[BoardView], name: str, size: tuple[int, int])
 def _solved(
     views: Sequence[BoardView], start: Camera, names: Collection[str], loss: AbstractLoss
 ) -> SolvedImages:
-    """Solve all poses and the intrinsics in `names`, with the others fixed."""
+    """Solve all poses and the intrinsics in `names`; other intrinsics are fixed."""
     sigma = UNINFORMATIVE * prior_deviations(replace(start, sigma=(1.0,) * len(INTRINSICS)), "free")
     sigma *= [name in names for name in INTRINSICS]
 
@@ -259,7 +262,7 @@ def _solved(
 
 
 def _covered(views: Sequence[BoardView], size: tuple[int, int]) -> Bool[np.ndarray, "cells cells"]:
-    """Return the cells of the image that contain a corner of some view."""
+    """Return for every cell of the image whether it contains a corner of any view."""
     covered = np.zeros((CELLS, CELLS), dtype=bool)
     for view in views:
         cell = np.clip(CELLS * (view.pixels + 0.5) / size, 0, CELLS - 1).astype(int)

@@ -1,1 +1,1 @@
-"""Measurement files: read, checked and written."""
+"""Read, check and write measurement files."""

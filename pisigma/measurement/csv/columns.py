@@ -1,4 +1,4 @@
-"""The columns of measurement files: their names, quantities and units, and the fields that they form."""
+"""Columns of measurement files: names, quantities and units, and the fields that they form."""
 
 import re
 from collections.abc import Iterable
@@ -19,13 +19,13 @@ _METRES = {"metres": 1.0, "millimetres": 1e-3, "centimetres": 1e-2, "inches": 0.
 MISNAMED_UNITS = tuple(
     (_METRES[are] / _METRES[named], are, named) for are in _METRES for named in _METRES if are != named
 )
-"""Factors on lengths that are in one unit and labelled as another: factor, actual unit, stated unit."""
+"""Factors on lengths whose unit is stated wrongly: factor, actual unit, stated unit."""
 
 CORNERS = ("corner", "u_px", "v_px")
-"""Columns of files of corners, which `pisigma.measurement.camera` reads."""
+"""Required columns of files of corners, which `pisigma.measurement.camera` reads."""
 
 PLAN_COLUMNS = ("order", "candidate")
-"""Columns of a plan; measurement files may keep them, and they are ignored there."""
+"""Columns of a plan; measurement files may contain them, but they are ignored."""
 
 _JOINT = re.compile(r"q([1-9][0-9]{0,2})_(deg|rad|mm|m)")
 _APPROACH = re.compile(r"approach([1-9][0-9]{0,2})")
@@ -37,8 +37,8 @@ class Column:
 
     Attributes:
         name: name in the header, such as "q1_deg".
-        quantity: its quantity, such as "q1"; unique within a file.
-        unit: unit of its values; "" for dimensionless ones and texts.
+        quantity: quantity of the column, such as "q1"; unique within a file.
+        unit: unit of the values; "" for dimensionless values and texts.
     """
 
     name: str
@@ -47,7 +47,7 @@ class Column:
 
     @property
     def is_number(self) -> bool:
-        """Whether its cells are numbers."""
+        """Whether the cells of the column are numbers."""
         return self.quantity not in (*TEXTS, *PLAN_COLUMNS, *reading_texts())
 
     @property
@@ -58,20 +58,20 @@ class Column:
 
     @property
     def approach(self) -> int:
-        """Number of the joint whose direction of approach it contains, from 1; 0 for other columns."""
+        """Number, from 1, of the joint whose direction of approach the column contains; 0 for other columns."""
         match = _APPROACH.fullmatch(self.name)
         return int(match[1]) if match else 0
 
 
 @dataclass(frozen=True)
 class FileField:
-    """A numeric field of measurements, and its columns in files.
+    """A numeric field of measurements, and the columns that contain it in files.
 
     Attributes:
         name: name of the field.
-        quantities: quantities of its columns, one for every value of a row.
-        units: valid units of the columns; files are written in the first.
-        column: name of its only column without the unit, if it differs from the quantity.
+        quantities: quantities of the columns, one for every value of a row.
+        units: valid units of the columns; files are written in the first unit.
+        column: name of the only column without its unit, if it differs from the quantity.
     """
 
     name: str
@@ -81,7 +81,7 @@ class FileField:
 
     @property
     def columns(self) -> tuple[Column, ...]:
-        """All columns that it may have, starting with those in the first unit."""
+        """All columns that the field may have, starting with the columns in the first unit."""
         return tuple(
             Column("_".join(filter(None, (self.column or quantity, unit))), quantity, unit)
             for unit in self.units
@@ -139,17 +139,17 @@ def _columns() -> dict[str, Column]:
 def column_choices(name: str) -> str:
     """Return a text that lists the valid columns and the one nearest to an unknown `name`.
 
-    Joint columns are listed for one joint only: the one that `name` seems to mean, else the first.
+    Joint columns are listed for one joint only: the joint that `name` seems to refer to, otherwise the first.
     """
     number = re.match(r"[A-Za-z]+[ _]?([1-9][0-9]?)(?![0-9])", name)
     joint = number[1] if number else "1"
     joints = (f"q{joint}_{unit}" for unit in (*REVOLUTE_UNITS, *PRISMATIC_UNITS))
     meant = name.lower()
-    if re.fullmatch(r"q[1-9][0-9]?", meant):  # most joints are revolute
+    if re.fullmatch(r"q[1-9][0-9]?", meant):  # degrees, because most joints are revolute
         meant += "_deg"
     return nearest_choice(meant, (*joints, *_columns(), f"approach{joint}"))
 
 
 def quoted_names(columns: Iterable[Column]) -> str:
-    """Return the names of columns as messages list them."""
+    """Return the quoted names of columns, joined for messages."""
     return ", ".join(f"'{column.name}'" for column in columns)

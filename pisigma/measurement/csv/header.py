@@ -1,4 +1,4 @@
-"""The header of a measurement file: the meaning of its columns by name, and whether they fit together."""
+"""Read the header of a measurement file: the meaning of its columns, and whether they fit together."""
 
 import math
 from dataclasses import dataclass, replace
@@ -40,25 +40,25 @@ class Layout:
 
     @property
     def position(self) -> tuple[str, ...]:
-        """The quantities x, y, z, or none."""
+        """Quantities of the position, x, y and z; empty if the file has no position."""
         return POSITION if POSITION[0] in self.index else ()
 
     @property
     def lengths(self) -> tuple[str, ...]:
-        """The quantities other than position and orientation of which one makes a row a measurement.
+        """Quantities other than position and orientation that make a row a measurement.
 
-        They include the names (sockets, anchors), so that a name without a value is reported as such.
+        They include names (of sockets and anchors), so that a name without a value is reported.
         """
         return tuple(name for name in ("socket", *_NEEDED, *reading_numbers()) if name in self.index)
 
     @property
     def joints(self) -> tuple[str, ...]:
-        """The quantities q1, q2, ... in order."""
+        """Quantities of the joint values, q1, q2, ..., in order."""
         return tuple(f"q{number}" for number in range(1, self.dof + 1))
 
     @property
     def approaches(self) -> tuple[str, ...]:
-        """The quantities approach1, approach2, ... that the file has."""
+        """Quantities approach1, approach2, ... that the file contains."""
         return tuple(column.quantity for column in self.columns if column.approach)
 
     def column(self, quantity: str) -> Column:
@@ -71,7 +71,7 @@ def read_header(table: Table, robot: Robot | None) -> Layout:
 
     Args:
         table: the file.
-        robot: checks number and units of the joint columns; None checks neither.
+        robot: robot against which number and units of the joint columns are checked; None for no check.
 
     Raises:
         MeasurementError: a column is unknown, missing or duplicate, or units do not fit together.
@@ -108,7 +108,7 @@ def read_header(table: Table, robot: Robot | None) -> Layout:
 
 
 def _fault(place: Place, problem: str, column: Column | None, remedy: str) -> MeasurementError:
-    """Return the exception for a header, or for one of its columns."""
+    """Return the exception for a fault of a header, or of one of its columns."""
     at = place if column is None else replace(place, column=column.name)
     return MeasurementError(problem, at=at, remedy=remedy)
 
@@ -161,7 +161,7 @@ def _is_number(name: str) -> bool:
 
 
 def _check_joints(place: Place, columns: tuple[Column, ...]) -> int:
-    """Check that joints are numbered from q1 without a gap, in one unit per type of joint; return their number."""
+    """Check that joints are numbered from q1 without a gap, with one unit per joint type; return their number."""
     joints = sorted((column for column in columns if column.joint), key=lambda column: column.joint)
     if not joints:
         remedy = "add q1_deg or q1_rad (q1_mm or q1_m for a prismatic joint) and so on for every joint"
@@ -267,7 +267,7 @@ def _check_lengths(place: Place, columns: tuple[Column, ...]) -> None:
 
 
 def _check_readings(place: Place, columns: tuple[Column, ...]) -> None:
-    """Check that all columns of a registered sensor are given, or none."""
+    """Check that a file has all columns of a registered sensor, or none."""
     present = {column.quantity: column for column in columns}
     for readings in READINGS.values():
         there = [column for column in readings.columns if column.name in present]
@@ -281,7 +281,7 @@ def _check_readings(place: Place, columns: tuple[Column, ...]) -> None:
 
 
 def _check_orientation(place: Place, columns: tuple[Column, ...]) -> tuple[str, ...]:
-    """Return the form in which the file gives the orientation, which must be complete and given once."""
+    """Return the quantities of the orientation, which must be complete and appear once."""
     groups = {
         group: [column for column in columns if column.quantity in group] for group in (RPY, QUATERNION)
     }

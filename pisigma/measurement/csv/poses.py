@@ -29,7 +29,7 @@ CHUNK_ROWS = 20_000
 _RPY_COLUMNS = tuple(f"{name}_deg" for name in RPY)
 _POSITION_COLUMNS = tuple(f"{name}_mm" for name in POSITION)
 _MAX_SHOWN, _MAX_LINE = 40, 10_000_000
-"""Number of characters of a cell that messages show, and that a line may have."""
+"""Largest numbers of characters of a cell that messages show, and of a line."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,8 +38,8 @@ class PoseChunk:
 
     Attributes:
         T: T_base_tool [m] of the valid rows.
-        line: lines of the valid rows.
-        bad: the other rows and what is wrong with them.
+        line: line numbers of the valid rows.
+        bad: invalid rows, and what is wrong with them.
         share: fraction of the file that has been read, 0 to 1; NaN if the file has no length.
     """
 
@@ -66,7 +66,7 @@ def read_poses(path: str | os.PathLike[str]) -> PoseChunk:
 
 
 def read_pose_chunks(path: str | os.PathLike[str], rows: int = CHUNK_ROWS) -> Iterator[PoseChunk]:
-    """Read desired poses in chunks of rows; invalid rows are reported and do not stop the others.
+    """Read desired poses in chunks of rows; invalid rows are reported, and reading continues.
 
     For the columns see `read_poses`. Blank lines and lines that start with # are skipped.
 
@@ -75,7 +75,7 @@ def read_pose_chunks(path: str | os.PathLike[str], rows: int = CHUNK_ROWS) -> It
         rows: number of rows per chunk.
 
     Raises:
-        MeasurementError: the file cannot be read, its header cannot be used, or no row follows it.
+        MeasurementError: the file cannot be read, its header cannot be used, or it has no rows.
     """
     try:
         with open(path, encoding="utf-8-sig", errors="surrogateescape", opener=open_input) as file:
@@ -108,7 +108,7 @@ def _chunks(file: TextIO, source: str, rows: int) -> Iterator[PoseChunk]:
 
 
 def _bounded_lines(file: TextIO, source: str) -> Iterator[str]:
-    """Yield the lines of a file, none of them so long that it fills the memory."""
+    """Yield the lines of a file, and refuse lines that are longer than `_MAX_LINE` characters."""
     for number in count(1):
         line = file.readline(_MAX_LINE)
         if len(line) == _MAX_LINE:
@@ -129,7 +129,7 @@ class _Layout:
     Attributes:
         names: names of all columns, in order.
         position: indices and meanings of the columns of the position.
-        orientation: those of the orientation, in the order of `QUATERNION` or `RPY`.
+        orientation: indices and meanings of the columns of the orientation, in the order of `QUATERNION` or `RPY`.
     """
 
     names: tuple[str, ...]
@@ -148,7 +148,7 @@ class _Layout:
         return _Layout(names, position, angles)
 
     def values(self, lines: Sequence[str]) -> tuple[Float64[np.ndarray, "rows columns"], dict[int, Fault]]:
-        """Return the numbers of rows in the file's units, and what is wrong by row."""
+        """Return the numbers of rows in the file's units, and the faults by row."""
         text = "".join(lines)
         if '"' not in text and "_" not in text:  # Python reads 1_000 as a number
             cells = [line.split(",") for line in lines]
@@ -158,12 +158,12 @@ class _Layout:
                 except ValueError:
                     pass
                 else:
-                    if np.abs(numbers).max(initial=0.0) <= MAX_MAGNITUDE:  # no NaN either
+                    if np.abs(numbers).max(initial=0.0) <= MAX_MAGNITUDE:  # NaN is refused, too
                         return numbers, {}
         return self._checked_values(lines)
 
     def _checked_values(self, lines: Sequence[str]) -> tuple[np.ndarray, dict[int, Fault]]:
-        """Return the same, row by row, for rows of which one is at fault."""
+        """Return numbers and faults like `values`, converting row by row because at least one row has a fault."""
         numbers, faults = np.full((len(lines), len(self.names)), np.nan), {}
         for row, line in enumerate(lines):
             fields, problem = split_line(line.rstrip("\n"))
@@ -174,7 +174,7 @@ class _Layout:
         return numbers, faults
 
     def _fault(self, line: str, fields: Sequence[str], problem: str) -> Fault | None:
-        """Return what is wrong with a row; None if nothing is."""
+        """Return the fault of a row; None if it has no fault."""
         if _is_foreign(line):
             return _NOT_UTF8
         if problem:
@@ -193,7 +193,7 @@ class _Layout:
     def poses(
         self, values: Float64[np.ndarray, "rows columns"], faults: dict[int, Fault]
     ) -> tuple[Float64[Tensor, "rows 4 4"], Bool[Tensor, " rows"]]:
-        """Return T_base_tool of rows, and which are valid; quaternions whose norm is not 1 are added to `faults`."""
+        """Return T_base_tool of valid rows, and their mask; quaternions whose norm is not 1 are added to `faults`."""
         position, angles = (
             torch.from_numpy(np.stack([to_si(values[:, place], column.unit) for place, column in group], -1))
             for group in (self.position, self.orientation)
@@ -216,7 +216,7 @@ _NOT_UTF8 = Fault(expected="UTF-8 text", remedy="save the file as CSV in UTF-8")
 
 
 def _is_foreign(line: str) -> bool:
-    """Return whether a line contains bytes that are not UTF-8, which are read as lone surrogates."""
+    """Return whether a line contains bytes that are not UTF-8, which were read as lone surrogates."""
     return not line.isascii() and any("\ud800" <= letter <= "\udfff" for letter in line)
 
 

@@ -1,4 +1,4 @@
-"""Read measurement files, completely with every row checked, or their joint values alone."""
+"""Read measurement files, either completely with every row checked, or their joint values only."""
 
 import math
 import os
@@ -33,29 +33,30 @@ from pisigma.robot import Robot
 from pisigma.robot.se3 import rotation_from_quaternion, rotation_from_rpy
 
 _MAX_BYTES = 2**22
-"""Size up to which a refused file is checked for being an export, so that a refusal does not take long."""
+"""Largest size [bytes] of a refused file that is tested for being an export, so that refusing does not take long."""
 
 
 def read_fields(
     path: str | os.PathLike[str], robot: Robot | None = None, on_bad_row: OnBadRow = "error"
 ) -> MeasuredFields:
-    """Read a measurement file, whose header states quantity and unit of every column, in any order.
+    """Read a measurement file, whose header states quantity and unit of every column; columns may be in any order.
 
     Required are the joint values `q1_deg` or `q1_rad` and so on (prismatic: `q3_mm` or `q3_m`), and at least one kind
     of length (each also in `_m`), of which every row contains at most one: `x_mm,y_mm,z_mm`; `socket`, the name of the
-    fixed point that the ball sits in; `touch_axis` (x, y or z) and `touch_mm` with `frame`, the jig; `distance_mm` with
-    `anchor`, the name of a fixed point whose position `anchor_x_mm,anchor_y_mm,anchor_z_mm` may be given, or with
-    `pair`, a name that is given in the two rows between which it was measured.
+    fixed point in which the ball sits; `touch_axis` (x, y or z) and `touch_mm` with `frame`, the jig; `distance_mm`
+    with `anchor`, the name of a fixed point whose position `anchor_x_mm,anchor_y_mm,anchor_z_mm` may be given, or
+    with `pair`, a name that the two rows share between which it was measured.
 
     Optional are `roll_deg,pitch_deg,yaw_deg` (RotZ(roll) · RotY(pitch) · RotX(yaw)) or `qx,qy,qz,qw`, `target`,
-    `frame`, `sigma_mm` (of the row's length), `sigma_deg`, `set`, `payload_kg`, `temperature_c`, and `approach1` and so
-    on: +1 where that joint's value increased before it stopped, -1 where it decreased. Registered sensors add their
-    own columns. Cells of what was not measured are empty.
+    `frame`, `sigma_mm` (standard deviation of the row's length), `sigma_deg`, `set`, `payload_kg`, `temperature_c`,
+    and `approach1` and so
+    on: +1 where that joint's value increased before it stopped, -1 where it decreased. Registered sensors add
+        further columns. Cells of quantities that were not measured are empty.
 
     Args:
         path: the file.
-        robot: checks number, units and limits of the joints and converts the controller's values of coupled joints to
-            joint values; None takes the values as they are.
+        robot: robot against which number, units and limits of the joints are checked, and which converts the
+            controller's values of coupled joints to joint values; None for neither.
         on_bad_row: "error" to raise at the first row that cannot be used, "leave_out" to continue without such
             rows and to list them in `left_out`.
 
@@ -72,16 +73,16 @@ def read_fields(
 
 
 def fields_of(table: Table, robot: Robot | None = None) -> MeasuredFields:
-    """Read the table of a measurement file; see `read_fields`.
+    """Return the fields in the table of a measurement file; see `read_fields`.
 
     Raises:
-        MeasurementError: its header or a row cannot be used.
+        MeasurementError: the header or a row cannot be used.
     """
     return _complete(read_usable_rows(table, robot), "error")
 
 
 def read_usable_rows(table: Table, robot: Robot | None) -> MeasuredFields:
-    """Read the usable rows of a table, possibly none; all others are listed in `left_out`.
+    """Return the usable rows of a table, possibly none; all other rows are listed in `left_out`.
 
     Args:
         table: one row or more.
@@ -94,7 +95,7 @@ def read_usable_rows(table: Table, robot: Robot | None) -> MeasuredFields:
 
 
 def _sound_rows(table: Table, layout: Layout, robot: Robot | None) -> MeasuredFields:
-    """Check all rows and convert those without a fault to fields."""
+    """Check all rows, and return the fields of the rows without a fault."""
     rows = check_cells(table, layout, robot)
     data, labels, faults = _fields(table, layout, rows), _labels(layout), rows.faults
     faults.add(row_faults(data, labels))
@@ -117,7 +118,7 @@ def _sound_rows(table: Table, layout: Layout, robot: Robot | None) -> MeasuredFi
 
 
 def _complete(data: MeasuredFields, on_bad_row: OnBadRow) -> MeasuredFields:
-    """Raise for the first fault, with the number of further ones, unless rows at fault may be left out."""
+    """Raise an error for the first fault, with the number of further faults, unless such rows may be left out."""
     if not data.left_out or (on_bad_row == "leave_out" and data.rows):
         return data
     problem, more = data.left_out[0].error(data.source), len(data.left_out) - 1
@@ -125,7 +126,7 @@ def _complete(data: MeasuredFields, on_bad_row: OnBadRow) -> MeasuredFields:
 
 
 def _labels(layout: Layout) -> FieldLabels:
-    """Return the columns that messages name, the first one of a field of several, and their units."""
+    """Return name and unit of the column that messages state for every field."""
     names = {quantity: layout.column(quantity).name for quantity in layout.index}
     groups = {field.name: field.quantities for field in number_fields() if len(field.quantities) > 1}
     groups |= {sensor: readings.numbers for sensor, readings in READINGS.items()}
@@ -137,7 +138,7 @@ def _labels(layout: Layout) -> FieldLabels:
 
 
 def _fields(table: Table, layout: Layout, rows: CheckedRows) -> MeasuredFields:
-    """Return all rows in SI units, including those at fault."""
+    """Return the fields of all rows in SI units, including rows with faults."""
 
     def numbers(*quantities: str) -> Tensor:
         columns = [to_si(rows.values[:, layout.index[name]], layout.column(name).unit) for name in quantities]
@@ -197,7 +198,7 @@ def contains_measurements(path: str | os.PathLike[str]) -> bool:
 
 
 def _joint_column(table: Table, number: int, robot: Robot) -> Column:
-    """Return the column of a joint."""
+    """Return the column with the values of a joint."""
     axis = robot.axes[number]
     units = REVOLUTE_UNITS if axis.type == "revolute" else PRISMATIC_UNITS
     valid = [f"q{number + 1}_{unit}" for unit in units]
@@ -215,7 +216,7 @@ def _joint_column(table: Table, number: int, robot: Robot) -> Column:
 
 
 def number_column(table: Table, name: str) -> Float64[np.ndarray, " rows"]:
-    """Read a column of a table as numbers, of which no cell may be empty.
+    """Return a column of a table as numbers; no cell may be empty.
 
     Raises:
         MeasurementError: there is no such column, or a cell is not a number; `line` and `column` state which.
@@ -237,7 +238,7 @@ def number_column(table: Table, name: str) -> Float64[np.ndarray, " rows"]:
 
 
 def text_column(table: Table, name: str) -> list[str]:
-    """Read a column of a table as texts without surrounding blanks.
+    """Return a column of a table as texts without surrounding blanks.
 
     Raises:
         MeasurementError: there is no such column.
@@ -253,7 +254,7 @@ def text_column(table: Table, name: str) -> list[str]:
 
 
 def import_hint(path: str | os.PathLike[str]) -> str:
-    """Return a sentence with the command that imports a file as an export; "" if no command does.
+    """Return a sentence with the command that imports a file as an export; "" if there is no such command.
 
     Args:
         path: a file whose table or header was refused as a measurement file.
@@ -271,7 +272,7 @@ def import_hint(path: str | os.PathLike[str]) -> str:
 
 
 def is_measurement_file(path: str | os.PathLike[str]) -> bool:
-    """Return whether a file's header has the columns of measurement files or of corners, so it is not an export."""
+    """Return whether a file is not an export, because its header has columns of measurement files or of corners."""
     try:
         header = read_table(path).header
         return set(CORNERS) <= set(header) or all(find_column(name) or name in CORNERS for name in header)

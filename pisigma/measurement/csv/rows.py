@@ -1,4 +1,4 @@
-"""Check every cell of a measurement file; every fault states its column."""
+"""Check every cell of a measurement file; faults state their column."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ from pisigma.robot.kinematics.joint_limits import far_beyond_limits
 from pisigma.robot.row import MAX_MAGNITUDE
 
 QUATERNION_TOLERANCE = 1e-3
-"""Largest deviation of the norm of a quaternion from 1."""
+"""Largest accepted deviation of the norm of a quaternion from 1."""
 
 _Values = Float64[np.ndarray, "rows columns"]
 
@@ -31,12 +31,12 @@ _UNIT_DOUBT = {
 
 @dataclass(frozen=True, eq=False)
 class CheckedRows:
-    """The cells of a file, by column.
+    """Cells of a file by column, with the faults of rows.
 
     Attributes:
         values: numbers in the file's units; NaN in empty cells and texts.
         cells: all cells as texts.
-        faults: what is wrong with the rows that cannot be used.
+        faults: faults of the rows that cannot be used.
     """
 
     values: Float64[np.ndarray, "rows columns"]
@@ -49,12 +49,12 @@ class CheckedRows:
 
 
 def check_cells(table: Table, layout: Layout, robot: Robot | None) -> CheckedRows:
-    """Convert all cells to values and find those that cannot be used.
+    """Convert all cells to values, and find the rows that cannot be used.
 
     Args:
         table: the file.
         layout: its columns.
-        robot: checks the limits of the joints; None does not check them.
+        robot: robot against which the limits of the joints are checked; None for no check.
     """
     faults = Faults(table.broken)
     cells = _cells(table, faults)
@@ -72,7 +72,7 @@ def check_cells(table: Table, layout: Layout, robot: Robot | None) -> CheckedRow
 
 
 def _cells(table: Table, faults: Faults) -> list[Sequence[str]]:
-    """Return the cells by column; rows of a wrong length are at fault and get empty cells."""
+    """Return the cells by column; rows of a wrong length get a fault and empty cells."""
     names, count = table.header, len(table.header)
     records = table.records
     for row, record in enumerate(records):
@@ -136,7 +136,7 @@ def _check_joints(values: _Values, layout: Layout, robot: Robot | None, faults: 
 def _check_limits(
     q: Float64[np.ndarray, " rows"], column: Column, joint: Row, robot: str, faults: Faults
 ) -> None:
-    """Check that a joint's values are not so far outside its limits that they belong to another unit or joint."""
+    """Check that a joint's values are not so far outside its limits that unit or joint must be wrong."""
     outside = far_beyond_limits(to_si(q, column.unit), joint)
     lower, upper = from_si(np.array([joint.lower, joint.upper]), column.unit).tolist()
     limits = f"{lower:.6g} to {upper:.6g} {column.unit}"
@@ -148,7 +148,7 @@ def _check_limits(
 
 
 def _check_measured(values: _Values, cells: list[Sequence[str]], layout: Layout, faults: Faults) -> None:
-    """Check that position and orientation are complete or empty, that a row measures something, and quaternions."""
+    """Check that position and orientation are complete or empty, that rows have a reading, and that norms are 1."""
     nothing = np.ones(len(values), dtype=bool)
     for quantity in layout.lengths:
         filled = [bool(cell.strip()) for cell in cells[layout.index[quantity]]]
@@ -160,7 +160,7 @@ def _check_measured(values: _Values, cells: list[Sequence[str]], layout: Layout,
     measured = quoted_names(
         layout.column(quantity) for quantity in (*layout.position, *layout.orientation, *layout.lengths)
     )
-    empty = Fault("nothing was measured in this row", remedy=f"fill {measured}, or remove it")
+    empty = Fault("nothing was measured in this row", remedy=f"fill {measured}, or remove the row")
     faults.add((row, empty) for row in rows_where(nothing))
     if layout.orientation == QUATERNION:
         norm = np.linalg.norm(values[:, [layout.index[quantity] for quantity in QUATERNION]], axis=1)
@@ -173,7 +173,7 @@ def _check_measured(values: _Values, cells: list[Sequence[str]], layout: Layout,
 
 
 def _check_whole(missing: Bool[np.ndarray, "rows group"], columns: list[Column], faults: Faults) -> None:
-    """Check that all cells of a group are filled or none."""
+    """Check that either all cells of a group are filled or none."""
     for row in rows_where(np.asarray(missing.any(1) & ~missing.all(1))):
         first = columns[int(missing[row].argmax())].name
         problem = f"the cell is empty, but not all of {quoted_names(columns)} are"

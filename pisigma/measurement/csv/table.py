@@ -1,4 +1,4 @@
-"""A CSV file as text: a header and the fields of every row with their lines and faults."""
+"""CSV files as text: header and fields of every row, with lines and faults."""
 
 import csv
 import os
@@ -15,7 +15,7 @@ from pisigma.measurement.faults import Fault
 SPREADSHEET_ERRORS = frozenset(
     ("#N/A", "#NV", "#REF!", "#VALUE!", "#DIV/0!", "#NAME?", "#NUM!", "#NULL!", "#SPILL!", "#CALC!")
 )
-"""Texts that spreadsheets write to cells that they cannot calculate."""
+"""Texts that spreadsheets write into cells that they cannot calculate."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,12 +23,12 @@ class Table:
     """The fields of a CSV file, uninterpreted.
 
     Attributes:
-        source: the file, as messages call it.
+        source: name of the file in messages.
         header: names of the columns, without surrounding blanks.
-        header_line: line of the header.
+        header_line: line number of the header.
         records: the fields of every row; empty for rows that are not valid CSV.
-        lines: lines of the rows.
-        broken: for rows that are not valid CSV, what is wrong with them, by row.
+        lines: line numbers of the rows.
+        broken: what is wrong with the rows that are not valid CSV, by row.
     """
 
     source: str
@@ -40,7 +40,7 @@ class Table:
 
     @property
     def header_place(self) -> Place:
-        """The line of the header, for messages."""
+        """Place of the header, for messages."""
         return Place(self.source, self.header_line)
 
     def place_of(self, row: int, column: str | int | None = None) -> Place:
@@ -92,7 +92,7 @@ def content_lines(lines: Iterable[str], source: str) -> Iterator[tuple[int, str]
     A line with as many fields as the header whose first field is an error of a spreadsheet (#N/A) is a row.
 
     Raises:
-        MeasurementError: there is no such line.
+        MeasurementError: there is no such line, not even a header.
     """
     columns = 0
     for number, line in enumerate(lines, start=1):
@@ -136,7 +136,7 @@ def split_line(line: str) -> tuple[list[str], str]:
 
 
 class Faults:
-    """Faults of rows, of which the first one of every row is kept.
+    """Faults of rows; only the first fault of every row is kept.
 
     Attributes:
         by_row: faults by number of the row.
@@ -149,12 +149,12 @@ class Faults:
         }
 
     def add(self, faults: Iterable[tuple[int, Fault]]) -> None:
-        """Add faults of rows, except of rows that have one already."""
+        """Add faults of rows that do not have a fault yet."""
         for row, fault in faults:
             self.by_row.setdefault(row, fault)
 
     def rows_without_faults(self, rows: int) -> Bool[np.ndarray, " rows"]:
-        """Return which of the `rows` rows have no fault so far."""
+        """Return the mask of the rows, `rows` in number, that have no fault."""
         sound = np.ones(rows, dtype=bool)
         sound[list(self.by_row)] = False
         return sound

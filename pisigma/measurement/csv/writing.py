@@ -24,11 +24,11 @@ def write_fields(data: MeasuredFields, path: str | os.PathLike[str], revolute: S
 
     Args:
         data: at least one row.
-        path: the file; an existing one is replaced.
+        path: the file; an existing file is replaced.
         revolute: per joint, whether it is revolute (degrees) or prismatic (millimetres).
 
     Raises:
-        MeasurementError: the measurements would not read back.
+        MeasurementError: the file could not be read back unchanged.
         OutputError: the file cannot be written there.
     """
     if data.rows == 0:
@@ -78,7 +78,7 @@ def _numbers(data: MeasuredFields, revolute: Sequence[bool]) -> dict[str, Float6
 
 
 def _check(data: MeasuredFields, texts: Mapping[str, Sequence[str]]) -> None:
-    """Refuse values that would not read back unchanged."""
+    """Refuse values that could not be read back unchanged."""
     nothing = ~torch.stack([data.is_measured(kind) for kind in (*KINDS, *READINGS)]).any(0).cpu()
     if bool(nothing.any()):
         raise MeasurementError(
@@ -98,7 +98,7 @@ def _check(data: MeasuredFields, texts: Mapping[str, Sequence[str]]) -> None:
 
 
 def _fits_cell(text: str) -> bool:
-    """Return whether a name reads back unchanged."""
+    """Return whether a name can be read back unchanged from a CSV cell."""
     try:
         text.encode("utf-8")
     except UnicodeEncodeError:

@@ -1,1 +1,1 @@
-"""Conversion of exports of instruments and controllers to measurement files."""
+"""Convert exports of instruments and controllers to measurement files."""

@@ -9,7 +9,7 @@ FileLine = tuple[str, int]
 """File and line of a row."""
 
 _MAX_LIST = 200
-"""Number of characters of a list of lines in a sentence; lists in JSON are complete."""
+"""Largest number of characters of a list of lines in a sentence; lists in JSON are complete."""
 
 
 @dataclass(frozen=True)
@@ -17,10 +17,10 @@ class LeftOutRow:
     """A row of a file that was not imported.
 
     Attributes:
-        file: its file.
-        line: its line.
+        file: the file of the row.
+        line: line number of the row.
         reason: why it was left out, as a clause after "is left out: ...".
-        point: name of its point, "" if it has none.
+        point: name of the measured point; "" if the row has no name.
     """
 
     file: str
@@ -35,13 +35,13 @@ class LeftOutRow:
 
 @dataclass(frozen=True)
 class FileAccount:
-    """Rows of a file that were used and left out; `read` is the sum of both.
+    """Numbers of rows of a file that were read, used and left out; the first is the sum of the others.
 
     Attributes:
         file: the file.
-        read: number of its rows.
+        read: number of rows of the file.
         used: number of rows that were imported, or whose joint values were joined to an imported row.
-        left_out: the other rows.
+        left_out: rows that were not used.
     """
 
     file: str
@@ -65,7 +65,7 @@ def count_rows(
     """Count the rows of every file.
 
     Args:
-        read: file and line of all rows that were read, in their order.
+        read: file and line of all rows that were read, in order.
         used: file and line of the rows that were imported or joined.
         left_out: the rows that were left out.
     """
@@ -83,7 +83,7 @@ def count_rows(
 
 
 def sentences(left_out: Sequence[LeftOutRow]) -> tuple[str, ...]:
-    """Return sentences that list the rows that were left out, one for every file and reason."""
+    """Return sentences that list the rows that were left out, one sentence for every file and reason."""
     by_reason: dict[tuple[str, str], list[LeftOutRow]] = {}
     for row in left_out:
         by_reason.setdefault((row.file, row.reason), []).append(row)
@@ -95,7 +95,7 @@ def sentences(left_out: Sequence[LeftOutRow]) -> tuple[str, ...]:
 
 
 def _lines(rows: Sequence[LeftOutRow]) -> str:
-    """Return lines with names of points, or as ranges such as "3, 5-9"; long lists end with "..."."""
+    """Return a text with line numbers and names of points, or ranges such as "3, 5-9"; long lists end with "..."."""
     if any(row.point for row in rows):
         texts = [f"{row.line} ({row.point})" if row.point else str(row.line) for row in rows]
     else:

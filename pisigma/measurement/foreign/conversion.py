@@ -43,9 +43,9 @@ class ConvertedRows:
 
     Attributes:
         source: the file.
-        lines: lines of the rows.
+        lines: line numbers of the rows.
         cells: texts of every row by column, such as "q1_deg", and by the keys "point" and "time".
-        origins: the file of every row; () if all are of the source.
+        origins: the file of every row; () if all rows are from the source.
     """
 
     source: str
@@ -159,7 +159,7 @@ def convert_rows(mapping: FileMapping) -> ConvertedRows:
 
 
 def _key(file: ExportFile, quantity: str, texts: list[str], unit: str) -> tuple[str, ...]:
-    """Return names of points unchanged, and numeric times in s."""
+    """Return names of points unchanged, and numeric times converted to seconds."""
     if quantity == "point":
         return tuple(texts)
     numbers = [file.dialect.numbers.text(text) for text in texts]
@@ -180,15 +180,15 @@ def _column(file: ExportFile, quantity: str, column: MappedColumn) -> tuple[str,
         return quantity, _dates(file, column)
     name = measurement_column(quantity, written)
     kept = find_column(name)
-    assert kept is not None  # parse_target and the proposals ensure it
+    assert kept is not None  # parse_target and the proposals ensure that this does not happen
     return name, _numbers(file, column) if kept.is_number else tuple(file.column(column.index))
 
 
 def _dates(file: ExportFile, column: MappedColumn) -> tuple[str, ...]:
-    """Return the dates of a column in the form of ISO 8601; other texts are unchanged and checked by the reader.
+    """Return the dates of a column in the form of ISO 8601; other texts are unchanged, and the reader checks them.
 
     Raises:
-        MeasurementError: the day or the month may be first.
+        MeasurementError: it is ambiguous whether day or month comes first.
     """
     texts = file.column(column.index)
     first, dates = day_first(texts), []
@@ -201,7 +201,7 @@ def _dates(file: ExportFile, column: MappedColumn) -> tuple[str, ...]:
 
 
 def _numbers(file: ExportFile, column: MappedColumn) -> tuple[str, ...]:
-    """Return the numbers of a column in the unit of measurement files; "" if nothing was measured.
+    """Return the numbers of a column, as texts in the unit of measurement files; "" if nothing was measured.
 
     Raises:
         MeasurementError: a cell is not a number.
@@ -227,7 +227,7 @@ def _numbers(file: ExportFile, column: MappedColumn) -> tuple[str, ...]:
 def _rotation(
     file: ExportFile, encoding: RotationEncoding, columns: list[MappedColumn]
 ) -> dict[str, tuple[str, ...]]:
-    """Return the quaternions of rotations; "" in rows without one."""
+    """Return the quaternions of all rows as texts, by column; "" in rows without a rotation."""
     rows = list(zip(*(_numbers(file, column) for column in columns), strict=True))
     values = torch.tensor([[float(text or "nan") for text in row] for row in rows], dtype=torch.float64)
     if columns[0].target.unit and UNITS[columns[0].target.unit].column == "deg":
@@ -262,9 +262,9 @@ class MeasurementTable:
     """The table of a measurement file.
 
     Attributes:
-        table: table of the rows in which something was measured.
+        table: table of the rows in which a value was measured.
         places: file and line of these rows.
-        left_out: the other rows, and why.
+        left_out: the rows that were left out, and why.
     """
 
     table: Table
@@ -282,7 +282,7 @@ def measurement_table(rows: ConvertedRows) -> MeasurementTable:
     """Build the table of a measurement file, checking every row as its reader does.
 
     Raises:
-        MeasurementError: the rows are not valid measurements; `line` is that of the export.
+        MeasurementError: the rows are not valid measurements; `line` is the line of the export.
     """
     names = sorted((name for name in rows.cells if name not in KEYS), key=_order)
     measured = [rows.cells[name] for name in names if is_measured(name)]

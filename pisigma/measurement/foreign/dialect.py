@@ -1,4 +1,4 @@
-"""The format of an export: separators of cells and format of numbers."""
+"""Formats of exports: separators of cells, and format of numbers."""
 
 import contextlib
 import csv
@@ -14,29 +14,29 @@ from pisigma.files.errors import MeasurementError, Place
 from pisigma.measurement.csv.table import SPREADSHEET_ERRORS
 
 SEPARATORS = ("\t", ";", ",", "|", " ")
-"""Separators of cells; a blank means any number of blanks and tabs."""
+"""Separators of cells; a blank stands for any number of blanks and tabs."""
 SAMPLED_LINES = 300
-"""Number of lines by which the format is recognised."""
+"""Number of lines from which the format is recognised."""
 MAX_COLUMNS = 2000
 _BLANKS = 0.8
-"""Weight of blanks as separators: names contain blanks, too, so other separators are preferred."""
+"""Weight of blanks as separators; it is small, because names contain blanks, too."""
 _SMALL, _FAR = 20.0, 200.0
-"""Numbers such as 2.104 below these may be lengths in mm with a group of thousands: no robot reaches 20,000 mm, and no
-position alone is 200,000 mm away."""
+"""Limits below which numbers such as 2.104 may be lengths in mm with a group of thousands: no robot reaches 20,000
+mm, and no measured position is 200,000 mm away."""
 COMMENT = re.compile(r"\s*(?://|#|%|!|\*\*|--|;|'|REM\b)\s*")
-"""Starts of comments; rows may start in the same way."""
+"""Texts with which comments start; rows may start with them, too."""
 Decimal = Literal[".", ","]
 MISSING = frozenset(("", "-", "--", "---", "*", "n/a", "na", "nan", "null", "none", "nil", "n.a.", "missing"))
-"""Texts of cells that were not measured, in lower case."""
+"""Texts of cells without a measured value, in lower case."""
 _SPACES = " \u00a0\u2009\u202f'\u2019"
 """Separators of thousands other than points and commas."""
 _PLAIN = {sign: re.compile(rf"[-+]?[0-9]+(?:\{sign}[0-9]+)?") for sign in get_args(Decimal)}
-"""Numbers of the usual form, for speed."""
+"""Pattern of numbers in the usual form, which are converted faster."""
 
 
 @dataclass(frozen=True)
 class NumberFormat:
-    """The format of the numbers of a file.
+    """Format of the numbers in a file.
 
     Attributes:
         decimal: the decimal sign; the other sign may separate thousands.
@@ -45,7 +45,7 @@ class NumberFormat:
     decimal: Decimal
 
     def text(self, cell: str) -> str | None:
-        """Return a number with a decimal point, without groups, with all digits; None if the cell is not a number."""
+        """Return a number with a decimal point, all digits and no groups; None if the cell is not a number."""
         if _PLAIN[self.decimal].fullmatch(cell):
             return cell if self.decimal == "." else cell.replace(",", ".")
         cell = cell.strip().replace("\u2212", "-")
@@ -57,7 +57,7 @@ class NumberFormat:
         return f"{match['sign']}{whole}{decimals}{exponent.replace('D', 'E')}"
 
     def certainty(self, cell: str) -> float:
-        """Return how certainly a cell is a number of this format: 0 if it is not, less than 1 if it is ambiguous.
+        """Return 1 if a cell is a number of this format, less if it is ambiguous, and 0 if it is not a number.
 
         A group of thousands without decimals, such as 1,234, may also be a number with three decimals.
         """
@@ -68,7 +68,7 @@ class NumberFormat:
         return 0.5 if cell.count(other) == 1 and self.decimal not in cell else 1.0
 
     def is_ambiguous(self, cells: Iterable[str]) -> bool:
-        """Return whether the decimal sign may separate thousands in every cell that has it, such as 1,234."""
+        """Return whether the decimal sign may separate thousands in every cell that contains it, such as 1,234."""
         sign = re.escape(self.decimal)
         signed = [cell for cell in cells if self.decimal in cell]
         return bool(signed) and all(
@@ -88,13 +88,13 @@ def _pattern(decimal: Decimal) -> re.Pattern[str]:
 
 
 def is_missing(cell: str) -> bool:
-    """Return whether a cell means that nothing was measured."""
+    """Return whether the text of a cell states that nothing was measured."""
     return cell.strip().lower() in MISSING
 
 
 @dataclass(frozen=True)
 class Dialect:
-    """The format of a file.
+    """Format of an exported file.
 
     Attributes:
         separator: separator of cells, one of `SEPARATORS`.
@@ -110,7 +110,7 @@ class Dialect:
         return f"{signs[self.separator]} between cells, decimal {signs[self.numbers.decimal]}"
 
     def split(self, line: str) -> list[str]:
-        """Return the cells of a line without surrounding blanks; an unclosed quote belongs to its cell."""
+        """Return the cells of a line without surrounding blanks; an unclosed quote is part of the cell."""
         if '"' in line:
             with contextlib.suppress(csv.Error):
                 reader = csv.reader(
@@ -135,12 +135,12 @@ class Dialect:
 
 
 def detect_dialect(lines: Sequence[tuple[int, str]], source: str, decimal: Decimal | None = None) -> Dialect:
-    """Find the separator and the decimal sign with which most cells of most lines are numbers.
+    """Find the separator and the decimal sign for which most cells of most lines are numbers.
 
     Of equally good formats the first is returned, in the order of `SEPARATORS` and with points first.
 
     Args:
-        lines: numbers and texts of the lines of the file, without blank ones.
+        lines: line numbers and texts of the lines of the file that are not blank.
         source: the file, for messages.
         decimal: the decimal sign, if it is stated.
 
@@ -173,9 +173,10 @@ def detect_dialect(lines: Sequence[tuple[int, str]], source: str, decimal: Decim
 def _check_decimal(dialect: Dialect, rows: Sequence[tuple[int, list[str]]], source: str) -> None:
     """Refuse a table whose numbers may have groups of thousands instead of decimals.
 
-    This is so if every number with the sign looks like 2.104, and either the sign also separates the cells, or a column
-    also contains whole numbers, or all of these numbers are small and another column contains whole numbers; and if a
-    column contains such numbers together with whole numbers of three digits only.
+    A table is ambiguous if every number with the sign looks like 2.104, and either the sign also separates the
+    cells, or a column also contains whole numbers, or all of these numbers are small and another column contains
+    whole numbers. It is also ambiguous if a column contains such numbers together with whole numbers of three digits
+    only.
 
     Raises:
         MeasurementError: the numbers of the table are ambiguous.
@@ -221,13 +222,13 @@ def _has_hundreds(cells: Sequence[str]) -> bool:
 
 
 def _counts(cells: Sequence[str]) -> bool:
-    """Return whether cells number the rows consecutively."""
+    """Return whether the cells of a column are consecutive row numbers."""
     numbers = [int(cell) if cell.isdigit() and len(cell) < 9 else -1 for cell in cells]
     return all(after - before == 1 for before, after in itertools.pairwise(numbers))
 
 
 def _score(dialect: Dialect, lines: Sequence[str]) -> float:
-    """Return the share of lines that are rows of one width, times the share of their cells that are certain numbers."""
+    """Return the share of lines that are rows of one width, times the share of certain numbers in their cells."""
     rows = [dialect.split(line) for line in lines]
     numeric = [row for row in rows if dialect.is_row(row)]
     if not numeric:

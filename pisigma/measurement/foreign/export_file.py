@@ -16,11 +16,11 @@ from pisigma.measurement.foreign.summary_rows import summary_rows
 from pisigma.measurement.foreign.units import ambiguous_unit, unit_symbol
 
 MAX_LINE = 100_000
-"""Number of characters of a line; a thousand columns have fewer."""
+"""Largest number of characters of a line; a line of a thousand columns is shorter."""
 _Lines = list[tuple[int, str]]
 _MARKS = (
     (codecs.BOM_UTF8, "utf-8"),
-    (codecs.BOM_UTF32_LE, "utf-32-le"),  # starts with the mark of UTF-16
+    (codecs.BOM_UTF32_LE, "utf-32-le"),  # a text that starts with the byte order mark of UTF-16
     (codecs.BOM_UTF32_BE, "utf-32-be"),
     (codecs.BOM_UTF16_LE, "utf-16-le"),
     (codecs.BOM_UTF16_BE, "utf-16-be"),
@@ -32,25 +32,25 @@ _BINARY = {
     b"\x1f\x8b": ("a compressed file", "unpack it"),
 }
 _CONTROLS = frozenset(map(chr, range(32))) - set("\t\n\r\x0b\x0c\x1a")
-"""Control characters that are not in texts; old exports end with the end-of-file mark 1A."""
+"""Control characters that texts do not contain; old exports end with the end-of-file mark 1A."""
 
 
 @dataclass(frozen=True, eq=False)
 class ExportFile:
-    """A file of an instrument or a controller, uninterpreted.
+    """Contents of a file of an instrument or a controller, without interpretation of the columns.
 
     Attributes:
         source: the file, for messages.
-        headings: headings of the columns; their numbers from "1" if the file has none.
-        has_header: whether it has headings.
-        header_line: line of the headings, or of the first row if it has none.
-        units: symbols of its unit row, "" for columns without a unit; ambiguous units keep their spelling.
+        headings: headings of the columns; their numbers from "1" if the file has no headings.
+        has_header: whether the file has headings.
+        header_line: line number of the headings, or of the first row if there are no headings.
+        units: symbols in the unit row, "" for columns without a unit; ambiguous units keep their spelling.
         comments: titles and comments.
         records: cells of every row, in the order of the file.
-        lines: lines of the rows.
+        lines: line numbers of the rows.
         dialect: format of the file.
-        skipped: lines with numbers that are not rows, lines after the first row that are neither rows nor blank, and
-            rows that summarise others.
+        skipped: lines that are not used as rows: lines with numbers that are not rows, lines after the first row
+            that are neither rows nor blank, and rows that summarise others.
     """
 
     source: str
@@ -66,7 +66,7 @@ class ExportFile:
 
     @property
     def row_places(self) -> tuple[FileLine, ...]:
-        """File and line of all rows, including skipped ones."""
+        """File and line of all rows, including skipped lines."""
         return (
             *((self.source, line) for line in self.lines),
             *((one.file, one.line) for one in self.skipped),
@@ -77,7 +77,7 @@ class ExportFile:
         return [record[index] for record in self.records]
 
     def numbers(self, index: int) -> list[float]:
-        """Return the numbers of a column in the file's unit, without cells that are not numbers."""
+        """Return the numbers of a column in the file's unit; cells that are not numbers are omitted."""
         texts = (self.dialect.numbers.text(cell) for cell in self.column(index))
         return [float(text) for text in texts if text is not None]
 
@@ -93,8 +93,8 @@ def read_export(
         most: largest size of the file [bytes].
 
     Raises:
-        MeasurementError: the file cannot be read, is not text, does not contain a table of numbers, or the number of
-            cells of a row differs from that of the others.
+        MeasurementError: the file cannot be read, is not text, does not contain a table of numbers, or a row has
+            another number of cells than the other rows.
     """
     source = make_printable(str(path), cut=False)
     lines = _lines_of(decode_text(read_input(path, MeasurementError, most), source), source)
@@ -112,7 +112,7 @@ def read_export(
         elif any(cells[i]) and cells[i][: len(top.headings)] != top.headings:
             if not _is_comment(line, cells[i]):
                 _check_skipped(cells[i], dialect, width, Place(source, number))
-            skipped.append(LeftOutRow(source, number, "it is not a row of the table"))
+            skipped.append(LeftOutRow(source, number, "the line is not a row of the table"))
     headings, units = top.headings, top.units
     used = [
         k for k in range(width - ends_empty) if (headings and headings[k]) or any(cells[i][k] for i in rows)
@@ -137,7 +137,7 @@ def read_export(
 
 
 def _lines_of(text: str, source: str) -> _Lines:
-    """Return the lines that are not blank, with their numbers."""
+    """Return the lines that are not blank, with their line numbers."""
     lines = [(number, line) for number, line in enumerate(text.split("\n"), start=1) if line.strip()]
     for number, line in lines:
         if len(line) > MAX_LINE:
@@ -151,7 +151,7 @@ def _lines_of(text: str, source: str) -> _Lines:
 
 
 def _is_content(line: str, row: list[str], headings: list[str]) -> bool:
-    """Return whether cells without numbers are a row, which the reader of measurement files will refuse."""
+    """Return whether cells without numbers are a row; the reader of measurement files then refuses it."""
     return any(row) and row[: len(headings)] != headings and not _is_comment(line, row)
 
 
@@ -160,10 +160,10 @@ def _is_comment(line: str, row: list[str]) -> bool:
 
 
 def _check_skipped(row: list[str], dialect: Dialect, width: int, at: Place) -> None:
-    """Refuse a row of another width, which would be lost.
+    """Refuse a row with a wrong number of cells, which would otherwise be lost.
 
     Raises:
-        MeasurementError: the number of cells of a row differs from that of its table.
+        MeasurementError: the number of cells of the row differs from that of the other rows.
     """
     if sum(map(dialect.is_number, row)) < 2:
         return
@@ -181,11 +181,11 @@ class _Top:
 
     Attributes:
         headings: headings of the columns, [] if there are none.
-        header_line: line of the headings, 0 if there are none.
-        units: units of the unit row, see `ExportFile.units`; [] if there is none.
+        header_line: line number of the headings, 0 if there are none.
+        units: units in the unit row, see `ExportFile.units`; [] if there is no unit row.
         comments: titles and comments.
         skipped: lines with numbers that are neither headings nor rows.
-        end: number of these lines.
+        end: number of lines before the first row.
     """
 
     headings: list[str]
@@ -200,7 +200,8 @@ def _read_top(lines: _Lines, dialect: Dialect, width: int, source: str) -> _Top:
     """Separate headings, unit row and comments in the lines before the first row.
 
     Raises:
-        MeasurementError: the number of headings is not that of the columns, or a row before the first one lacks a cell.
+        MeasurementError: the number of headings differs from the number of columns, or a line before the first row
+            lacks a cell.
     """
     cells = [_heading_cells(line, dialect, width) for _, line in lines]
     is_units = [len(row) == width and _is_unit_row(row) for row in cells]
@@ -228,19 +229,19 @@ def _read_top(lines: _Lines, dialect: Dialect, width: int, source: str) -> _Top:
         if i in (heading, units):
             continue
         if is_certain and i > table and is_plain:
-            top.end = i  # lines below the headings are accounted for in the same way as those between rows
+            top.end = i  # lines below the headings are treated like lines between rows
             break
         if is_plain and numeric >= max(2, width // 2) and (heading is None or i > table):
             _check_skipped(cells[i], dialect, width, Place(source, number))
         if numeric >= 2:
-            top.skipped.append(LeftOutRow(source, number, "it is not a row of the table"))
+            top.skipped.append(LeftOutRow(source, number, "the line is not a row of the table"))
         else:
             top.comments.append(line)
     return top
 
 
 def _heading_row(lines: _Lines, cells: list[list[str]], is_units: list[bool], width: int) -> int | None:
-    """Return the index of the headings: the line of the table's width with the most recognised names."""
+    """Return the index of the headings: the line with one cell per column and the most recognised names."""
     possible = [
         (_recognised(row), i)
         for i, row in enumerate(cells)
@@ -254,7 +255,7 @@ def _heading_row(lines: _Lines, cells: list[list[str]], is_units: list[bool], wi
 
 
 def _is_unit_row(cells: list[str]) -> bool:
-    """Return whether cells are units, possibly with other texts that are not names of columns."""
+    """Return whether the cells of a line are units, possibly with other texts that are not names of columns."""
     symbols = [unit_symbol(cell) or ambiguous_unit(cell) for cell in cells]
     others = [cell for cell, symbol in zip(cells, symbols, strict=True) if cell and not symbol]
     count = sum(map(bool, symbols))
@@ -262,7 +263,7 @@ def _is_unit_row(cells: list[str]) -> bool:
 
 
 def _wrong_headings(cells: list[str], dialect: Dialect, width: int, at: Place) -> MeasurementError:
-    """Return the exception for a number of headings that is not that of the columns."""
+    """Return the exception for a number of headings that differs from the number of columns."""
     commas = dialect.separator == "," and len(cells) < width
     action = (
         "export decimal points, or semicolons between cells" if commas else "give every column one heading"
@@ -273,7 +274,7 @@ def _wrong_headings(cells: list[str], dialect: Dialect, width: int, at: Place) -
 
 
 def _heading_cells(line: str, dialect: Dialect, width: int) -> list[str]:
-    """Return the cells of a heading, which may start like a comment, end with a separator or have spaced units."""
+    """Return the cells of a heading line, which may start like a comment, end with a separator or have spaced units."""
     bare = COMMENT.sub("", line, count=1) if COMMENT.match(line) else line
     for text in (line, bare, re.sub(r"(?<!\s)\s+(?=[\[(])", "", bare)):
         cells = dialect.split(text)
@@ -290,14 +291,14 @@ def _recognised(cells: list[str]) -> float:
 
 
 def decode_text(content: bytes, source: str) -> str:
-    """Decode a text: by its byte order mark, as UTF-16 without one, as UTF-8, else as Windows-1252.
+    """Decode a text by its byte order mark, or else as UTF-16, UTF-8 or Windows-1252, whichever fits first.
 
     Args:
         content: content of the file.
         source: the file, for messages.
 
     Raises:
-        MeasurementError: it is not text.
+        MeasurementError: the content is not text.
     """
     for start, (what, remedy) in _BINARY.items():
         if content.startswith(start):
@@ -311,12 +312,14 @@ def decode_text(content: bytes, source: str) -> str:
         if attempt and not _CONTROLS & set(text):
             return text.rstrip("\x1a").replace("\r\n", "\n").replace("\r", "\n")
     raise MeasurementError(
-        expected="text in UTF-8, UTF-16 or Windows-1252", at=Place(source), remedy="export it as text"
+        expected="text in UTF-8, UTF-16 or Windows-1252",
+        at=Place(source),
+        remedy="export the measurements as text",
     )
 
 
 def _utf16_without_mark(content: bytes) -> str:
-    """Return the byte order of UTF-16, in which most characters have a zero byte; "" for other texts."""
+    """Return the encoding of UTF-16 without a mark, in which most characters have a zero byte; "" for other texts."""
     even, odd = content[0:4096:2].count(0), content[1:4096:2].count(0)
     most = 0.4 * min(len(content), 4096) / 2
     return "utf-16-le" if odd > most > even else "utf-16-be" if even > most > odd else ""

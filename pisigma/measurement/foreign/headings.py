@@ -1,4 +1,4 @@
-"""A registry of the headings of makers and instruments, and their meanings."""
+"""Registry of column headings of makers and instruments, and their meanings."""
 
 import re
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ _SIDES = {
     "measured": "actual act meas measured ist tracker reflector smr laser",
     "": "tcp tool pos position pose coord coordinate coordinates value values val jnt trans translation",
 }
-"""Words that may accompany a name: for commanded values, for measured values, and without meaning."""
+"""Words that may accompany a name: for commanded values, for measured values, and words without meaning."""
 _SIDE_OF = {word: side for side, words in _SIDES.items() for word in words.split()}
 _OF_QUATERNION = re.compile(r"^(?:rot|rotation|ori|orient|orientation|quat|quaternion)(?=q[0-4xyzw]$)")
 _BRACKETS = re.compile(r"^(.*?)\s*(?:\[([^\]]*)\]|\(([^)]*)\)|<([^>]*)>)\s*$")
@@ -26,11 +26,11 @@ class Heading:
 
     Attributes:
         text: the heading as in the file.
-        name: its name without unit, case, separators and words without meaning, such as "j1" of "J_1 [deg]".
-        unit: symbol of its unit, or "".
+        name: name in the heading without unit, case, separators and words without meaning, such as "j1" of "J_1 [deg]".
+        unit: symbol of the unit, or "".
         unknown_unit: text in brackets that is not a unit.
-        side: "commanded" or "measured" if it states so, or "".
-        is_column: whether it is the name of a column of measurement files, in any case.
+        side: "commanded" or "measured" if the heading states it, otherwise "".
+        is_column: whether the heading is the name of a column of measurement files, in upper or lower case.
     """
 
     text: str
@@ -42,7 +42,7 @@ class Heading:
 
 
 def parse_heading(text: str) -> Heading:
-    """Parse a heading; overlong ones have no meaning."""
+    """Parse a heading; a heading that is too long gets no meaning."""
     if len(text) > MAX_WORD_CHARACTERS:
         return Heading(text, "", "")
     column = find_column(text.strip().lower())
@@ -59,7 +59,7 @@ def parse_heading(text: str) -> Heading:
 
 
 def _unit_apart(text: str) -> tuple[str, str, str]:
-    """Return the name in a heading, the symbol of its unit, and a text in place of a unit that is not one."""
+    """Return the name in a heading, the symbol of its unit, and a text in brackets that is not a unit."""
     match = _BRACKETS.match(text)
     if match:
         inside = next(group for group in match.groups()[1:] if group is not None)
@@ -75,13 +75,13 @@ def _unit_apart(text: str) -> tuple[str, str, str]:
 
 @dataclass(frozen=True)
 class MakerHeadings:
-    """A maker's names of columns.
+    """Column names that a maker uses.
 
     Attributes:
         name: name of the maker.
-        joints: names of the joints in order, or one name that is followed by numbers; "" if others use the same names.
-        rotation: its encoding of rotations.
-        position: name of x, if it is needed to recognise the maker.
+        joints: names of the joints in order, or one name that is followed by numbers; "" if the names are not specific.
+        rotation: name of the maker's encoding of rotations.
+        position: name of the coordinate x, if it is needed to recognise the maker.
         length: unit of all lengths; "" if it is configurable.
         angle: unit of all angles; "" if it is configurable.
     """
@@ -105,7 +105,7 @@ MAKERS = (
     MakerHeadings("Epson", "", "epson", length="mm", angle="deg"),
     MakerHeadings("Kawasaki", "", "kawasaki", length="mm", angle="deg"),
 )
-"""Makers; a further one is one line. Makers without specific names of joints are recognised by their rotations."""
+"""Column names of makers, one maker per line. Makers without specific joint names are recognised by their rotations."""
 
 _JOINTS = "j joint q axis ax achse th theta gelenk axe eje asse jt a rax position"
 JOINT_NAMES = tuple(_JOINTS.split())
@@ -123,7 +123,7 @@ POSITIONS = tuple(
         "r14 r24 r34",
     )
 )
-"""Names of the coordinates of a position; a further set of names is one text."""
+"""Names of the coordinates of a position, one text per set of names."""
 
 _MEANINGS = {
     "point": "point pointname punkt punktname pt ptname pos name label pointid id measurement no nr num number index",
@@ -133,7 +133,7 @@ _MEANINGS = {
     "set": "set split",
 }
 MEANINGS = {name: quantity for quantity, names in _MEANINGS.items() for name in names.split()}
-"""Names of other quantities, better ones first; a further name is one word."""
+"""Names of other quantities, in the order of preference, separated by blanks."""
 _OTHERS = {
     name
     for names in (
@@ -145,11 +145,11 @@ _OTHERS = {
 
 
 def joint_of(name: str, pattern: str) -> int | None:
-    """Return the number of a joint by a maker's name of it, as written; None if it is not a joint.
+    """Return the number of the joint that a name denotes, as written; None if the name does not denote a joint.
 
     Args:
         name: name in a heading.
-        pattern: the maker's names, see `MakerHeadings.joints`.
+        pattern: names of the joints that the maker uses, see `MakerHeadings.joints`.
     """
     if not pattern.endswith("#"):
         names = pattern.split()

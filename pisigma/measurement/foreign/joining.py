@@ -27,9 +27,9 @@ from pisigma.measurement.foreign.time_stamps import (
 
 JoinBy = Literal["point", "order", "time"]
 _MAX_MOTION = 0.05
-"""[deg or mm] Motion of a joint around a time stamp above which the robot did not stand still."""
+"""Motion of a joint around a time stamp [deg or mm] above which the robot was not at rest."""
 _NANOSECONDS = 1e15
-"""Numbers above are nanoseconds, as in ROS's names of images, not seconds."""
+"""Number above which a time is in nanoseconds, as in ROS's names of images, not in seconds."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,10 +37,11 @@ class JoinedRows:
     """Measurements joined with joint values.
 
     Attributes:
-        rows: the measurements in their order, with joint values.
+        rows: the measurements in the order of the list, with joint values.
         used: file and line of the rows of the log that were joined.
         unmatched: rows of both files that have no partner.
-        unused: rows of the log that need no partner, because another row has their point or nothing was measured then.
+        unused: rows of the log that need no partner, because another row has the same point or nothing was measured
+            at their time.
         warnings: warnings, each a sentence.
     """
 
@@ -54,19 +55,19 @@ class JoinedRows:
 def join_rows(measured: ConvertedRows, joints: ConvertedRows, by: JoinBy, within: float = 0.2) -> JoinedRows:
     """Join a list of measurements and a log of joint values.
 
-    Rows of the list keep their order; rows without a partner are left out and listed. Poses in the log are commanded or
-    calculated ones and are left out.
+    Rows of the list keep their order; rows without a partner are left out and listed. Poses in the log are commanded
+    or calculated, so they are left out.
 
     Args:
         measured: rows without joint values.
         joints: rows with joint values.
-        by: "point": names of points, ignoring groups before "::", case and leading zeros; "order": the first with the
-            first and so on; "time": the row of the log that is nearest in time.
+        by: "point": by names of points, ignoring groups before "::", case and leading zeros; "order": by position in
+            the files; "time": with the row of the log that is nearest in time.
         within: largest difference of time stamps [s].
 
     Raises:
-        MeasurementError: there is no column to join by, numbers of rows differ, a name has different joint values, no
-            row has a partner, or names of points contradict the order or the time.
+        MeasurementError: there is no column to join by, the numbers of rows differ, a name has different joint
+            values, no row has a partner, or names of points contradict the order or the time.
     """
     if by == "order":
         partner = _by_order(measured, joints)
@@ -103,8 +104,8 @@ def join_rows(measured: ConvertedRows, joints: ConvertedRows, by: JoinBy, within
         rows=rows,
         used=tuple(joints.row_places[row] for row in np.unique(partner[matched])),
         unmatched=(
-            *_left_out(measured, np.flatnonzero(partner < 0), f"it has no partner in {joints.source}"),
-            *_left_out(joints, np.setdiff1d(alone, known), f"it has no partner in {measured.source}"),
+            *_left_out(measured, np.flatnonzero(partner < 0), f"the row has no partner in {joints.source}"),
+            *_left_out(joints, np.setdiff1d(alone, known), f"the row has no partner in {measured.source}"),
         ),
         unused=tuple(_left_out(joints, known, why)),
         warnings=tuple(warnings),
@@ -117,7 +118,7 @@ def _left_out(rows: ConvertedRows, which: Int64[np.ndarray, " _which"], reason: 
 
 
 def append_rows(rows: Sequence[ConvertedRows]) -> ConvertedRows:
-    """Concatenate the rows of several files; columns that one of them does not have are empty in its rows."""
+    """Concatenate the rows of several files; columns that a file does not have are empty in its rows."""
     if len(rows) == 1:
         return rows[0]
     names = list(dict.fromkeys(name for one in rows for name in one.cells))
@@ -137,10 +138,10 @@ def _check_names(
 ) -> list[str]:
     """Refuse joined rows whose points have different names in both files.
 
-    If no name is in both files, the numbers at the ends of the names are compared; their first numbers may differ.
+    If no name is in both files, the numbers at the ends of the names are compared, up to a constant offset.
 
     Returns:
-        Warnings of names that cannot be compared.
+        Warnings about names that cannot be compared.
 
     Raises:
         MeasurementError: the two files name a point differently.
@@ -233,7 +234,7 @@ def _times(rows: ConvertedRows, other: ConvertedRows) -> Float64[np.ndarray, " r
     """Return the time stamps [s].
 
     Raises:
-        MeasurementError: one is invalid, or neither file determines its order of day and month.
+        MeasurementError: a time stamp is invalid, or neither file determines the order of day and month.
     """
     texts, others = _stamps(rows), _stamps(other)
     first = day_first(texts)
@@ -256,7 +257,7 @@ def _times(rows: ConvertedRows, other: ConvertedRows) -> Float64[np.ndarray, " r
 
 
 def _stamps(rows: ConvertedRows) -> list[str]:
-    """Return the texts of the time stamps; clock times are completed by a column of dates."""
+    """Return the texts of the time stamps; a column of dates completes clock times."""
     _check_key(rows, "time", "time stamps")
     dates = rows.cells.get("date", ("",) * len(rows.lines))
     return [
@@ -283,7 +284,7 @@ def _joint_columns(rows: ConvertedRows) -> list[str]:
 def _partners(
     joints: ConvertedRows, partner: Int64[np.ndarray, " rows"], by: JoinBy
 ) -> Int64[np.ndarray, " _log"]:
-    """Return the rows of the log that need not be listed: joined ones, and those between them of a continuous log."""
+    """Return the rows of the log that need not be listed: joined rows, and rows between them in a continuous log."""
     if by != "time":
         if by == "point":
             names = {_plain_name(joints.cells["point"][row]) for row in partner if row >= 0}
@@ -319,7 +320,7 @@ def _moving(joints: ConvertedRows, partner: Int64[np.ndarray, " _rows"], within:
 def _no_partner(
     measured: ConvertedRows, joints: ConvertedRows, by: JoinBy, within: float
 ) -> MeasurementError:
-    """Return the exception for files of which no row has a partner."""
+    """Return the exception for two files without matching rows."""
     at = Place(f"{measured.source} and {joints.source}")
     if by == "time":
         times, logged = _times(measured, joints), _times(joints, measured)
@@ -338,8 +339,8 @@ class JoinedJoints:
 
     Attributes:
         columns: columns of the log that are kept, such as "q1_deg" and "payload_kg".
-        cells: texts of these columns by name of the image; images without a partner are missing.
-        remarks: sentences on rows without a partner, and warnings.
+        cells: texts of these columns by image name; images without a partner are missing.
+        remarks: sentences about rows without a partner, and warnings.
     """
 
     columns: tuple[str, ...]
@@ -351,7 +352,7 @@ def join_joints(names: Sequence[str], path: str | os.PathLike[str], within: floa
     """Return the joint values at which every image was taken.
 
     Args:
-        names: names of the images without file extensions; time stamps if the log has times.
+        names: names of the images without file extensions; they must be time stamps if the log has times.
         path: CSV file with joint values (`q1_deg` and so on) and a column `image` (with or without extension) or
             `time`; further columns are kept if they are columns of measurement files.
         within: largest difference of time stamps [s].
@@ -390,7 +391,7 @@ def join_joints(names: Sequence[str], path: str | os.PathLike[str], within: floa
 
 
 def _stamp(name: str) -> str:
-    """Return the time stamp in the name of an image, with nanoseconds converted to seconds."""
+    """Return the time stamp in the name of an image as text, with nanoseconds converted to seconds."""
     try:
         return repr(int(name) * 1e-9) if int(name) > _NANOSECONDS else name
     except ValueError:

@@ -1,4 +1,4 @@
-"""Map the columns of an export to quantities and units, as stated or else as proposed, and warn of doubtful ones."""
+"""Map the columns of an export to quantities and units, as stated or as proposed, and warn of doubtful columns."""
 
 import re
 from collections.abc import Mapping
@@ -41,18 +41,18 @@ from pisigma.measurement.foreign.units import (
 )
 
 _JOINT_LIKE = re.compile(r"e(?:ax|xt)?[1-6a-f]|[qj]\d.*")
-"""Names of external axes, and names that start like those of joints."""
+"""Pattern of names of external axes, and of names that start like names of joints."""
 _MIN_TILT = 0.2
-"""[deg or rad] Angles of rotations that are all smaller may be those of a tool that hardly tilts, in any unit."""
+"""Largest angle of rotations [deg or rad] below which the unit is uncertain, because the tool may hardly tilt."""
 
 
 @dataclass(frozen=True, eq=False)
 class FileMapping:
-    """A file and the meaning of its columns.
+    """An exported file, and the meaning of its columns.
 
     Attributes:
         file: the export.
-        columns: all columns, in its order.
+        columns: all columns, in the order of the file.
         rotations: encodings of rotations that fit the headings; () if at most one does.
         incomplete: columns that contain some but not all values of a rotation; () if there are none.
     """
@@ -64,7 +64,7 @@ class FileMapping:
 
     @property
     def quantities(self) -> dict[str, MappedColumn]:
-        """The kept columns by quantity."""
+        """Columns that are kept, by quantity."""
         return {one.target.quantity: one for one in self.columns if one.target.quantity != LEFT_OUT}
 
     @property
@@ -74,16 +74,16 @@ class FileMapping:
 
     @property
     def has_measured(self) -> bool:
-        """Whether it contains other kept columns, except names and times of the rows."""
+        """Whether the file contains kept columns other than joint values, names and times."""
         return bool(set(self.quantities) - {*KEYS, *joints_of(self.quantities)})
 
     def key(self, column: MappedColumn) -> str:
-        """Return the name of a column in mappings: its heading, or its number if several have the same heading."""
+        """Return the name of a column in mappings: its heading, or its number if several columns have that heading."""
         return column.heading if self.file.headings.count(column.heading) == 1 else str(column.index + 1)
 
     @property
     def without_unit(self) -> tuple[MappedColumn, ...]:
-        """The columns whose unit is unknown; times without a unit are in s."""
+        """Columns whose unit is unknown; times without a unit are in seconds."""
         return tuple(one for one in self.columns if one.target.missing_unit_kind not in (None, "time"))
 
     @property
@@ -97,7 +97,7 @@ class FileMapping:
 
     @property
     def title(self) -> str:
-        """A line with file, number of rows and format."""
+        """Line of text with file, number of rows and format."""
         return f"{self.file.source}: {len(self.file.records)} rows, {self.file.dialect}"
 
     def place_of(self, column: MappedColumn, line: int = 0) -> Place:
@@ -110,7 +110,7 @@ class FileMapping:
 
     @property
     def possible_joints(self) -> list[MappedColumn]:
-        """The columns that are left out although they are named like joints."""
+        """Columns that are left out although they are named like joints."""
         left_out = [
             one for one in self.columns if one.target.quantity == LEFT_OUT and one.reason == UNRECOGNISED
         ]
@@ -122,16 +122,16 @@ def map_columns(
 ) -> FileMapping:
     """Determine the quantities and units of the columns of a file.
 
-    Units are taken, in this order, from the mapping, the heading, the unit row, the comments, `units`, for a coordinate
-    from the other coordinates if these are stated, and from the maker with these names if the values can be in no other
-    unit.
+    Units are taken, in this order, from the mapping, the heading, the unit row, the comments, `units`, for a
+    coordinate from the stated unit of the other coordinates, and from the maker with these names if the values
+    cannot be in another unit.
 
     Args:
         file: the export.
-        stated: targets by heading or number of a column, see `parse_target`; names that the file does not have are
-            ignored.
-        rotation: encoding of the rotations, `NO_ROTATION` to leave them out, None to determine it by the headings.
-        units: symbols by kind of unit, for columns for which the file states none.
+        stated: targets by heading or number of a column, see `parse_target`; names of columns that the file does not
+            have are ignored.
+        rotation: encoding of the rotations, `NO_ROTATION` to leave them out, None to determine it from the headings.
+        units: symbols by kind of unit, for columns for which the file does not state a unit.
 
     Raises:
         MeasurementError: a statement does not fit the file, or the headings do not determine the columns.
@@ -150,7 +150,7 @@ def map_columns(
 
 
 def _take_stated(proposal: Proposal, name: str, text: str) -> None:
-    """Decide the columns that the caller names by heading or number."""
+    """Map the columns that the caller names by heading or number."""
     file = proposal.file
     indices = [index for index, heading in enumerate(file.headings) if heading == name]
     if not indices and name.isdigit() and 1 <= int(name[:9]) <= len(file.headings):
@@ -178,7 +178,7 @@ def _written_unit(proposal: Proposal, index: int) -> str:
 def _with_units(
     columns: tuple[MappedColumn, ...], proposal: Proposal, units: Mapping[UnitKind, str]
 ) -> tuple[MappedColumn, ...]:
-    """Return the columns with the units that their targets lack, as far as they can be determined."""
+    """Return the columns with missing units added, as far as they can be determined."""
     file = proposal.file
     written = stated_units(file.comments)
     for stated, symbol in units.items():
@@ -213,7 +213,7 @@ def _with_units(
         )
         for source, by_kind in sources:
             if ambiguous and source != "--unit":
-                continue  # only the caller knows which unit is meant
+                continue  # only the caller knows the intended unit
             if kind is not None and kind in by_kind and open_unit and not target.unit:
                 target = replace(target, unit=by_kind[kind])
                 column = replace(column, target=target, reason=f"{column.reason}; unit by {source}")
@@ -239,7 +239,7 @@ def ambiguous_spelling(file: ExportFile, index: int, kind: UnitKind | None) -> s
 def _units_of_maker(
     maker: MakerHeadings | None, file: ExportFile, columns: tuple[MappedColumn, ...]
 ) -> dict[UnitKind, str]:
-    """Return the units that a maker always writes, if the values can be in no other unit."""
+    """Return the units that a maker always uses, if the values cannot be in another unit."""
     if maker is None:
         return {}
     kinds: tuple[tuple[UnitKind, str, list[MappedColumn]], ...] = (
@@ -265,7 +265,7 @@ def position_columns(columns: tuple[MappedColumn, ...]) -> list[MappedColumn]:
 
 
 def rotation_columns(columns: tuple[MappedColumn, ...]) -> list[MappedColumn]:
-    """Return the columns of angles of rotations."""
+    """Return the columns with angles of rotations."""
     return [
         one
         for one in columns
@@ -279,7 +279,7 @@ def largest_value(file: ExportFile, columns: list[MappedColumn]) -> float:
 
 
 def mapping_warnings(mapping: FileMapping) -> tuple[str, ...]:
-    """Return warnings of values that are unlikely in their units, moving external axes, and doubtful rows.
+    """Return warnings about values that are unlikely in their unit, external axes that move, and doubtful rows.
 
     Every sentence states file, line and column.
     """
@@ -299,7 +299,7 @@ def mapping_warnings(mapping: FileMapping) -> tuple[str, ...]:
 
 
 def _of_unit(mapping: FileMapping, name: str, columns: list[MappedColumn], unit: str) -> str:
-    """Return a warning of values that are too large or too small for their unit; "" if there are none."""
+    """Return a warning about values that are too large or too small for their unit; "" if there are none."""
     values = [
         (abs(float(number)), line, column)
         for column in columns
@@ -314,7 +314,7 @@ def _of_unit(mapping: FileMapping, name: str, columns: list[MappedColumn], unit:
 
 
 def _left_out(mapping: FileMapping, column: MappedColumn) -> str:
-    """Return a warning of an external axis that moves and is left out; "" if it does not move."""
+    """Return a warning about an external axis that moves and is left out; "" if it does not move."""
     values = mapping.file.numbers(column.index)
     if not values or min(values) == max(values):
         return ""
@@ -325,7 +325,7 @@ def _left_out(mapping: FileMapping, column: MappedColumn) -> str:
 
 
 def _no_values(mapping: FileMapping) -> list[str]:
-    """Return warnings of positions with three equal coordinates, which may mark that nothing was measured."""
+    """Return warnings about positions with three equal coordinates, which may mark rows without a measurement."""
     columns = position_columns(mapping.columns)
     if len(columns) != 3:
         return []
@@ -339,7 +339,7 @@ def _no_values(mapping: FileMapping) -> list[str]:
 
 
 def _called_means(mapping: FileMapping) -> list[str]:
-    """Return a warning of rows that are named as means, unlike others, and that are used as measurements."""
+    """Return a warning about rows that are named as means but are used as measurements."""
     records = mapping.file.records
     named = named_statistics(records)
     if not named or len(named) == len(records):

@@ -1,4 +1,4 @@
-"""Propose the quantities of the columns of an export by their headings, or by their order without headings."""
+"""Propose the quantities of the columns of an export from their headings, or without headings from their order."""
 
 import itertools
 from collections.abc import Mapping, Sequence
@@ -26,17 +26,18 @@ from pisigma.measurement.foreign.units import UNITS, UnitKind
 NO_ROTATION = "none"
 """The choice of `--rotation` that leaves out rotations."""
 UNRECOGNISED = "not recognised"
-"""Reason for columns that are left out because their headings have no known meaning."""
+"""Reason that is stated for columns whose headings have no known meaning."""
 
 _JOINTS_WITHOUT_HEADINGS = (6, 7)
 _MIN_RISING = 5
-"""Number of rows of which the first column rises by chance in one of 120 files."""
+"""Number of rows in which the first column rises by chance in one of 120 files."""
 _MIN_ORDERED = 8
-"""Number of rows of which one of ten columns rises or falls by chance in one of 2,000 files."""
+"""Number of rows in which one of ten columns rises or falls by chance in one of 2,000 files."""
 _MANY, _MAX_REVERSED = 20, 0.1
-"""Number of rows from which this share of the steps may have the other sign, as where a clock was set."""
+"""Smallest number of rows in which a share of the steps of a time may have the other sign, for example because a
+clock was set, and this share."""
 _MIN_CHANGES = 0.4
-"""Smallest share of the steps in which times change; joints that stand still in many rows change less often."""
+"""Smallest share of the rows in which a time changes; joints that are at rest in many rows change less often."""
 _Side = Literal["commanded", "measured"]
 
 
@@ -46,8 +47,8 @@ class Proposal:
 
     Attributes:
         file: the export.
-        columns: decided columns by index.
-        maker: the maker with these names of columns; None if several makers use them.
+        columns: mapped columns by index.
+        maker: the maker that uses these column names; None if several makers use them.
         rotations: encodings of rotations that fit the headings, if there are several.
     """
 
@@ -63,16 +64,16 @@ class Proposal:
 
     @property
     def quantities(self) -> set[str]:
-        """Quantities of the decided columns."""
+        """Quantities of the columns mapped so far."""
         return {column.target.quantity for column in self.columns.values()}
 
     def set_quantity(self, index: int, quantity: str, reason: str) -> None:
-        """Decide the quantity of a column."""
+        """Set the quantity of a column."""
         target = Target(quantity, "" if quantity == LEFT_OUT else self.headings[index].unit)
         self.columns[index] = MappedColumn(index, self.file.headings[index], target, reason)
 
     def names(self, *kinds: UnitKind) -> dict[str, list[int]]:
-        """Return the undecided columns by name, without those whose heading states a unit of another kind.
+        """Return the columns not yet mapped by name, without columns whose heading states a unit of another kind.
 
         Args:
             kinds: kinds of units; none for all columns.
@@ -87,7 +88,7 @@ class Proposal:
     def assign_columns(
         self, group: Mapping[str, str], names: Mapping[str, list[int]], side: _Side, reason: str
     ) -> None:
-        """Decide columns by their names; of commanded and measured ones, keep those of one side."""
+        """Map columns by their names; of commanded and measured columns, keep one side."""
         for name, quantity in group.items():
             sides = {self.headings[index].side for index in names[name]}
             chosen = next(one for one in (side, "", *sides) if one in sides)
@@ -104,7 +105,7 @@ class Proposal:
 
 
 def propose_quantities(proposal: Proposal, rotation: str | None) -> None:
-    """Decide the quantities of all undecided columns.
+    """Map all columns that are not yet mapped.
 
     Args:
         proposal: the mapping with the stated columns.
@@ -130,7 +131,7 @@ def propose_quantities(proposal: Proposal, rotation: str | None) -> None:
 
 
 def _take_by_order(proposal: Proposal, rotation: str | None) -> None:
-    """Decide columns without headings: joints and a position, a point and its position, or a position.
+    """Map columns without headings: joints and a position, a point and its position, or a position.
 
     Columns that are stated as other quantities, such as a time, are skipped.
     """
@@ -166,7 +167,7 @@ def _take_by_order(proposal: Proposal, rotation: str | None) -> None:
 
 
 def _has_place(stated: str | None) -> bool:
-    """Return whether a column counts in the order of joints, position and rotation."""
+    """Return whether a column is counted in the order of joints, position and rotation."""
     rotations = {name for one in ROTATIONS.values() for name in (*one.columns, *one.quantities())}
     return stated is None or bool(joints_of([stated])) or stated in {*POSITION, *RPY, *QUATERNION, *rotations}
 
@@ -206,11 +207,11 @@ def _check_times(proposal: Proposal, of_index: Mapping[int, str]) -> None:
 
 
 def _is_ordered(numbers: Sequence[float], rising: int) -> bool:
-    """Return whether numbers rise or fall from row to row more often than by chance, except where a clock was set.
+    """Return whether numbers rise or fall from row to row more often than by chance, apart from clock changes.
 
     Args:
         numbers: numbers of a column.
-        rising: number of rows from which it is enough that all rise; 0 if it is not.
+        rising: number of rows from which it is sufficient that all numbers rise; 0 if that is never sufficient.
     """
     steps = [after - before for before, after in itertools.pairwise(numbers)]
     up, down = (sum(sign * step > 0 for step in steps) for sign in (1, -1))
@@ -232,9 +233,9 @@ def _ends_with_matrices(file: ExportFile, leading: int) -> bool:
 
 
 def _take_joints(proposal: Proposal) -> None:
-    """Decide the joints: the largest group of columns with names of joints, preferring a maker's names.
+    """Map the joints: the largest group of columns with names of joints, preferring a maker's names.
 
-    Stated joints count with the number in their heading, or else with that of their target.
+    Stated joints have the number in their heading, otherwise the number of their target.
     """
     stated = [one for one in proposal.columns.values() if joints_of([one.target.quantity])]
     if not all(one.is_stated for one in stated):
@@ -263,7 +264,7 @@ def _take_joints(proposal: Proposal) -> None:
 
 
 def _take_position(proposal: Proposal) -> None:
-    """Decide the measured coordinates; a position that is only commanded is left out."""
+    """Map the measured coordinates; a position that is only commanded is left out."""
     for group in POSITIONS:
         names, taken = proposal.names("length"), proposal.quantities
         missing = {name: one for name, one in zip(group, POSITION, strict=True) if one not in taken}
@@ -276,7 +277,7 @@ def _take_position(proposal: Proposal) -> None:
 
 
 def _take_rotation(proposal: Proposal, rotation: str | None) -> None:
-    """Decide the rotation by the names of its values, by the maker of the joints, or as stated."""
+    """Map the rotation by the names of its values, by the maker of the joints, or as stated."""
     columns = {name for one in ROTATIONS.values() for name in (*one.columns, *one.quantities())}
     names = {
         name: indices
@@ -303,7 +304,7 @@ def _take_rotation(proposal: Proposal, rotation: str | None) -> None:
 
 
 def _take_names(proposal: Proposal) -> None:
-    """Decide the names of points: without such a heading, the first column with a different name in every row."""
+    """Map the names of points: without such a heading, the first column with a different name in every row."""
     file = proposal.file
     if "point" in proposal.quantities:
         return
@@ -323,7 +324,7 @@ def _take_names(proposal: Proposal) -> None:
 
 
 def _take_third_coordinate(proposal: Proposal) -> None:
-    """Decide the third of two stated coordinates: the only remaining length, or else the column in its place."""
+    """Map the third coordinate if two are stated: the only remaining length, otherwise the column in its place."""
     place = {
         one.target.quantity: index
         for index, one in proposal.columns.items()
@@ -356,7 +357,7 @@ def _take_third_coordinate(proposal: Proposal) -> None:
 
 
 def incomplete_rotation(proposal: Proposal) -> list[int]:
-    """Find columns with the names of all values of a rotation except one, and no other numbers between them.
+    """Return columns with the names of all values of a rotation except one, and no other numbers between them.
 
     Args:
         proposal: the complete mapping; stated and used columns are ignored.
@@ -379,7 +380,7 @@ def incomplete_rotation(proposal: Proposal) -> list[int]:
 
 
 def _take_other(proposal: Proposal, name: str, index: int) -> None:
-    """Decide a column that is neither joint, position nor rotation."""
+    """Map a column that is neither joint, position nor rotation."""
     unit = proposal.headings[index].unit
     of_unit = {"temperature": "temperature", "time": "time"}.get(UNITS[unit].kind if unit else "")
     quantity = of_unit or MEANINGS.get(name, LEFT_OUT)

@@ -1,4 +1,4 @@
-"""Targets of columns of exports: columns of measurement files, values of rotations, names and times."""
+"""Targets of columns in exports: columns of measurement files, values of rotations, names and times."""
 
 import functools
 from collections.abc import Iterable
@@ -10,9 +10,9 @@ from pisigma.measurement.foreign.rotations import ROTATIONS
 from pisigma.measurement.foreign.units import UNITS, UnitKind
 
 LEFT_OUT = "-"
-"""Target of a column that a mapping omits; before a target it reverses the sign: "-q4_deg"."""
+"""Target of a column that a mapping omits; in front of a target it reverses the sign: "-q4_deg"."""
 ALTHOUGH = "!"
-"""After a target in a mapping: the column is in this unit although its heading states another one ("x_in!")."""
+"""Mark after a target in a mapping: the column is in this unit although its heading states another one ("x_in!")."""
 KEYS = ("point", "time")
 """Quantities by which rows of two files are joined; they are not in measurement files."""
 
@@ -47,7 +47,7 @@ class Target:
 
     Attributes:
         quantity: quantity such as "q1", "x", "kuka_a" or "point"; `LEFT_OUT` if the column is left out.
-        unit: symbol of the unit of the cells; "" if it has none or is unknown.
+        unit: symbol of the unit of the cells; "" if there is no unit or it is unknown.
         is_reversed: whether the cells have the opposite sign.
         overrides: whether the unit applies although the file states another one.
     """
@@ -59,7 +59,7 @@ class Target:
 
     @property
     def text(self) -> str:
-        """The text for `--map`."""
+        """Text of the target for `--map`."""
         named = measurement_column(self.quantity, self.unit)
         named = named or "_".join(filter(None, (self.quantity, self.unit)))
         return f"{LEFT_OUT * self.is_reversed}{named}{ALTHOUGH * self.overrides}"
@@ -77,8 +77,8 @@ class MappedColumn:
     Attributes:
         index: index of the column in its file, from 0.
         heading: heading of the column, or its number from 1.
-        target: its quantity and unit.
-        reason: why, in a few words.
+        target: quantity and unit of the column.
+        reason: reason for the target, in a few words.
         is_stated: whether the caller stated the target.
     """
 
@@ -95,7 +95,7 @@ def joints_of(quantities: Iterable[str]) -> list[str]:
 
 
 def fits_unit(quantity: str, unit: str) -> bool:
-    """Return whether values of a quantity can be in a unit; "" fits all, and joints can be in angles or lengths."""
+    """Return whether a quantity can be in a unit; "" fits all quantities, and joints can be angles or lengths."""
     kinds = {unit_kind(quantity)} | ({"length"} if is_joint(quantity) else set())
     return not unit or UNITS[unit].kind in kinds
 
@@ -114,7 +114,7 @@ def unit_kind(quantity: str) -> UnitKind | None:
 
 
 def measurement_column(quantity: str, unit: str) -> str:
-    """Return the column of measurement files for a quantity in one of their units; "" if there is none."""
+    """Return the column of measurement files for a quantity in a unit; "" if there is no such column."""
     names = (f"{quantity}_{unit}" if unit else quantity, f"{quantity.partition('_')[0]}_{unit}")
     return next((name for name in names if (column := find_column(name)) and column.quantity == quantity), "")
 

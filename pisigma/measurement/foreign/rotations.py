@@ -1,4 +1,4 @@
-"""Encodings of rotations, named by the makers that write them."""
+"""Encodings of rotations, named after the makers that use them."""
 
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
@@ -24,8 +24,8 @@ class RotationEncoding:
     Attributes:
         name: name for `--rotation` and for columns in mappings, such as "kuka_a_deg".
         meaning: description for messages.
-        values: names of its values, in the order of files without a header.
-        to_rotation: converts values (angles [rad] or numbers) to rotations.
+        values: names of the values, in the order of files without a header.
+        to_rotation: function that converts values (angles [rad] or numbers) to rotations.
         columns: columns of measurement files with the same meaning, in the order of the values; () if there are none
             and the rotation is written as a quaternion.
         is_angles: whether the values are angles, which have a unit.
@@ -41,11 +41,11 @@ class RotationEncoding:
     aliases: tuple[tuple[str, ...], ...] = ()
 
     def quantities(self) -> tuple[str, ...]:
-        """Return the names of its values in mappings."""
+        """Return the names of the values in mappings."""
         return tuple(f"{self.name}_{value}" for value in self.values)
 
     def is_rotation(self, values: _Values) -> Bool[Tensor, " rows"]:
-        """Return for which rows the values are a rotation."""
+        """Return the mask of the rows whose values are a rotation."""
         if self.is_angles:
             return values.isfinite().all(1)
         R = values.reshape(-1, 3, 3) if len(self.values) == 9 else values[:, :, None]
@@ -70,7 +70,7 @@ def _euler(name: str, meaning: str, values: str, product: str, *aliases: str) ->
         "z": "roll",
         "y": "pitch",
         "x": "yaw",
-    }  # of measurement files: RotZ(roll)·RotY(pitch)·RotX(yaw)
+    }  # encodings of measurement files: RotZ(roll)·RotY(pitch)·RotX(yaw)
     of_value = {value: of_axis[axis] for value, axis in factors}
     columns = tuple(of_value[value] for value in names) if axes == "zyx" else ()
     return RotationEncoding(name, meaning, tuple(names), to_rotation, columns, aliases=_split(aliases))
@@ -137,7 +137,7 @@ _ENCODINGS = (
     ),
 )  # fmt: skip
 ROTATIONS: dict[str, RotationEncoding] = {encoding.name: encoding for encoding in _ENCODINGS}
-"""Encodings by name; a further encoding is one line."""
+"""Encodings of rotations by name."""
 MATRIX_ROWS = (
     *("matrix_r11", "matrix_r12", "matrix_r13", "x"),
     *("matrix_r21", "matrix_r22", "matrix_r23", "y"),
@@ -147,7 +147,7 @@ MATRIX_ROWS = (
 
 
 def encodings_of(names: Collection[str]) -> dict[str, dict[str, str]]:
-    """Return the encodings whose values are all among `names`: by encoding, its quantities by these names."""
+    """Return the encodings whose values are all among `names`, with the quantity of every name, by encoding."""
     there = set(names)
     matches: dict[str, dict[str, str]] = {}
     for encoding in _ENCODINGS:

@@ -11,20 +11,20 @@ from pisigma.measurement.foreign.mapping import FileMapping
 
 
 class SavedMap(Section):
-    """A file of mappings: targets by heading, for every file of an import."""
+    """Contents of a file of mappings: targets by heading, for every file of an import."""
 
     files: tuple[dict[str, str], ...]
 
 
 StatedMaps = Sequence[Mapping[str, str]]
-"""Mappings, of which the one that fits a file best is used."""
+"""Type of several mappings; the mapping that fits a file best is used for it."""
 
 
 def parse_map(text: str) -> StatedMaps:
     """Parse a mapping such as "A1=q1_deg,X=x_mm,note=-", or read a file of mappings.
 
     Raises:
-        MeasurementError: it is neither.
+        MeasurementError: the text is neither a mapping nor a file of mappings.
     """
     if "=" not in text:
         if not os.path.exists(text):
@@ -54,7 +54,7 @@ def parse_map(text: str) -> StatedMaps:
 
 
 def map_for(maps: StatedMaps, headings: Sequence[str]) -> Mapping[str, str]:
-    """Return the mapping that names most headings of a file; of several mappings, one that names no others."""
+    """Return the mapping that names most headings of a file, and that names no other headings if possible."""
     there = {*headings, *map(str, range(1, len(headings) + 1))}
     fitting = maps if len(maps) == 1 else [one for one in maps if set(one) <= there]
     return max(fitting, key=lambda one: len(set(one) & there), default={})

@@ -1,4 +1,4 @@
-"""Find rows that summarise others, such as "Mean" and "StdDev", which are not measurements."""
+"""Find rows that summarise other rows, such as "Mean" and "StdDev", and are not measurements."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -24,28 +24,28 @@ _OTHERS = frozenset(_CALLED_OTHERWISE.split())
 """Names of other statistics."""
 
 _MAX_SHARE = 0.25
-"""Share of rows named as means up to which they are summaries without a check of their values."""
+"""Largest share of rows named as means that are treated as summaries without a check of their values."""
 _MIN_ROWS = 4
-"""Smallest number of rows of which a row without a name can be recognised as the mean."""
+"""Smallest number of rows whose mean can be recognised in a row without a name."""
 _LAST_ROWS = 6
-"""Number of rows at the end of a file that are compared with statistics of those before them."""
+"""Number of rows at the end of a file that are compared with statistics of the preceding rows."""
 _MIN_RANGE = 100.0
 """Range of a column's values relative to their rounding above which it distinguishes a mean from a measurement."""
 
 
 def summary_rows(records: Sequence[Sequence[str]], numbers: NumberFormat) -> dict[int, str]:
-    """Find rows that summarise others.
+    """Find rows that summarise other rows.
 
     A row is a summary if one of its cells names a statistic, or if it precedes or follows all other rows and contains
-    their mean or other statistics in every column. Many rows named as means, of which none is the mean of the rows
-    before it, are measurements: the instrument averaged every one of them.
+    their mean or other statistics in every column. If many rows are named as means and none is the mean of the rows
+    before it, they are measurements that the instrument averaged.
 
     Args:
         records: cells of the rows.
         numbers: format of numbers.
 
     Returns:
-        The reason why a row is a summary, by the index of the row.
+        The reason why a row is a summary, by row index.
     """
     named = named_statistics(records)
     is_mode = len(named) == len(records) or (
@@ -62,13 +62,13 @@ def summary_rows(records: Sequence[Sequence[str]], numbers: NumberFormat) -> dic
     texts = [[numbers.text(cell) for cell in records[row]] for row in unnamed]
     after = _count_statistics(texts)
     before = 0 if after else _count_statistics(texts[::-1])
-    why = "it is the mean, or another statistic, of the rows"
+    why = "the row is the mean, or another statistic, of the rows"
     found |= dict.fromkeys(unnamed[len(unnamed) - after :], f"{why} before it")
     return found | dict.fromkeys(unnamed[:before], f"{why} after it")
 
 
 def named_statistics(records: Sequence[Sequence[str]]) -> dict[int, str]:
-    """Return the statistics that cells name, by row; the last such cell of a row is used."""
+    """Return the statistics that cells name, by row index; the last such cell of a row is used."""
     return {
         row: name
         for row, record in enumerate(records)
@@ -78,13 +78,13 @@ def named_statistics(records: Sequence[Sequence[str]]) -> dict[int, str]:
 
 
 def statistic_name(cell: str) -> str:
-    """Return a cell without blanks, signs, multiples ("3σ"), "value" and the quantity ("mean of X")."""
+    """Return the name of a statistic in a cell, without blanks, signs, multiples ("3σ") and quantity ("mean of X")."""
     text = re.sub(r"^\d+\s*[x*]?\s*(?=σ|sigma)|\(.*?\)|\[.*?\]|\s(?:of|von)\s.*", "", cell.casefold().strip())
     return re.sub(r"[\W_]+|values?$|wert$", "", text) if text[:1].isalpha() else ""
 
 
 def _holds_means(records: Sequence[Sequence[str]], numbers: NumberFormat, named: Mapping[int, str]) -> bool:
-    """Return whether a row that is named as a mean is that of the rows since the previous such row."""
+    """Return whether a row that is named as a mean is the mean of the rows since the previous such row."""
     group: list[list[str | None]] = []
     for row, record in enumerate(records):
         texts = [numbers.text(cell) for cell in record]
@@ -122,11 +122,11 @@ def _are_statistics(
 ) -> bool:
     """Return whether all of the last rows are statistics of the rows, and one of them is their mean.
 
-    A calculated mean is rounded or has more digits than the rows, unlike a centre of commanded values.
+    A calculated mean is rounded or has more digits than the rows; a central commanded value is not.
     """
     finest = rounding[: len(rows)].min(0)
     clear = np.ptp(rows, axis=0) > _MIN_RANGE * rounding[len(rows) :].max(0)
-    clear &= ~np.all(np.diff(rows, axis=0) == 1, axis=0)  # numbers of the points
+    clear &= ~np.all(np.diff(rows, axis=0) == 1, axis=0)  # a column with the numbers of the points
     if clear.sum() < 3:
         return False
     rows, last, rounding = rows[:, clear], last[:, clear], rounding[len(rows) :, clear]

@@ -12,13 +12,13 @@ _CLOCK = re.compile(r"(\d{1,2}):(\d{2})(?::(\d{2}(?:[.,]\d+)?))?(?:\s*([AaPp])\.
 
 
 def seconds_of(text: str, day_first: bool | None = None) -> float | None:
-    """Return the seconds of a number, a clock time, or a date with a clock time (UTC by default); None for others.
+    """Return the time in seconds of a number, a clock time, or a date with clock time (UTC by default), or None.
 
     Args:
         text: time stamp such as "12.5", "10:31:02.5", "10:31:02 PM", "2026-03-02 10:31:02.5", "02.03.2026 10:31" or
             "02/03/2026 10:31".
-        day_first: whether the day is before the month in dates such as 02/03/2026; None if unknown: such dates are read
-            if only one order is possible.
+        day_first: whether the day precedes the month in dates such as 02/03/2026; None if unknown: such a date is
+            then accepted if only one order is possible.
     """
     text = text.strip()
     try:
@@ -40,7 +40,7 @@ def seconds_of(text: str, day_first: bool | None = None) -> float | None:
 
 
 def iso_day(text: str, day_first: bool | None = None) -> str | None:
-    """Return the day of a date, with or without a clock time, in the form of ISO 8601; None for other texts."""
+    """Return the day of a date, with or without clock time, in the form of ISO 8601; None for other texts."""
     match = _DATE.fullmatch(text.strip())
     if match is None or (match[5] and not is_clock(match[5])):
         return None
@@ -49,7 +49,7 @@ def iso_day(text: str, day_first: bool | None = None) -> str | None:
 
 
 def date_of(text: str) -> str:
-    """Return the date of a time stamp as written; "" if it has none."""
+    """Return the date in a time stamp as written; "" if it contains no date."""
     match = _DATE.match(text.strip())
     return text.strip()[: match.start(5) if match[5] is not None else None].strip(" T,") if match else ""
 
@@ -60,7 +60,7 @@ def is_clock(text: str) -> bool:
 
 
 def day_first(texts: Sequence[str]) -> bool | None:
-    """Return whether dates such as 13/03/2026 have the day first; None if they do not determine it or disagree."""
+    """Return whether dates such as 13/03/2026 begin with the day; None if the dates do not determine it or disagree."""
     matches = [match for match in map(_DATE.match, map(str.strip, texts)) if match and _is_open(match)]
     is_day, is_month = (any(int(match[group]) > 12 for match in matches) for group in (1, 3))
     return is_day if is_day != is_month else None
@@ -73,7 +73,7 @@ def has_open_date(text: str) -> bool:
 
 
 def ambiguous_date(at: Place, text: str) -> MeasurementError:
-    """Return the exception for a date of which the day or the month may be first."""
+    """Return the exception for a date that may begin with the day or with the month."""
     return MeasurementError(
         expected="a date with a known order of day and month",
         value=text,
@@ -83,12 +83,12 @@ def ambiguous_date(at: Place, text: str) -> MeasurementError:
 
 
 def _is_open(match: re.Match[str]) -> bool:
-    """Return whether a date has slashes or dashes and its year last; with points the day is first."""
+    """Return whether a date has slashes or dashes and ends with the year; dates with points begin with the day."""
     return match[2] != "." and len(match[4]) == 4
 
 
 def _day(match: re.Match[str], first: bool | None) -> datetime | None:
-    """Return midnight of a date; None if it is invalid or ambiguous."""
+    """Return the time of midnight on a date; None if the date is invalid or ambiguous."""
     one, two, last = int(match[1]), int(match[3]), int(match[4])
     if len(match[1]) == 4:
         year, month, day = one, two, last
@@ -109,7 +109,7 @@ def _day(match: re.Match[str], first: bool | None) -> datetime | None:
 
 
 def _clock(match: re.Match[str]) -> float | None:
-    """Return the seconds since midnight; None if there is no such time."""
+    """Return the seconds since midnight of a clock time; None if it is invalid."""
     hours, minutes, seconds = int(match[1]), int(match[2]), float((match[3] or "0").replace(",", "."))
     if half := match[4]:
         if not 1 <= hours <= 12:

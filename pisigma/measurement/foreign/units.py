@@ -11,9 +11,9 @@ from pisigma.files.errors import MeasurementError, nearest_choice
 
 UnitKind = Literal["length", "angle", "time", "mass", "temperature"]
 _MIN_ROWS = 3
-"""Number of rows from which small values determine their unit."""
+"""Smallest number of rows in which small values determine their unit."""
 _MAX_DIGITS = 40
-"""Number of digits up to which a scaled number is written without an exponent."""
+"""Largest number of digits of a converted number that is written without an exponent."""
 
 
 @dataclass(frozen=True)
@@ -22,9 +22,9 @@ class ForeignUnit:
 
     Attributes:
         kind: the measured quantity.
-        column: unit of measurement files to which its values are converted.
+        column: unit of measurement files to which values are converted.
         factor: exact conversion factor to that unit.
-        spellings: spellings in addition to its symbol, in lower case.
+        spellings: spellings in addition to the symbol, in lower case.
     """
 
     kind: UnitKind
@@ -50,7 +50,7 @@ UNITS: dict[str, ForeignUnit] = {
     "g": ForeignUnit("mass", "kg", "1e-3", "gram grams"),
     "c": ForeignUnit("temperature", "c", "1", "°c degc celsius"),
 }
-"""Units by symbol; a further unit is one line."""
+"""Units of exports by symbol."""
 
 AMBIGUOUS = {
     "grad": "degrees in German, gradians in other languages",
@@ -58,7 +58,7 @@ AMBIGUOUS = {
 }
 """Ambiguous spellings of units and their meanings; `--unit` or `--map` has to state the meaning."""
 _MAX_COMMENT = 500
-"""Number of characters of a comment that are searched for units."""
+"""Largest number of characters of a comment that are searched for units."""
 
 _SYMBOLS = {name: symbol for symbol, unit in UNITS.items() for name in (symbol, *unit.spellings.split())}
 _STATEMENT = re.compile(
@@ -66,7 +66,7 @@ _STATEMENT = re.compile(
     r"values)\b(.*)"
 )
 _BETWEEN = frozenset(("", "in", "and", "und", "are", "is"))
-"""Words that may be between a word of `_STATEMENT` and its unit; in comments, an inch has to be spelt out."""
+"""Words that may be between a word of `_STATEMENT` and its unit; comments have to spell out inches."""
 
 
 def unit_symbol(text: str) -> str:
@@ -75,7 +75,7 @@ def unit_symbol(text: str) -> str:
 
 
 def ambiguous_unit(text: str) -> str:
-    """Return the spelling of an ambiguous unit, see `AMBIGUOUS`; "" if it is not one."""
+    """Return the spelling of an ambiguous unit, see `AMBIGUOUS`; "" if the text is not an ambiguous unit."""
     bare = text.strip().strip("[]()<>{}").strip().lower()
     return bare if bare in AMBIGUOUS else ""
 
@@ -83,8 +83,8 @@ def ambiguous_unit(text: str) -> str:
 def stated_units(comments: Sequence[str]) -> dict[UnitKind, str]:
     """Return the units that comments and titles state, such as "units mm, deg" or "angles: degrees".
 
-    The units follow their word; of several units of one kind the first is used. Ambiguous units keep their spelling,
-    see `AMBIGUOUS`.
+    A unit follows a word such as "units"; of several units of one kind the first is used. Ambiguous units keep their
+    spelling, see `AMBIGUOUS`.
     """
     stated: dict[UnitKind, str] = {}
     for comment in comments:
@@ -107,7 +107,7 @@ def parse_units(text: str) -> dict[UnitKind, str]:
     """Parse units such as "mm,deg" and return their symbols by kind.
 
     Raises:
-        MeasurementError: a unit is unknown, or two are of the same kind.
+        MeasurementError: a unit is unknown, or two units are of the same kind.
     """
     units: dict[UnitKind, str] = {}
     for word in filter(None, re.split(r"[\s,;]+", text)):
@@ -122,11 +122,11 @@ def parse_units(text: str) -> dict[UnitKind, str]:
 
 
 def to_file_unit(number: str, symbol: str) -> str:
-    """Return a number in the unit of its column of measurement files, with every digit.
+    """Return the text of a number converted to the unit of measurement files, with all digits.
 
     Args:
         number: text of the number with a decimal point, or another text, which is returned unchanged.
-        symbol: symbol of its unit; "" if it has none.
+        symbol: symbol of the number's unit; "" if it has no unit.
     """
     factor = UNITS[symbol].factor if symbol else "1"
     if factor == "1":
@@ -141,10 +141,10 @@ def to_file_unit(number: str, symbol: str) -> str:
 
 
 def reason_to_doubt(symbol: str, largest: float, rows: int) -> str:
-    """Return why values are unlikely to be in their unit; "" if they are not.
+    """Return the reason why values are unlikely to be in the stated unit; "" if they are plausible.
 
-    Joints rotate by at most two or three turns, nothing is measured from more than 200 m away, and a measured robot
-    moves by more than three degrees and 20 mm.
+    Joints rotate by at most two or three turns, instruments measure at most 200 m away, and a measured robot moves
+    by more than three degrees and 20 mm.
 
     Args:
         symbol: symbol of the unit.
@@ -166,6 +166,6 @@ def reason_to_doubt(symbol: str, largest: float, rows: int) -> str:
 
 
 def is_certain(symbol: str, largest: float) -> bool:
-    """Return whether values can only be in a unit, not in the other usual unit of its kind (see `reason_to_doubt`)."""
+    """Return whether values cannot be in the other usual unit of the same kind (see `reason_to_doubt`)."""
     bounds = {"deg": largest > 4 * math.pi, "rad": 0.2 < largest <= 2 * math.pi + 0.1}
     return bounds.get(symbol, {"mm": largest > 200, "m": 0.05 < largest < 20}.get(symbol, False))

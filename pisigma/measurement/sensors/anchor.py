@@ -1,4 +1,4 @@
-"""Draw wires and bars: the distance from a fixed anchor to the tool."""
+"""Draw-wire sensors and bars, which measure the distance from a fixed anchor to the tool."""
 
 from collections.abc import Collection
 from dataclasses import dataclass
@@ -33,9 +33,9 @@ MIN_DISTANCES = 5
 ITERATIONS = 30
 """Number of damped least-squares steps after the linear solution."""
 MAX_NOMINAL_ERROR = 0.05
-"""[reach] Largest plausible position error of the nominal robot."""
+"""Largest plausible position error of the nominal robot, as a share of the reach."""
 MAX_COMPARED = 1_024
-"""Number of distances that are compared with each other."""
+"""Largest number of distances that are compared with each other."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,8 +45,8 @@ class AnchorSensor(AbstractSensor):
     Attributes:
         anchor: index of every row's anchor, -1 in rows without one.
         measured: measured distances [m].
-        present: which rows have a distance.
-        sigma: standard deviation of every row [m], or None.
+        present: mask of the rows with a distance.
+        sigma: standard deviation of every row's distance [m]; None if it is estimated.
     """
 
     name = "distance"
@@ -60,7 +60,7 @@ class AnchorSensor(AbstractSensor):
 
     @classmethod
     def build(cls, rows: SensorRows) -> "AnchorSensor | None":
-        """Gather the distances from anchors."""
+        """Build the sensor from the rows with a distance from an anchor; None if there are none."""
         data = rows.measurements
         names = distinct_names(data.anchor)
         if data.distance is None or not names:
@@ -77,7 +77,7 @@ class AnchorSensor(AbstractSensor):
         return residual[None]
 
     def derivative(self, motion: ToolMotion, unknowns: Unknowns, rows: slice) -> Derivative:
-        """Return the shift of the tool away from the anchor."""
+        """Return the derivatives of the distances: the shift of the tool away from the anchor."""
         return component_along(unit_vectors(self._from_anchor(motion, unknowns, rows)), motion.derivative)
 
     def unknown_derivatives(
@@ -100,10 +100,10 @@ class AnchorSensor(AbstractSensor):
 
     @classmethod
     def initial_guess(cls, measurements: Measurements, T: Poses, reach: float) -> InitialUnknowns | None:
-        """Guess zero offsets, and the positions that are not given by multilateration.
+        """Guess zero offsets, and by multilateration the positions that are not given.
 
         Raises:
-            IdentificationError: a distance contradicts most of the others, or an anchor has too few.
+            IdentificationError: a distance contradicts most other distances, or an anchor has too few distances.
         """
         names = distinct_names(measurements.anchor)
         if measurements.distance is None or not names:
@@ -131,7 +131,7 @@ class AnchorSensor(AbstractSensor):
         """Return the anchor's given position with a zero offset of 0.
 
         Raises:
-            IdentificationError: its position is not given.
+            IdentificationError: the position of the anchor is not given.
         """
         row = (measurements.anchor or ()).index(owner)
         position = stated_position(measurements, row)
@@ -169,7 +169,7 @@ def anchor_from_distances(
     centre, middle = (
         points.mean(-2),
         distance.mean(-1, keepdim=True),
-    )  # for the condition of the linear system
+    )  # centred and scaled, for the condition of the linear system
     p, d = points - centre[..., None, :], distance - middle
     A = torch.cat([-2 * p, 2 * d[..., None], torch.ones_like(d)[..., None]], -1)
     squares = p.square().sum(-1)
@@ -216,12 +216,12 @@ def _check_wire(
     points: Float64[Tensor, "rows 3"],
     reach: float,
 ) -> None:
-    """Refuse distances from an anchor that no position of it explains.
+    """Refuse distances from an anchor that no position of the anchor explains.
 
     By the triangle inequality, two distances differ at most by the distance of their points, for any zero offset.
 
     Raises:
-        IdentificationError: a distance contradicts most of the others, or there are too few.
+        IdentificationError: a distance contradicts most other distances, or there are too few distances.
     """
     if len(rows) < MIN_DISTANCES:
         raise IdentificationError(

@@ -44,12 +44,12 @@ WEIGHTS = 21
 
 
 def weight_text(weight: Float64[np.ndarray, "6 6"]) -> str:
-    """Return the text of a cell of weights: the lower triangle, row by row, separated by blanks."""
+    """Return the weights as the text of a cell: the lower triangle, row by row, separated by blanks."""
     return " ".join(f"{value:.17g}" for value in weight[np.tril_indices(6)])
 
 
 def _row_faults(readings: Readings) -> Iterator[RowFault]:
-    """Find rows with only one of noise and weights, and rows with invalid ones."""
+    """Return the faults of rows in which noise or weights are missing or invalid."""
     noise = np.asarray(readings[NOISE_COLUMN])
     texts = readings[WEIGHT_COLUMN]
     weighted = np.array([bool(numbers_in(str(text), WEIGHTS)) for text in texts])
@@ -83,14 +83,15 @@ class CornerSensor(AbstractSensor):
     An image determines some directions of its pose much better than others, and position and rotation are correlated.
     The row of an image therefore states, in addition to the pose, a lower triangular W with `W^T W` the inverse
     covariance of (position [m], rotation vector [rad]) in the axes of the row's frame. The covariance is the sum of
-    that of the corners and of the robot's repeatability; the pose error that all corners of an image share is thereby
-    eliminated in closed form. Values are the noise of one corner, as a length at the board, times W times the errors.
+    the covariances of the corners and of the robot's repeatability; the pose error that all corners of an image
+    share is thereby eliminated in closed form. Values are the noise of one corner, as a length at the board, times W
+    times the errors.
 
     Attributes:
         position: measured positions [m].
         rotation: measured rotations, the row index last.
         weight: noise times W for errors in the frame of the base's anchor [1, and m/rad].
-        present: which rows are from an image.
+        present: mask of the rows from images.
         camera: index of the camera among those whose intrinsics are estimated, -1 in rows without one.
         at: intrinsics with which the poses were solved.
         by_intrinsics: derivative of the weighted measured pose with respect to the intrinsics.
@@ -122,7 +123,7 @@ class CornerSensor(AbstractSensor):
 
     @classmethod
     def build(cls, rows: SensorRows) -> "CornerSensor | None":
-        """Gather the poses by corners, as seen from the bases' anchors and freed of the tools' anchors."""
+        """Build the sensor from the rows of images, with poses relative to the anchors of bases and tools."""
         data, present = rows.measurements, rows.has_corner_poses
         if data.position is None or data.rotation is None or not bool(present.any()):
             return None
@@ -162,7 +163,7 @@ class CornerSensor(AbstractSensor):
         return residual
 
     def derivative(self, motion: ToolMotion, unknowns: Unknowns, rows: slice) -> Derivative:
-        """Return the weighted shift and rotation of the tool.
+        """Return the derivatives of the weighted poses: the weighted shift and rotation of the tool.
 
         A rotation ω of the predicted pose changes the rotation vector r by `-(ω + r × ω / 2 + r × (r × ω) / 12)`, the
         inverse right Jacobian of SO(3) to third order in r (Chirikjian 2012, eq. 10.86).
@@ -190,7 +191,7 @@ class CornerSensor(AbstractSensor):
 
 
 def position_sigmas(measurements: Measurements) -> Float64[Tensor, "rows 3"]:
-    """Return standard deviations of positions relative to the noise of a corner; NaN in rows of other sensors."""
+    """Return standard deviations of positions, relative to the noise of a corner; NaN in rows of other sensors."""
     weight = _scaled_weights(measurements)
     from_image = measurements.is_measured("corner")
     eye = torch.eye(6).to(weight)
@@ -199,7 +200,7 @@ def position_sigmas(measurements: Measurements) -> Float64[Tensor, "rows 3"]:
 
 
 def _scaled_weights(measurements: Measurements) -> Float64[Tensor, "rows 6 6"]:
-    """Return the noise times W of every row, 0 in rows that are not from images."""
+    """Return the noise times W of every row; 0 in rows that are not from images."""
     scaled = measurements.q.new_zeros(measurements.rows, 6, 6)
     noise, texts = (measurements.readings.get(name) for name in (NOISE_COLUMN, WEIGHT_COLUMN))
     if isinstance(noise, Tensor) and isinstance(texts, tuple):

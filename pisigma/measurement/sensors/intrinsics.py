@@ -40,9 +40,10 @@ CAMERA_UNITS: dict[str, OtherUnit] = {
 }
 NUMBERS = len(CAMERA_UNITS)
 UNINFORMATIVE = 1e3
-"""Factor on given standard deviations with which they have no influence compared with the images."""
+"""Factor on given standard deviations that makes the prior negligible relative to the images."""
 USUAL_SCALE = 1e-3
-"""Standard deviation of the scale of a board without a given one: the error of printers and paper."""
+"""Relative standard deviation of a board's scale if the board file does not state it: the error of printers and
+paper."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,11 +52,11 @@ class ImageIntrinsics:
 
     Attributes:
         by: derivative of the measured position and rotation vector, in the axes of the row's frame, with respect to k.
-        root: equations of k with the poses eliminated: `root (k - at) = residual` with unit variances.
-        residual: see `root`.
+        root: matrix of the equations of k with the poses eliminated, `root (k - at) = residual` with unit variances.
+        residual: right side of the equations of `root`.
         at: intrinsics at which the images were linearised.
         stated: intrinsics of the camera file, the prior mean.
-        sigma: prior standard deviations, 0 for fixed ones.
+        sigma: prior standard deviations; 0 for fixed intrinsics.
     """
 
     by: Float64[np.ndarray, "*rows 6 9"]
@@ -66,18 +67,18 @@ class ImageIntrinsics:
     sigma: Float64[np.ndarray, "*rows 9"]
 
     def select(self, rows: Bool[np.ndarray, " rows"]) -> "ImageIntrinsics":
-        """Return the chosen images."""
+        """Return the information of the chosen images."""
         return ImageIntrinsics(*(getattr(self, item.name)[rows] for item in fields(self)))
 
     @property
     def texts(self) -> tuple[str, ...]:
-        """Texts of the column of intrinsics: all numbers of an image, separated by blanks."""
+        """Cells of the column of intrinsics: all numbers of an image as text, separated by blanks."""
         blocks = [getattr(self, item.name).reshape(len(self.at), -1) for item in fields(self)]
         return tuple(" ".join(f"{value:.17g}" for value in row) for row in np.concatenate(blocks, 1))
 
     @staticmethod
     def from_texts(texts: tuple[str, ...]) -> "ImageIntrinsics":
-        """Parse texts of the column of intrinsics; 0 for empty ones."""
+        """Return the information in cells of the column of intrinsics; 0 for empty cells."""
         empty = [0.0] * SIZE
         block = np.array([numbers_in(text, SIZE) or empty for text in texts]).reshape(-1, 19, NUMBERS)
         return ImageIntrinsics(block[:, :6], block[:, 6:15], *(block[:, row] for row in range(15, 19)))
@@ -90,7 +91,7 @@ SIZE = 19 * NUMBERS
 def intrinsics_information(
     images: ImageIntrinsics,
 ) -> tuple[Float64[np.ndarray, "9 9"], Float64[np.ndarray, " 9"]]:
-    """Add up the information of the images of one camera and of its prior on its intrinsics, with poses eliminated.
+    """Sum the information of the images and the prior of one camera on its intrinsics, with poses eliminated.
 
     Returns:
         U [1/px; 1 for distortion] with `U^T U` the information (0 for fixed intrinsics), and the mean [px; 1 for
@@ -135,7 +136,7 @@ def without_stated_priors(measurements: Measurements, counted: Mapping[str, Coll
 
 
 def numbers_in(text: str, count: int) -> list[float]:
-    """Parse `count` numbers separated by blanks; empty if the text is anything else."""
+    """Return `count` numbers separated by blanks in a text; empty if the text is anything else."""
     try:
         numbers = [float(word) for word in text.split()]
     except ValueError:
@@ -149,7 +150,7 @@ def texts_of(measurements: Measurements, name: str) -> tuple[str, ...]:
 
 
 def cameras(measurements: Measurements) -> tuple[str, ...] | None:
-    """Return per row the camera whose intrinsics are estimated, or ""; None if there is none in any row."""
+    """Return per row the name of the camera whose intrinsics are estimated, or ""; None if no row has one."""
     stated = zip(
         texts_of(measurements, CAMERA_COLUMN), texts_of(measurements, INTRINSICS_COLUMN), strict=True
     )
@@ -158,7 +159,7 @@ def cameras(measurements: Measurements) -> tuple[str, ...] | None:
 
 
 def boards(measurements: Measurements) -> tuple[str, ...] | None:
-    """Return per row the board of an image: its frame or its target, whichever is not the camera.
+    """Return per row the name of the board in the image: the frame or the target, whichever is not the camera.
 
     Boards without a name are named "board".
     """
@@ -193,7 +194,7 @@ class IntrinsicsSensor(AbstractSensor):
         owner: index of the camera of every row, -1 in rows without a value.
         root: noise times U [m per px or 1].
         mean: combined estimate of k [px or 1].
-        present: which rows have the value of a camera.
+        present: mask of the rows that have the value of a camera.
         sigma: the noise [m].
     """
 
@@ -210,7 +211,7 @@ class IntrinsicsSensor(AbstractSensor):
 
     @classmethod
     def build(cls, rows: SensorRows) -> "IntrinsicsSensor | None":
-        """Add up the information on every camera; None if no intrinsics are estimated."""
+        """Build the sensor with the information on every camera; None if no intrinsics are estimated."""
         data, names = rows.measurements, cameras(rows.measurements)
         if names is None or not bool(rows.has_corner_poses.any()):
             return None
@@ -240,7 +241,7 @@ class IntrinsicsSensor(AbstractSensor):
     def unknown_derivatives(
         self, motion: ToolMotion, unknowns: Unknowns, rows: slice
     ) -> tuple[UnknownDerivative, ...]:
-        """Return the weights."""
+        """Return the derivatives of the values with respect to the intrinsics: the weights."""
         return (UnknownDerivative("camera", self.owner[rows], self.root[..., rows].transpose(0, 1)),)
 
     @classmethod
@@ -255,7 +256,7 @@ class IntrinsicsSensor(AbstractSensor):
 
     @classmethod
     def initial_guess(cls, measurements: Measurements, T: Poses, reach: float) -> InitialUnknowns | None:
-        """Start at the prior mean of the intrinsics; those without a standard deviation are fixed."""
+        """Return the prior means of the intrinsics; intrinsics without a standard deviation are fixed."""
         names = cameras(measurements)
         if names is None:
             return None
@@ -275,7 +276,7 @@ class BoardScaleSensor(AbstractSensor):
     Attributes:
         owner: index of the board of every row, -1 in rows without a value.
         weight: the noise divided by the prior standard deviation of s [m].
-        present: which rows have the value of a board.
+        present: mask of the rows that have the value of a board.
         sigma: standard deviation of the values [m]: the noise of one corner as a length at the board.
     """
 
@@ -291,7 +292,7 @@ class BoardScaleSensor(AbstractSensor):
 
     @classmethod
     def build(cls, rows: SensorRows) -> "BoardScaleSensor | None":
-        """Assign every board with a free scale to its first row; None if there is none."""
+        """Build the sensor with every board of free scale assigned to its first row; None if there is no such board."""
         data, names = rows.measurements, boards(rows.measurements)
         deviations = scale_deviations(data)
         if names is None or not bool((deviations > 0).any()) or not bool(rows.has_corner_poses.any()):
@@ -317,18 +318,18 @@ class BoardScaleSensor(AbstractSensor):
     def unknown_derivatives(
         self, motion: ToolMotion, unknowns: Unknowns, rows: slice
     ) -> tuple[UnknownDerivative, ...]:
-        """Return the weight."""
+        """Return the derivatives of the values with respect to the scales: the weights."""
         return (UnknownDerivative("board", self.owner[rows], self.weight[None, None, rows]),)
 
     @classmethod
     def unknowns(cls, measurements: Measurements) -> UnknownGroup | None:
-        """Return the boards."""
+        """Return the boards whose scale is estimated."""
         owners, frames = owners_of(measurements, boards(measurements))
         return UnknownGroup("board", ("scale",), owners, frames, units={"scale": "1"}) if owners else None
 
     @classmethod
     def initial_guess(cls, measurements: Measurements, T: Poses, reach: float) -> InitialUnknowns | None:
-        """Start at the given scale."""
+        """Return 0 for every board: the given scale."""
         if boards(measurements) is None:
             return None
         free = scale_deviations(measurements)[:, None] > 0

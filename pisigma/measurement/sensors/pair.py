@@ -1,4 +1,4 @@
-"""Pairs: the distance between the tools of two rows, as with a ball bar or a gauge block."""
+"""Distances between the tool positions of two rows, measured with a ball bar or a gauge block."""
 
 from dataclasses import dataclass
 
@@ -23,17 +23,17 @@ from pisigma.measurement.sensors.sensor import (
 from pisigma.robot.kinematics.parameter_jacobian import ToolMotion
 
 MAX_NOMINAL_ERROR = 0.2
-"""[reach] Largest plausible error of a distance between two poses of the nominal robot."""
+"""Largest plausible error of a distance between two poses of the nominal robot, as a share of the reach."""
 
 
 @dataclass(frozen=True, eq=False)
 class PairSensor(AbstractSensor):
-    """The distance between the tools of two neighbouring rows, as a value of the first one.
+    """The distance between the tool positions of two neighbouring rows, as a value of the first row.
 
     Attributes:
-        measured: the distance [m].
-        present: which rows are the first of a pair; these have even numbers.
-        sigma: standard deviation of every row [m], or None.
+        measured: measured distance of every row [m].
+        present: mask of the first rows of pairs, which have even indices.
+        sigma: standard deviation of every row's distance [m]; None if it is estimated.
     """
 
     name = "pair"
@@ -47,7 +47,7 @@ class PairSensor(AbstractSensor):
 
     @classmethod
     def build(cls, rows: SensorRows) -> "PairSensor | None":
-        """Gather the pairs, whose rows come first and are neighbours."""
+        """Build the sensor from the pairs, whose rows come first and are neighbours; None if there are none."""
         data = rows.measurements
         if data.distance is None or data.pair is None:
             return None
@@ -62,11 +62,11 @@ class PairSensor(AbstractSensor):
         return residual[None]
 
     def derivative(self, motion: ToolMotion, unknowns: Unknowns, rows: slice) -> Derivative:
-        """Return the relative shift of the tools along their connecting line."""
+        """Return the derivatives of the distances: the relative shift of the tools along their connecting line."""
         return component_along(unit_vectors(_apart(motion.position)), _apart(motion.derivative[:, :3]))
 
     def partner_derivative(self, motion: ToolMotion) -> Derivative:
-        """Return the negative shift of the next row's tool along the line."""
+        """Return the derivatives with respect to the next row's tool: its negative shift along the connecting line."""
         return -component_along(unit_vectors(_apart(motion.position)), _following(motion.derivative[:, :3]))
 
     @classmethod
@@ -74,7 +74,7 @@ class PairSensor(AbstractSensor):
         """Check the distances; there are no unknowns to guess.
 
         Raises:
-            IdentificationError: a distance differs too much from that of the nominal robot.
+            IdentificationError: a distance differs too much from the distance by the nominal robot.
         """
         if measurements.pair is None or measurements.distance is None:
             return None

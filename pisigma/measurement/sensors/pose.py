@@ -1,4 +1,4 @@
-"""Trackers: measured positions of a target, and measured orientations of the tool."""
+"""Trackers, which measure positions of a target and orientations of the tool."""
 
 from dataclasses import dataclass
 
@@ -20,8 +20,8 @@ class PositionSensor(AbstractSensor):
 
     Attributes:
         measured: measured positions [m].
-        present: which rows have a position.
-        sigma: standard deviation of a coordinate [m] of every row, or None.
+        present: mask of the rows with a position.
+        sigma: standard deviation of a coordinate [m] of every row; None if it is estimated.
     """
 
     name = "position"
@@ -33,7 +33,7 @@ class PositionSensor(AbstractSensor):
 
     @classmethod
     def build(cls, rows: SensorRows) -> "PositionSensor | None":
-        """Gather the positions in the frames of the bases' anchors."""
+        """Build the sensor from the positions, in the frames of the bases' anchors; None if there are none."""
         data = rows.measurements
         present = (data.is_measured("position") | data.is_measured("pose")) & ~rows.has_corner_poses
         if data.position is None or not bool(present.any()):
@@ -47,7 +47,7 @@ class PositionSensor(AbstractSensor):
         return self.measured[:, rows] - motion.position
 
     def derivative(self, motion: ToolMotion, unknowns: Unknowns, rows: slice) -> Derivative:
-        """Return the shift of the tool."""
+        """Return the derivatives of the positions: the shift of the tool."""
         return motion.derivative[:, :3]
 
 
@@ -57,8 +57,8 @@ class RotationSensor(AbstractSensor):
 
     Attributes:
         measured: measured rotations, the row index last.
-        present: which rows have an orientation.
-        sigma: standard deviation of an angle [rad] of every row, or None.
+        present: mask of the rows with an orientation.
+        sigma: standard deviation of an angle [rad] of every row; None if it is estimated.
     """
 
     name = "rotation"
@@ -71,7 +71,7 @@ class RotationSensor(AbstractSensor):
 
     @classmethod
     def build(cls, rows: SensorRows) -> "RotationSensor | None":
-        """Gather the orientations relative to the bases' and the tools' anchors."""
+        """Build the sensor from the orientations, relative to the anchors of bases and tools; None without any."""
         data = rows.measurements
         present = (data.is_measured("rotation") | data.is_measured("pose")) & ~rows.has_corner_poses
         if data.rotation is None or not bool(present.any()):
@@ -86,7 +86,7 @@ class RotationSensor(AbstractSensor):
         return rotation_difference(self.measured[..., rows], motion.rotation)
 
     def derivative(self, motion: ToolMotion, unknowns: Unknowns, rows: slice) -> Derivative:
-        """Return the rotation vectors of the tool's motion.
+        """Return the derivatives of the orientations: the rotation vectors of the tool's motion.
 
         The exact derivative of the residual r is `-J_r(r)^-1` times that rotation vector. As `J_r^-T r = r`, the
         gradient of the cost is exact without J_r, and the Gauss-Newton matrix is correct to second order in r.
@@ -99,8 +99,8 @@ def rotation_difference(
 ) -> Float[Tensor, "3 rows"]:
     """Return the rotation vectors of measured · predicted^T [rad], equal to those of `rotation_vector`.
 
-    Only the trace of the product R and `R - R^T` are computed, which determine all rotations except those near 180 deg:
-    with m and p the columns of the rotations, the vector part of `R - R^T` is `Σ p × m`.
+    Only the trace of the product R and `R - R^T` are computed, which determine all rotations except rotations near
+    180 deg: with m and p the columns of the rotations, the vector part of `R - R^T` is `Σ p × m`.
     """
     twice_sine_axis = torch.linalg.cross(predicted, measured, dim=0).sum(1)
     cosine = ((measured * predicted).sum((0, 1)) - 1) / 2

@@ -1,4 +1,4 @@
-"""The registry of sensors: a new kind of sensor is a file and one line here."""
+"""Registry of sensors, and functions that combine all kinds of sensors."""
 
 import math
 from collections.abc import Mapping
@@ -31,7 +31,7 @@ from pisigma.robot.kinematics.parameter_jacobian import ToolMotion
 from pisigma.robot.se3 import transform
 
 SENSORS: dict[str, type[AbstractSensor]] = {}
-"""All kinds of sensors by name, in the order of their residuals."""
+"""Classes of sensors by name, in the order of their residuals."""
 
 OUTLIER_FACTOR, MAX_ITERATIONS = 4.0, 3
 """Residual relative to the owner's median above which a row is an outlier for the owner's unknowns, and number of
@@ -42,14 +42,14 @@ IdentifiedUnknowns = Mapping[str, Mapping[str, Float64[np.ndarray, " columns"]]]
 
 
 def register_sensor(sensor: type[AbstractSensor]) -> type[AbstractSensor]:
-    """Register a kind of sensor for measurement files, calibration and validation; also a class decorator.
+    """Register a kind of sensor for measurement files, calibration and validation; usable as a class decorator.
 
     Args:
         sensor: a final subclass of `AbstractSensor`. Its `readings` are the columns that it adds to measurement files;
             only the sensors that come with pisigma may have none.
 
     Returns:
-        The same class.
+        The registered class, unchanged.
 
     Raises:
         MeasurementError: a sensor of that name or one of its columns already exists.
@@ -87,7 +87,7 @@ for _sensor in (
 
 
 def build_sensors(rows: SensorRows) -> list[AbstractSensor]:
-    """Gather the measured values of every kind of sensor.
+    """Return a sensor for every kind of measured values in the rows.
 
     Raises:
         IdentificationError: only some rows of a kind state a standard deviation.
@@ -97,13 +97,13 @@ def build_sensors(rows: SensorRows) -> list[AbstractSensor]:
 
 
 def unknown_groups(measurements: Measurements) -> tuple[UnknownGroup, ...]:
-    """Return the groups of unknowns of the sensors of some rows."""
+    """Return the groups of unknowns of all sensors in the rows."""
     groups = (sensor.unknowns(measurements) for sensor in SENSORS.values())
     return tuple(group for group in groups if group is not None)
 
 
 def sort_pairs_first(measurements: Measurements, rows: Int64[Tensor, " rows"]) -> Int64[Tensor, " rows"]:
-    """Sort rows such that pairs come first, with their rows next to each other; the others keep their order."""
+    """Sort rows such that pairs come first, with their rows next to each other; other rows keep their order."""
     if measurements.pair is None:
         return rows
     order = distinct_names(measurements.pair)
@@ -125,8 +125,8 @@ def measured_errors(
             multiplied by `sqrt(n / (n - p))`, and NaN without degrees of freedom.
 
     Returns:
-        Errors by sensor [m or rad], NaN in rows without a value; the error of a pair is in both of its rows, and that
-        of an image is that of its pose. Sensors without rows are left out.
+        Errors by sensor [m or rad], NaN in rows without a value; the error of a pair is in both of its rows, and the
+        error of an image is the error of its pose. Sensors without rows are left out.
 
     Raises:
         IdentificationError: the rows of an owner that was not calibrated do not determine its unknowns.

@@ -1,4 +1,4 @@
-"""The interface of sensors: residuals of rows of measurements, and their derivatives by the chain rule."""
+"""Interface of sensors: residuals of rows of measurements, and their derivatives by the chain rule."""
 
 import math
 from abc import ABC, abstractmethod
@@ -26,13 +26,13 @@ SHOWN_UNITS: Mapping[str, tuple[ShownUnit, float]] = {
 }
 """For every unit, the unit in which figures are shown, and the conversion factor."""
 MIN_LENGTH = 1e-12
-"""[m] Lower bound of lengths in quotients."""
+"""Lower bound of lengths in denominators [m]."""
 
 Unknowns = Mapping[str, Float64[Tensor, "columns owners"]]
 """Unknowns of sensors by group; points are in the frame of the anchor of their base."""
 
 Poses = Float64[Tensor, "rows 4 4"]
-"""Tool poses, each in the frame of its row."""
+"""Tool poses, each in the frame of the row."""
 Values = Float[Tensor, "components poses"]
 """Measured values of a sensor, or their residuals [m or rad]."""
 Derivative = Float[Tensor, "parameters components poses"]
@@ -41,16 +41,16 @@ Derivative = Float[Tensor, "parameters components poses"]
 
 @dataclass(frozen=True)
 class UnknownGroup:
-    """Unknowns of one kind of sensor, which each of its owners has.
+    """Unknowns of one kind of sensor; every owner, such as an anchor, has one set of them.
 
     Attributes:
         name: name of the group, such as "anchor".
         columns: names of one owner's unknowns. If the first ones are x, y, z, they are a point in the owner's frame
             [m]; all others are the same in every frame.
-        owners: names of the owners of such unknowns, such as the anchors.
-        frames: per owner, the frame that contains it.
-        angles: the columns that are angles [rad]; the others are lengths [m].
-        units: units of columns that are neither, "px" or "1" (dimensionless).
+        owners: names of the owners, for example of the anchors.
+        frames: per owner, the frame in which it is located.
+        angles: columns that are angles [rad]; other columns are lengths [m].
+        units: units of columns that are neither angles nor lengths: "px" or "1" (dimensionless).
     """
 
     name: str
@@ -75,8 +75,8 @@ class InitialUnknowns:
     """Initial values of the unknowns of a group.
 
     Attributes:
-        values: values of every owner, in its frame [m or rad].
-        free: which of them are estimated; the others are fixed.
+        values: values of every owner, in the owner's frame [m or rad].
+        free: mask of the values that are estimated; other values are fixed.
     """
 
     values: Float64[Tensor, "owners columns"]
@@ -89,8 +89,8 @@ class SensorRows:
 
     Attributes:
         measurements: the rows; pairs come first, with their rows next to each other.
-        bases: per row, the anchor of its base, `T_frame_tool = anchor · T_anchor_tool`.
-        tools: per row, the anchor of its tool's rotation, `R_anchor_tool = R_predicted · anchor`.
+        bases: per row, the anchor of the base, `T_frame_tool = anchor · T_anchor_tool`.
+        tools: per row, the anchor of the tool's rotation, `R_anchor_tool = R_predicted · anchor`.
     """
 
     measurements: Measurements
@@ -103,7 +103,7 @@ class SensorRows:
         """Return the standard deviations that a sensor's rows state [m or rad]; None if no row does.
 
         Raises:
-            IdentificationError: some of the sensor's rows state one and some do not.
+            IdentificationError: some of the sensor's rows state a standard deviation, others do not.
         """
         data = self.measurements
         sigma = data.sigma_position if unit == "m" else data.sigma_rotation
@@ -130,7 +130,7 @@ class SensorRows:
         return values if isinstance(values, Tensor) else torch.full_like(self.measurements.q[:, 0], torch.nan)
 
     def numbers(self, names: tuple[str, ...] | None, order: tuple[str, ...]) -> Int64[Tensor, " rows"]:
-        """Return the index of every row's name in `order`, -1 if it is not in it."""
+        """Return the index of every row's name in `order`; -1 if `order` does not contain it."""
         return numbers_of(names, order, self.measurements.rows).to(self.measurements.q.device)
 
 
@@ -150,7 +150,7 @@ class UnknownDerivative:
 
 
 class AbstractSensor(ABC):
-    """One kind of measurement: its values, their predictions from the tool's motion, and derivatives.
+    """A kind of sensor: measured values, their predictions from the tool's motion, and derivatives.
 
     A subclass is a frozen dataclass whose tensors have the row index last; rows are those of the calibration
     problem. It is registered with `pisigma.measurement.sensors.register_sensor`. Values are predicted in the frame of
@@ -158,16 +158,16 @@ class AbstractSensor(ABC):
 
     Attributes:
         name: name of the sensor, such as "position"; one noise level is estimated per name.
-        unit: unit of its values.
+        unit: unit of the values.
         components: number of values per row.
-        turning: whether it needs the tool's rotation.
-        certain: whether its values are given rather than measured: their standard deviation is not estimated, and none
-            of them is an outlier.
-        paired: whether a value belongs to a row together with the next one.
-        holds_frame: whether its values determine the position of the frame in which it measures.
-        readings: the columns that it adds to measurement files; None for a sensor whose values are fields of
+        turning: whether the predicted values depend on the tool's rotation.
+        certain: whether the values are given rather than measured: their standard deviation is not estimated, and
+            they are never outliers.
+        paired: whether a value belongs to a row and the next one.
+        holds_frame: whether the values determine the position of the frame in which the sensor measures.
+        readings: columns that the sensor adds to measurement files; None for a sensor whose values are fields of
             `Measurements`.
-        present: which rows have a value.
+        present: mask of the rows with a value.
         sigma: standard deviation of the values if the rows state it; None if it is estimated.
     """
 
@@ -185,7 +185,7 @@ class AbstractSensor(ABC):
     @classmethod
     @abstractmethod
     def build(cls, rows: SensorRows) -> "AbstractSensor | None":
-        """Gather the values of this kind; None if no row has one.
+        """Build the sensor from the rows with values of this kind; None if no row has a value.
 
         Raises:
             IdentificationError: the rows contradict each other.
@@ -200,7 +200,7 @@ class AbstractSensor(ABC):
         """Return the derivative of the predicted values with respect to every parameter that moves the tool."""
 
     def partner_derivative(self, motion: ToolMotion) -> Derivative:
-        """Return the derivative with respect to the next row's tool for paired values; else 0."""
+        """Return the derivative with respect to the next row's tool for paired values, otherwise 0."""
         return motion.derivative.new_zeros(1, self.components, 1).expand(
             motion.derivative.shape[0], -1, motion.derivative.shape[2]
         )
@@ -213,20 +213,20 @@ class AbstractSensor(ABC):
 
     @classmethod
     def unknowns(cls, measurements: Measurements) -> UnknownGroup | None:
-        """Return the unknowns of this sensor in some rows; None if it has none."""
+        """Return the unknowns of this sensor in the rows; None if it has no unknowns."""
         return None
 
     @classmethod
     def initial_guess(cls, measurements: Measurements, T: Poses, reach: float) -> InitialUnknowns | None:
-        """Guess the unknowns by the nominal robot, and refuse values that are impossible for a robot near it.
+        """Estimate initial unknowns by the nominal robot, and refuse values that are impossible for a similar robot.
 
         Args:
             measurements: the rows; pairs come first, with their rows next to each other.
-            T: poses of the best fitting tool of the nominal robot, in the frame of every row.
+            T: poses of the best-fitting tool of the nominal robot, in the frame of every row.
             reach: reach of the robot [m].
 
         Raises:
-            IdentificationError: a value is impossible, or there are too few of them.
+            IdentificationError: a value is impossible, or there are too few values.
         """
         return None
 
@@ -240,10 +240,10 @@ class AbstractSensor(ABC):
             measurements: rows that were not used for the calibration.
             owner: name of the owner, such as an anchor.
             T: poses of the tool by a model, in the frame of every row.
-            calibrated: the owners that were calibrated.
+            calibrated: names of the owners that were calibrated.
 
         Raises:
-            IdentificationError: the rows do not determine them.
+            IdentificationError: the rows do not determine the unknowns.
         """
         row = next(row for row in range(measurements.rows) if owner in _names_in(measurements, row))
         raise IdentificationError(
@@ -254,7 +254,7 @@ class AbstractSensor(ABC):
         )
 
     def select(self, rows: Int64[Tensor, " chosen"]) -> "AbstractSensor":
-        """Return the sensor with the rows of an index."""
+        """Return the sensor with the rows that an index selects."""
         tensors = {item.name: getattr(self, item.name) for item in fields(self)}  # type: ignore[arg-type]
         chosen: dict[str, Any] = {
             name: value[..., rows] for name, value in tensors.items() if isinstance(value, Tensor)
@@ -267,7 +267,7 @@ def _names_in(measurements: Measurements, row: int) -> set[str]:
 
 
 def numbers_of(names: tuple[str, ...] | None, order: Sequence[str], rows: int) -> Int64[Tensor, " rows"]:
-    """Return the index of every row's name in `order`, -1 if it is not in it."""
+    """Return the index of every row's name in `order`; -1 if `order` does not contain it."""
     numbers = {name: number for number, name in enumerate(order)}
     different = set(names or ("",))
     if len(different) == 1:
@@ -276,14 +276,14 @@ def numbers_of(names: tuple[str, ...] | None, order: Sequence[str], rows: int) -
 
 
 def distinct_names(names: tuple[str, ...] | None) -> tuple[str, ...]:
-    """Return the different names except "", in the order of their first row."""
+    """Return the distinct names except "", in the order of their first row."""
     return tuple(name for name in dict.fromkeys(names or ()) if name)
 
 
 def owners_of(
     measurements: Measurements, names: tuple[str, ...] | None
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the different names and the frame of the first row of each."""
+    """Return the distinct names, and for each the frame of its first row."""
     owners = distinct_names(names)
     return owners, tuple(measurements.frame[(names or ()).index(owner)] for owner in owners)
 

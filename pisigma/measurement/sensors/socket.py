@@ -1,4 +1,4 @@
-"""Sockets: fixed points in which the ball at the tool sits, and given distances between them."""
+"""Sockets: fixed points in which the ball at the tool sits, and given distances between sockets."""
 
 import re
 from collections.abc import Collection, Iterable, Mapping
@@ -31,7 +31,7 @@ PairOfSockets = tuple[str, str]
 SOCKET_COLUMNS = ("x", "y", "z")
 
 MAX_SCATTER = 0.05
-"""[reach] Largest plausible scatter of the rows of one socket by the nominal robot."""
+"""Largest plausible scatter of the rows of one socket by the nominal robot, as a share of the reach."""
 
 OUTLIER_FACTOR = 4.0
 """Distance of a row from the median position, relative to the median distance, above which it is an outlier: about 6
@@ -44,8 +44,8 @@ class SocketSensor(AbstractSensor):
 
     Attributes:
         socket: index of every row's socket, -1 in rows without one.
-        present: which rows have a socket.
-        sigma: standard deviation of a coordinate [m] of every row, or None.
+        present: mask of the rows with a socket.
+        sigma: standard deviation of a coordinate [m] of every row; None if it is estimated.
     """
 
     name = "socket"
@@ -58,7 +58,7 @@ class SocketSensor(AbstractSensor):
 
     @classmethod
     def build(cls, rows: SensorRows) -> "SocketSensor | None":
-        """Gather the rows whose ball sat in a socket."""
+        """Build the sensor from the rows whose ball sat in a socket; None if there are none."""
         names = rows.measurements.socket
         present = rows.measurements.is_measured("socket")
         if not bool(present.any()):
@@ -66,17 +66,17 @@ class SocketSensor(AbstractSensor):
         return cls(rows.numbers(names, distinct_names(names)), present, rows.sigma(present))
 
     def residual(self, motion: ToolMotion, unknowns: Unknowns, rows: slice) -> Values:
-        """Return the socket's position minus the tool's [m]."""
+        """Return the socket's position minus the tool's position [m]."""
         return unknowns["socket"][:, self.socket[rows]] - motion.position
 
     def derivative(self, motion: ToolMotion, unknowns: Unknowns, rows: slice) -> Derivative:
-        """Return the shift of the tool."""
+        """Return the derivatives of the tool's position: the shift of the tool."""
         return motion.derivative[:, :3]
 
     def unknown_derivatives(
         self, motion: ToolMotion, unknowns: Unknowns, rows: slice
     ) -> tuple[UnknownDerivative, ...]:
-        """Return the negative identity for the socket's position."""
+        """Return the derivatives with respect to the socket's position: the negative identity."""
         socket = self.socket[rows]
         eye = torch.eye(3).to(motion.position)
         return (UnknownDerivative("socket", socket, -eye[..., None].expand(3, 3, len(socket))),)
@@ -130,8 +130,8 @@ class SocketDistanceSensor(AbstractSensor):
         first: index of one socket, -1 in rows without a distance.
         second: index of the other socket.
         measured: the distance [m].
-        present: which rows have a distance.
-        sigma: its standard deviation [m].
+        present: mask of the rows with a distance.
+        sigma: standard deviation of the distance [m].
     """
 
     name = "socket distance"
@@ -202,7 +202,7 @@ class SocketDistanceSensor(AbstractSensor):
     def unknown_derivatives(
         self, motion: ToolMotion, unknowns: Unknowns, rows: slice
     ) -> tuple[UnknownDerivative, ...]:
-        """Return the unit vector from the second socket to the first, and its negative."""
+        """Return the derivatives for both sockets: the unit vector from the second to the first, and its negative."""
         direction = unit_vectors(self._apart(unknowns, rows))[:, None]
         return (
             UnknownDerivative("socket", self.first[rows], direction),
@@ -237,7 +237,7 @@ def _check_distance(one: str, other: str, distance: float, order: tuple[str, ...
 def means_by_number(
     values: Float64[Tensor, "rows size"], number: Int64[Tensor, " rows"], count: int
 ) -> Tensor:
-    """Return the mean over the rows of every number from 0 to `count - 1`."""
+    """Return the mean of the values over the rows of every index from 0 to `count - 1`."""
     total = values.new_zeros((count, values.shape[1])).index_add(0, number, values)
     return total / torch.bincount(number, minlength=count).clamp(min=1)[:, None]
 
@@ -245,7 +245,7 @@ def means_by_number(
 def matching_sockets(
     distances: Mapping[tuple[str, str], float], sockets: Iterable[str]
 ) -> dict[tuple[str, str], float]:
-    """Return distances by names of sockets in the data, expanding "*"; see `CalibrationSettings`."""
+    """Return distances by names of sockets in the data, with "*" expanded; see `CalibrationSettings`."""
     names = dict.fromkeys(name for name in sockets if name)
     matching: dict[tuple[str, str], float] = {}
     for (first, second), distance in distances.items():

@@ -1,4 +1,4 @@
-"""Touches: one coordinate of the tip in the frame of the jig."""
+"""Touches of a jig, which measure one coordinate of the tip in the frame of the jig."""
 
 from dataclasses import dataclass
 
@@ -23,9 +23,9 @@ class TouchSensor(AbstractSensor):
 
     Attributes:
         axis: unit vector of the touched coordinate, in the frame of the base's anchor.
-        measured: the coordinate along it [m].
-        present: which rows have a touch.
-        sigma: standard deviation of every row [m], or None.
+        measured: measured coordinate along the axis [m].
+        present: mask of the rows with a touch.
+        sigma: standard deviation of every row's coordinate [m]; None if it is estimated.
     """
 
     name = "touch"
@@ -38,7 +38,7 @@ class TouchSensor(AbstractSensor):
 
     @classmethod
     def build(cls, rows: SensorRows) -> "TouchSensor | None":
-        """Gather the touches; `e · (R p + t) = coordinate` is `(R^T e) · p = coordinate - e · t`."""
+        """Build the sensor from the touches; `e · (R p + t) = coordinate` is `(R^T e) · p = coordinate - e · t`."""
         data = rows.measurements
         present = data.is_measured("touch")
         if data.touch is None or not bool(present.any()):
@@ -53,5 +53,5 @@ class TouchSensor(AbstractSensor):
         return (self.measured[rows] - (self.axis[:, rows] * motion.position).sum(0))[None]
 
     def derivative(self, motion: ToolMotion, unknowns: Unknowns, rows: slice) -> Derivative:
-        """Return the shift of the tool along the axis."""
+        """Return the derivatives of the coordinates: the shift of the tool along the axis."""
         return component_along(self.axis[:, rows], motion.derivative)

@@ -1,1 +1,1 @@
-"""Compiled kernels of corrected inverse kinematics for single poses and batches on the CPU, without torch."""
+"""Compiled kernels for corrected inverse kinematics of single poses and batches on the CPU, without torch."""

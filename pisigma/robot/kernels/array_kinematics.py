@@ -16,7 +16,7 @@ from pisigma.files.errors import ModelError
 from pisigma.robot.kernels.arrays import FIXED, FORWARD, PRISMATIC, REVOLUTE
 from pisigma.robot.kernels.layout import DESCRIPTION, DOF, ROWS, make_memory
 
-if TYPE_CHECKING:  # full names, which run-time type checkers find without these imports
+if TYPE_CHECKING:  # run-time type checkers find the full names without these imports
     import pisigma.robot.description
 
 KINDS = {"fixed": FIXED, "revolute": REVOLUTE, "prismatic": PRISMATIC}
@@ -94,15 +94,15 @@ def call_with_tensors(function: Callable[[Any], Any], q: Any) -> Any:
 
 
 class _Chain:
-    """A robot packed for the kernels, which several threads may use."""
+    """A robot packed for the kernels; several threads may use it."""
 
     def __init__(self, robot: "pisigma.robot.description.Robot") -> None:
-        """Pack a robot.
+        """Pack a robot into the structs of the kernels.
 
         Raises:
             ModelError: the robot is larger than the kernels allow, or there are no kernels for this machine.
         """
-        from pisigma.robot.kernels.machine_code import (  # here: LLVM takes 40 MB from the fits
+        from pisigma.robot.kernels.machine_code import (  # imported here, because LLVM takes 40 MB that fits need
             IGNORED,
             load_kernels,
         )

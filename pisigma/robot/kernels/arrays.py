@@ -6,13 +6,13 @@ from pisigma.robot.kernels.forms import KernelForms
 from pisigma.robot.kinematics.status import Status
 
 NOMINAL, IDENTIFIED, NOMINAL_WITHOUT_BASE = 0, 1, 2
-"""Indices of the arms: nominal, with the identified geometry (of a hybrid the one that belongs to its correction), and
-the nominal one without base, for gravity torques."""
+"""Indices of the arms: the nominal arm, the arm with the identified geometry (for a hybrid, the geometry that
+belongs to its correction), and the nominal arm without base, for gravity torques."""
 CORRECTED = 3
-"""The identified arm at `q + Δ(q)`."""
+"""Index of the identified arm with joint correction, at `q + Δ(q)`."""
 
 FIXED, REVOLUTE, PRISMATIC = 0, 1, 2
-"""Types of rows."""
+"""Types of DH rows."""
 
 NO_CLOSED_FORM = 0
 """Kind of a nominal arm without a closed form; other kinds are 1 + the index of the name in
@@ -26,15 +26,16 @@ UNREACHABLE = int(Status.UNREACHABLE)
 INVALID = int(Status.INVALID_POSE)
 
 FINE, NOT_FINITE, LAST_ROW, NOT_ORTHONORMAL, LEFT_HANDED, NEAR_NOT_FINITE = -1, 1, 2, 3, 4, 5
-"""Faults of a pose matrix, or of the reference joint values."""
+"""Results of the check of a pose matrix and of the reference joint values."""
 
 ANY_BRANCH, EVERY_BRANCH = -1, -2
-"""Special values instead of the index of a branch."""
+"""Values that request any branch or all branches instead of the index of one branch."""
 NEAREST = -2
-"""The same for closed forms: all branches, with the nearest joint values of those that do not reach the pose."""
+"""Value that requests all branches of a closed form, with the nearest joint values of branches that do not reach the
+pose."""
 
 SOLVE, EVALUATE, FORWARD = 0, 1, 2
-"""Tasks: solve poses, evaluate the corrected arm, or compute poses and Jacobians of an arm."""
+"""Tasks of the kernels: solve poses, evaluate the corrected arm, or compute poses and Jacobians of an arm."""
 
 ANGLE, SINE, COSINE = 6, 7, 8
 """Kinds of network inputs; 0 to 5 are coordinates of the pose, in the order of `network.inputs.POSE_INPUTS`."""
@@ -71,7 +72,7 @@ class Correction(NamedTuple):
         rate: angle of periodic functions per joint value, for every joint.
         middle: middle of every joint's travel [rad or m].
         half: half of every joint's travel [rad or m].
-        values: concatenated numbers of all features, as returned by their `pack`.
+        values: concatenated numbers of all features, as returned by the features' method `pack`.
         starts: index of the first number of every feature, in the order of `Description.forms`.
         weight: `(factors, inputs, dof)`: weights of the product units.
         bias: `(factors, dof)`: biases of the product units.
@@ -112,9 +113,9 @@ class Network(NamedTuple):
     """A network that corrects nominal joint values; see `network.correction_network` and `model.domain`.
 
     Attributes:
-        used: 1 if there is such a network, else 0.
+        used: 1 if there is a network, otherwise 0.
         source: kind of every input: a coordinate of the pose, ANGLE, SINE or COSINE; inputs of a group are consecutive.
-        factors: `(inputs, dof)`: the angle of an input is the sum of the joint values times these.
+        factors: `(inputs, dof)`: the angle of an input is the sum of the joint values times these factors.
         offset: offset of every input.
         scale: scale of every input.
         reference: `(groups, 3, 3)`: rotation to which roll, pitch and yaw are relative.
@@ -125,10 +126,11 @@ class Network(NamedTuple):
         bias: `(dof, factors)`: biases.
         output_offset: output offset of every joint [rad or m].
         output_scale: output scale of every joint [rad or m].
-        centre: middle of the training rows for every joint [rad or m], which determines the turns of the training.
+        centre: middle of every joint's values in the training rows [rad or m]; joint values are shifted to turns
+            near it.
         samples: number of training rows of the domain; 0 without a domain.
         column: index of the input of every coordinate of the domain; identical inputs are one coordinate.
-        times: root of the number of occurrences of every coordinate's input in the network.
+        times: square root of the number of occurrences of every coordinate's input in the network.
         coarse: number of leading coordinates that determine most of a distance.
         rows: `(coordinates · samples,)`: scaled inputs of the training rows, coordinate by coordinate.
         radius: radius of the domain, in scaled inputs.
@@ -187,7 +189,7 @@ class ClosedForm(NamedTuple):
 
 
 class Starts(NamedTuple):
-    """Stored joint values as starts of the iteration.
+    """Stored joint values from which the iteration may start.
 
     Attributes:
         q: `(starts, dof)`: joint values [rad or m].
@@ -217,4 +219,4 @@ class Description(NamedTuple):
 
 
 PARTS: dict[str, Any] = {part: kind for part, kind in Description.__annotations__.items() if part != "forms"}
-"""The parts of a description by name."""
+"""Classes of the parts of a description, by name."""

@@ -1,4 +1,4 @@
-"""The kernels' intermediate code in the package, compiled by numba and tied to the sources by a hash.
+"""Intermediate code of the kernels, which numba compiles, stored in the package with a hash of the sources.
 
 `python -m pisigma.joint_correction.registry` builds it with all features and closed forms. The code is for a generic
 processor and not vectorised: all 64-bit machines have the same layout of the kernels' structs, and the machine that
@@ -22,18 +22,18 @@ FILE = Path(__file__).parent / "kernels.ll.zlib"
 _PYTHON = frozenset(
     ("__init__.py", "array_kinematics.py", "build.py", "description_file.py", "machine_code.py")
 )
-"""Files of this folder without kernels and without constants of kernels."""
+"""Files of this folder that contain neither kernels nor constants of kernels."""
 _SHARED = ("kinematics/status.py", "kinematics/tolerances.py")
-"""Files of other folders with constants of kernels."""
+"""Files of other folders that contain constants of kernels."""
 _NO_CODE = re.compile(rb'"""[\s\S]*?"""|#[^\n]*|^[ \t]*\n', re.MULTILINE)
 
 
 _FORMS = re.compile(rb"^@no_type_check\ndef [\s\S]*?(?=^(?:@|class |def |[A-Z_a-z])|\Z)", re.MULTILINE)
-"""Compiled forms in the files of features and closed forms."""
+"""Pattern of the files of features and closed forms with compiled forms."""
 
 
 def source_files() -> list[Path]:
-    """Return the source files of the kernels, without those of features and closed forms."""
+    """Return the source files of the kernels, excluding the files of features and closed forms."""
     robot = Path(__file__).parent.parent
     kernels = sorted(path for path in (robot / "kernels").glob("*.py") if path.name not in _PYTHON)
     return [*kernels, *(robot / name for name in _SHARED)]
@@ -54,11 +54,11 @@ def source_hash() -> str:
 
 
 def write_ready(code: str, forms: KernelForms, **made_with: str) -> None:
-    """Write the intermediate code of the present sources.
+    """Write the intermediate code of the current sources.
 
     Args:
         code: LLVM text.
-        forms: features and closed forms that it evaluates.
+        forms: features and closed forms that the code evaluates.
         made_with: versions of the compilers.
     """
     stated = {"sources": source_hash(), "forms": dataclasses.asdict(forms), **made_with}
@@ -67,13 +67,13 @@ def write_ready(code: str, forms: KernelForms, **made_with: str) -> None:
 
 
 def ready_forms() -> KernelForms | None:
-    """Return the forms that the code evaluates; None if `read_ready` returns None, except for damaged code."""
+    """Return the forms that the stored code evaluates; None if it is missing or belongs to other sources."""
     header, _ = _content()
     return None if header is None else KernelForms(**{kind: tuple(n) for kind, n in header["forms"].items()})
 
 
 def read_ready() -> str | None:
-    """Return the intermediate code; None if it is missing or damaged, or the sources have changed."""
+    """Return the stored intermediate code; None if it is missing or damaged, or if the sources have changed."""
     header, code = _content()
     try:
         return None if header is None else zlib.decompress(code).decode()
@@ -82,7 +82,7 @@ def read_ready() -> str | None:
 
 
 def _content() -> tuple[dict[str, Any] | None, bytes]:
-    """Return the first line of the file if it belongs to the present sources, and the compressed code."""
+    """Return the parsed first line of the file, if it belongs to the current sources, and the compressed code."""
     try:
         stated, _, code = FILE.read_bytes().partition(b"\n")
         header = json.loads(stated)
@@ -94,17 +94,17 @@ def _content() -> tuple[dict[str, Any] | None, bytes]:
 ENTRY = "pisigma_run"
 """Name of the only exported function of the code."""
 ARGUMENTS = "ppiippipipiiiipi"
-"""Arguments of `kernels.run`: p for a pointer, i for an integer."""
+"""Types of the arguments of `kernels.run`: p for a pointer, i for an integer."""
 
 _MACHINE = re.compile(r"^target (?:triple|datalayout) = .*\n", re.MULTILINE)
 _NO_PROCESSOR = {"CPU_NAME": "generic", "CPU_FEATURES": "", "LOOP_VECTORIZE": 0, "SLP_VECTORIZE": 0}
-"""Settings of numba."""
+"""Settings of numba for a generic processor."""
 _NEWER = re.compile(r" captures\([^)]*\)| nocreateundeforpoison| memory\([^)]*(?:errnomem|target_mem)[^)]*\)")
-"""Attributes that LLVM 20, the oldest supported version, does not know; they only help to optimise."""
+"""Attributes that LLVM 20, the oldest supported version, does not know; they only enable optimisations."""
 _LIFETIME = re.compile(r"^.*@llvm\.lifetime\..*\n", re.MULTILINE)
-"""Lifetime hints of stack memory, which LLVM 20 and 22 write differently."""
+"""Pattern of lifetime hints of stack memory, which LLVM 20 and 22 write differently."""
 _MANGLED = re.compile(r"(?<=[@\"])_ZN[\w.$]+")
-"""Function names that numba mangles with the types of all arguments."""
+"""Pattern of function names that numba mangles with the types of all arguments."""
 
 
 def intermediate_code() -> str:
@@ -123,7 +123,7 @@ def intermediate_code() -> str:
 
     for name, module in list(sys.modules.items()):
         if name.startswith("pisigma.robot.kernels.") and hasattr(module, "kernel"):
-            del sys.modules[name]  # its kernels may have been compiled for other forms
+            del sys.modules[name]  # imported kernels may have been compiled for other forms
     from pisigma.robot.kernels.kernels import run
     from pisigma.robot.kernels.layout import DESCRIPTION, MEMORY
 
@@ -143,7 +143,7 @@ def intermediate_code() -> str:
 
 
 def build() -> None:
-    """Write the code of the package, and print its size."""
+    """Compile the intermediate code, write it into the package, and print its size."""
     from importlib.metadata import version
 
     code = intermediate_code()

@@ -37,7 +37,7 @@ def walk(arms: Record, arm: int, q: Array, axes: Array, T: Array) -> None:
             else:
                 d += value
             joint += 1
-        # The frame's rows a, b, c follow RotZ(theta), Trans(a, 0, d), RotX(alpha) and RotY(beta) in turn.
+        # The frame's rows a, b, c are transformed by RotZ(theta), Trans(a, 0, d), RotX(alpha) and RotY(beta).
         ax, ay = cos * ax + sin * ay, cos * ay - sin * ax
         bx, by = cos * bx + sin * by, cos * by - sin * bx
         cx, cy = cos * cx + sin * cy, cos * cy - sin * cx
@@ -131,7 +131,7 @@ def walk_many(arms: Record, arm: int, memory: Record, q: Array, T: Array, J: Arr
 def _turn_by_joint(
     arms: Record, row: Array, kind: int, joint: int, q: Array, first: int, count: int, memory: Record
 ) -> None:
-    """Rotate frames about their z axes by theta and translate them along z by d, one of these plus the joint value."""
+    """Rotate frames about their z axes by theta and translate them along z by d, including the joint value."""
     frame, turns = memory.lanes, memory.lane_turns
     for b in range(LANES):
         turns[0, b] = arms.direction[joint] * q[first + min(b, count - 1), joint]
@@ -222,7 +222,7 @@ def _write_poses(tool: Array, frame: Array, first: int, count: int, T: Array) ->
 
 @contracted_kernel
 def _write_jacobians(arms: Record, axes: Array, T: Array, first: int, count: int, J: Array) -> None:
-    """Write the columns of all joints; see `jacobian`."""
+    """Write the columns of the Jacobian for all joints; see `jacobian`."""
     for j in range(arms.dof):
         sign = arms.direction[j]
         for b in range(count):

@@ -1,4 +1,4 @@
-"""Closed-form inverses of the nominal arm, branch by branch, on plain numbers.
+"""Closed-form inverse kinematics of the nominal arm on plain numbers, branch by branch.
 
 The formulas are plain functions in the files of `pisigma.robot.kinematics.closed_form`.
 """
@@ -52,7 +52,7 @@ def all_branches(
         T: target T_base_tool.
         only: the only requested branch, -1 for all, NEAREST for all with the nearest joint values of those that do
             not reach the pose. The first joint value of other branches is NaN.
-        rounding: relative size below which a cosine beyond 1 or a length is a rounding error of T.
+        rounding: relative size below which the excess of a cosine over 1, or a length, is a rounding error of T.
         P: `(4, 4)`, overwritten.
         q: `(8, dof)`, output [rad or m]: in (-pi, pi], or shifted by a full turn into the limits.
     """
@@ -95,7 +95,7 @@ def nearest_turn(arms: Record, q: Array, near: Array, within_limits: bool) -> No
     for j in range(arms.dof):
         if not arms.revolute[j]:
             continue
-        # numpy's floor and ceil stay floats, and so infinite where a joint has no limits
+        # numpy's floor and ceil return floats, which are infinite for a joint without limits
         turns = np.floor((near[j] - q[j]) / (2 * math.pi) + 0.5)
         if within_limits:
             lowest = np.ceil((arms.limits[j, 0] - LIMIT_TOLERANCE - q[j]) / (2 * math.pi))

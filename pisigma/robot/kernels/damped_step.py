@@ -1,4 +1,4 @@
-"""Damped least-squares steps and the distance from a singularity, on plain numbers."""
+"""Damped least-squares steps, and the distance from a singularity, on plain numbers."""
 
 import math
 
@@ -19,7 +19,7 @@ def scaled_square(reach: float, error: Array) -> float:
 
 @contracted_kernel
 def _scale(arms: Record, reach: float, J: Array, memory: Record) -> None:
-    """Write the dimensionless Jacobian A."""
+    """Write the dimensionless Jacobian A into memory."""
     A, inverse = memory.scaled, 1 / reach
     for j in range(arms.dof):
         length = memory.scale[j]
@@ -143,7 +143,7 @@ def singularity_measure(arms: Record, reach: float, J: Array, memory: Record) ->
 
 @contracted_kernel
 def _compact(arms: Record, reach: float, J: Array, memory: Record) -> int:
-    """Write the rows of the dimensionless Jacobian in use, without that of the elbow; return their number."""
+    """Write the rows of the dimensionless Jacobian in use, except the elbow's; return their number."""
     _scale(arms, reach, J, memory)
     if memory.whole:
         return 6

@@ -1,4 +1,4 @@
-"""Files of calibrated arms as plain arrays, read without torch."""
+"""Read and write calibrated arms as files of plain arrays, without torch."""
 
 import dataclasses
 import json
@@ -28,9 +28,9 @@ def write_description(
     name: str,
     belongs_to: str = "",
 ) -> None:
-    """Write a description, and the names that go with it, as `.npz`; see `CompiledIK` for these.
+    """Write a description, and the names of branches, joints and model, as `.npz`; see `CompiledIK`.
 
-    All numbers are in two arrays, because reading every array of a file takes time in a new process.
+    All numbers are in two arrays, because reading many arrays takes a new process more time.
     """
     shapes: dict[str, tuple[str, tuple[int, ...]]] = {}
     rows: dict[str, list[Any]] = {"floats": [], "integers": []}
@@ -58,7 +58,7 @@ def write_description(
 
 
 def read_description(file: str | os.PathLike[str]) -> tuple[Description, dict[str, Any]]:
-    """Read a file of `write_description`; return the description, and the names by kind.
+    """Return the description in a file of `write_description`, and the names by kind.
 
     Raises:
         ModelError: the file is missing, truncated, foreign, changed or has another format.
@@ -93,7 +93,7 @@ def read_description(file: str | os.PathLike[str]) -> tuple[Description, dict[st
 
 
 def _description(shapes: dict[str, Any], values: dict[str, Any]) -> Description:
-    """Split the two arrays of numbers into fields; single numbers become Python numbers."""
+    """Return a description whose fields are parts of the two arrays; single numbers become Python numbers."""
     taken = {"floats": 0, "integers": 0}
     parts: dict[str, dict[str, Any]] = {part: {} for part in PARTS}
     for part, field in _FIELDS:

@@ -1,4 +1,4 @@
-"""Compiled forms of features and closed-form inverses, which the kernels get as plain functions."""
+"""Registry of compiled forms: plain functions of features and closed-form inverses that kernels evaluate."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -13,17 +13,17 @@ MAX_JOINTS = 8
 class CompiledForm:
     """The functions of a feature that numba compiles: plain functions without a decorator.
 
-    Both are called as `function(arms, correction, first, memory, q)` with `kernels.arrays.Arms` and `Correction`, the
-    index in `correction.values` of the first number that the feature's `pack` gave, `kernels.layout.MEMORY`, and the
-    joint values [rad or m]. They may read `memory.turning` (sines and cosines of the joints' angles, see
-    `angle_per_joint_value`), `memory.phi` (inputs of product units) and `memory.approach` (+1, -1, or 0 where not
-    stated).
+    Both functions are called as `function(arms, correction, first, memory, q)` with `kernels.arrays.Arms` and
+    `Correction`, the index in `correction.values` of the first number that the feature's `pack` returned,
+    `kernels.layout.MEMORY`, and the joint values [rad or m]. They may read `memory.turning` (sines and cosines of
+    the joints' angles, see `angle_per_joint_value`), `memory.phi` (inputs of product units) and `memory.approach`
+    (+1, -1, or 0 where not stated).
 
     Attributes:
         add: adds corrections of all joints to `memory.delta` [rad or m].
         add_slope: adds the derivatives of every joint's correction with respect to its own value to `memory.slope`;
             None if they are small.
-        frames: whether `add` reads `memory.frames`: of every joint axis and origin, axes and origin of its row's
+        frames: whether `add` reads `memory.frames`: axis and origin of every joint, and axes and origin of its row's
             frame, in the frame of the first row of the nominal arm.
     """
 
@@ -65,7 +65,7 @@ class KernelForms:
 
     @staticmethod
     def registered() -> "KernelForms":
-        """Return all registered forms, which kernels compiled now evaluate."""
+        """Return all registered forms, which kernels that are compiled now evaluate."""
         return KernelForms(tuple(FORMS), tuple(compiled_closed_forms()))
 
     def cover(self, wanted: "KernelForms") -> bool:
@@ -73,13 +73,13 @@ class KernelForms:
         return {*wanted.features} <= {*self.features} and {*wanted.closed_forms} <= {*self.closed_forms}
 
     def fingerprints(self, ready: "KernelForms") -> list[str]:
-        """Return the names, or for forms that are not `ready`, texts that change with their functions."""
+        """Return names of the forms in `ready`, and for other forms texts that change with their functions."""
         names, known = (*self.features, *self.closed_forms), {*ready.features, *ready.closed_forms}
         return [name if name in known else _fingerprint(*_functions(name)) for name in names]
 
 
 def _functions(name: str) -> tuple[Callable[..., Any] | None, ...]:
-    """Return the plain functions of a feature or of a closed form."""
+    """Return the plain functions of a feature or a closed form with the given name."""
     return (FORMS[name].add, FORMS[name].add_slope) if name in FORMS else (compiled_closed_forms()[name],)
 
 

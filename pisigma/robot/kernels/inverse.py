@@ -26,7 +26,7 @@ from pisigma.robot.kernels.task_axes import level_pose, write_residuals
 from pisigma.robot.kinematics import tolerances
 
 _DISTINCT, _FAR = 0.05, 0.5
-"""Difference of a joint [rad or m] above which solutions are different; much larger for redundant arms."""
+"""Difference of a joint value [rad or m] above which solutions are different; much larger for redundant arms."""
 
 
 @kernel
@@ -85,7 +85,7 @@ def solve_every(description: Record, memory: Record, out: Array) -> None:
 
 @kernel
 def _distinct_solutions(description: Record, memory: Record, most: int) -> int:
-    """Store different joint values that reach the pose in `memory.candidates`; return their number."""
+    """Store the distinct joint values that reach the pose in `memory.candidates`; return their number."""
     arms, count = description.arms, 0
     least = _FAR if is_redundant(description, memory) else _DISTINCT
     starts = nearest_starts(description, memory, memory.pose, tolerances.MORE_ATTEMPTS)
@@ -126,7 +126,7 @@ def _solve_by_network(
 
 @kernel
 def _write(description: Record, memory: Record, reached: bool, status: int, branch: int, out: Array) -> None:
-    """Write joint values, NaN if they do not reach the pose, status and branch."""
+    """Write joint values (NaN if they do not reach the pose), status and branch."""
     dof = description.arms.dof
     for j in range(dof):
         out[j] = memory.solution[j] if reached else math.nan
@@ -138,7 +138,8 @@ def _write(description: Record, memory: Record, reached: bool, status: int, bran
 def _solve_in_order(description: Record, memory: Record, wanted: int) -> int:
     """Solve on the requested branch, or the first that reaches the pose inside the limits; return it, or -1.
 
-    If all reach it outside the limits only, the first of these is returned. Joint values are in `memory.solution`.
+    If all branches reach it outside the limits only, the first of them is returned. Joint values are in
+    `memory.solution`.
     """
     arms, form, outside = description.arms, description.closed_form, -1
     first = form.order[0] if wanted < 0 else wanted
@@ -178,7 +179,7 @@ def _follow(description: Record, memory: Record, branch: int) -> bool:
 def _solve_nearest(description: Record, memory: Record) -> int:
     """Solve for joint values `memory.solution` near `memory.near`; return their branch, or -1.
 
-    The nearest branch that reaches the pose inside the limits is preferred, else the nearest of the others.
+    The nearest branch that reaches the pose inside the limits is preferred, otherwise the nearest other branch.
     """
     arms, form, others = description.arms, description.closed_form, memory.others
     all_branches(arms, form, memory.level, -1, memory.rounding, memory.wanted, memory.branches)
@@ -304,7 +305,7 @@ def finish(
 
 @kernel
 def _choose_turns(description: Record, memory: Record, has_near: bool) -> tuple[bool, bool]:
-    """Shift joints into their limits and near the reference; return whether inside, and whether the pose is reached."""
+    """Shift joints into the limits near the reference; return whether they are inside and reach the pose."""
     arms, q = description.arms, memory.solution
     copy(q, memory.q)
     inside = wrap_into_limits(arms, q)

@@ -1,4 +1,4 @@
-"""The joint correction Δ(q), and pose and Jacobian of an arm with it, on plain numbers."""
+"""The joint correction Δ(q), and pose and Jacobian of an arm with joint correction, on plain numbers."""
 
 import math
 from collections.abc import Callable, Iterable
@@ -71,7 +71,7 @@ def joint_correction(arms: Record, correction: Record, memory: Record, q: Array)
 
 @kernel
 def correction_slope(arms: Record, correction: Record, memory: Record, q: Array) -> None:
-    """Write large derivatives of every joint's correction with respect to its own value into `memory.slope`.
+    """Write large derivatives of every joint's correction with respect to its joint value into `memory.slope`.
 
     Args:
         arms: the arms.
@@ -86,7 +86,7 @@ def correction_slope(arms: Record, correction: Record, memory: Record, q: Array)
 
 @contracted_kernel
 def _add_products(correction: Record, dof: int, phi: Array, delta: Array) -> None:
-    """Add products of sums of the inputs, four joints at a time."""
+    """Add the product units, products of sums of the inputs, for four joints at a time."""
     for j in range(0, dof, 4):
         total, factor = delta[j : j + 4], 0
         weights, biases = correction.weight[:, :, j : j + 4], correction.bias[:, j : j + 4]
@@ -113,7 +113,7 @@ def _add_products(correction: Record, dof: int, phi: Array, delta: Array) -> Non
 def _walk_nominal(arms: Record, q: Array, turning: Array, frames: Array) -> None:
     """Write axis and origin of every joint, and axes and origin of its row's frame, of the nominal arm.
 
-    All are in the frame of the arm's first row. `frames` is `(dof, 18)`.
+    All vectors are in the frame of the arm's first row. `frames` is `(dof, 18)`.
     """
     ax, ay, az, ap = 1.0, 0.0, 0.0, 0.0
     bx, by, bz, bp = 0.0, 1.0, 0.0, 0.0

@@ -16,7 +16,7 @@ from pisigma.robot.kinematics.tolerances import POSE_TOLERANCE, POSE_TOLERANCE_S
 Pointer = Any
 
 _EPSILON, _EPSILON_SINGLE = 2.220446049250313e-16, 1.1920928955078125e-07
-"""Of float64 and float32."""
+"""Machine epsilon of float64 and float32."""
 
 
 @no_type_check
@@ -89,9 +89,9 @@ def solve_poses(
     single: bool,
     out: Array,
 ) -> int:
-    """Solve every pose on as many branches as `out` has.
+    """Solve every pose on the branches for which `out` has space.
 
-    Return -1, or `8 · row + fault` of the first invalid pose if these are not marked.
+    Return -1, or `8 · row + fault` of the first invalid pose if invalid poses are not marked.
     """
     dof, has_near = description.arms.dof, near.shape[0] > 0
     tolerance = POSE_TOLERANCE_SINGLE if single else POSE_TOLERANCE
@@ -124,7 +124,7 @@ def solve_poses(
 
 @kernel
 def _take_row(values: Array, row: int, target: Array, dof: int) -> None:
-    """Copy the row of a pose, or the only row."""
+    """Copy the row of a pose, or the only row, into `target`."""
     for j in range(dof):
         target[j] = values[row if values.shape[0] > 1 else 0, j]
 
@@ -140,7 +140,7 @@ def _take_approach(approach: Array, row: int, target: Array, dof: int) -> None:
 
 @kernel
 def _check_pose(T: Array, tolerance: float) -> int:
-    """Return the fault of a matrix, in the order of `se3.check_transforms`."""
+    """Return the first fault of a pose matrix, in the order in which `se3.check_transforms` checks."""
     total = 0.0
     for i in range(4):
         for k in range(4):

@@ -1,6 +1,6 @@
 """The structs for an arm and for working memory, to which the kernels get one pointer each.
 
-Arrays are as long as the largest robot needs and have counts, so that one compiled function serves all robots.
+Arrays have the length that the largest robot needs, and counts, so that one compiled function serves all robots.
 """
 
 from typing import Any
@@ -13,13 +13,14 @@ from pisigma.robot.kernels.forms import MAX_JOINTS, MAX_KINDS, MAX_VALUES, Kerne
 
 DOF = MAX_JOINTS
 ROWS, FACTORS, UNITS, STRETCHES, STARTS = 24, 24, 12, 96, 512
-"""The largest numbers of rows, factors and product units, stretches and starts."""
+"""Largest numbers of rows, of factors and product units, of measured intervals, and of starts."""
 BRANCHES, CANDIDATES = 8, 16
-"""The largest numbers of branches of a closed form, and of joint values that are kept to search from."""
+"""Largest numbers of branches of a closed form, and of joint values that are stored as starts of a search."""
 INPUTS = 2 * DOF
-"""The largest number of inputs of product units."""
+"""Largest number of inputs of product units."""
 GROUPS, SEEN, GROUP_INPUTS, SAMPLES, ENTRIES = 8, 512, 80, 2048, 2048 * 320
-"""The largest numbers of groups of a network, inputs of all and of one, rows of a domain, and entries of these."""
+"""Largest numbers of groups of a network, of inputs of all groups and of one group, of rows of a domain, and of
+entries of these rows."""
 
 LANES = 16
 """Number of poses whose forward kinematics is vectorised."""
@@ -84,7 +85,7 @@ _STARTS = _integers(count=()) + _floats(q=(STARTS, DOF), points=(STARTS, 12), le
 
 _STRUCTS = (_ARMS, _CORRECTION, _COVERAGE, _NETWORK, _CLOSED_FORM, _STARTS)
 DESCRIPTION = np.dtype([(part, np.dtype(fields)) for part, fields in zip(PARTS, _STRUCTS, strict=True)])
-"""Description of an arm for the kernels: the fields of `kernels.arrays`, and counts."""
+"""Struct with the description of an arm for the kernels: the fields of `kernels.arrays`, and counts."""
 
 MEMORY = np.dtype(
     _floats(
@@ -93,20 +94,20 @@ MEMORY = np.dtype(
         approach=(DOF,),  # approach direction of every joint: +1 or -1, 0 if not stated
         rounding=(),  # relative size of rounding errors of the target poses
         solution=(DOF,),  # joint values found
-        nominal=(DOF,),  # those of the nominal arm
-        axes=(DOF, 6),  # of the joints: direction and origin
+        nominal=(DOF,),  # joint values of the nominal arm
+        axes=(DOF, 6),  # direction and origin of the joint axes
         T=(3, 4),  # pose and Jacobian of an arm
         J=(7, DOF),
         R=(3, 3),
-        error=(7,),  # of the pose at a trial, and of the elbow angle
-        best=(7,),  # of the pose at the best so far, and the Jacobian there
+        error=(7,),  # error of the pose at a trial step, and of the elbow angle
+        best=(7,),  # error of the pose at the best joint values so far, and the Jacobian there
         J_best=(7, DOF),
         trial=(DOF,),
         theta=(DOF,),  # joint values with correction
-        delta=(DOF,),  # the correction, and the slope of its series
+        delta=(DOF,),  # joint correction, and the slope of its series
         slope=(DOF,),
         step=(DOF,),
-        turning=(2, DOF),  # sines and cosines
+        turning=(2, DOF),  # sines and cosines of the joint angles
         phi=(INPUTS,),  # inputs of product units
         frames=(DOF, 18),  # frames for gravity torques
         scaled=(7, DOF),  # dimensionless Jacobian, normal equations and their right side
@@ -116,36 +117,38 @@ MEMORY = np.dtype(
             DOF,
         ),  # joint motion [rad or m] per unit of the columns of the scaled Jacobian; 0 for a joint that is fixed now
         branches=(BRANCHES, DOF),  # closed-form joint values of all branches
-        others=(BRANCHES, DOF),  # the same for other poses, or the nearest values of branches
+        others=(BRANCHES, DOF),  # closed-form joint values for other poses, or the nearest values of branches
         wanted=(4, 4),  # a pose in the frames of the closed form
         q=(DOF,),  # joint values of a candidate
         start=(DOF,),  # joint values to start from
         kept=(DOF,),  # joint values outside their limits, used if there are no others
         checked=(DOF,),  # joint values of T, J and error, NaN if these are not valid
         lanes=(12, LANES),  # frames of many poses, entry by entry
-        lane_turns=(2, LANES),  # cosines and sines of a joint
+        lane_turns=(2, LANES),  # cosines and sines of the angles of a joint
         lane_axes=(DOF, 6, LANES),  # directions and origins of the joints
         seen=(SEEN,),  # scaled inputs of a network
         angles=(3,),  # roll, pitch and yaw
-        tolerance=(6,),  # of the axes of the tool, see `kinematics.task_axes.TaskAxes.row`
-        weight=(6,),  # of these axes in least squares
-        turned=(6,),  # an error in these axes
-        elbow=(),  # requested elbow angle, NaN if it is free, and intermediate one
+        tolerance=(6,),  # tolerances of the axes of the tool, see `kinematics.task_axes.TaskAxes.row`
+        weight=(6,),  # weights of these axes in least squares
+        turned=(6,),  # pose error in these axes
+        elbow=(),  # requested elbow angle, NaN if it is free, and the intermediate angle of a search
         elbow_now=(),
         line=(3,),  # from shoulder to wrist, with the vectors upright, bend and lateral
         upright=(3,),
         bend=(3,),
         lateral=(3,),
         level=(4, 4),  # the target pose, modified for the nominal arm
-        candidates=(CANDIDATES, DOF),  # starts, the most promising first
+        candidates=(CANDIDATES, DOF),  # joint values of starts, the most promising first
         rank=(CANDIDATES,),
         preferred=(DOF,),  # preferred joint values of a redundant arm
         chosen=(DOF,),  # the best of several solutions
         first=(DOF,),  # initial joint values of a search
-        distance=(SAMPLES,),  # squared, of scaled inputs from rows of a domain, or of poses from stored ones
+        distance=(
+            SAMPLES,
+        ),  # squared distances of scaled inputs from rows of a domain, or of poses from stored poses
     )
     + _integers(
-        nearest=(128,),  # stored starts
+        nearest=(128,),  # indices of the stored starts with the nearest poses
         whole=(),  # 1 if all six axes are exact, else 0
         loose=(),  # 1 if the arm has too few joints for all axes, which are then weighted by tolerances
         pivot=(),  # the axis about which rotations are split into twist and swing, or -1

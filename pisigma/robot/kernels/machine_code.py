@@ -32,7 +32,7 @@ from pisigma.robot.kernels.forms import KernelForms
 
 _ALLOWED = {"acos", "atan2", "ceil", "cos", "fabs", "floor", "hypot", "log", "pow", "sin", "sqrt"}
 _ALLOWED |= {"memcpy", "memset"}
-"""Functions of the C library that are available in every process."""
+"""Mathematical functions of the C library that are available in every process."""
 _OPTIONS = "speed 3, vectors up to 256 bits, internal linkage"
 """Options of `optimised_object` that affect the code; part of the cache key."""
 _PATIENCE = 2.0
@@ -41,7 +41,7 @@ _COMPILING = "pisigma: preparing the inverse kinematics for this processor, once
 Said = ctypes.c_int64 * 1
 """Status that a call of the kernels writes."""
 IGNORED = Said()
-"""Status of calls whose status is ignored."""
+"""Address for the status of calls whose status is ignored."""
 _lock = threading.Lock()
 _kept: list[Any] = []
 
@@ -57,7 +57,7 @@ _NOTHING = KernelForms()
 def kernel_forms(wanted: KernelForms = _NOTHING) -> KernelForms:
     """Return the forms that the kernels of `load_kernels` evaluate.
 
-    These are the forms of the code in the package if they include the wanted ones, else all registered forms.
+    These are the forms of the code in the package if they include the wanted forms, otherwise all registered forms.
     """
     ready = _ready_forms()
     return ready if ready is not None and ready.cover(wanted) else KernelForms.registered()
@@ -76,7 +76,7 @@ def load_kernels(wanted: KernelForms = _NOTHING) -> Callable[..., int]:
         wanted: forms that the kernels have to evaluate.
 
     Raises:
-        ModelError: there is no intermediate code of the present sources, and numba is not installed.
+        ModelError: the package has no intermediate code of the current sources, and numba is not installed.
     """
     notice = threading.Timer(_PATIENCE, sys.stderr.write, (_COMPILING,))
     notice.daemon = True
@@ -120,7 +120,7 @@ def library_object(wanted: KernelForms) -> bytes:
         wanted: forms that the kernels have to evaluate.
 
     Raises:
-        ModelError: see `load_kernels`.
+        ModelError: the kernels cannot be compiled, see `load_kernels`.
     """
     with _lock:
         llvm.initialize_native_target()
@@ -150,7 +150,7 @@ def _key(forms: KernelForms) -> str:
 
 
 def _intermediate_code(forms: KernelForms) -> str:
-    """Return the code of the package if it has the present sources and forms, else compile it with numba."""
+    """Return the code of the package if it has the current sources and forms, otherwise compile it with numba."""
     ready = read_ready() if _ready_forms() == forms else None
     if ready is not None:
         return ready
@@ -205,10 +205,10 @@ def optimised_object(code: str, machine: Any) -> bytes:
 
 
 def cache_folders() -> list[Path]:
-    """Return the cache folders of machine code: next to the package, or else in the user's cache folder.
+    """Return the folders in which machine code is cached: next to the package, and in the user's cache folder.
 
-    `XDG_CACHE_HOME` is used if it is an absolute path, as its specification says; without a home there is no cache
-    of the user.
+    `XDG_CACHE_HOME` is used if it is an absolute path, as its specification requires; without a home folder the user
+    has no cache.
     """
     folders = [Path(__file__).parent / "__pycache__"]
     stated = os.environ.get("XDG_CACHE_HOME", "")
@@ -234,7 +234,7 @@ def read_code(path: Path) -> bytes | None:
 
 
 def write_code(path: Path, code: bytes) -> bool:
-    """Write a file completely or not at all, in folders that only the user can access; return success."""
+    """Write a file completely or not at all, in a folder that only the user can access; return success."""
     try:
         _make_private(path.parent)
         if not _trusted(os.stat(path.parent)):

@@ -89,7 +89,7 @@ def _roll_pitch_yaw(reference: Array, T: Array, R: Array, angles: Array) -> None
 def domain_measure(description: Record, memory: Record) -> float:
     """Return the distance of `memory.seen` from the nearest training row over the radius; NaN without a domain.
 
-    The coarse coordinates alone exclude most rows.
+    The coarse coordinates alone exclude most training rows.
     """
     net, distance, n = description.network, memory.distance, description.network.samples
     if n == 0:
@@ -157,10 +157,10 @@ def choose_corrected(
 
 @kernel
 def add_correction(description: Record, memory: Record, has_near: bool) -> bool:
-    """Correct `memory.nominal` to `memory.solution`, both on the turns to command; return whether inside the limits."""
+    """Correct `memory.nominal` to `memory.solution`, both on the turns to command; return whether in limits."""
     arms, q = description.arms, memory.q
     copy(memory.nominal, q)
-    nearest_turn(arms, q, description.network.centre, False)  # as the training rows were turned
+    nearest_turn(arms, q, description.network.centre, False)  # shifted to the same turns as the training rows
     network_correction(description, memory, memory.pose, q)
     for j in range(arms.dof):
         q[j] = memory.nominal[j] + memory.delta[j]

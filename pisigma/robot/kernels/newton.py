@@ -12,7 +12,7 @@ from pisigma.robot.kinematics import tolerances
 
 _CLOSE, _LAST, _SETTLED = 0.05, 1e-15, 3e-12
 """Squared errors [reach or rad]: from _CLOSE**2 on quick steps are tried; below _LAST one more step is exact.
-_SETTLED: joint values [rad or m] move less after a step that is the last one."""
+_SETTLED: the iteration ends when joint values [rad or m] move less."""
 
 
 @kernel
@@ -71,7 +71,7 @@ def _move_steeply(description: Record, memory: Record, arm: int, q: Array) -> No
     move(description, memory, arm, q)
     dof = description.arms.dof
     if arm != CORRECTED or dof > 6:
-        return  # with joints to spare it would lead to another of the many solutions than the torch route's
+        return  # for a redundant arm it would lead to a different solution than in torch
     correction_slope(description.arms, description.correction, memory, q)
     for j in range(dof):
         for i in range(6):
@@ -125,8 +125,8 @@ def _search_loosely(description: Record, memory: Record, T: Array, q: Array) -> 
 def _search_exactly(description: Record, memory: Record, T: Array, q: Array) -> bool:
     """Move q to a pose in the axes in use without deviation.
 
-    The arm is solved first without, then with its correction, which may reach slightly farther; if the start is near, a
-    shorter iteration leads to the same joint values.
+    The arm is solved first without the correction, then with it, because the corrected arm may reach slightly
+    farther; if the start is near, a shorter iteration leads to the same joint values.
     """
     arms = description.arms
     fill(memory.checked, math.nan)
@@ -146,7 +146,7 @@ def _search_exactly(description: Record, memory: Record, T: Array, q: Array) -> 
 
 @kernel
 def _quick(description: Record, memory: Record, T: Array, q: Array) -> bool:
-    """Solve for `q + Δ(q)` by Newton steps, then for q by fixed-point steps; checked on the arm itself.
+    """Solve for `q + Δ(q)` by Newton steps, then for q by fixed-point steps; return whether q reaches the pose.
 
     This is used only if the solution is near the start, because the correction is then not needed in Newton steps.
     """
@@ -188,7 +188,7 @@ def _checked(memory: Record, q: Array, tolerance: float) -> bool:
 
 @kernel
 def _converge(description: Record, memory: Record, T: Array, q: Array) -> bool:
-    """Perform Newton steps of the identified arm while each is much better than the one before."""
+    """Perform Newton steps of the identified arm while each reduces the error strongly."""
     arms, dof = description.arms, description.arms.dof
     reach, before = arms.reach[IDENTIFIED], _CLOSE * _CLOSE
     for _ in range(8):

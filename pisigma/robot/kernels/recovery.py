@@ -1,4 +1,4 @@
-"""Search from several starts, for poses beyond the nominal arm's reach and for redundant arms; on plain numbers."""
+"""Search from several starts for poses beyond the nominal arm's reach and for redundant arms, on plain numbers."""
 
 import math
 
@@ -21,7 +21,7 @@ _AROUND, _ASIDE = 8, 0.2
 _APART = 1e-4
 """Difference of a joint [rad or m] above which two solutions near a singular pose are different."""
 _OUTSIDE = 1e6
-"""Penalty of joint values outside their limits."""
+"""Penalty in the merit of joint values outside their limits."""
 
 
 @kernel
@@ -43,7 +43,7 @@ def nearest_starts(description: Record, memory: Record, T: Array, most: int) -> 
     starts, near = description.starts, memory.nearest
     pivot, turned = memory.pivot if memory.rows > 3 else -1, memory.whole == 1
     count = min(most, starts.count)
-    best = memory.distance  # squared
+    best = memory.distance  # compared with squared distances
     fill(best, math.inf)
     for s in range(starts.count):
         point, distance = starts.points[s], 0.0
@@ -64,7 +64,7 @@ def nearest_starts(description: Record, memory: Record, T: Array, most: int) -> 
 
 @kernel
 def recover(description: Record, memory: Record, branch: int, any_branch: bool) -> int:
-    """Search joint values from other starts like `model.inverse.numeric_ik`: from the nearest values of branches.
+    """Search for joint values from the values of branches nearest to the pose, like `model.inverse.numeric_ik`.
 
     Args:
         description: the calibrated arm.
@@ -73,7 +73,7 @@ def recover(description: Record, memory: Record, branch: int, any_branch: bool) 
         any_branch: whether another branch is accepted.
 
     Returns:
-        Index of their branch, -1 if nothing was found.
+        Index of the branch of the joint values, -1 if nothing was found.
     """
     form, starts, branches, plausible = description.closed_form, description.starts, memory.others, False
     all_branches(description.arms, form, memory.level, NEAREST, memory.rounding, memory.wanted, branches)
@@ -105,7 +105,7 @@ def recover(description: Record, memory: Record, branch: int, any_branch: bool) 
 
 @kernel
 def _recover_branch(description: Record, memory: Record, branch: int) -> bool:
-    """Search joint values on one branch from the nearest values of the nominal arm in `memory.others`.
+    """Search for joint values on one branch from the nearest values of the nominal arm in `memory.others`.
 
     Near singular poses two branches may lead to the same solution with the other one close to it, or two solutions
     may be nearest to one nominal branch; the solution that this branch does not lead to belongs to the other.
@@ -243,7 +243,7 @@ def solve_redundant(description: Record, memory: Record, has_near: bool, branch:
 
 @kernel
 def _worth(description: Record, memory: Record, has_near: bool) -> tuple[float, bool]:
-    """Shift `memory.trial` to the turns to command; return its merit, and whether it is inside the limits."""
+    """Shift `memory.trial` to the turns to command; return its merit, and whether it is within the limits."""
     arms, q = description.arms, memory.trial
     inside = wrap_into_limits(arms, q)
     if has_near:
@@ -338,7 +338,7 @@ def _approach_preferred(description: Record, memory: Record, q: Array) -> bool:
 
 @kernel
 def _turn_elbow(description: Record, memory: Record, q: Array) -> bool:
-    """Rotate the elbow to `memory.elbow` in either sense, the shorter first; return whether it gets there."""
+    """Rotate the elbow to `memory.elbow`, in the shorter sense first; return whether it reaches that angle."""
     arms, arm = description.arms, CORRECTED if description.arms.corrected else IDENTIFIED
     use_elbow(memory, True)
     memory.elbow_now = memory.elbow

@@ -1,4 +1,4 @@
-"""Decorators of kernels by numba, and functions to copy and fill rows of numbers."""
+"""Decorators that compile kernels by numba, and functions that copy and fill rows of numbers."""
 
 import inspect
 from collections.abc import Callable
@@ -9,7 +9,7 @@ from numba import njit
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 Array = Any
-"""An array of numbers, or a field of a record that is one."""
+"""An array of numbers, or an array field of a record."""
 Record = Any
 """One of the structs of `kernels.layout`, or a part of one."""
 
@@ -27,7 +27,7 @@ def contracted_kernel(function: Function) -> Function:
     return njit(error_model="numpy", fastmath={"contract"})(inspect.unwrap(function))  # type: ignore[return-value]
 
 
-# Loops, because the error messages of slice assignments would add much of numba's string code.
+# Loops, because error messages of slice assignments would add much of numba's code for strings.
 
 
 @kernel

@@ -1,6 +1,6 @@
 """Pose errors and Jacobians in the tool axes of a task, on plain numbers.
 
-The formulas are those of `kinematics.task_error`, which explains them.
+The formulas are explained in `kinematics.task_error`.
 """
 
 import math
@@ -9,7 +9,7 @@ from pisigma.robot.kernels.rotations import pose_error, wrap
 from pisigma.robot.kernels.rows import Array, Record, copy_rows, fill, kernel
 
 ELBOW = 6
-"""Row of the elbow angle after the six axes."""
+"""Index of the elbow angle, after the six axes."""
 
 _TURNS, _ORIENTATIONS = 12, 24
 """Number of orientations that are tried for a tool that may rotate about one axis, and about two or all axes."""
@@ -138,7 +138,7 @@ def _relative(reached: Array, T: Array, R: Array) -> None:
 
 @kernel
 def _split(arms: Record, memory: Record, k: int) -> None:
-    """Replace the rotation vector in `memory.turned` by swing of an axis and twist about it, and J accordingly."""
+    """Replace the rotation vector in `memory.turned` by the swing of an axis and the twist about it, and convert J."""
     R, e, J = memory.R, memory.turned, memory.J
     i, m = (k + 1) % 3, (k + 2) % 3
     sine = math.sqrt(R[i, k] * R[i, k] + R[m, k] * R[m, k])
@@ -190,7 +190,7 @@ def elbow_angle(arms: Record, memory: Record) -> float:
 
 @kernel
 def _speed(axes: Array, joint: int, point: int, along: Array) -> float:
-    """Return the velocity along a vector of the origin of a joint axis per motion of another revolute joint."""
+    """Return the velocity of a joint axis's origin along a vector, per motion of another revolute joint."""
     if joint >= point:
         return 0.0
     x, y, z = axes[joint, 0], axes[joint, 1], axes[joint, 2]
@@ -214,7 +214,7 @@ def _cross(a: Array, b: Array, c: Array) -> None:
 
 @kernel
 def miss(arms: Record, memory: Record, T: Array, error: Array) -> None:
-    """Write the error of the arm, whose pose and Jacobian are in memory, from a pose in the axes in use."""
+    """Write the error of the arm with pose and Jacobian in memory from a target pose, in the axes in use."""
     pose_error(T, memory.T, memory.R, error)
     if not memory.whole or memory.height > ELBOW:
         in_task_axes(arms, memory, T, error, False)
@@ -222,7 +222,7 @@ def miss(arms: Record, memory: Record, T: Array, error: Array) -> None:
 
 @kernel
 def write_residuals(arms: Record, memory: Record, e: Array, out: Array) -> bool:
-    """Write distance [m] and angle [rad] of a pose error in the axes in use; return whether it is tolerated.
+    """Write distance [m] and angle [rad] of a pose error in the axes in use; return whether it is within tolerances.
 
     Args:
         arms: the arms.
@@ -267,7 +267,7 @@ def level_pose(description: Record, memory: Record) -> bool:
 def _straighten(form: Record, T: Array, out: Array) -> float:
     """Write the pose rotated about the tool's origin so that the last joint's axis is parallel to the first's.
 
-    A SCARA can reach that pose; its closed form rejects others. Returns the angle of the rotation [rad].
+    A SCARA can reach that pose; its closed form rejects other poses. Return the angle of the rotation [rad].
     """
     v, u = form.first[2], out[3]
     for i in range(3):

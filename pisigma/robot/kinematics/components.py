@@ -1,7 +1,7 @@
 """Frames as separate components, so that exact zeros and ones of a nominal robot cost nothing.
 
 A frame is stored as twelve scalars: the three columns of its rotation and its origin. Each scalar is either a Python
-float, the same for all poses, or a tensor of the batch shape. Products with a float 0 or 1 are never computed. Forward
+float for all poses, or a tensor of the batch shape. Products with a float 0 or 1 are never computed. Forward
 kinematics in this form is 25 times as fast as with batched 4x4 products.
 """
 
@@ -14,11 +14,11 @@ from torch import Tensor
 Scalar = float | Tensor
 Vector = tuple[Scalar, Scalar, Scalar]
 Frame = tuple[Vector, Vector, Vector, Vector]
-"""Columns x, y, z of the rotation, and the origin [m]."""
+"""A frame as the columns x, y, z of its rotation, and its origin [m]."""
 
 Axis = tuple[Tensor, Tensor, Tensor]
 Columns = tuple[Axis, Axis, Axis, Axis]
-"""The columns of a frame whose scalars are all tensors."""
+"""A frame whose scalars are all tensors, as the columns of its rotation and its origin."""
 
 IDENTITY: Frame = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (0.0, 0.0, 0.0))
 
@@ -143,7 +143,7 @@ def compose_row(frame: Frame, row: Sequence[Scalar]) -> Frame:
 
 
 def stack_components(values: Sequence[Scalar], like: Tensor) -> Tensor:
-    """Stack scalars to `(*batch, len(values))`, a view in which the batch dimension is contiguous in memory.
+    """Stack scalars to a tensor `(*batch, len(values))`, a view whose batch dimension is contiguous in memory.
 
     Args:
         values: floats, or tensors that broadcast to the shape of `like`.
@@ -175,7 +175,7 @@ def frame_of(T: Tensor) -> Frame:
 
 
 def as_tensors(frame: Frame) -> Columns:
-    """Convert all scalars of a frame to tensors; those that are equal for all poses have no batch dimensions."""
+    """Convert all scalars of a frame to tensors; scalars that are equal for all poses get no batch dimensions."""
     like = next(value for column in frame for value in column if isinstance(value, Tensor))
 
     def tensor(value: Scalar) -> Tensor:

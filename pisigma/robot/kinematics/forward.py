@@ -28,7 +28,7 @@ CHUNK = 16_384
 
 @dataclass(frozen=True)
 class Geometry:
-    """Geometric parameters: floats of a robot, or tensors for derivatives.
+    """Geometric parameters of a robot, as floats, or as tensors for derivatives.
 
     Attributes:
         dh: theta [rad], d [m], a [m], alpha [rad], beta [rad] of every row.
@@ -49,20 +49,20 @@ class Geometry:
     def from_tensors(
         dh: Float[Tensor, "rows 5"], base: Float[Tensor, " 6"], tool: Float[Tensor, " 6"]
     ) -> "Geometry":
-        """Make a geometry through which gradients flow."""
+        """Return the geometry of tensors, through which gradients flow."""
         return Geometry([tuple(row.unbind()) for row in dh.unbind()], base.unbind(), tool.unbind())
 
 
 @dataclass(frozen=True)
 class RowFrames:
-    """Frames within a row, in the base frame.
+    """Intermediate frames of a DH row, in the base frame.
 
     Attributes:
         before: frame before the row; its z axis is the joint's axis.
         turned: frame after RotZ(theta + q); its x axis is the common normal.
-        moved: frame after Trans(a, 0, d) as well.
-        twisted: frame after RotX(alpha) as well; its y axis is Hayati's.
-        after: frame after RotY(beta) as well, the next row's `before`.
+        moved: frame after RotZ and Trans(a, 0, d).
+        twisted: frame after RotZ, Trans and RotX(alpha); beta rotates about its y axis.
+        after: frame after the whole row, which is `before` of the next row.
     """
 
     before: Frame
@@ -105,7 +105,7 @@ def forward_kinematics(
     Args:
         robot: the robot.
         q: joint values [rad or m].
-        geometry: other parameters of the same rows, such as tensors for derivatives.
+        geometry: geometric parameters to use instead of the robot's, such as tensors for derivatives.
 
     Returns:
         T_base_tool, contiguous, with the dtype and device of q.
@@ -121,7 +121,7 @@ def forward_kinematics(
 
 
 def iterate_chunks(q: Float[Tensor, "*batch dof"]) -> Iterator[Float[Tensor, "poses dof"]]:
-    """Yield the flattened batch in chunks of `CHUNK` poses; an empty batch is one empty chunk."""
+    """Yield the flattened batch in chunks of `CHUNK` poses; an empty batch gives one empty chunk."""
     flat = q.reshape(-1, q.shape[-1])
     for start in range(0, max(flat.shape[0], 1), CHUNK):
         yield flat[start : start + CHUNK]

@@ -1,4 +1,4 @@
-"""Joint Jacobian of the tool pose, batched, in closed form, and how near it is to a singularity."""
+"""Joint Jacobian of the tool pose in closed form, batched, and a measure of its distance from a singularity."""
 
 from collections.abc import Sequence
 
@@ -99,9 +99,9 @@ def characteristic_length(robot: Robot) -> float:
 
 
 def dimensionless_jacobian(robot: Robot, J: Float[Tensor, "*batch 6 dof"]) -> Float[Tensor, "*batch 6 dof"]:
-    """Return the joint Jacobian with all lengths in units of the characteristic length.
+    """Return the joint Jacobian with lengths in units of the characteristic length.
 
-    Rows of translation are divided by that length, columns of prismatic joints multiplied by it.
+    Rows of translation are divided by this length, and columns of prismatic joints are multiplied by it.
     """
     length = characteristic_length(robot)
     rows = J.new_tensor([1 / length] * 3 + [1.0] * 3)
@@ -129,6 +129,6 @@ def singularity_measure(robot: Robot, q: Float[Tensor, "*batch dof"]) -> Float[T
 def smallest_singular_value(
     robot: Robot, J: Float[Tensor, "*batch 6 dof"], rows: int = 6
 ) -> Float[Tensor, "*batch"]:
-    """Return the `singularity_measure` of a known joint Jacobian, of which all but the given number of rows are 0."""
+    """Return the `singularity_measure` for a given joint Jacobian with the given number of rows that are not 0."""
     values: Tensor = torch.linalg.svdvals(dimensionless_jacobian(robot, J).contiguous())
     return values[..., min(rows, robot.dof) - 1]

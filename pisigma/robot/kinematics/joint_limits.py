@@ -74,10 +74,11 @@ def nearest_turn(
 
 
 GROSS_ANGLE = np.pi / 4
-"""Excess over the limits [rad] above which a value belongs to another joint, unit or zero; stated limits of published
-robots were wrong by up to 14 deg."""
+"""Excess over the limits [rad] above which a value must be of another joint, in another unit, or relative to another
+zero; stated limits of published robots were wrong by up to 14 deg."""
 GROSS_SHARE = 0.25
-"""The same excess for a prismatic joint, as a share of its stroke."""
+"""Excess over the limits of a prismatic joint, as a share of its stroke, above which a value must be of another
+joint, in another unit, or relative to another zero."""
 
 
 def beyond_limits(

@@ -1,4 +1,4 @@
-"""Numeric inverse kinematics from a start, for any robot: damped Gauss-Newton, batched."""
+"""Numeric inverse kinematics for any robot, batched: damped Gauss-Newton steps from initial joint values."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -25,12 +25,12 @@ from pisigma.robot.kinematics.task_error import task_error, tolerated
 from pisigma.robot.se3 import check_transforms, pose_error
 
 Motion = Callable[[Tensor], tuple[Tensor, Tensor]]
-"""Function that returns T_base_tool and the joint Jacobian at joint values, like `joint_jacobian`."""
+"""Type of functions that return T_base_tool and the joint Jacobian at joint values, like `joint_jacobian`."""
 
 
 @dataclass(frozen=True, eq=False)
 class NumericSolution:
-    """Result of the iteration for every pose.
+    """Result of numeric inverse kinematics for every pose.
 
     Attributes:
         q: joint values [rad or m]; if the status is NOT_CONVERGED, the best values found, which do not reach the pose.
@@ -49,7 +49,7 @@ class NumericSolution:
 
 @dataclass
 class _Iterate:
-    """State of the iteration for all poses, of which only the active ones are updated.
+    """State of the iteration for all poses; only active poses are updated.
 
     Attributes:
         q: best joint values so far.
@@ -107,11 +107,12 @@ def solve_numeric(
         weights: weights of the six tool axes in least squares, 0 for an ignored one; None: `axes.weights`.
 
     Returns:
-        The solution that the iteration converged to. If it did not, the status is NOT_CONVERGED and q, the best values
-        found, does not reach the pose: see the residuals.
+        The solution to which the iteration converged. If it did not converge, the status is NOT_CONVERGED, and q
+        contains the best values found, with the stated residuals.
 
     Raises:
-        PoseError: T is not a stack of rigid transforms, or start is not finite or does not fit robot or T.
+        PoseError: T is not a stack of rigid transforms, or start is not finite or does not have the shape that robot
+            and T require.
     """
     check_transforms(T, "T_base_tool")
     _check_start(robot, T, start)
@@ -182,13 +183,13 @@ class TaskMotion:
 
     @property
     def rows(self) -> int:
-        """Number of axes with a weight other than 0."""
+        """Number of task axes whose weight is not 0."""
         return int(self.weights.count_nonzero())
 
     def errors(
         self, T: Float[Tensor, "poses 4 4"], q: Float[Tensor, "poses dof"]
     ) -> tuple[Float[Tensor, "poses 6"], Float[Tensor, "poses 6 dof"]]:
-        """Return the weighted error from the target poses at joint values, and its Jacobian."""
+        """Return the weighted errors of the poses at joint values relative to the target poses, and their Jacobian."""
         reached, J = self.motion(q)
         if self.axes.whole:
             return pose_error(T, reached), J.clone()
@@ -232,7 +233,7 @@ def damped_step(
     damping: Float[Tensor, " poses"],
     rows: int = 6,
 ) -> Float[Tensor, "poses dof"]:
-    """Compute the damped least-squares step [rad or m] from the smaller form of the normal equations.
+    """Compute the damped least-squares step [rad or m] from the smaller of both forms of the normal equations.
 
     Args:
         robot: the robot.
@@ -324,7 +325,7 @@ def approach_preferred(
 
     Args:
         robot: the robot.
-        task: weighted pose errors of the arm.
+        task: weighted pose errors of the arm in the axes of the task.
         T: target poses.
         q: joint values that reach them [rad or m].
         preferred: preferred joint values [rad or m].
@@ -341,7 +342,7 @@ def approach_preferred(
         # Where the joints would go without the pose; a joint at its limit (scale 0) no longer moves.
         pull = torch.where(scale > 0, share * (preferred - best), 0.0)
         A = rows[:, None] * J * scale[:, None]
-        # What the pull changes at the tool is undone by the smallest scaled motion that reaches the pose.
+        # The smallest scaled motion that reaches the pose cancels the effect of the pull on the tool.
         left = rows * (error - (J @ pull[..., None])[..., 0])
         small = A @ A.mT
         floor = 4 * torch.finfo(A.dtype).eps * small.diagonal(dim1=-2, dim2=-1).sum(-1)

@@ -7,7 +7,8 @@ Every parameter is a translation along, or a rotation about, an axis that forwar
     beta_i   rotates about y of the frame after RotX
 
 A translation along u moves the tool by u; a rotation about u through o moves it by `u × (p_tool - o)` and rotates it
-about u. This is the error propagation of Lim et al. 1999, eqs. (8) to (33), in the base frame instead of the tool's.
+about u. This is the error propagation of Lim et al. 1999, eqs. (8) to (33), in the base frame instead of the tool
+frame.
 
 Axes and origins are stored as `(3, poses)` blocks of a few large tensors: few operations for small batches, whole
 cache lines for large ones.
@@ -30,12 +31,13 @@ JACOBIAN_CHUNK = 2_048
 AXES, ORIGIN = slice(6, 9), 9
 """Indices of x, y, z and of the origin in `_frame_axes`."""
 STARTS = torch.tensor((0, 0, 0, 1, 1, ORIGIN, 2, 6, 6, 6, 7, 10, ORIGIN, 8))
-"""Indices in `_frame_axes` that start the recursion of `_walk_rows`: rotation axes of the base, then its frame."""
+"""Indices in `_frame_axes` of the vectors that start the recursion of `_walk_rows`: rotation axes of the base, then
+its frame."""
 
 
 @dataclass(frozen=True, eq=False)
 class ToolMotion:
-    """Tool pose and its derivative with respect to the parameters; the batch index is last.
+    """Tool pose and its derivative with respect to the geometric parameters; the batch index is last.
 
     Attributes:
         position: position of the tool in the measuring frame [m].
@@ -50,9 +52,9 @@ class ToolMotion:
 
 
 def motion_order(rows: int) -> list[int]:
-    """Return the indices of the parameters in `ToolMotion.derivative`, which has all rotations before all translations.
+    """Return the index of every parameter in `ToolMotion.derivative`, where rotations precede translations.
 
-    The rotations are those about every third axis of `_walk_rows`, some of which belong to no parameter.
+    The rotation axes are every third vector of `_walk_rows`; some of them belong to no parameter.
 
     Returns:
         The index of theta, d, a, alpha, beta of every row, then of base and tool (x, y, z, roll, pitch, yaw each).
@@ -113,9 +115,9 @@ def tool_motion(
         robot: robot with the types and directions of the rows.
         dh: parameters of the rows.
         base: x, y, z [m], roll, pitch, yaw [rad] of the base; one for all poses, or one per measuring frame.
-        tool: the same for the tool; one for all poses, or one per target.
+        tool: x, y, z [m], roll, pitch, yaw [rad] of the tool; one for all poses, or one per target.
         q: joint values [rad or m].
-        turning: whether to compute the derivative of the rotation too.
+        turning: whether to compute also the derivative of the rotation.
         frame: index of the base for every pose, if there are several.
         target: index of the tool for every pose, if there are several.
     """
@@ -191,12 +193,12 @@ def _walk_rows(
 
 
 def _last(frames: Float[Tensor, "rows_and_2 7 3 poses"]) -> Float[Tensor, "4 3 poses"]:
-    """Return axes x, y, z and origin after the last row."""
+    """Return the axes x, y, z and the origin of the frame after the last row."""
     return torch.cat([frames[-1, 2:4], frames[-1, 6:], frames[-1, 5:6]])
 
 
 def _row_matrices(dh: Float64[np.ndarray, "rows 5"], like: Tensor) -> Float[Tensor, "rows 5 4"]:
-    """Return the matrix of every row from origin and z before it, and x and y rotated, to x, y, -x, origin, z after it.
+    """Return for every row the matrix from origin, z and rotated x, y before it to x, y, -x, origin, z after it.
 
     It is `Trans(a, 0, d) · RotX(alpha) · RotY(beta)`; the motion of a prismatic joint is added separately.
     """

@@ -12,10 +12,10 @@ import numpy as np
 from pisigma.files.errors import PoseError, check_choice
 
 AXES = ("x", "y", "z", "roll", "pitch", "yaw")
-"""Motions of the tool along and about its x, y and z axes."""
+"""Names of the motions of the tool along and about its x, y and z axes."""
 
 MAX_TILT = math.radians(10.0)
-"""Largest tilt of the tool of an arm with four joints, whose roll and pitch are free [rad]."""
+"""Largest tilt [rad] of the tool of an arm with four joints, whose roll and pitch are free up to this angle."""
 
 _FREE = {3: ("roll", "pitch", "yaw"), 4: ("roll", "pitch"), 5: ("yaw",)}
 
@@ -36,7 +36,7 @@ class TaskAxes:
         elbow_angle: elbow angle of an arm with seven revolute joints [rad], the arm angle of Kreutz-Delgado et al.
             1992: about the line from the shoulder (origin of the second joint's axis) to the wrist (that of the sixth),
             from the plane through this line and the direction of the first axis to the elbow (origin of the fourth
-            axis). None if it is free.
+            axis). None if the elbow angle is free.
     """
 
     tolerance: tuple[float, ...] = (0.0,) * 6
@@ -63,7 +63,7 @@ class TaskAxes:
         return any(value != 0 and not free for value, free in zip(self.tolerance, self.free, strict=True))
 
     def weights(self, joints: int) -> tuple[float, ...]:
-        """Return 1 for the axes that an arm can meet exactly, with tolerances too if it has enough joints, else 0."""
+        """Return 1 for every axis that an arm with this number of joints can meet exactly, otherwise 0."""
         exact = self.tolerance.count(0.0)
         enough = exact < joints
         return tuple(
@@ -73,7 +73,7 @@ class TaskAxes:
 
     @property
     def loose_weights(self) -> tuple[float, ...]:
-        """Inverse tolerances, scaled to 1 for the smallest one; weights of exact axes are then 1000 times as large."""
+        """Weights in least squares: relative inverse tolerances; exact axes have 1000 times the largest of them."""
         least = min((value for value in self.tolerance if value > 0), default=1.0)
         share = 1e-3 if 0.0 in self.tolerance else 1.0
         return tuple(
@@ -108,11 +108,11 @@ class TaskAxes:
 
 
 WHOLE = TaskAxes()
-"""Task in which all six axes have to be met exactly."""
+"""Task that requires all six axes to be met exactly."""
 
 
 def default_axes(joints: int) -> TaskAxes:
-    """Return the default task of an arm: all six axes for six or more joints.
+    """Return the default task of an arm with the given number of joints: all six axes for six or more.
 
     With five joints the rotation about the tool's z axis is free. With four joints roll and pitch are free up to
     `MAX_TILT`. With three joints the orientation is ignored.
@@ -157,7 +157,7 @@ def task_axes(
 
 
 def _three(what: str, stated: float | Sequence[float]) -> list[float]:
-    """Return a tolerance for each of three axes.
+    """Return the tolerances of three axes from one number or three.
 
     Raises:
         PoseError: the option `what` is neither one number >= 0 nor three.
@@ -166,5 +166,5 @@ def _three(what: str, stated: float | Sequence[float]) -> list[float]:
         values: list[float] = np.broadcast_to(np.asarray(stated, dtype=float), 3).tolist()
         if all(value >= 0 for value in values):
             return values
-    expected = "a number >= 0, or three, one for each axis"
+    expected = "one number >= 0, or three numbers, one for each axis"
     raise PoseError(f"expected {expected}, got {stated!r}", expected=expected, value=stated, option=what)

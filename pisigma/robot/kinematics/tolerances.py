@@ -4,11 +4,11 @@ POSE_TOLERANCE, POSE_TOLERANCE_SINGLE = 1e-6, 1e-4
 """Largest deviation of `R^T R` from the identity and of the last row from (0, 0, 0, 1), for float64 and float32."""
 
 MEASURED_ROUNDING = 1e-9
-"""Largest excess [rad] over the measured joint range that still is treated as measured: commanded values of measured
-poses equal those of the rows up to the residuals of their solution."""
+"""Largest excess [rad] over the measured joint range that is treated as measured: commanded values of measured poses
+equal the values of the rows up to the residuals of their solution."""
 
 LIMIT_TOLERANCE = 1e-9
-"""Largest excess [rad or m] over a joint limit that still is treated as inside; the value is not changed."""
+"""Largest excess [rad or m] over a joint limit that is treated as within the limits; the value is not changed."""
 
 SINGULAR_TOLERANCE = 1e-5
 """`singularity_measure` below which a solution is SINGULAR (in float32: 3e-3). The iteration gets within about 1e-6 rad
@@ -22,17 +22,18 @@ TILT_TOLERANCE = 1e-9
 """Largest tilt [rad] of the target tool axis from the joint axes of a SCARA that is treated as rounding."""
 
 TRIANGLE_MARGIN = 1e-9
-"""Relative distance of two links from stretched or folded, if a free joint moves to make them reach."""
+"""Relative distance of two links from the stretched or folded arm, if a free joint moves so that they reach a point."""
 
 TOLERANCE, HYBRID_TOLERANCE = 1e-13, 1e-12
-"""Residuals [m and rad] at which the iteration of an arm has converged, without and with a joint correction, which adds
-rounding errors."""
+"""Residuals [m and rad] at which the iteration of an arm has converged, without a joint correction and with one,
+which adds rounding errors."""
 
 ACCEPTED = 1e-11
 """Residuals [m and rad] that are accepted if rounding stops the iteration earlier."""
 
 INITIAL_DAMPING, MIN_DAMPING, MAX_DAMPING = 0.1, 1e-6, 1e12
-"""Damping factor of the squared error: initial value, smallest value, and value at which an iteration is abandoned."""
+"""Factor of the squared error in the damping: initial value, smallest value, and value at which an iteration is
+abandoned."""
 
 DAMPING_DOWN, DAMPING_UP = 0.2, 8.0
 """Change of the damping factor after a step that decreases the error, and after one that does not."""
@@ -59,13 +60,14 @@ BRANCH_MISS = 0.05
 may still reach a pose; its parameter errors are far smaller."""
 
 ATTEMPTS, MORE_ATTEMPTS = 4, 128
-"""Number of stored starts that are tried for a pose, nearest first; the second for arms without a closed form."""
+"""Numbers of stored starts that are tried for a pose, nearest first, for arms with a closed form and for other arms."""
 
 FAR_AWAY = 0.1
 """Distance [rad or m] from the reference joint values above which a solution may not be the intended one."""
 
 MAX_CORRECTION = 1.0
-"""Upper bound of joint corrections [rad or m]: branches that are farther away need not be corrected to be compared."""
+"""Upper bound of joint corrections [rad or m]: the nearest branch is found without correcting branches that are
+farther away."""
 
 FORWARD_ITERATIONS, FORWARD_TOLERANCE, FORWARD_ACCEPTED = 100, 1e-12, 1e-9
 """Largest number of fixed-point iterations from corrected to nominal joint values, change [rad or m] at which they have
@@ -75,4 +77,4 @@ MAX_STEPS, MAX_STEP = 40, 0.3
 """Largest number and size [rad or m] of the steps of redundant joints towards their preferred values."""
 
 STEP_TOLERANCE = 1e-9
-"""Size of such a step [rad or m] below which it is the last one."""
+"""Size of a step of redundant joints [rad or m] below which the iteration ends."""

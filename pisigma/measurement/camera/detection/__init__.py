@@ -1,1 +1,1 @@
-"""Corners of printed boards in images, by OpenCV (the extra `camera`)."""
+"""Detect corners of printed boards in images with OpenCV (the extra `camera`)."""

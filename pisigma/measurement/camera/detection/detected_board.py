@@ -1,4 +1,4 @@
-"""Corners of a board in an image, refined to sub-pixel accuracy as saddles of gray values, and the blur of edges."""
+"""Refine corners of a board in an image to sub-pixel accuracy, as saddles of gray values, and measure the blur."""
 
 from dataclasses import dataclass
 
@@ -12,33 +12,36 @@ from pisigma.measurement.camera.board import Board
 from pisigma.measurement.camera.board_pose import MIN_CORNERS
 
 Image = UInt8[np.ndarray, "height width"]
-"""Gray values; the centre of the first pixel is at u = v = 0."""
+"""Gray values of an image; the centre of the first pixel is at u = v = 0."""
 ALONG = np.linspace(0.2, 0.8, 9)
-"""Positions of the crossings of an edge relative to its length, away from other edges."""
+"""Positions along an edge, relative to its length, at which it is sampled, away from other edges."""
 ACROSS = np.linspace(-1.0, 1.0, 41)
-"""Positions of the samples on both sides of an edge, relative to half the sampled width."""
+"""Positions of the samples across an edge, relative to half the sampled width."""
 FOLLOWED = 0.7
-"""Half the sampled width relative to the clearance of an edge: the print beyond it is blurred, too."""
+"""Half the sampled width relative to the clearance of an edge; it is < 1 because neighbouring edges are blurred,
+too."""
 ENDS = 0.7
-"""Relative position beyond which the samples are fully black or white."""
+"""Relative position across an edge beyond which the samples are fully black or white."""
 SMOOTHING = 1.5
-"""[px] Standard deviation of the smoothing before gradients, less in small windows; best on rendered images."""
+"""Standard deviation [px] of the smoothing before gradients are computed, less in small windows; the best value on
+rendered images."""
 WINDOW = 0.8
-"""Half of the side of the window around a corner, relative to the clearance."""
+"""Half the side of the window around a corner, relative to the clearance."""
 MIN_SQUARE = 16.0
-"""[px²] Smallest area of a square in the image that contains a window."""
+"""Smallest area of a square in the image whose corners are refined [px²]."""
 _STOP = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 100, 1e-4)
 MAX_HALF_WINDOW = 16
-"""[px] Half of the side of a window: lines distorted by a lens are straight in it to some thousandths of a pixel."""
+"""Largest half side of a window [px], within which lines distorted by a lens are straight to some thousandths of a
+pixel."""
 ITERATIONS = 4
 DAMPING = 1e-9
 """Damping of the normal matrices, whose diagonals are scaled to 1, for windows without contrast."""
 LOG_BLURS = np.log((0.2, 6.0))
 """Logarithms of the smallest and largest blur [px] of a fit."""
 MAX_SHIFT = 0.5
-"""[px] Shift of a corner above which a fit is discarded, because it has fitted something else."""
+"""Shift of a corner [px] above which a fit is discarded, because it has fitted another structure."""
 INITIAL_BLUR = 1.0
-"""[px] Initial standard deviation of the blur in a fit."""
+"""Initial standard deviation of the blur in a fit [px]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,8 +62,8 @@ class NoBoard:
     """An image without usable corners.
 
     Attributes:
-        reason: why, as a clause, such as "no board is found in it".
-        piece: number of rows and columns of corners that were found; None if none were.
+        reason: the reason as a clause, such as "no board is found in it".
+        piece: numbers of rows and columns of the corners that were found; None if no corners were found.
         is_mirrored: whether the image is mirrored.
     """
 
@@ -70,7 +73,7 @@ class NoBoard:
 
 
 def edge_pixels(detected: DetectedBoard, board: Board) -> Float64[np.ndarray, "edges 2 2"]:
-    """Return the pixels of both ends of the board's edges between detected corners [px]."""
+    """Return the pixels of both ends of all edges of the board between detected corners [px]."""
     pixels = np.full((len(board.corners), 2), np.nan)
     pixels[detected.corners] = detected.pixels
     ends = pixels[board.edges]
@@ -79,7 +82,7 @@ def edge_pixels(detected: DetectedBoard, board: Board) -> Float64[np.ndarray, "e
 
 
 def refine_corners(image: Image, detected: DetectedBoard, board: Board) -> DetectedBoard:
-    """Refine corners of squares to sub-pixel accuracy.
+    """Return corners of squares refined to sub-pixel accuracy.
 
     Corners are first moved to the point to which the gradients around them are perpendicular (Förstner & Gülch 1987).
     The window around each is as large as possible without other edges in it; corners whose window leaves the image are
@@ -111,7 +114,7 @@ def refine_corners(image: Image, detected: DetectedBoard, board: Board) -> Detec
 def _axes_of_squares(
     grid: Float64[np.ndarray, "corners 2"], pixels: Float64[np.ndarray, "corners 2"]
 ) -> Float64[np.ndarray, "corners 2 2"] | None:
-    """Return the change of pixels per step along rows and columns of squares; None without a homography."""
+    """Return the change of pixels per step along rows and columns of squares; None if there is no homography."""
     H = cv2.findHomography(grid, pixels)[0] if len(grid) > MIN_CORNERS and np.ptp(grid, 0).all() else None
     if H is None:
         return None
@@ -126,7 +129,7 @@ class EdgeProfiles:
 
     Attributes:
         at: crossing points on every edge [px].
-        across: normals of the edges, of half the sampled width [px].
+        across: normal vectors of the edges, with half the sampled width as length [px].
         profile: gray values along the crossings, from 0 at the start to 1 at the end; NaN without contrast.
     """
 
@@ -170,7 +173,7 @@ class EdgeProfiles:
 
     @property
     def edge_positions(self) -> Float64[np.ndarray, "edges crossings 2"]:
-        """Positions of the edge on every crossing [px], with half of the blurred area on either side.
+        """Position of the edge on every crossing [px], with equal blurred areas on both sides.
 
         Edges without contrast keep their position.
         """
@@ -197,7 +200,7 @@ def fit_saddles(
         gray: gray values of the image.
         pixels: corners, accurate to half a pixel [px].
         axes: derivative of pixels with respect to steps along rows and columns of squares, one in each column [px].
-        share: distance up to which nothing else is printed, relative to a square.
+        share: distance from a corner within which no other edge is printed, relative to a square.
 
     Returns:
         The corners; those that a fit would move by more than `MAX_SHIFT` are not changed.
@@ -229,7 +232,7 @@ def _windows(
     axes: Float64[np.ndarray, "corners 2 2"],
     share: float,
 ) -> tuple[Int64[np.ndarray, "corners window 2"], Float64[np.ndarray, "corners window"]]:
-    """Return the pixels around every corner, and weights: 1 within the squares of the corner, else 0."""
+    """Return the pixels around every corner, and their weights: 1 within the squares of the corner, otherwise 0."""
     side = np.arange(-MAX_HALF_WINDOW, MAX_HALF_WINDOW + 1)
     offsets = np.stack(np.meshgrid(side, side), -1).reshape(-1, 2)
     x = np.rint(pixels)[:, None].astype(int) + offsets

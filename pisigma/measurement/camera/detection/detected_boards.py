@@ -1,4 +1,4 @@
-"""The boards in several images, and the residuals of their corners."""
+"""Boards in several images, and the residuals of their corners."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -18,12 +18,12 @@ from pisigma.measurement.camera.image_rows import MAX_MEDIAN_RESIDUAL
 
 @dataclass(frozen=True, eq=False)
 class BoardImage:
-    """The image of a file, and the board in it.
+    """An image file, and the board in the image.
 
     Attributes:
         file: the image file.
         size: width and height of the image [px]; 0 if the file cannot be read.
-        board: the usable corners, or why there are none.
+        board: the usable corners, or the reason why the image has none.
         blur: standard deviation of the blur of the board's edges [px]; NaN if no board was found.
     """
 
@@ -45,11 +45,11 @@ class BoardImage:
 
 @dataclass(frozen=True, eq=False)
 class DetectedBoards:
-    """Boards in images, and their corners as predicted by their poses.
+    """Boards in images, with the corners that the solved poses predict.
 
     Attributes:
         images: all images, in the order of the files.
-        predicted: predicted pixels of the corners of every image with a board, by its name [px].
+        predicted: predicted pixels [px] of the corners of every image with a board, by image name.
     """
 
     images: tuple[BoardImage, ...]
@@ -57,28 +57,28 @@ class DetectedBoards:
 
     @property
     def boards(self) -> dict[str, DetectedBoard]:
-        """The usable boards, by names of the images."""
+        """Usable boards by image name."""
         return {one.name: one.board for one in self.images if isinstance(one.board, DetectedBoard)}
 
     @property
     def left_out(self) -> dict[str, str]:
-        """Why images have no usable board, by names of the images."""
+        """Reasons why images have no usable board, by image name."""
         return {one.name: one.board.reason for one in self.images if isinstance(one.board, NoBoard)}
 
     @property
     def residuals(self) -> dict[str, Float64[np.ndarray, "_corners 2"]]:
-        """Detected minus predicted pixels, by names of the images [px]."""
+        """Detected minus predicted pixels [px] by image name."""
         return {name: board.pixels - self.predicted[name] for name, board in self.boards.items()}
 
     @property
     def rms(self) -> float:
-        """Root mean square of u and v of the residuals [px]; NaN without corners."""
+        """Root mean square of the u and v components of all residuals [px]; NaN without corners."""
         residuals = list(self.residuals.values())
         return rms_of(np.concatenate(residuals)) if residuals else np.nan
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """Sentences about the used and the left-out images; requires a usable board."""
+        """Sentences about used images and images that were left out; at least one board must be usable."""
         boards = self.boards
         count = sum(len(board.corners) for board in boards.values())
         used = [one for one in self.images if one.name in boards]
@@ -92,7 +92,7 @@ class DetectedBoards:
         )
 
     def to_json(self) -> dict[str, object]:
-        """Return figures of the images as plain values for JSON."""
+        """Return residuals, blur and reasons of all images as plain values for JSON."""
         residuals, left_out = self.residuals, self.left_out
         return {
             "rms_px": self.rms,
@@ -111,12 +111,12 @@ class DetectedBoards:
 
 
 def rms_of(residual: Float64[np.ndarray, "*corners 2"]) -> float:
-    """Return the root mean square of u and v [px]."""
+    """Return the root mean square of the u and v components of residuals [px]."""
     return float(np.sqrt(np.square(residual).mean()))
 
 
 def predict_boards(images: Sequence[BoardImage], camera: Camera, board: Board) -> DetectedBoards:
-    """Predict corners by the pose of the board in every image; images that no pose explains lose their corners.
+    """Predict corners from the pose of the board in every image; images that no pose explains lose their corners.
 
     Raises:
         MeasurementError: the size of an image differs from that of the camera's images.

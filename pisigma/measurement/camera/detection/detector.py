@@ -1,4 +1,4 @@
-"""Detection of boards of all kinds in image files."""
+"""Detect boards of all kinds in image files."""
 
 import os
 from collections.abc import Callable, Sequence
@@ -24,7 +24,7 @@ from pisigma.measurement.camera.detection.detected_boards import BoardImage
 from pisigma.measurement.camera.detection.markers import detect_apriltags, detect_charuco
 
 MIN_PIECE = 3
-"""Number of rows and columns of corners from which a piece of a board is recognised."""
+"""Smallest number of rows and columns of corners of a piece of a board that is recognised."""
 
 
 def detect_checkerboard(image: Image, board: Board) -> DetectedBoard | NoBoard:
@@ -34,7 +34,7 @@ def detect_checkerboard(image: Image, board: Board) -> DetectedBoard | NoBoard:
     accurate as the search at twice the resolution, and four times as fast.
 
     Returns:
-        The corners; those of a symmetric board are numbered from the one nearest to the upper left of the image.
+        The corners; on a symmetric board the numbering starts at the corner nearest to the upper left of the image.
     """
     there, corners = cv2.findChessboardCornersSB(image, (board.columns, board.rows))
     if not there:
@@ -79,14 +79,14 @@ DETECTORS: dict[BoardKind, Callable[[Image, Board], DetectedBoard | NoBoard]] = 
     "apriltag": detect_apriltags,
 }
 ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".webp")
-"""Extensions of image files in a folder."""
+"""File name extensions of the images in a folder that are read."""
 
 
 def image_files(paths: Sequence[str | os.PathLike[str]]) -> tuple[Path, ...]:
-    """Return image files; those of a folder sorted by name.
+    """Return all image files in the given files and folders; the files of a folder are sorted by name.
 
     Raises:
-        MeasurementError: there are none, or two have the same name.
+        MeasurementError: there are no images, or two images have the same name.
     """
     files = list[Path]()
     for path in map(Path, paths):
@@ -116,7 +116,7 @@ def detect_boards(
     max_blur: float = 3.0,
     progress: Callable[[str], None] = lambda name: None,
 ) -> list[BoardImage]:
-    """Find the corners of a board in image files; see `detect_board`.
+    """Find the corners of a board in several image files; see `detect_board`.
 
     Raises:
         MeasurementError: no image can be used.
@@ -126,7 +126,7 @@ def detect_boards(
         progress(file.name)
         try:
             images.append(detect_board(file, board, max_blur))
-        except MeasurementError as problem:  # one damaged file does not stop the others
+        except MeasurementError as problem:  # a damaged file must not stop the detection in the others
             reason = str(problem).replace(f" ({file})", "").rstrip(".")
             images.append(BoardImage(file, (0, 0), NoBoard(reason), np.nan))
     reasons = [f"{one.name}: {one.board.reason}" for one in images if isinstance(one.board, NoBoard)]
@@ -145,7 +145,7 @@ def detect_board(path: Path, board: Board, max_blur: float) -> BoardImage:
     Args:
         path: the file.
         board: the board to find.
-        max_blur: largest standard deviation of the blur of its edges [px].
+        max_blur: largest standard deviation of the blur of the board's edges [px].
 
     Raises:
         MeasurementError: the file cannot be read or is not an image.
@@ -168,17 +168,17 @@ def detect_board(path: Path, board: Board, max_blur: float) -> BoardImage:
 
 
 def read_image(path: str | os.PathLike[str]) -> Image:
-    """Read the gray values of an image file in any format of OpenCV.
+    """Return the gray values of an image file in any format that OpenCV reads.
 
     The orientation in its metadata is ignored, because the intrinsics are those of the sensor.
 
     Raises:
-        MeasurementError: it cannot be read or is not an image.
+        MeasurementError: the file cannot be read or is not an image.
     """
     content = np.frombuffer(read_input(path, MeasurementError), dtype=np.uint8)
     try:
         image = cv2.imdecode(content, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
-    except cv2.error:  # it is empty, or its header states more pixels than memory can hold
+    except cv2.error:  # the file is empty, or its header states more pixels than memory can hold
         image = None
     if _is_truncated(content.tobytes()):
         raise MeasurementError("the image is truncated", at=Place(path), remedy="copy the file again")
@@ -190,7 +190,7 @@ def read_image(path: str | os.PathLike[str]) -> Image:
 
 
 def _is_truncated(content: bytes) -> bool:
-    """Return whether the end of a PNG, JPEG or BMP file is missing; OpenCV would return the part that is there."""
+    """Return whether the end of a PNG, JPEG or BMP file is missing; OpenCV would return an incomplete image."""
     if content.startswith(b"\x89PNG"):
         return b"IEND" not in content[-4096:]
     if content.startswith(b"\xff\xd8"):

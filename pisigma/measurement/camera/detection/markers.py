@@ -15,7 +15,7 @@ from pisigma.measurement.camera.detection.detected_board import (
 )
 
 ITERATIONS = 2
-"""Number of searches of the sides of tags: before the first one, they may be off by a pixel."""
+"""Number of searches for the sides of tags; the sides that OpenCV returns may be off by a pixel."""
 
 
 def detect_charuco(image: Image, board: Board) -> DetectedBoard | NoBoard:
@@ -49,7 +49,7 @@ def detect_apriltags(image: Image, board: Board) -> DetectedBoard | NoBoard:
 def _crossings(
     image: Image, tags: Float64[np.ndarray, "tags 4 2"], clearance: float
 ) -> Float64[np.ndarray, "tags 4 2"]:
-    """Return corners of tags as intersections of the lines fitted to their sides, the first one after the last side."""
+    """Return corners of tags as intersections of the lines fitted to their sides."""
     ends = np.stack([tags, np.roll(tags, -1, 1)], 2).reshape(-1, 2, 2)
     points = EdgeProfiles.from_image(image, ends, clearance).edge_positions
     middle = points.mean(1)
@@ -63,10 +63,10 @@ def _crossings(
 
 
 def dictionary_of(board: Board) -> cv2.aruco.Dictionary:
-    """Return the dictionary of a board's markers, of which it has the first ones.
+    """Return the dictionary of a board's markers; the board has the first markers of the dictionary.
 
     Raises:
-        MeasurementError: the board has more markers than the dictionary.
+        MeasurementError: the board has more markers than the dictionary contains.
     """
     is_grid = board.kind == "apriltag"
     name = f"APRILTAG_{board.dictionary.removeprefix('tag')}" if is_grid else board.dictionary.upper()

@@ -1,7 +1,7 @@
-"""Convert rows to the twists of a textbook robot, so that one set of formulas also covers its mirror images.
+"""Convert rows to the twists of a textbook robot, so that one set of formulas also covers mirrored robots.
 
-`RotX(pi) · RotZ(t) · Trans(a, 0, d) = RotZ(-t) · Trans(a, 0, -d) · RotX(pi)`: a twist that differs by 180 deg
-from the textbook's changes the sign of t and d in all later rows; the remaining RotX becomes part of the tool.
+`RotX(pi) · RotZ(t) · Trans(a, 0, d) = RotZ(-t) · Trans(a, 0, -d) · RotX(pi)`: a twist that differs from the
+textbook's by 180 deg changes the sign of t and d in all later rows; the remaining RotX becomes part of the tool.
 """
 
 import math
@@ -34,8 +34,8 @@ class CanonicalRows:
 
     Attributes:
         T_base_first: frame before the first joint; base and leading fixed rows.
-        T_last_tool: tool in the last joint's frame after its rotation: remainder of its row, trailing fixed rows and
-            tool.
+        T_last_tool: tool in the last joint's frame after its rotation: the remainder of the row, trailing fixed rows
+            and tool.
         sign: +1 or -1 for every joint.
         direction: +1 or -1 for every joint, the sign of the controller's values.
         offset: theta [rad] of a revolute and d [m] of a prismatic row.

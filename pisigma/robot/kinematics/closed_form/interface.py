@@ -1,4 +1,4 @@
-"""Interface of closed forms, which return all branches of a pose with a status each."""
+"""Interface of closed forms, which return the joint values and the status of all branches for a pose."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
@@ -22,7 +22,7 @@ Own = TypeVar("Own", bound="AbstractClosedForm")
 
 @dataclass(frozen=True, eq=False)
 class InverseSolutions:
-    """All solutions of all poses.
+    """Joint values of all branches for every pose, with a status each.
 
     Attributes:
         q: joint values [rad or m]; revolute ones in (-pi, pi], or shifted by a full turn if only that is within the
@@ -44,16 +44,17 @@ class AbstractClosedForm(ABC):
         branches: names of the branches in order: the combinations of choices between two solutions (forks), with the
             last fork varying fastest.
         robot: the robot.
-        rows: its rows with canonical twists.
+        rows: rows of the robot with canonical twists.
         margin: distance that cosines keep from 1: 0, except for `start_values`.
         name: name of the form in model files.
-        compiled: the same formulas as a plain function that the kernels compile; None if there is none. It is called as
-            `compiled(form, P, only, rounding, q)` with `kernels.arrays.ClosedForm`, the pose `(4, 4)` (of which
-            `_solve_components` gets the first three rows), the index of the only requested branch or -1 for all, and
-            the relative size of rounding errors. It writes the canonical joint variables of branches that reach the
-            pose into `q`, `(branches, dof)`, whose first column is NaN before; with -2 also those of branches that do
-            not reach it, as near to it as possible (see `start_values`). It and its functions may use numbers,
-            entries of arrays and functions of `math` only; each is decorated by `typing.no_type_check`.
+        compiled: the formulas as a plain function that the kernels compile; None if there is no such function. It is
+            called as `compiled(form, P, only, rounding, q)` with `kernels.arrays.ClosedForm`, the pose `(4, 4)` (of
+            which `_solve_components` gets the first three rows), the index of the only requested branch or -1 for
+            all, and the relative size of rounding errors. It writes the canonical joint variables of branches that
+            reach the pose into `q`, `(branches, dof)`, whose first column is NaN before; with -2 also the variables
+            of branches that do not reach it, as near to it as possible (see `start_values`). The function and those
+            that it calls may use numbers, entries of arrays and functions of `math` only; each is decorated by
+            `typing.no_type_check`.
     """
 
     name: ClassVar[str]
@@ -114,10 +115,10 @@ class AbstractClosedForm(ABC):
         return tuple(self.branches[i] for i in order if counts[i] > 0)
 
     def start_values(self, T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch branches dof"]:
-        """Return joint values of all branches; those that do not reach a pose are nearest to it, stretched or folded.
+        """Return joint values of all branches; where a branch does not reach a pose, the arm is stretched or folded.
 
-        They are starts for an arm that differs slightly from this one and may reach the pose. A small margin keeps them
-        away from the singular joint values, which an iteration cannot leave.
+        They serve as starts for an arm that differs slightly from this one and may reach the pose. A small margin
+        keeps them away from singular joint values, which an iteration cannot leave.
 
         Args:
             T: T_base_tool [m].
@@ -125,9 +126,10 @@ class AbstractClosedForm(ABC):
         return replace(self, margin=NEAREST_MARGIN)._solve_branches(T)[0]
 
     def upright_poses(self, T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:
-        """Return poses that a SCARA can reach if its tool may tilt.
+        """Return the poses that a SCARA can reach if its tool may tilt.
 
-        They are rotated about the tool's origin until the last joint's axis is parallel to the first's.
+        Each pose is rotated about the tool's origin until the axis of the last joint is parallel to the axis of the
+        first.
         """
         axis = T[..., :3, :3] @ invert(self.rows.T_last_tool.to(T))[:3, 2]
         first = self.rows.T_base_first.to(T)[:3, 2].expand(axis.shape)
@@ -169,6 +171,6 @@ class AbstractClosedForm(ABC):
     def _wrapped(
         self, q: Float[Tensor, "*batch dof"]
     ) -> tuple[Float[Tensor, "*batch dof"], Bool[Tensor, "*batch"]]:
-        """Wrap joint values to the turn nearest to 0, or to another one if only that is within the limits."""
+        """Wrap joint values to the turn nearest to 0, or to another turn if only that one is within the limits."""
         revolute = torch.tensor(self.robot.revolute, device=q.device)
         return wrap_into_limits(self.robot, torch.where(revolute, wrap_to_pi(q), q))

@@ -19,7 +19,7 @@ from pisigma.robot.kinematics.tolerances import NEAREST_MARGIN, TILT_TOLERANCE
 
 @no_type_check
 def scara_branches(form: Any, P: Any, only: int, rounding: float, q: Any) -> None:
-    """Compute both branches; see `AbstractClosedForm.compiled`."""
+    """Compute both branches of a SCARA; see `AbstractClosedForm.compiled`."""
     nearest = only < -1
     margin = NEAREST_MARGIN if nearest else 0.0
     # Four joints cannot tilt the tool: its axis must be parallel to axis 1 and point the same way.

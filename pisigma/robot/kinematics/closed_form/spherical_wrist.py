@@ -58,7 +58,7 @@ def _spherical_joints(form: Any, P: Any, t: Any, only: int, branch: int, roundin
 
 @no_type_check
 def spherical_wrist_branches(form: Any, P: Any, only: int, rounding: float, q: Any) -> None:
-    """Compute all eight branches; see `AbstractClosedForm.compiled`."""
+    """Compute all eight branches of an arm with a spherical wrist; see `AbstractClosedForm.compiled`."""
     a, d, nearest = form.a, form.d, only < -1
     margin = NEAREST_MARGIN if nearest else 0.0
     # The second link is the diagonal from axis 3 to the wrist centre, at (a_3, d_4) in the axes of row 3.
@@ -75,11 +75,11 @@ def spherical_wrist_branches(form: Any, P: Any, only: int, rounding: float, q: A
         shoulder, elbow = 1.0 - 2 * (pair // 2), 1.0 - 2 * (pair % 2)
         ahead = shoulder * far
         t_1 = azimuth - math.atan2(side, ahead)
-        # On axis 1 atan2 of two rounding errors is arbitrary: back is half a turn from the azimuth.
+        # On axis 1, atan2 of two rounding errors is arbitrary; the back branch is half a turn from the azimuth.
         if shoulder < 0 and on_axis:
             t_1 = azimuth - math.pi
-        # The twist of -90 deg turns y of the plane downwards: a positive elbow angle puts the elbow above the line.
-        # Reaching backwards and a negative first link each reverse that.
+        # Because of the twist of -90 deg, y of the plane points downwards: a positive elbow angle puts the elbow
+        # above the line. The back branch and a negative first link each reverse this.
         upwards = shoulder * elbow * math.copysign(1.0, a[1])
         zero = form.sign[1] * form.offset[1]
         t_2, bend, reached = two_link(

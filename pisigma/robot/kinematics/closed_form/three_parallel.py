@@ -33,14 +33,14 @@ _TWISTS = (_RIGHT, 0.0, 0.0, _RIGHT, -_RIGHT)
 def _plane_joints(
     form: Any, P: Any, t: Any, x: float, upwards: float, free: bool, margin: float, rounding: float, q: Any
 ) -> None:
-    """Solve joints 2 to 4 for t = joints 1, 5, 6: two links that carry axis 4; a straight wrist may rotate for them."""
+    """Solve joints 2 to 4 for t = joints 1, 5, 6: two links that carry axis 4; a straight wrist may help them."""
     t_1, t_5, t_6 = t
     a, y, zero = form.a, P[2, 3] - form.d[0], form.sign[1] * form.offset[1]
     along, across, b = a[3], -form.d[4], abs(a[2])
-    # A straight wrist leaves joint 6 free: if axis 4 is out of reach, it turns until axis 4 just is within reach.
+    # A straight wrist leaves joint 6 free: if axis 4 is out of reach, joint 6 turns until axis 4 is just within reach.
     for attempt in range(2):
         s_6, c_6 = math.sin(t_6), math.cos(t_6)
-        # Axis 5 in the wanted pose, turned back by joint 6, is (s_234, -c_234) in the plane of joints 2 to 4.
+        # Axis 5 in the target pose, rotated back by joint 6, is (s_234, -c_234) in the plane of joints 2 to 4.
         u, v = -s_6 * P[0, 0] - c_6 * P[0, 1], -s_6 * P[1, 0] - c_6 * P[1, 1]
         t_234 = math.atan2(math.cos(t_1) * u + math.sin(t_1) * v, s_6 * P[2, 0] + c_6 * P[2, 1])
         c, s = math.cos(t_234), math.sin(t_234)
@@ -65,7 +65,7 @@ def _plane_joints(
         square = far * far + hand * hand - 2 * far * hand * math.cos(turn)
         square = min(max(square, nearest * nearest), farthest * farthest)
         cosine = (far * far + hand * hand - square) / (2 * (far if far > 0 else 1.0) * hand)
-        # Axis 4 stays on its side of the line from axis 2 to the wrist: of both solutions this turns less.
+        # Axis 4 remains on its side of the line from axis 2 to the wrist, which is the smaller of both rotations.
         change = math.copysign(math.acos(min(max(cosine, -1.0), 1.0)), math.sin(turn)) - turn
         # The pose fixes t_234 + t_6 if axis 6 is parallel to axis 4 (t_5 = 0), and t_234 - t_6 if it is opposite (pi).
         t_6 -= math.copysign(1.0, math.cos(t_5)) * change
@@ -73,7 +73,7 @@ def _plane_joints(
 
 @no_type_check
 def three_parallel_branches(form: Any, P: Any, only: int, rounding: float, q: Any) -> None:
-    """Compute all eight branches; see `AbstractClosedForm.compiled`."""
+    """Compute all eight branches of an arm with three parallel axes; see `AbstractClosedForm.compiled`."""
     a, d, margin = form.a, form.d, NEAREST_MARGIN if only < -1 else 0.0
     side = d[1] + d[2] + d[3]
     scale = abs(a[0]) + abs(a[1]) + abs(a[2]) + math.hypot(a[3], d[4]) + abs(side)
@@ -87,11 +87,11 @@ def three_parallel_branches(form: Any, P: Any, only: int, rounding: float, q: An
             continue
         ahead = far * (1.0 - 2 * shoulder)
         t_1 = azimuth + math.atan2(side, ahead)
-        # On axis 1 atan2 of two rounding errors is arbitrary: back is half a turn from the azimuth.
+        # On axis 1, atan2 of two rounding errors is arbitrary; the back branch is half a turn from the azimuth.
         if shoulder == 1 and on_axis:
             t_1 = azimuth + math.pi
         s_1, c_1 = math.sin(t_1), math.cos(t_1)
-        # Axis 2, the normal of the plane, in the wanted frame: (s_5 c_6, -s_5 s_6, c_5) determines joints 5 and 6.
+        # Axis 2, the normal of the plane, in the target frame: (s_5 c_6, -s_5 s_6, c_5) determines joints 5 and 6.
         u, v, w = s_1 * P[0, 0] - c_1 * P[1, 0], s_1 * P[0, 1] - c_1 * P[1, 1], s_1 * P[0, 2] - c_1 * P[1, 2]
         sine = math.hypot(u, v)
         for wrist in range(2):
@@ -105,7 +105,7 @@ def three_parallel_branches(form: Any, P: Any, only: int, rounding: float, q: An
                 branch = 4 * shoulder + 2 * elbow + wrist
                 if only < 0 or only == branch:
                     # y of the plane points up: a positive elbow angle puts the elbow below the line outwards.
-                    # Reaching backwards and a negative first link each reverse that.
+                    # The back branch and a negative first link each reverse this.
                     upwards = -(1.0 - 2 * shoulder) * (1.0 - 2 * elbow) * math.copysign(1.0, a[1])
                     ahead_of_2, out = ahead - a[0], q[branch]
                     _plane_joints(form, P, (t_1, t_5, t_6), ahead_of_2, upwards, free, margin, rounding, out)
@@ -148,7 +148,7 @@ class ThreeParallelArm(AbstractClosedForm):
 
     @property
     def _scale(self) -> float:
-        """Length of the arm [m], the unit of rounding errors."""
+        """Length of the arm [m], to which rounding errors are relative."""
         a, d = self.rows.a, self.rows.d
         return abs(a[0]) + abs(a[1]) + abs(a[2]) + math.hypot(a[3], d[4]) + abs(d[1] + d[2] + d[3])
 

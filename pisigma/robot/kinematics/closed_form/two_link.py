@@ -19,8 +19,8 @@ ARM_BRANCHES = tuple(
 """Branch names `shoulder/elbow/wrist` of arms with six joints."""
 
 SINGULAR_TOLERANCE = 1e-6
-"""A solution is SINGULAR if the sine of its elbow angle or of its wrist angle, or the distance of the wrist centre from
-axis 1 divided by the arm's reach, is smaller (in float32: 1.2e-5)."""
+"""A solution is SINGULAR if the sine of its elbow angle, the sine of its wrist angle, or the distance of the wrist
+centre from axis 1 divided by the arm's reach is smaller than this (in float32: 1.2e-5)."""
 
 
 def singular_tolerance(dtype: torch.dtype) -> float:
@@ -59,7 +59,7 @@ def solve_first_joint(
         x: x of the point [m].
         y: y of the point [m].
         side: distance of the point to the left of the arm's plane [m].
-        scale: length of the arm [m], the unit of rounding errors.
+        scale: length of the arm [m], to which rounding errors are relative.
         shoulder: +1 for a point ahead of axis 1, -1 for one behind it; broadcasts.
         free: azimuth [rad] to use for a point on axis 1, for which it is arbitrary.
         margin: smallest square of the distance ahead of axis 1, as a share of the squared scale.
@@ -73,7 +73,8 @@ def solve_first_joint(
     on_axis = torch.hypot(x, y) <= rounding(x.dtype) * scale
     azimuth = torch.where(on_axis, free, torch.atan2(y, x))
     angle = azimuth - torch.atan2(torch.full_like(ahead, side), ahead)
-    # On axis 1 ahead is 0 or -0, and atan2 of two rounding errors arbitrary: back is half a turn from the azimuth.
+    # On axis 1 `ahead` is 0 or -0, and atan2 of two rounding errors is arbitrary; the back branch is half a turn
+    # from the azimuth.
     back = azimuth - math.copysign(math.pi, side)
     return torch.where(on_axis & ahead.signbit(), back, angle), ahead, reached
 
@@ -93,13 +94,13 @@ def solve_two_link(
         margin: distance that the cosine of the elbow angle keeps from 1.
 
     Returns:
-        The angles; for a point out of reach they are those of the nearest arm and `reached` is False.
-        A cosine beyond 1 by rounding is treated as 1.
+        The angles. For a point out of reach the arm is as near to it as possible and `reached` is False. A cosine
+        that exceeds 1 by rounding is treated as 1.
     """
     cosine = (x * x + y * y - (a * a + b * b)) / (2 * a * b)
     reached = cosine.abs() <= 1 + rounding(x.dtype)
     cosine = cosine.clamp(margin - 1, 1 - margin)
-    # (1 - c)(1 + c) keeps its digits near a stretched arm, where 1 - c² cancels.
+    # (1 - c)(1 + c) is accurate near a stretched arm, where 1 - c² suffers from cancellation.
     sine = elbow_sign * ((1 - cosine) * (1 + cosine)).sqrt()
     on_axis = torch.hypot(x, y) <= rounding(x.dtype) * (abs(a) + b)
     # Angle from the first link to the line to the point.
@@ -112,15 +113,15 @@ def solve_two_link(
 def two_link(
     x: float, y: float, a: float, b: float, elbow_sign: float, free: float, rounding: float, margin: float
 ) -> tuple[float, float, bool]:
-    """Like `solve_two_link` on plain numbers: return the angles [rad], and whether the point is within reach."""
+    """Return the angles of `solve_two_link` [rad] on plain numbers, and whether the point is within reach."""
     cosine = (x * x + y * y - (a * a + b * b)) / (2 * a * b)
     reached = abs(cosine) <= 1 + rounding
     cosine = min(max(cosine, margin - 1), 1 - margin)
-    # (1 - c)(1 + c) keeps its digits near a stretched arm, where 1 - c² cancels.
+    # (1 - c)(1 + c) is accurate near a stretched arm, where 1 - c² suffers from cancellation.
     sine = elbow_sign * math.sqrt((1 - cosine) * (1 + cosine))
     first = free
     if math.sqrt(x * x + y * y) > rounding * (abs(a) + b):
-        # The second angle is that from the first link to the line to the point.
+        # The second term is the angle from the first link to the line to the point.
         first = math.atan2(y, x) - math.atan2(b * sine, a + b * cosine)
     return first, math.atan2(sine, cosine), reached
 
@@ -129,7 +130,7 @@ def two_link(
 def first_joint(
     P: Any, side: float, scale: float, zero: float, rounding: float, margin: float
 ) -> tuple[float, float, bool, bool]:
-    """Locate a point relative to axis 1 of an arm from whose plane it has the distance `side` [m].
+    """Locate a point relative to axis 1 of an arm, at a distance `side` [m] from the plane of the arm.
 
     Returns:
         The distance [m] ahead of axis 1, the azimuth [rad], whether a solution exists, and whether the point is on the
