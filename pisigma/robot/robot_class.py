@@ -17,7 +17,17 @@ COBOT_MAKERS: Final = (
     "Techman",
     "Neuromeka",
 )
-HOBBY_MAKERS: Final = ("Trossen", "ROBOTIS", "Niryo", "AR4", "Elephant Robotics", "Dobot")
+HOBBY_MAKERS: Final = (
+    "TheRobotStudio",
+    "Alexander Koch",
+    "Enactic",
+    "Trossen",
+    "ROBOTIS",
+    "Niryo",
+    "AR4",
+    "Elephant Robotics",
+    "Dobot",
+)
 
 
 @dataclass(frozen=True)

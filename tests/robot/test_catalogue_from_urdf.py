@@ -1,10 +1,19 @@
-"""Robots of the catalogue that come from URDF files have the poses of these files.
+"""Robots of the catalogue have the poses of the URDF files and other descriptions that their `source` names.
 
-The poses were computed from the files named in `source` by products of the joints' origins and axis rotations alone.
+`POSES` were computed from the files by products of the joints' origins and axis rotations alone; of the others
+`published_joints.yaml` has the origins and axes themselves.
 """
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
+from scipy.spatial.transform import Rotation
 from testing.closeness import assert_close
 
 import pisigma
@@ -50,3 +59,72 @@ def test_tool_poses_are_those_of_the_urdf_file(name):
     q, T = POSES[name]
     tolerance = 2e-5 if name == "xarm7" else 3e-9  # the file of xarm7 writes 1.5708 for right angles
     assert_close(pisigma.forward_kinematics(pisigma.Robot.load(name), q)[:3], np.array(T), atol=tolerance)
+
+
+PUBLISHED = yaml.safe_load((Path(__file__).parent / "published_joints.yaml").read_text())
+ROUNDED = 3e-5
+"""Deviation [m, and of rotation matrices] that right angles written with five digits cause."""
+
+
+def random_joint_values(name, count=20):
+    low, high = pisigma.Robot.load(name).limits.T
+    return np.random.default_rng(0).uniform(low, high, (count, len(low)))
+
+
+def published_pose(joints, q):
+    """Multiply the published origins and the rotations about the published axes (scipy)."""
+    T = np.eye(4)
+    for index, joint in enumerate(joints):
+        here = np.eye(4)
+        here[:3, :3], here[:3, 3] = Rotation.from_euler("xyz", joint["rpy"]).as_matrix(), joint["xyz"]
+        T = T @ here
+        if "axis" in joint:
+            T[:3, :3] = T[:3, :3] @ Rotation.from_rotvec(q[index] * np.array(joint["axis"])).as_matrix()
+    return T
+
+
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_arms_have_the_poses_of_their_published_descriptions(name):
+    q = random_joint_values(name)
+    poses = np.array([published_pose(PUBLISHED[name], values) for values in q])
+    assert_close(pisigma.forward_kinematics(pisigma.Robot.load(name), q)[:, :3], poses[:, :3], atol=ROUNDED)
+
+
+def published_urdf(name, joints):
+    """Write the published joints as a URDF file whose last link is `tip`."""
+    links, text = (
+        ["root", *(f"link{index}" for index in range(1, len(joints))), "tip"],
+        f'<robot name="{name}">',
+    )
+    text += "".join(f'<link name="{link}"/>' for link in links)
+    for index, joint in enumerate(joints):
+        origin = " ".join(f'{key}="{" ".join(map(str, joint[key]))}"' for key in ("xyz", "rpy"))
+        kind = "revolute" if "axis" in joint else "fixed"
+        axis = f'<axis xyz="{" ".join(map(str, joint["axis"]))}"/>' if "axis" in joint else ""
+        limit = '<limit lower="-7" upper="7" effort="1" velocity="1"/>' if "axis" in joint else ""
+        text += (
+            f'<joint name="joint{index}" type="{kind}"><parent link="{links[index]}"/>'
+            f'<child link="{links[index + 1]}"/><origin {origin}/>{axis}{limit}</joint>'
+        )
+    return text + "</robot>"
+
+
+def test_pinocchio_computes_the_poses_of_the_published_descriptions(tmp_path, repository):
+    """It runs in the interpreter of PISIGMA_PEERS, as in `test_urdf_peers`."""
+    python = os.environ.get("PISIGMA_PEERS", sys.executable)
+    if subprocess.run([python, "-c", "import pinocchio"], capture_output=True, check=False).returncode:
+        pytest.skip(f"pinocchio is not installed for {python}; name a Python that has it in PISIGMA_PEERS")
+    requests = []
+    for name, joints in PUBLISHED.items():
+        path = tmp_path / f"{name}.urdf"
+        path.write_text(published_urdf(name, joints))
+        requests.append(
+            {"file": str(path), "base": "root", "tool": "tip", "q": random_joint_values(name).tolist()}
+        )
+    script = str(repository / "benchmarks" / "urdf_peers.py")
+    run = subprocess.run(
+        [python, script, "pinocchio"], input=json.dumps(requests), capture_output=True, text=True, check=True
+    )
+    for name, request, answer in zip(PUBLISHED, requests, json.loads(run.stdout), strict=True):
+        poses = pisigma.forward_kinematics(pisigma.Robot.load(name), request["q"])
+        assert_close(poses[:, :3], np.array(answer["poses"])[:, :3], atol=ROUNDED)
