@@ -143,9 +143,7 @@ MEMORY = np.dtype(
         preferred=(DOF,),  # preferred joint values of a redundant arm
         chosen=(DOF,),  # the best of several solutions
         first=(DOF,),  # initial joint values of a search
-        distance=(
-            SAMPLES,
-        ),  # squared distances of scaled inputs from rows of a domain, or of poses from stored poses
+        distance=(SAMPLES,),  # squared distances from rows of a domain, or from stored poses
     )
     + _integers(
         nearest=(128,),  # indices of the stored starts with the nearest poses
