@@ -1,23 +1,153 @@
 """A calibration as text: verdict, warnings, errors of held-out rows, what was learned, and all parameters."""
 
+import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from pisigma.reporting import calibration_tables as tables
 from pisigma.reporting.calibration_tables import parameter_table, undetermined_lines
-from pisigma.reporting.calibration_verdict import (
-    POSSIBLE_SCALE,
-    calibration_verdict,
-    error_quantity,
-    error_table,
-    held_out_text,
-    scale_error,
-    scale_matters,
-    scale_text,
-)
-from pisigma.reporting.result_text import Block, ResultText, sentences, table_block
+from pisigma.reporting.result_text import Block, ResultText, Table, sentences, table_block
 from pisigma.reporting.tables import distance_table
-from pisigma.validation.held_out.calibration_summary import CalibrationSummary
+from pisigma.reporting.verdict import Verdict, count_text, rms_text, rounded
+from pisigma.validation.held_out.calibration_summary import CalibrationSummary, ScaleFigures
+from pisigma.validation.held_out.validation_figures import ValidationFigures
+
+LIKELY_SCALE, POSSIBLE_SCALE = 1.0, 0.1
+"""Odds above which a common factor on all lengths is a warning, or a remark, if the error that would follow matters."""
+MIN_SCALE_SHARE = 0.5
+"""Share of the held-out RMS error above which the error that would follow from a wrong scale matters."""
+MIN_COVERAGE = 0.9
+"""Share of held-out coordinates within their predicted 95 % intervals below which these are called too narrow."""
+_SHOWN = {"rms": "RMS", "p95": "95 %", "max": "largest"}
+
+
+def error_table(figures: ValidationFigures) -> Table:
+    """RMS, 95 % quantile and maximum of the errors, one column per calibration."""
+    models = figures.models
+    named = [errors.figures_by_name for errors in models.values()]
+    rows = []
+    for key in named[0]:
+        statistic, unit = key.rsplit("_", 1)
+        if statistic in _SHOWN:
+            quantity = "position" if unit == "mm" else "orientation"
+            cells = (rounded(errors[key], figures.rows) for errors in named)
+            rows.append((f"{quantity}, {_SHOWN[statistic]} [{unit}]", *cells))
+    return Table(("error", *models), tuple(rows))
+
+
+def held_out_text(figures: ValidationFigures, summary: CalibrationSummary) -> str:
+    """Describe which rows the errors belong to."""
+    if figures is summary.cross_validation:
+        repeats = f", {figures.repeats} repeats" if figures.repeats else ""
+        if (figures.folds or 1) > 1:
+            return f"held out in {figures.folds}-fold cross-validation of {figures.rows} rows{repeats}"
+        return f"{figures.rows} rows, held out once"
+    if figures is summary.held_out:
+        return f"{figures.rows} other simulated rows"
+    return (
+        f"{figures.rows} rows of the set 'test'" if figures is summary.test else f"fit to {figures.rows} rows"
+    )
+
+
+def error_quantity(summary: CalibrationSummary) -> str:
+    """Describe the quantity of the errors and the frame in which they are measured."""
+    sensors = {noise.sensor for noise in summary.noise}
+    if "corner" in sensors:
+        return "the poses that images give, camera relative to board"
+    if "socket" in sensors:
+        return "the ball about the mean of its socket"
+    return "the measured point in the sensor's frame" if "position" in sensors else "the measured values"
+
+
+def calibration_verdict(summary: CalibrationSummary, folder: Path | None, warnings: int) -> Verdict:
+    """Judge a calibration.
+
+    Args:
+        summary: its figures.
+        folder: folder of the model; None if none was written.
+        warnings: number of warnings.
+    """
+    return Verdict(_accuracy(summary), _trust(summary, warnings), _next_step(summary, folder, warnings))
+
+
+def _accuracy(summary: CalibrationSummary) -> str:
+    figures, implausible = (
+        summary.validation_errors,
+        any(one.severity == "implausible" for one in summary.diagnostics),
+    )
+    if figures is None and summary.predicted_rms_mm is not None and not implausible:
+        return (
+            f"{rounded(summary.predicted_rms_mm, 0)} mm RMS at other poses, because the calibration's own uncertainty "
+            "predicts; no row was held out."
+        )
+    figures = figures or summary.calibrated
+    if figures is None or not figures.models:
+        return "not known, because no row was judged."
+    (first, nominal), *_ = figures.models.items()
+    *_, best = figures.models.values()
+    than = f"; {first} {rms_text(nominal, figures.rows)}" if best is not nominal else ""
+    images = any(noise.sensor == "corner" for noise in summary.noise)
+    scatter = ", with the scatter of the images" if images else ""
+    return f"{rms_text(best, figures.rows)} RMS{scatter}, {held_out_text(figures, summary)}{than}."
+
+
+def _trust(summary: CalibrationSummary, warnings: int) -> str:
+    implausible = [one for one in summary.diagnostics if one.severity == "implausible"]
+    if implausible:
+        return f"no: {implausible[0].sentence}"
+    judged = summary.validation_errors
+    if judged is None:
+        return "not known: no row was held out, so nothing judged the calibration."
+    share = judged.coverage
+    covered = share is None or share >= MIN_COVERAGE
+    cautions = ["the sensor's scale may be wrong"] if scale_matters(summary) else []
+    cautions += [] if covered else ["the predicted accuracy is too good"]
+    intervals = (
+        ""
+        if share is None
+        else f"; {100 * share:.0f} % of the held-out coordinates are within their predicted 95 % intervals"
+    )
+    if cautions or warnings:
+        which = f": {', '.join(cautions)}" if cautions else ""
+        return f"with caution ({count_text(warnings, 'warning')}){which}{intervals}."
+    return f"yes, for joint values like the measured ones{intervals}."
+
+
+def _next_step(summary: CalibrationSummary, folder: Path | None, warnings: int) -> str:
+    if folder is None or any(one.severity == "implausible" for one in summary.diagnostics):
+        unwritten = "; no model was written" if folder is None else ""
+        return f"correct what is named above and calibrate again{unwritten}."
+    if summary.validation_errors is None:
+        return "measure more poses and calibrate again, or start from the prior of a fleet (--prior)."
+    first = "follow the warnings, then verify" if warnings else "verify"
+    return f"{first} with other poses: `pisigma verify {folder} ROWS.csv`."
+
+
+def scale_matters(summary: CalibrationSummary, odds: float = LIKELY_SCALE) -> bool:
+    """Return whether a wrong scale of the sensor has at least these odds and causes an error that matters."""
+    scale, judged = summary.scale, summary.validation_errors
+    if scale is None or judged is None or scale.odds < odds:
+        return False
+    *_, best = judged.models.values()
+    return best.rms_mm is not None and scale.rms_mm >= MIN_SCALE_SHARE * best.rms_mm
+
+
+def scale_text(scale: ScaleFigures) -> str:
+    """Describe how likely a wrong scale of the sensor is, and the error that it would cause."""
+    digits = 1 - math.floor(math.log10(scale.sigma)) if scale.sigma > 0 else 5
+    return (
+        f"scale of the sensor: lengths of the arm come out {scale.factor:.{digits}f} +- {scale.sigma:.{digits}f} "
+        f"times nominal, with odds of {scale.odds:.2g} to 1 for one common factor, such as a wrong scale of the "
+        f"sensor, against an error of each link. {scale_error(scale)}"
+    )
+
+
+def scale_error(scale: ScaleFigures) -> str:
+    """Describe the consequence of a wrong scale of the sensor."""
+    return (
+        f"If the sensor's scale is wrong, true positions are off by {scale.rms_mm:.2g} mm RMS in addition to the "
+        "errors shown; check it with a scale bar."
+    )
 
 
 def calibration_text(
@@ -47,13 +177,13 @@ def calibration_text(
     return ResultText(
         calibration_verdict(summary, folder, len(warnings)),
         tuple(warnings),
-        (*also, *_accuracy(summary), sentences("scale of the sensor", remarks)),
+        (*also, *_accuracy_blocks(summary), sentences("scale of the sensor", remarks)),
         (*_learned(summary), *_fit(summary), *_parameters(summary)),
         () if folder is None else (written,),
     )
 
 
-def _accuracy(summary: CalibrationSummary) -> Iterator[Block]:
+def _accuracy_blocks(summary: CalibrationSummary) -> Iterator[Block]:
     """Lay out the errors of rows that were held out, and the remarks on them."""
     judged = [one for one in (summary.cross_validation, summary.held_out, summary.test) if one is not None]
     for figures in judged:

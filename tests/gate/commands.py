@@ -16,11 +16,11 @@ from pisigma.model.folder.model_folder import save_model
 from pisigma.planning.plan_settings import PlanSettings
 from pisigma.robot import Robot
 from pisigma.workflow.calibrate import calibrate
-from pisigma.workflow.cell.advance import advance_cell
 from pisigma.workflow.cell.cell import Cell
 from pisigma.workflow.cell.new_cell import NewCell, cell_from_model
 from pisigma.workflow.compare import compare
 from pisigma.workflow.evaluate import evaluate
+from pisigma.workflow.fleet.run import advance_cell
 from pisigma.workflow.measure import MeasuringSession
 from pisigma.workflow.monitor import monitor
 from pisigma.workflow.plan import plan

@@ -5,8 +5,8 @@ from testing.models import no_type_checker
 
 from pisigma.files.errors import PisigmaError
 from pisigma.lifetime.cell.layout import cells_in
-from pisigma.workflow.cell.advance import advance_cell
 from pisigma.workflow.cell.cell import Cell
+from pisigma.workflow.fleet.run import advance_cell
 
 
 def test_every_bad_file_is_named_with_its_reason(tmp_path):

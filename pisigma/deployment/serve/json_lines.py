@@ -13,8 +13,11 @@ from pydantic_core import from_json
 
 from pisigma.deployment.serve.metrics import Metrics
 from pisigma.deployment.serve.models import ModelStatus, ServedModel, ServedModels, solution_row
-from pisigma.deployment.serve.protocol import STATUS_NAMES, AbstractProtocol, BrokenStreamError, Reply
-from pisigma.deployment.serve.request_values import (
+from pisigma.deployment.serve.protocol import (
+    STATUS_NAMES,
+    AbstractProtocol,
+    BrokenStreamError,
+    Reply,
     pose_entries,
     read_branch,
     read_flag,

@@ -1,9 +1,13 @@
-"""Interface of a server's protocols, which cut a stream into messages and answer them."""
+"""Interface of a server's protocols, which cut a stream into messages and answer them, and the values of requests."""
 
 import hmac
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from typing import Any
 
+from pisigma.files.errors import RequestError
+from pisigma.robot.kernels.array_kinematics import transform_entries
 from pisigma.robot.kinematics.status import Status
 
 STATUS_NAMES = {float(status): status.name.lower() for status in Status}
@@ -55,3 +59,57 @@ class AbstractProtocol(ABC):
 def tokens_match(given: bytes | None, wanted: bytes) -> bool:
     """Compare tokens in a time that does not depend on where they differ."""
     return given is not None and hmac.compare_digest(given, wanted)
+
+
+MAX_NUMBER = 1e9
+"""[mm or deg] Largest accepted value of a pose or joint."""
+
+
+def pose_entries(pose: Any, name: str) -> tuple[float, ...]:
+    """Convert x, y, z [mm], roll, pitch, yaw [deg] to the 16 entries of T_base_tool [m], row by row."""
+    x, y, z, *angles = read_numbers({name: pose}, name, 6)
+    return transform_entries(x / 1e3, y / 1e3, z / 1e3, *map(math.radians, angles))
+
+
+def read_numbers(request: dict[str, Any], key: str, count: int) -> list[float]:
+    """Read a list of finite numbers.
+
+    Raises:
+        RequestError: the value is anything else.
+    """
+    values = request[key]
+    if not isinstance(values, list) or len(values) != count:
+        length = len(values) if isinstance(values, list) else str(values)[:40]
+        raise RequestError(expected=f"a list of {count} numbers", value=length, option=key)
+    for value in values:
+        if type(value) not in (float, int) or not -MAX_NUMBER <= value <= MAX_NUMBER:
+            raise RequestError(
+                expected=f"{count} numbers [mm or deg] up to {MAX_NUMBER:g}",
+                value=str(value)[:40],
+                option=key,
+            )
+    return values
+
+
+def read_tolerance(request: dict[str, Any], key: str) -> list[float] | None:
+    """Read the tolerances of three axes, as a list or one number for all; None if not given."""
+    if key not in request:
+        return None
+    stated = request[key]
+    return read_numbers(request if isinstance(stated, list) else {key: [stated] * 3}, key, 3)
+
+
+def read_branch(request: dict[str, Any]) -> str | None:
+    """Read the name of a branch; None if not given."""
+    branch = request.get("branch")
+    if branch is None or isinstance(branch, str):
+        return branch
+    raise RequestError(expected="the name of a branch", value=repr(branch)[:40], option="branch")
+
+
+def read_flag(request: dict[str, Any], key: str) -> bool:
+    """Read a truth value; False if not given."""
+    value = request.get(key, False)
+    if isinstance(value, bool):
+        return value
+    raise RequestError(expected="true or false", value=repr(value)[:40], option=key)

@@ -38,8 +38,7 @@ from pisigma.validation.report.corrections import (
     parameter_correlations,
 )
 from pisigma.validation.report.dependence import Dependence, ErrorsByName, dependences, group_errors_by_name
-from pisigma.validation.report.error_map import ErrorMap, map_of_rows, map_of_workspace
-from pisigma.validation.report.largest_errors import largest_errors
+from pisigma.validation.report.error_map import ErrorMap, largest_errors, map_of_rows, map_of_workspace
 
 WITHOUT_CAUSE = ("few_rows", "search", "camera", "stated_noise", "temperature")
 """Kinds of warnings that name no cause of the errors."""

@@ -1,11 +1,13 @@
 """Carry out the steps that are due in the cells of a folder, in processes or on Ray, and write one table of results."""
 
 import functools
+import io
 import os
+import shlex
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,26 +15,164 @@ from typing import TYPE_CHECKING, Any
 from pisigma.files.engines.engine import AbstractEngine
 from pisigma.files.engines.processes import ProcessEngine
 from pisigma.files.errors import PisigmaError
+from pisigma.files.output_file import write_atomically
 from pisigma.files.progress import Progress
-from pisigma.lifetime.cell.facts import CellFacts
+from pisigma.lifetime.cell.facts import CellFacts, facts_of
 from pisigma.lifetime.cell.layout import MODELS, cells_in
-from pisigma.lifetime.cell.status import status_of
+from pisigma.lifetime.cell.status import CellStatus, next_step, status_of
 from pisigma.lifetime.cell.step import ATTENTION
-from pisigma.lifetime.fleet.results import (
-    RESULTS,
-    ParameterValue,
-    read_parameters,
-    write_results,
-)
 from pisigma.lifetime.fleet.status import FleetStatus
 from pisigma.workflow.settings.fleet import FleetSettings
 
 if TYPE_CHECKING:
     from pisigma.model.calibrated_model import CalibratedModel
+    from pisigma.workflow.cell.cell import Cell
 
 CELLS_PER_CHUNK = 4
 """Cells that a worker processes at once, which takes some seconds."""
 _LOST = "the process that worked on it ended twice; check the memory and its files."
+RESULTS = "results.parquet"
+"""Name of the table in the folder of the cells."""
+
+
+def advance_cell(
+    cell: "Cell", prior: Path | None = None, progress: Progress = lambda what: None
+) -> CellStatus:
+    """Calibrate, verify, monitor and recalibrate a cell as its status says, for every new session in turn.
+
+    New files in `sessions/` are added one by one in the order of their dates, each after all steps that the earlier
+    ones make possible: a model of the first session is verified with the second, and monitored with the third. A cell
+    whose status names no such step is not changed.
+
+    Args:
+        cell: the cell.
+        prior: model folder of `pisigma fleet prior` to start calibrations from; None: calibrate from scratch.
+        progress: called with the name of each step.
+
+    Returns:
+        The status afterwards.
+
+    Raises:
+        PisigmaError: the rows of a session cannot be used, or a step refuses them.
+    """
+    cell.sessions.one_by_one = True
+    done: set[str] = set()
+    while True:
+        step = next_step(replace(facts_of(cell.folder), not_taken_in=()))
+        if step.verb is not None and step.command not in done:
+            done.add(step.command)
+            progress(step.verb)
+            _take(cell, step.verb, shlex.split(step.command)[3:], prior)
+        elif not cell.sessions.add_next_file():
+            return status_of(cell.folder)
+        else:
+            done.clear()
+
+
+def _take(cell: "Cell", verb: str, options: list[str], prior: Path | None) -> None:
+    """Carry out a step."""
+    if verb == "verify":
+        cell.verify(model=options[1] if options else None)
+    elif verb == "calibrate":
+        cell.calibrate(prior=prior)
+    elif verb == "monitor":
+        cell.monitor()
+    else:
+        cell.recalibrate()
+
+
+@dataclass(frozen=True)
+class ParameterValue:
+    """An estimated geometric parameter.
+
+    Attributes:
+        name: name such as "theta_1".
+        unit: "mm" or "deg", of the three figures.
+        value: identified value.
+        change: difference from the nominal value.
+        standard_error: standard error of the estimate.
+    """
+
+    name: str
+    unit: str
+    value: float
+    change: float
+    standard_error: float
+
+
+Parameters = Mapping[str, Sequence[ParameterValue]]
+"""Estimated parameters of models by the SHA-256 of their `model.yaml`."""
+
+
+def read_parameters(path: Path) -> Parameters:
+    """Read the parameters of the models in a table; empty if there is no table, or it cannot be read."""
+    from pyarrow import ArrowException, parquet
+
+    try:
+        table = parquet.read_table(path, columns=["model_sha256", "parameters"]).to_pylist()
+    except (OSError, ArrowException):
+        return {}
+    return {
+        row["model_sha256"]: [ParameterValue(**one) for one in row["parameters"]]
+        for row in table
+        if row["parameters"]
+    }
+
+
+def write_results(path: Path, cells: Sequence[CellFacts], parameters: Parameters) -> None:
+    """Write one row for every check of every cell; the row of a new model has its parameters.
+
+    Args:
+        path: file to write.
+        cells: facts about the cells.
+        parameters: estimated parameters of the models.
+
+    Raises:
+        OutputError: the file cannot be written; an existing one is kept.
+        ImportError: pyarrow is not installed.
+    """
+    import pyarrow
+    from pyarrow import parquet
+
+    text, number = pyarrow.string(), pyarrow.float64()
+    estimates = ((name, number) for name in ("value", "change", "standard_error"))
+    parameter = pyarrow.struct([("name", text), ("unit", text), *estimates])
+    schema = pyarrow.schema(
+        [
+            *((name, text) for name in ("cell", "command", "session", "day")),
+            ("rows", pyarrow.int64()),
+            ("temperature_c", number),
+            *((name, text) for name in ("model", "model_sha256", "verdict", "summary")),
+            ("rms_mm", number),
+            ("p95_mm", number),
+            ("recalibrate", pyarrow.bool_()),
+            ("parameters", pyarrow.list_(parameter)),
+        ]
+    )
+    rows = [row for facts in cells for row in _rows(facts, parameters)]
+    content = io.BytesIO()
+    parquet.write_table(pyarrow.Table.from_pylist(rows, schema), content)
+    write_atomically(path, content.getvalue())
+
+
+def _rows(facts: CellFacts, parameters: Parameters) -> list[dict[str, object]]:
+    """Return a row for every check of a cell, in the order in which they were made."""
+    sessions = {one.name: one for one in facts.sessions}
+    models = {one.name: one for one in facts.models}
+    rows = []
+    for check in facts.checks:
+        session, model = sessions.get(check.session), models.get(check.model)
+        new = model is not None and check.command in ("calibrate", "recalibrate")
+        row = {
+            "cell": Path(facts.folder).name,
+            "day": session.day if session else model.day if model else "",
+            "rows": session.rows if session else None,
+            "temperature_c": session.temperature_c if session else None,
+            "model_sha256": model.sha256 if model else "",
+            "parameters": [asdict(one) for one in parameters.get(model.sha256, ())] if model and new else [],
+        }
+        rows.append(asdict(check) | row)
+    return rows
 
 
 @dataclass(frozen=True)
@@ -77,7 +217,7 @@ def run_fleet(
 ) -> FleetRun:
     """Advance all cells in a folder: calibrate, verify, monitor and recalibrate as the status of each requires.
 
-    See `pisigma.workflow.cell.advance.advance_cell`. A cell with bad rows is reported and does not stop the others. The
+    See `advance_cell`. A cell with bad rows is reported and does not stop the others. The
     contents of a cell are always complete, so a later call continues after an interruption; a cell whose status names
     no step is not opened.
 
@@ -135,10 +275,7 @@ def run_fleet(
 
 def _advance(folder: Path, prior: Path | None) -> tuple[str, dict[str, list[ParameterValue]]]:
     """Advance a cell; return why it needs attention, "" if it does not, and the parameters of its models."""
-    from pisigma.workflow.cell.advance import (
-        advance_cell,  # torch takes seconds, and most calls have nothing to do
-    )
-    from pisigma.workflow.cell.cell import Cell
+    from pisigma.workflow.cell.cell import Cell  # torch takes seconds, and most calls have nothing to do
 
     reason = ""
     try:

@@ -6,7 +6,7 @@ from testing.closeness import assert_close
 
 from pisigma.validation.held_out.rank_tests import SIGNIFICANT
 from pisigma.validation.report.dependence import bin_errors
-from pisigma.validation.report.largest_errors import CELLS, worst_region
+from pisigma.validation.report.error_map import CELLS, worst_region
 
 
 def test_a_planted_region_is_found():

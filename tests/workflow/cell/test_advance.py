@@ -6,8 +6,8 @@ from testing.models import no_type_checker
 from testing.refusals import refused
 
 from pisigma.files.errors import MeasurementError
-from pisigma.workflow.cell.advance import advance_cell
 from pisigma.workflow.cell.cell import Cell
+from pisigma.workflow.fleet.run import advance_cell
 
 
 @pytest.fixture(scope="module")

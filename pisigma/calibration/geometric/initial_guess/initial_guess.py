@@ -8,13 +8,13 @@ import torch
 from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
-from pisigma.calibration.geometric.initial_guess.base_and_tool import guess_base_and_tool
-from pisigma.calibration.geometric.initial_guess.base_and_tool_closed_form import fit_base_to_points
-from pisigma.calibration.geometric.initial_guess.base_from_touches import (
+from pisigma.calibration.geometric.initial_guess.base_and_tool import (
     check_touched_base,
     check_touched_frames,
     fit_base_to_touches,
+    guess_base_and_tool,
 )
+from pisigma.calibration.geometric.initial_guess.base_and_tool_closed_form import fit_base_to_points
 from pisigma.calibration.geometric.initial_guess.tool_from_distances import (
     base_from_anchors,
     tools_from_distances,

@@ -3,9 +3,9 @@
 import pytest
 from testing.refusals import refused
 
-from pisigma.files import file_system
 from pisigma.files.errors import OutputError
-from pisigma.files.file_system import NETWORK_TYPES, file_system_type, linux_mounts, macos_mounts
+from pisigma.lifetime.cell import database
+from pisigma.lifetime.cell.database import NETWORK_TYPES, file_system_type, linux_mounts, macos_mounts
 from pisigma.lifetime.cell.history import History
 
 MOUNTINFO = r"""22 27 0:21 / /proc rw,relatime - proc proc rw
@@ -58,7 +58,7 @@ def test_local_file_systems_are_not_those_of_networks():
 def test_a_history_on_the_file_system_of_a_network_is_refused(tmp_path, monkeypatch, kind):
     table = tmp_path / "mountinfo"
     table.write_text(f"{MOUNTINFO}50 27 0:60 / {tmp_path} rw - {kind} host:/export rw\n", encoding="utf-8")
-    monkeypatch.setattr(file_system, "MOUNTINFO", table)
+    monkeypatch.setattr(database, "MOUNTINFO", table)
     history = History(tmp_path / "history.sqlite")
     if kind == "ext4":
         history.record("firmware")
