@@ -1,1 +1,1 @@
-"""Features and weights of the joint correction, which is fitted through the kinematics."""
+"""Joint corrections, which are fitted through the kinematics: features, weights and export to ONNX."""

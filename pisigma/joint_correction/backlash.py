@@ -1,4 +1,4 @@
-"""Backlash of joints, which depends on the direction of approach."""
+"""Feature for the backlash of joints, which depends on the direction of approach."""
 
 from typing import Any, no_type_check
 
@@ -16,7 +16,7 @@ from pisigma.robot.kernels.forms import CompiledForm
 
 @no_type_check
 def add_backlash(arms: Any, correction: Any, first: int, memory: Any, q: Any) -> None:
-    """Add a weight times the approach direction of the joint."""
+    """Add the weight of every joint times its approach direction."""
     for j in range(arms.dof):
         memory.delta[j] += correction.values[first + j] * memory.approach[j]
 
@@ -24,8 +24,8 @@ def add_backlash(arms: Any, correction: Any, first: int, memory: Any, q: Any) ->
 class Backlash(AbstractFeature):
     """`Δ_j = b_j · approach_j`: half the backlash of a joint in its direction of approach.
 
-    The approach is +1 if the joint value increased before it stopped and -1 if it decreased; if it is not stated it is
-    0, the middle of the backlash. The weight b_j of a joint is half its backlash; all joints share a prior size.
+    The approach is +1 if the joint value increased before it stopped and -1 if it decreased; it is 0, the middle of
+    the backlash, if it is not stated. The weight b_j of a joint is half its backlash; all joints share a prior size.
 
     Source: Whitney, Lozinski and Rourke, ASME Journal of Dynamic Systems, Measurement, and Control 108(1), 1986, 1-8,
     who list backlash among the errors of joints. Its effect on the pose is the multi-directional pose accuracy
@@ -33,26 +33,26 @@ class Backlash(AbstractFeature):
     """
 
     name = "backlash"
-    reads = (APPROACH,)
+    additional_inputs = (APPROACH,)
     compiled = CompiledForm(add_backlash)
     group_names = ("backlash",)
 
     def __init__(self, robot: Robot) -> None:
-        """Make a feature with one weight per joint."""
+        """Create the feature with one weight per joint."""
         super().__init__(robot)
         self.used = torch.ones(robot.dof, 1, dtype=torch.bool)
         self.group = torch.zeros(robot.dof, 1, dtype=torch.int64)
 
     @classmethod
     def candidates(cls, robot: Robot, options: FeatureOptions, state: JointState) -> tuple["Backlash", ...]:
-        """Return the feature if a joint was approached from both sides, else nothing."""
+        """Return the feature if any joint was approached from both sides, otherwise an empty tuple."""
         approach = state.stated.get(APPROACH)
         if approach is None or not bool(((approach > 0).any(0) & (approach < 0).any(0)).any()):
             return ()
         return (Backlash(robot),)
 
     def columns(self, state: JointState) -> Float[Tensor, "*batch dof columns"]:
-        """Return the approach direction of every joint."""
+        """Return one column per joint, the joint's approach direction."""
         approach = state.stated.get(APPROACH)
         if approach is None:
             return torch.zeros_like(state.q)[..., None]

@@ -1,4 +1,4 @@
-"""Effects of payload and temperature on the joints, and corrections under fixed conditions."""
+"""Feature for effects of payload and temperature on the joints, and corrections under fixed conditions."""
 
 from collections.abc import Callable, Sequence
 from typing import Annotated, Literal
@@ -29,11 +29,11 @@ class ConditionSection(FeatureSection):
 
 
 class ConditionFeatures(AbstractFeature):
-    """Payload and temperature, each times 1, sine and cosine of the joint's own value (prismatic: scaled value).
+    """Payload and temperature, each times 1, sine and cosine of the joint value (prismatic: scaled joint value).
 
     A condition is expressed in standard deviations from its mean over the measured rows, so that missing
     conditions are treated as their means. The payload also multiplies the gravity torques of a mass in the last row's
-    frame; its effect is proportional, beyond the measured values too. Beyond the lowest and highest measured
+    frame; its effect is proportional, also beyond the measured values. Beyond the lowest and highest measured
     temperature the correction is constant, because thermal expansion of an arm is not linear and extrapolating it would
     soon increase the errors.
 
@@ -46,7 +46,7 @@ class ConditionFeatures(AbstractFeature):
 
     name = "conditions"
     section = ConditionSection
-    reads = ("payload_kg", "temperature_c")
+    additional_inputs = ("payload_kg", "temperature_c")
     usually_zero = True
 
     def __init__(
@@ -58,7 +58,7 @@ class ConditionFeatures(AbstractFeature):
         measured: Sequence[tuple[float, float]],
         gravity: Direction = (0.0, 0.0, -1.0),
     ) -> None:
-        """Make a feature of conditions.
+        """Create the feature for the given conditions.
 
         Raises:
             ValueError: there is no condition, one does not vary, or its mean is outside its measured values.
@@ -91,7 +91,7 @@ class ConditionFeatures(AbstractFeature):
     def candidates(
         cls, robot: Robot, options: FeatureOptions, state: JointState
     ) -> tuple["ConditionFeatures", ...]:
-        """Return the feature if a condition varies, else nothing."""
+        """Return the feature if a condition varies, otherwise an empty tuple."""
         if not options.varying:
             return ()
         values = torch.stack([state.stated[name] for name in options.varying], 1)
@@ -100,7 +100,7 @@ class ConditionFeatures(AbstractFeature):
         return (ConditionFeatures(robot, options.varying, mean, spread, measured, options.gravity),)
 
     def columns(self, state: JointState) -> Float[Tensor, "*batch dof columns"]:
-        """Return the products; 0 under mean conditions, and for conditions that are NaN or missing."""
+        """Return products of conditions and functions of the joint values; 0 for mean, missing or NaN conditions."""
         q = state.q
         if not any(name in state.stated for name in self.names):
             return q.new_zeros((*q.shape, self.count))
@@ -121,9 +121,9 @@ class ConditionFeatures(AbstractFeature):
     def scaled_conditions(
         self, stated: Float[Tensor, "*batch conditions"]
     ) -> Float[Tensor, "*batch conditions"]:
-        """Conditions [kg, deg C] in standard deviations from their means; 0 where one is NaN.
+        """Return conditions [kg, deg C] in standard deviations from their means; 0 for NaN.
 
-        A temperature beyond the measured ones is treated as the nearest of these.
+        A temperature beyond the measured values is replaced by the nearest measured value.
         """
         low, high = stated.new_tensor(self.measured).unbind(-1)
         kept = torch.tensor([name == "temperature_c" for name in self.names], device=stated.device)
@@ -133,21 +133,21 @@ class ConditionFeatures(AbstractFeature):
 
 
 def learned_conditions(correction: JointCorrection) -> ConditionFeatures | None:
-    """Return the `ConditionFeatures` of a correction; None if it has none."""
+    """Return the `ConditionFeatures` of a correction; None if it has no such feature."""
     return next((own for own in correction.features if isinstance(own, ConditionFeatures)), None)
 
 
 def at_conditions(
     correction: JointCorrection, scaled: Float64[Tensor, " conditions"]
 ) -> tuple[JointCorrection, Float64[Tensor, " dof"]]:
-    """Reduce a correction at fixed conditions to a function of the joint values.
+    """Convert a correction at fixed conditions to a correction that depends on the joint values only.
 
     At fixed conditions `ConditionFeatures` are offsets of the joints, first harmonics, and gravity torques of the last
     row; these are added to the weights of the other features.
 
     Args:
         correction: correction with `ConditionFeatures`.
-        scaled: the conditions, in standard deviations from their means.
+        scaled: conditions in standard deviations from their means.
 
     Returns:
         The correction without `ConditionFeatures`, and the remaining offset of every joint [rad or m].
@@ -166,7 +166,7 @@ def at_conditions(
     slides = ~torch.tensor(robot.revolute)
     series = _weights_of(kept, FourierSeries(robot, 1), lambda other: isinstance(other, FourierSeries))
     harmonics = series.shape[1] // 2
-    # Columns of a series are all sines, then all cosines; the first of each are the first harmonic.
+    # Columns of a series are all sines, then all cosines; the first column of each kind is the first harmonic.
     series[:, 0] += torch.where(slides, 0.0, sine)
     series[:, harmonics] += torch.where(slides, 0.0, cosine)
     if bool(slides.any()):
@@ -190,7 +190,7 @@ def _weights_of(
     wanted: AbstractFeature,
     fits: Callable[[AbstractFeature], bool],
 ) -> Float64[Tensor, "dof columns"]:
-    """Return the weights of the first feature that fits, to be changed in place; if none fits, add `wanted`."""
+    """Return the weights of the first feature that fits, to be changed in place; if no feature fits, add `wanted`."""
     for feature, weights in kept:
         if fits(feature):
             return weights

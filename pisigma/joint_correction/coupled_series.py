@@ -1,4 +1,4 @@
-"""Errors of the drives of coupled joints: factors, gears before the coupling, and guides that are not straight."""
+"""Feature for errors of the drives of coupled joints: factors, gears before the coupling, and curved guides."""
 
 from typing import Any
 
@@ -12,8 +12,8 @@ from pisigma.measurement.conditions import JointState
 from pisigma.robot.description import Robot
 
 HARMONICS, LOW = 8, 3
-"""Number of harmonics of every axis, and number of low ones with their own prior size: guides have errors in low
-harmonics, gears in others too."""
+"""Number of harmonics of every axis, and number of low harmonics, which have a separate prior size: guides have
+errors in low harmonics, gears also in higher ones."""
 
 
 class CoupledSeries(AbstractFeature):
@@ -41,7 +41,7 @@ class CoupledSeries(AbstractFeature):
     )
 
     def __init__(self, robot: Robot) -> None:
-        """Make columns for the axes that drive every coupled joint; joints that are not coupled have none."""
+        """Create the feature with columns for the axes that drive every coupled joint."""
         super().__init__(robot)
         coupling = robot.coupling
         axes = len(robot.axes)
@@ -70,14 +70,14 @@ class CoupledSeries(AbstractFeature):
 
     @property
     def usual_sizes(self) -> tuple[float, ...]:
-        """See `AbstractFeature.usual_sizes`."""
+        """Initial standard deviation of the weights of every group [rad]."""
         return (10 * USUAL_SIZE,) * len(self.group_names)
 
     @classmethod
     def candidates(
         cls, robot: Robot, options: FeatureOptions, state: JointState
     ) -> tuple["CoupledSeries", ...]:
-        """Return the feature for a robot with coupled joints, else nothing."""
+        """Return the feature for a robot with coupled joints, otherwise an empty tuple."""
         return () if robot.coupling is None else (CoupledSeries(robot),)
 
     def columns(self, state: JointState) -> Float[Tensor, "*batch dof columns"]:
@@ -98,7 +98,7 @@ class CoupledSeries(AbstractFeature):
         return torch.cat([columns, lengths], -1)
 
     def is_periodic(self, weight: Float64[np.ndarray, "dof columns"]) -> bool:
-        """Return False if a factor has an error, because a full turn of an axis then moves the joint differently."""
+        """Return False if a factor has an error: a full turn of an axis then moves the joint differently."""
         return not weight[:, : len(self.robot.axes)].any()
 
     def factor_errors(self, weight: Float64[np.ndarray, "dof columns"]) -> Float64[np.ndarray, "dof axes"]:

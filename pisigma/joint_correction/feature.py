@@ -1,4 +1,4 @@
-"""Interface of features: functions of the joint values whose weighted sum is a joint's correction."""
+"""Interface of features, functions of the joint values whose weighted sum is the correction of a joint."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -21,14 +21,14 @@ Feature = TypeVar("Feature", bound="AbstractFeature")
 
 
 class FeatureSection(Section):
-    """Section of a feature in the description of a model: its name, and in subclasses further values."""
+    """Section of a feature in the description of a model: the name, and further values in subclasses."""
 
     name: str
 
 
 @dataclass(frozen=True)
 class FeatureOptions:
-    """Options of a calibrator for the features that it tries.
+    """Options of a calibrator that determine which features it tries.
 
     Attributes:
         harmonics: numbers of harmonics of Fourier series, in the order in which they are tried.
@@ -44,30 +44,33 @@ class FeatureOptions:
 
 
 class AbstractFeature(ABC):
-    """Columns for every joint: the correction of joint j is `Σ_m weight[j, m] · columns(state)[..., j, m]`.
+    """Columns of every joint; the correction of joint j is `Σ_m weight[j, m] · columns(state)[..., j, m]`.
 
     A new feature is a subclass in its own file and a line in `registry.py`; `register_feature` adds features of
-    plug-ins. Models with a feature without `compiled` are solved in torch; those with one without `add_onnx` cannot be
-    exported as ONNX.
+    plug-ins. Models that contain a feature without `compiled` are solved in torch; models that contain a feature
+    without `add_onnx` cannot be exported as ONNX.
 
     Attributes:
         robot: the nominal robot.
         name: name of the feature in recipes and models.
-        section: class of its section in the description of a model.
-        reads: row data that it needs in addition to the joint values, by the names of `JointState.stated`.
-        compiled: its form in the kernels, which gets the numbers of `pack`; None if it has none.
-        usually_zero: whether it is 0 if only joint values are stated, so that kernels and graphs may omit it.
-        used: `(dof, m)`: which columns a joint uses; the others must not have weights.
+        section: class of the feature's section in the description of a model.
+        additional_inputs: names in `JointState.stated` of the row data that the feature requires in addition to the
+            joint values.
+        compiled: compiled form for the kernels, which get the numbers of `pack`; None if the feature has no compiled
+            form.
+        usually_zero: whether the correction is 0 if only joint values are stated, so that kernels and graphs may
+            omit the feature.
+        used: `(dof, m)`: mask of the columns that a joint uses; weights of other columns must be 0.
         group: `(dof, m)`: index of the prior size of a column's weight, from 0.
         group_names: names of the prior sizes.
-        size: size among features of the same name that are tried one after the other, such as the number of harmonics;
-            0 if there is only one.
-        fastest: its highest harmonic of a joint value.
+        size: size among features of the same name that are tried in sequence, such as the number of harmonics; 0 if
+            there is only one.
+        fastest: highest harmonic of a joint value in the columns.
     """
 
     name: ClassVar[str]
     section: ClassVar[type[FeatureSection]] = FeatureSection
-    reads: ClassVar[tuple[str, ...]] = ()
+    additional_inputs: ClassVar[tuple[str, ...]] = ()
     compiled: ClassVar[CompiledForm | None] = None
     usually_zero: ClassVar[bool] = False
     used: Bool[Tensor, "dof columns"]
@@ -80,17 +83,17 @@ class AbstractFeature(ABC):
     def usual_sizes(self) -> tuple[float, ...]:
         """Initial standard deviations of the weights of every group [rad] for fits of few rows.
 
-        They are larger rather than smaller than usual, because the evidence quickly reduces sizes that are too large.
+        They should be too large rather than too small, because the evidence quickly reduces sizes that are too large.
         """
         return (USUAL_SIZE,) * len(self.group_names)
 
     def __init__(self, robot: Robot) -> None:
-        """Make a feature for the nominal robot."""
+        """Create the feature for a nominal robot."""
         self.robot = robot
 
     @abstractmethod
     def columns(self, state: JointState) -> Float[Tensor, "*batch dof columns"]:
-        """Compute the columns, of the order of 1.
+        """Compute the columns of every joint; the values are of the order of 1.
 
         Args:
             state: joint values [rad or m], and further data of the rows.
@@ -100,7 +103,7 @@ class AbstractFeature(ABC):
     def candidates(
         cls: type[Feature], robot: Robot, options: FeatureOptions, state: JointState
     ) -> tuple[Feature, ...]:
-        """Return the features that a calibrator tries: one, several of increasing size, or none if data are missing.
+        """Return the features that a calibrator tries: one, several of increasing size, or none if data is missing.
 
         Args:
             robot: the nominal robot.
@@ -111,7 +114,7 @@ class AbstractFeature(ABC):
 
     @classmethod
     def from_section(cls: type[Feature], robot: Robot, section: Any) -> Feature:
-        """Make the feature that a section describes; the inverse of `describe`.
+        """Return the feature that a section describes; the inverse of `describe`.
 
         Args:
             robot: the nominal robot.
@@ -149,7 +152,7 @@ class AbstractFeature(ABC):
         return True
 
     def columns_in(self, larger: "AbstractFeature") -> Int64[Tensor, "dof columns"]:
-        """Return the indices of this feature's columns in one of the same name and at least this size."""
+        """Return the indices of this feature's columns in a feature of the same name and at least the same size."""
         return torch.arange(self.count).expand(self.used.shape)
 
     @property

@@ -1,4 +1,4 @@
-"""Sines and cosines of multiples of a joint's own value: errors of gears and encoders."""
+"""Feature for errors of gears and encoders: sines and cosines of multiples of a joint's value."""
 
 from typing import Annotated, Any, Literal, no_type_check
 
@@ -22,13 +22,14 @@ from pisigma.robot.kernels.forms import MAX_JOINTS, CompiledForm
 BAND_STARTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256)
 """First harmonic of every band for few configurations: about two bands per octave."""
 FINE_BAND_STARTS = (*range(1, 10), 11, 13, 15, 18, 21, 25, 30, 35, 41, 49, 58, 69, 82, 97, 115, 137, 163)
-"""The same for many configurations: one harmonic each up to 8, then about four bands per octave.
+"""First harmonic of every band for many configurations: one harmonic per band up to 8, then about four bands per
+octave.
 
 The log evidence of all 29 subsets of the measured UR5 and UR10 that were tested (random folds, boxes and halves) is
 higher than with `BAND_STARTS`, by 12 on average for 11 additional prior sizes. Eight bands per octave raise it by
 another 17 for 18 sizes, which is less than their number (Akaike 1974, IEEE Transactions on Automatic Control 19(6))."""
 MANY_CONFIGURATIONS = 200
-"""Number of configurations from which fine bands are used; fewer do not determine the size of every band."""
+"""Smallest number of configurations with which fine bands are used; fewer do not determine the size of every band."""
 BAND_SIZES = (
     2e-4,
     1.6e-4,
@@ -49,8 +50,8 @@ BAND_SIZES = (
 )
 """Initial standard deviations of the weights of every band of `BAND_STARTS` [rad] for fits of few rows.
 
-They are between those that maximise the evidence of hybrid calibrations of the measured UR5, UR10 and FANUC R-2000iC
-and of simulated arms with gear errors of 0.26 mrad at harmonics 1, 2 and 7."""
+They are between the sizes that maximise the evidence of hybrid calibrations of the measured UR5, UR10 and FANUC
+R-2000iC and of simulated arms with gear errors of 0.26 mrad at harmonics 1, 2 and 7."""
 USUAL_HARMONICS = 56
 """Number of harmonics up to which series are tried for any number of rows, because few rows start with `BAND_SIZES`."""
 
@@ -101,7 +102,7 @@ def add_series(arms: Any, correction: Any, first: int, memory: Any, q: Any) -> N
 
 @no_type_check
 def add_series_slope(arms: Any, correction: Any, first: int, memory: Any, q: Any) -> None:
-    """Add the derivative of every joint's series with respect to its own value, with the same recurrence."""
+    """Add the derivative of every joint's series with respect to its joint value, with the same recurrence."""
     values = correction.values
     harmonics = int(values[first])
     for j in range(0, arms.dof, 4):
@@ -129,7 +130,7 @@ def add_series_slope(arms: Any, correction: Any, first: int, memory: Any, q: Any
 
 
 class FourierSeries(AbstractFeature):
-    """sin(k q_j) and cos(k q_j) of the joint's own value, k = 1 … K.
+    """Columns sin(k q_j) and cos(k q_j) of the value q_j of a joint, with k = 1 … K.
 
     Weights of neighbouring harmonics share a prior size (see `BAND_STARTS`), so that the data determine how the
     spectrum of the error decreases with k; fine bands (see `FINE_BAND_STARTS`) contain fewer harmonics. Source of the
@@ -141,7 +142,7 @@ class FourierSeries(AbstractFeature):
     compiled = CompiledForm(add_series, add_series_slope)
 
     def __init__(self, robot: Robot, harmonics: int, fine: bool = False) -> None:
-        """Make a feature of the first `harmonics` harmonics, at least one, in coarse or fine bands."""
+        """Create the feature with the first `harmonics` harmonics, at least one, in coarse or fine bands."""
         super().__init__(robot)
         if harmonics < 1:
             raise ValueError(f"expected at least one harmonic of a Fourier series, got {harmonics}.")
@@ -161,7 +162,7 @@ class FourierSeries(AbstractFeature):
 
     @property
     def usual_sizes(self) -> tuple[float, ...]:
-        """See `AbstractFeature.usual_sizes`."""
+        """Initial standard deviation of the weights of every band [rad]."""
         bands = torch.bucketize(self._starts, torch.tensor(BAND_STARTS), right=True) - 1
         return tuple(BAND_SIZES[band] for band in bands.tolist())
 
@@ -175,11 +176,11 @@ class FourierSeries(AbstractFeature):
         return tuple(FourierSeries(robot, k, fine) for k in options.harmonics if k <= most)
 
     def columns(self, state: JointState) -> Float[Tensor, "*batch dof columns"]:
-        """Return all sines, sin(q) first, then all cosines."""
+        """Return the columns: all sines, beginning with sin(q), then all cosines."""
         return sines_cosines(state.q * self._rate.to(state.q), torch.arange(1, self.harmonics + 1))
 
     def columns_in(self, larger: AbstractFeature) -> Int64[Tensor, "dof columns"]:
-        """Return the indices of the first sines and the first cosines."""
+        """Return the indices of this feature's sines and cosines in a longer series."""
         k = torch.arange(self.harmonics)
         return torch.cat([k, larger.size + k]).expand(self.used.shape)
 
@@ -198,11 +199,11 @@ class FourierSeries(AbstractFeature):
 def sines_cosines(
     angle: Float[Tensor, "*batch dof"], orders: Shaped[Tensor, "*dof harmonics"]
 ) -> Float[Tensor, "*batch dof columns"]:
-    """Compute sines of multiples of every joint's angle, then cosines.
+    """Compute sines and then cosines of multiples of every joint's angle.
 
     Args:
         angle: angles of the joints [rad].
-        orders: multiples, for every joint or the same for all.
+        orders: multiples of the angle, for every joint or common to all joints.
     """
     multiple = angle[..., None] * orders.to(angle)
     return torch.cat([multiple.sin(), multiple.cos()], -1)

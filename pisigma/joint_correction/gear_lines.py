@@ -1,4 +1,4 @@
-"""Lines of high order in the error spectrum of gears and motors."""
+"""Feature for lines of high order in the error spectrum of gears and motors."""
 
 import math
 from collections.abc import Sequence
@@ -32,7 +32,7 @@ class LinesSection(FeatureSection):
 
 @no_type_check
 def add_lines(arms: Any, correction: Any, first: int, memory: Any, q: Any) -> None:
-    """Add the lines; `correction.values` contains their number, and joint, order and weights of each."""
+    """Add the lines; `correction.values` contains the number of lines, and joint, order and weights of each."""
     for line in range(int(correction.values[first])):
         start = first + 1 + 4 * line
         j, order = int(correction.values[start]), correction.values[start + 1]
@@ -43,7 +43,7 @@ def add_lines(arms: Any, correction: Any, first: int, memory: Any, q: Any) -> No
 
 @no_type_check
 def add_lines_slope(arms: Any, correction: Any, first: int, memory: Any, q: Any) -> None:
-    """Add the derivative of the lines with respect to every joint's own value."""
+    """Add the derivative of the lines with respect to every joint's value."""
     for line in range(int(correction.values[first])):
         start = first + 1 + 4 * line
         j = int(correction.values[start])
@@ -53,7 +53,7 @@ def add_lines_slope(arms: Any, correction: Any, first: int, memory: Any, q: Any)
 
 
 class GearLines(AbstractFeature):
-    """sin(k q_j) and cos(k q_j) of the joint's own value for a few orders k, which may be in the thousands.
+    """Columns sin(k q_j) and cos(k q_j) of the value q_j of a joint for a few orders k, which may be in the thousands.
 
     The error of a strain wave gear of ratio N has 2N and 4N cycles per turn, the cogging of a motor with p pole pairs
     multiples of pN. Between these lines the spectrum is empty, and a series up to them would have thousands of weights.
@@ -71,7 +71,7 @@ class GearLines(AbstractFeature):
     compiled = CompiledForm(add_lines, add_lines_slope)
 
     def __init__(self, robot: Robot, orders: Sequence[Sequence[int]]) -> None:
-        """Make a feature of the lines of every joint.
+        """Create the feature with the lines of every joint.
 
         Raises:
             ValueError: there are no lines, or the number of joints is wrong.
@@ -91,15 +91,15 @@ class GearLines(AbstractFeature):
 
     @classmethod
     def candidates(cls, robot: Robot, options: FeatureOptions, state: JointState) -> tuple["GearLines", ...]:
-        """Return nothing: orders are found in the residuals of a first model (see `hybrid.spectrum`)."""
+        """Return no features, because the orders are found in residuals of a first model (see `hybrid.spectrum`)."""
         return ()
 
     def columns(self, state: JointState) -> Float[Tensor, "*batch dof columns"]:
-        """Return the sines of all lines of a joint, then the cosines."""
+        """Return the columns: the sines of all lines of a joint, then the cosines."""
         return sines_cosines(state.q * self._rate.to(state.q), self._orders)
 
     def pack(self, weight: Float64[np.ndarray, "dof columns"]) -> Float64[np.ndarray, " values"]:
-        """Return the number of lines, and joint, order and weights of sine and cosine of each."""
+        """Return the number of lines, and joint, order and weights of sine and cosine of every line."""
         sines, cosines = np.split(weight, 2, axis=1)
         lines = [
             (j, order, sines[j, k], cosines[j, k])
@@ -109,7 +109,7 @@ class GearLines(AbstractFeature):
         return np.concatenate([[len(lines)], np.ravel(lines)])
 
     def add_onnx(self, graph: OnnxGraph, weight: Float64[np.ndarray, "dof columns"], q: str) -> str:
-        """See `AbstractFeature.add_onnx`."""
+        """Add the weighted sum of the lines to an ONNX graph; see `AbstractFeature.add_onnx`."""
         return add_harmonics(
             graph, graph.add_node("Mul", q, self._rate.numpy()), self._orders.numpy(), weight
         )

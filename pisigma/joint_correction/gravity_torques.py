@@ -1,4 +1,4 @@
-"""Gravity torques of unknown masses, which deflect compliant joints and gears."""
+"""Feature for gravity torques of unknown masses, which deflect compliant joints and gears."""
 
 from typing import Any, Literal, no_type_check
 
@@ -30,8 +30,9 @@ def add_gravity(arms: Any, correction: Any, first: int, memory: Any, q: Any) -> 
     """Add the deflections of the joints by the gravity torques of unknown masses.
 
     Torque j is `Σ_k z_j · (arm_jk × g)`, with the weights of row k in `arm_jk`, and `z · (a × g) = a · (g × z)`.
-    `correction.values` contains g, and four weights for joint j and moved row k: divided by the reach (mass), and times
-    the arm (first moments). `memory.frames` contains axis and origin of every joint, and axes and origin of its row.
+    `correction.values` contains g, and four weights for joint j and moved row k: the weight of the mass divided by
+    the reach, and the weights of the first moments times `ARM`. `memory.frames` contains axis and origin of every
+    joint, and axes and origin of its row.
     """
     gx, gy, gz = correction.values[first], correction.values[first + 1], correction.values[first + 2]
     dof = arms.dof
@@ -60,14 +61,14 @@ def add_gravity(arms: Any, correction: Any, first: int, memory: Any, q: Any) -> 
 class GravityTorques(AbstractFeature):
     """Deflection of joints by gravity torques.
 
-    The torque on joint j is linear in the masses that it carries. For every moved row k from joint j to the tool there
-    are four columns, a mass at the origin p_k of the row's frame and first moments along its axes u [1/m, scaled by
-    `ARM` as a typical distance]::
+    The torque on joint j is linear in the masses that it carries. For every moved row k from joint j to the tool
+    there are four columns: a mass at the origin p_k of the row's frame, and first moments along the axes u of the
+    frame [1/m, scaled by `ARM` as a typical distance]::
 
         z_j · ((p_k - p_j) × g) / reach        z_j · (u_k × g) · ARM
 
-    with g the direction of gravity; a weight is then compliance times mass. For a prismatic joint it is the force
-    `z_j · g`. The nominal geometry is used.
+    with g the direction of gravity; a weight is then compliance times mass. For a prismatic joint the first column
+    is the force `z_j · g`. The nominal geometry is used.
 
     Source: Whitney, Lozinski and Rourke, ASME Journal of Dynamic Systems, Measurement, and Control 108(1),
     1986, 1-8; regressors linear in the masses as in Khalil and Dombre, "Modeling, Identification and Control
@@ -85,10 +86,10 @@ class GravityTorques(AbstractFeature):
     1.7e-4 for the UR5."""
 
     def __init__(self, robot: Robot, gravity: Direction = (0.0, 0.0, -1.0)) -> None:
-        """Make a feature for a robot.
+        """Create the feature for a robot and a direction of gravity.
 
         Args:
-            robot: the nominal robot; its base and tool do not matter.
+            robot: the nominal robot; base and tool are not used.
             gravity: direction of gravity in the frame of the robot's first row.
         """
         super().__init__(robot)
@@ -106,11 +107,11 @@ class GravityTorques(AbstractFeature):
     def candidates(
         cls, robot: Robot, options: FeatureOptions, state: JointState
     ) -> tuple["GravityTorques", ...]:
-        """See `AbstractFeature.candidates`."""
+        """Return the feature, with the direction of gravity of the options."""
         return (GravityTorques(robot, options.gravity),)
 
     def columns(self, state: JointState) -> Float[Tensor, "*batch dof columns"]:
-        """Return torques of unit masses and moments over the reach; 0 for masses that the joint does not carry."""
+        """Return the columns: torques of unit masses and moments; 0 for masses that the joint does not carry."""
         q = state.q
         z, p, carried = self._frames(q.reshape(-1, self.robot.dof))
         g, z = q.new_tensor(self.gravity), z * q.new_tensor(self.robot.directions)[:, None, None]
@@ -144,7 +145,7 @@ class GravityTorques(AbstractFeature):
         return np.concatenate([self.gravity, (masses * scale[:, None]).ravel()])
 
     def add_onnx(self, graph: OnnxGraph, weight: Float64[np.ndarray, "dof columns"], q: str) -> str:
-        """See `AbstractFeature.add_onnx`."""
+        """Add the deflections by gravity torques to an ONNX graph; see `AbstractFeature.add_onnx`."""
         node, dof, g = graph.add_node, self.robot.dof, np.array(self.gravity)
         axes, origins, carried = add_joint_frames(graph, self.robot, q)
         z = node("Mul", axes, self.robot.directions[:, None])

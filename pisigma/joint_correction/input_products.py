@@ -1,4 +1,4 @@
-"""Products of the inputs of different joints, and their conversion to product units of a Pi-Sigma network."""
+"""Feature of products of the inputs of different joints, and its conversion to product units of a Pi-Sigma network."""
 
 from itertools import combinations
 
@@ -12,7 +12,7 @@ from pisigma.robot.description import Robot
 
 
 class InputProducts(AbstractFeature):
-    """Products φ_a φ_b of two inputs of different joints, with one weight each.
+    """Products φ_a φ_b of two inputs of different joints, with one weight per product.
 
     With φ = `unit_inputs`, product units of order 2 express the sum `Σ_ab w_ab φ_a φ_b`. After the weights are fitted,
     the sum is converted to such units (see `factors`), which models contain.
@@ -21,7 +21,7 @@ class InputProducts(AbstractFeature):
     name = "products"
 
     def __init__(self, robot: Robot) -> None:
-        """Make a feature of all pairs of inputs of different joints."""
+        """Create the feature with all pairs of inputs of different joints."""
         super().__init__(robot)
         turning = [j for j, turns in enumerate(robot.revolute) if turns]
         sliding = [j for j, turns in enumerate(robot.revolute) if not turns]
@@ -34,7 +34,7 @@ class InputProducts(AbstractFeature):
         self.group_names = tuple(f"products, {row.name}" for row in robot.joints)
 
     def columns(self, state: JointState) -> Float[Tensor, "*batch dof columns"]:
-        """Return the products."""
+        """Return the products as columns, the same for every joint."""
         phi = unit_inputs(self.robot, state.q)
         first, second = self.pairs.to(phi.device)
         values = phi.index_select(-1, first) * phi.index_select(-1, second)
@@ -45,7 +45,7 @@ class InputProducts(AbstractFeature):
 
         `Σ_ab w_ab φ_a φ_b = φ^T M φ` with a symmetric M. With its positive and negative eigenvalues λ and μ and their
         eigenvectors e and f, it is the sum over units of `λ (e·φ)² - |μ| (f·φ)² = (r·φ) (s·φ)` with
-        r, s = √λ e ± √|μ| f. The number of units is that of the eigenvalues of the more frequent sign.
+        r, s = √λ e ± √|μ| f. The number of units equals the number of eigenvalues of the more frequent sign.
         """
         first, second = self.pairs
         M = weights.new_zeros((len(self.used), self.inputs, self.inputs))

@@ -1,4 +1,4 @@
-"""The Pi-Sigma network of joint corrections as functions of the joint values, fitted through the kinematics."""
+"""Joint correction: a Pi-Sigma network of the joint values, fitted through the kinematics."""
 
 from collections.abc import Sequence
 
@@ -14,7 +14,7 @@ from pisigma.robot.description import Robot
 
 
 class JointCorrection(nn.Module):
-    """Δ_j(q) [rad or m]: a unit of order 1 on some features, and product units on sines and cosines.
+    """Correction Δ_j(q) [rad or m]: a unit of order 1 on features, and product units on sines and cosines.
 
     For every joint j, with features f and φ = `unit_inputs` of all joints::
 
@@ -28,9 +28,9 @@ class JointCorrection(nn.Module):
         features: features of the unit of order 1.
         orders: number of factors of every product unit; empty for an additive correction.
         linear: weights `(dof, columns)` of every feature.
-        weight: `(dof, factors, inputs)`: v.
-        bias: `(dof, factors)`: b.
-        fixed: `(dof, factors)`: ones.
+        weight: `(dof, factors, inputs)`: weights v of the product units.
+        bias: `(dof, factors)`: biases b of the product units.
+        fixed: `(dof, factors)`: fixed weights of the products, all 1.
     """
 
     weight: nn.Parameter
@@ -38,7 +38,7 @@ class JointCorrection(nn.Module):
     fixed: Tensor
 
     def __init__(self, robot: Robot, features: Sequence[AbstractFeature], orders: Sequence[int] = ()) -> None:
-        """Build a correction that is 0 until its weights are set.
+        """Create a correction that is 0 until weights are set.
 
         Raises:
             ValueError: an order is below 2.
@@ -58,18 +58,18 @@ class JointCorrection(nn.Module):
         self.register_buffer("fixed", torch.ones(robot.dof, factors, dtype=torch.float64))
 
     @property
-    def reads(self) -> tuple[str, ...]:
-        """Row data that it needs in addition to the joint values, by the names of `JointState.stated`."""
-        return tuple(dict.fromkeys(name for feature in self.features for name in feature.reads))
+    def additional_inputs(self) -> tuple[str, ...]:
+        """Names in `JointState.stated` of the row data that the features require in addition to joint values."""
+        return tuple(dict.fromkeys(name for feature in self.features for name in feature.additional_inputs))
 
     @property
     def is_periodic(self) -> bool:
-        """Whether it is the same after full turns of revolute joints."""
+        """Whether the correction is the same after full turns of revolute joints."""
         pairs = zip(self.features, self.linear, strict=True)
         return all(feature.is_periodic(weight.detach().cpu().numpy()) for feature, weight in pairs)
 
     def for_rows(self, measurements: Measurements) -> Float[Tensor, "rows dof"]:
-        """Compute the corrections of measured rows; data that a row does not state have their usual values."""
+        """Compute the corrections of measured rows [rad or m]; data that a row does not state has its usual value."""
         delta: Tensor = self(JointState.from_measurements(measurements))
         return delta
 
@@ -81,8 +81,8 @@ class JointCorrection(nn.Module):
         """Compute the corrections to add to joint values [rad or m].
 
         Args:
-            q: joint values [rad or m], under the usual conditions and in the middle of all backlash; or joint states
-                with further data.
+            q: joint values [rad or m], for usual conditions and the middle of all backlash, or joint states with
+                further data.
             approach: approach direction of every joint for plain joint values: +1 if its value increases, -1 if it
                 decreases, 0 if not stated.
         """

@@ -31,8 +31,8 @@ def add_pose(graph: OnnxGraph, robot: Robot, q: str) -> tuple[str, str]:
 def add_joint_frames(graph: OnnxGraph, robot: Robot, q: str) -> tuple[str, str, str]:
     """Add axes `(batch, dof, 3)` and origins `(batch, dof, 3)` of the joints, and frames of their rows.
 
-    All are in the frame of the first row, without base and tool. The frames `(batch, 4 dof, 3)` are the origin and the
-    three axes of every joint's row.
+    All vectors are in the frame of the first row, without base and tool. The frames `(batch, 4 dof, 3)` are the
+    origin and the three axes of every joint's row.
     """
     node, dof = graph.add_node, robot.dof
     steps = [step for step in _add_chain(graph, robot, q, np.eye(4)) if step.row.type != "fixed"]
@@ -40,7 +40,7 @@ def add_joint_frames(graph: OnnxGraph, robot: Robot, q: str) -> tuple[str, str, 
     after = [graph.reshape(step.after, [16]) for step in steps]
     axes = node("Concat", *(graph.columns(cells, [2, 6, 10]) for cells in before), axis=1)
     origins = node("Concat", *(graph.columns(cells, [3, 7, 11]) for cells in before), axis=1)
-    order = [3, 7, 11, 0, 4, 8, 1, 5, 9, 2, 6, 10]  # origin, then the three axes
+    order = [3, 7, 11, 0, 4, 8, 1, 5, 9, 2, 6, 10]  # origin and the three axes
     carried = node("Concat", *(graph.columns(cells, order) for cells in after), axis=1)
     return (
         graph.reshape(axes, [dof, 3]),
@@ -50,7 +50,7 @@ def add_joint_frames(graph: OnnxGraph, robot: Robot, q: str) -> tuple[str, str, 
 
 
 def add_roll_pitch_yaw(graph: OnnxGraph, cells: str) -> list[str]:
-    """Add roll, pitch, yaw of rotations `(batch, 9)`, each `(batch, 1)`; see `pisigma.robot.se3.rpy_from_rotation`."""
+    """Add roll, pitch and yaw, each `(batch, 1)`, of rotations `(batch, 9)`; see `robot.se3.rpy_from_rotation`."""
     node = graph.add_node
     entry = {(i, j): graph.column(cells, 3 * i + j) for i in range(3) for j in range(3)}
     square = node("Add", *(node("Mul", entry[i, 0], entry[i, 0]) for i in range(2)))
@@ -64,10 +64,10 @@ def add_roll_pitch_yaw(graph: OnnxGraph, cells: str) -> list[str]:
 
 
 def _add_chain(graph: OnnxGraph, robot: Robot, q: str, base: np.ndarray) -> Iterator[_Step]:
-    """Yield the rows: `RotZ(q)` or `Trans(0, 0, q)` is followed by the constant transform of the row."""
+    """Yield the rows of the chain, adding `RotZ(q)` or `Trans(0, 0, q)` and the constant transform of each row."""
     ones = graph.add_node(
         "Add", graph.add_node("Mul", graph.column(q, 0), 0.0), 1.0
-    )  # of the batch size of q
+    )  # expanded to the batch size of q
     frame, joint = graph.add_node("Mul", graph.reshape(ones, [1, 1]), base), 0
     for row, still in zip(robot.rows, _still(robot), strict=True):
         before = frame

@@ -9,16 +9,16 @@ import numpy as np
 from pisigma.files.errors import missing_extra
 
 OPSET, IR_VERSION = 17, 8
-"""Versions that runtimes of 2022 support."""
+"""Versions of the operator set and of the file format, which runtimes of 2022 support."""
 
 BATCH = "batch"
-"""Name of the first dimension of every input and output."""
+"""Name of the first dimension of all inputs and outputs."""
 
 _TINY = 1e-300
 
 
 def import_onnx() -> Any:
-    """Import the optional package onnx.
+    """Import and return the optional package onnx.
 
     Raises:
         MissingExtraError: onnx is not installed.
@@ -40,7 +40,7 @@ class OnnxGraph:
     """
 
     def __init__(self) -> None:
-        """Make an empty graph.
+        """Create an empty graph.
 
         Raises:
             MissingExtraError: onnx is not installed.
@@ -58,7 +58,7 @@ class OnnxGraph:
         return name
 
     def add_output(self, value: str, name: str, shape: Sequence[int], doc: str) -> None:
-        """Declare a value as an output `(batch, *shape)` with a name."""
+        """Declare a value as a named output `(batch, *shape)` of the graph."""
         self.nodes.append(self._onnx.helper.make_node("Identity", [value], [name]))
         self.outputs.append(self._described(name, shape, doc))
 
@@ -106,8 +106,9 @@ class OnnxGraph:
     def angle(self, sine: str, cosine: str) -> str:
         """Add `atan2(sine, cosine)` in full double precision, for values of any length.
 
-        Runtimes have no inverse trigonometric functions in double. The one in float returns an angle a; the exact angle
-        is `a + asin(u)` with `u = (sine cos a - cosine sin a) / length`, about 1e-7, so two terms of asin suffice.
+        Runtimes have no inverse trigonometric functions in double. The function in float returns an angle a; the
+        exact angle is `a + asin(u)` with `u = (sine cos a - cosine sin a) / length`, about 1e-7, so two terms of
+        asin suffice.
         """
         node, doubles, floats = self.add_node, self._onnx.TensorProto.DOUBLE, self._onnx.TensorProto.FLOAT
         high, wide = node("Abs", sine), node("Abs", cosine)
@@ -115,7 +116,7 @@ class OnnxGraph:
         a = node("Cast", node("Atan", node("Cast", ratio, to=floats)), to=doubles)
         a = node("Where", node("Greater", high, wide), node("Sub", math.pi / 2, a), a)
         a = node("Where", node("Less", cosine, 0.0), node("Sub", math.pi, a), a)
-        below = node("Less", node("Reciprocal", sine), 0.0)  # -0 is treated as negative, as for atan2
+        below = node("Less", node("Reciprocal", sine), 0.0)  # -0 is treated as negative, as in atan2
         a = node("Where", below, node("Neg", a), a)
         square = node("Add", node("Mul", sine, sine), node("Mul", cosine, cosine))
         length = node("Max", node("Sqrt", square), _TINY)
@@ -125,7 +126,7 @@ class OnnxGraph:
         return node("Add", a, node("Add", u, third))
 
     def to_bytes(self, name: str, doc: str, metadata: dict[str, str]) -> bytes:
-        """Check the model, and return it as the content of a file."""
+        """Check the ONNX model, and return it as the content of a file."""
         from pisigma import __version__
 
         helper = self._onnx.helper

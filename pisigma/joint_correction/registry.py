@@ -15,7 +15,7 @@ from pisigma.robot.description import Robot
 from pisigma.robot.kernels.forms import register_compiled
 
 FEATURES: dict[str, type[AbstractFeature]] = {}
-"""All features by name, in the order of registration."""
+"""Classes of all features by name, in the order of registration."""
 
 
 def register_feature(feature: type[AbstractFeature]) -> type[AbstractFeature]:
@@ -35,7 +35,7 @@ def register_feature(feature: type[AbstractFeature]) -> type[AbstractFeature]:
 
 
 def feature_by_name(name: str) -> type[AbstractFeature]:
-    """Return the feature with a name.
+    """Return the class of the feature with the given name.
 
     Raises:
         ModelError: there is no such feature.
@@ -67,7 +67,7 @@ def feature_section(value: Any) -> FeatureSection:
 
 
 def feature_from(robot: Robot, section: FeatureSection) -> AbstractFeature:
-    """Make the feature that a section describes.
+    """Return the feature that a section describes.
 
     Args:
         robot: the nominal robot.

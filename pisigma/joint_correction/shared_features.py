@@ -22,7 +22,7 @@ class AbstractSharedFeature(AbstractFeature):
     """Base class of features whose columns do not depend on the joint that they correct."""
 
     def __init__(self, robot: Robot) -> None:
-        """Make a feature for a robot."""
+        """Create the feature for a robot."""
         super().__init__(robot)
         count = self.values(torch.zeros(robot.dof, dtype=torch.float64)).shape[-1]
         self.used = torch.ones(robot.dof, count, dtype=torch.bool)
@@ -30,16 +30,16 @@ class AbstractSharedFeature(AbstractFeature):
         self.group_names = (self.name,)
 
     def columns(self, state: JointState) -> Float[Tensor, "*batch dof columns"]:
-        """Return the same values for every joint."""
+        """Return the columns, which are the same for every joint."""
         values = self.values(state.q)
         return values.unsqueeze(-2).expand(*state.q.shape, values.shape[-1])
 
     @abstractmethod
     def values(self, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch columns"]:
-        """Compute the columns."""
+        """Compute the columns that all joints share, `(*batch, columns)`."""
 
     def add_onnx(self, graph: OnnxGraph, weight: Float64[np.ndarray, "dof columns"], q: str) -> str:
-        """See `AbstractFeature.add_onnx`."""
+        """Add the weighted sum of the columns to an ONNX graph; see `AbstractFeature.add_onnx`."""
         return graph.add_node("MatMul", self.add_values(graph, q), weight.T)
 
     @abstractmethod
@@ -49,7 +49,7 @@ class AbstractSharedFeature(AbstractFeature):
 
 @no_type_check
 def add_scaled(arms: Any, correction: Any, first: int, memory: Any, q: Any) -> None:
-    """Add weighted scaled joint values."""
+    """Add the weighted sum of the scaled joint values to every joint's correction."""
     for j in range(arms.dof):
         for i in range(arms.dof):
             weight = correction.values[first + arms.dof * j + i]
@@ -57,17 +57,17 @@ def add_scaled(arms: Any, correction: Any, first: int, memory: Any, q: Any) -> N
 
 
 class ScaledJoints(AbstractSharedFeature):
-    """Scaled values of all joints: 0 in the middle of the limits, ±1 at them."""
+    """Scaled values of all joints: 0 in the middle of the limits, and ±1 at the limits."""
 
     name = "joints"
     compiled = CompiledForm(add_scaled)
 
     def values(self, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch columns"]:
-        """See `scaled_joints`."""
+        """Return the scaled joint values; see `scaled_joints`."""
         return scaled_joints(self.robot, q)
 
     def add_values(self, graph: OnnxGraph, q: str) -> str:
-        """See `AbstractSharedFeature.add_values`."""
+        """Add the columns to an ONNX graph; see `AbstractSharedFeature.add_values`."""
         return add_scaled_joints(graph, self.robot, q)
 
     def is_periodic(self, weight: Float64[np.ndarray, "dof columns"]) -> bool:
@@ -77,24 +77,24 @@ class ScaledJoints(AbstractSharedFeature):
 
 @no_type_check
 def add_inputs(arms: Any, correction: Any, first: int, memory: Any, q: Any) -> None:
-    """Add weighted inputs of the product units."""
+    """Add the weighted sum of the inputs of product units to every joint's correction."""
     for j in range(arms.dof):
         for i in range(correction.inputs):
             memory.delta[j] += correction.values[first + correction.inputs * j + i] * memory.phi[i]
 
 
 class SinesCosines(AbstractSharedFeature):
-    """Sine and cosine of every revolute joint, scaled value of every prismatic one."""
+    """Sine and cosine of every revolute joint value, and scaled value of every prismatic joint."""
 
     name = "sin_cos"
     compiled = CompiledForm(add_inputs)
 
     def values(self, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch columns"]:
-        """See `unit_inputs`."""
+        """Return the inputs of the product units; see `unit_inputs`."""
         return unit_inputs(self.robot, q)
 
     def add_values(self, graph: OnnxGraph, q: str) -> str:
-        """See `AbstractSharedFeature.add_values`."""
+        """Add the columns to an ONNX graph; see `AbstractSharedFeature.add_values`."""
         return add_unit_inputs(graph, self.robot, q)
 
 
@@ -104,17 +104,17 @@ class NominalPose(AbstractSharedFeature):
     name = "pose"
 
     def __init__(self, robot: Robot) -> None:
-        """Make a feature for a robot."""
+        """Create the feature for a robot."""
         self._inputs = Inputs.from_names(robot, ("x", "y", "z", "roll", "pitch", "yaw"))
         super().__init__(robot)
 
     def values(self, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch columns"]:
-        """Compute the coordinates of the pose."""
+        """Compute the scaled coordinates of the nominal pose."""
         values = self._inputs(forward_kinematics(self.robot, q), q)
         return values / values.new_tensor([self.robot.reach] * 3 + [1.0] * 3)
 
     def add_values(self, graph: OnnxGraph, q: str) -> str:
-        """See `AbstractSharedFeature.add_values`."""
+        """Add the columns to an ONNX graph; see `AbstractSharedFeature.add_values`."""
         position, R = add_pose(graph, self.robot, q)
         scaled = graph.add_node("Div", position, self.robot.reach)
         return graph.add_node("Concat", scaled, *add_roll_pitch_yaw(graph, R), axis=1)

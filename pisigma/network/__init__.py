@@ -1,1 +1,1 @@
-"""The Pi-Sigma network, its inputs and its training."""
+"""The Pi-Sigma network, its inputs, and its training."""

@@ -25,7 +25,7 @@ class JointGroup:
 
 
 class CorrectionNetwork(nn.Module):
-    """Networks for the corrections of all joints [rad or m]; joints in no group are not corrected."""
+    """Networks that compute corrections of the joints [rad or m]; joints without a group are not corrected."""
 
     networks: nn.ModuleList
 
@@ -50,19 +50,20 @@ class CorrectionNetwork(nn.Module):
         self.networks = nn.ModuleList(networks)
 
     def members(self) -> list[tuple[JointGroup, PiSigma]]:
-        """Return every group with its network."""
-        return [(group, network) for group, network in zip(self.groups, self.networks, strict=True)]  # type: ignore[misc]
+        """Return pairs of every joint group and its network."""
+        return [(group, network) for group, network in zip(self.groups, self.networks, strict=True)]  # type:
+        ignore[misc]
 
     def scaled_inputs(
         self, T: Float[Tensor, "*batch 4 4"], q: Float[Tensor, "*batch dof"]
     ) -> Float[Tensor, "*batch all_inputs"]:
-        """Compute the concatenated scaled inputs of all groups, the space of the domain."""
+        """Compute the concatenated scaled inputs of all groups, in which the domain is defined."""
         return torch.cat([net.scale_inputs(group.inputs(T, q)) for group, net in self.members()], -1)
 
     def forward(
         self, T: Float[Tensor, "*batch 4 4"], q: Float[Tensor, "*batch dof"]
     ) -> Float[Tensor, "*batch dof"]:
-        """Compute the correction of the nominal joint values `q` of the poses `T`."""
+        """Compute the correction [rad or m] of the nominal joint values `q` [rad or m] of poses T_base_tool [m]."""
         columns: list[Tensor] = [torch.zeros_like(q[..., 0])] * self.dof
         for group, network in self.members():
             for joint, value in zip(group.joints, network(group.inputs(T, q)).unbind(-1), strict=True):

@@ -1,4 +1,4 @@
-"""Energy of a Pi-Sigma network, its derivatives in closed form, and its history."""
+"""Energy of a Pi-Sigma network: its value, its derivatives in closed form, and its history during a training."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -30,7 +30,7 @@ def energy_gradient(
         d: scaled targets.
 
     Returns:
-        Energy, and its gradients with respect to `network.weight` and `network.bias`.
+        The energy of every output, and its gradients with respect to `network.weight` and `network.bias`.
     """
     weighted = weigh_sums(x, network.weight.detach(), network.bias.detach(), network.fixed)
     difference = d - sum_of_products(weighted, network.orders)
@@ -77,7 +77,7 @@ def output_jacobian(
         orders: number of summing units of every product unit.
 
     Returns:
-        For each summing unit the derivatives with respect to its weights, then to its bias.
+        For each summing unit, the derivatives with respect to its weights and then to its bias.
     """
     by_sum = (products_of_others(weighted, orders) * fixed).movedim(0, -2)
     with_bias = torch.cat([x, x.new_ones((x.shape[0], 1))], -1)

@@ -14,14 +14,14 @@ from pisigma.robot.description import Robot
 from pisigma.robot.se3 import rpy_from_rotation
 
 POSE_INPUTS = ("x", "y", "z", "roll", "pitch", "yaw")
-"""Coordinates of the pose: x, y, z [m] and angles [rad] of the rotation relative to the reference."""
+"""Names of the coordinates of the pose: x, y, z [m], and angles [rad] of the rotation relative to the reference."""
 
 _FUNCTION = re.compile(r"^(sin|cos)\((.+)\)$")
 
 
 @dataclass(frozen=True, eq=False)
 class Inputs:
-    """Named inputs for one robot.
+    """Named inputs of a network for one robot.
 
     A name is a coordinate of the pose (`x`, `y`, `z`, `roll`, `pitch`, `yaw`), a joint (`theta_1`: its
     nominal value [rad or m]), or `sin(...)` or `cos(...)` of a sum of revolute joints with optional integer factors
@@ -41,7 +41,7 @@ class Inputs:
     def from_names(
         robot: Robot, names: Sequence[str], reference: Float64[np.ndarray, "3 3"] | None = None
     ) -> "Inputs":
-        """Make the inputs for a robot.
+        """Return the inputs with the given names for a robot.
 
         Raises:
             RecipeError: a name is not valid (the message lists the valid ones), two inputs are the same, or one is a
@@ -70,11 +70,11 @@ class Inputs:
     def __call__(
         self, T: Float[Tensor, "*batch 4 4"], q: Float[Tensor, "*batch dof"]
     ) -> Float[Tensor, "*batch inputs"]:
-        """Compute the inputs.
+        """Compute the unscaled inputs [m, rad or 1].
 
         Args:
-            T: poses T_base_tool.
-            q: their nominal joint values [rad or m].
+            T: poses T_base_tool [m].
+            q: nominal joint values of the poses [rad or m].
         """
         rpy: tuple[Tensor, ...] = ()
         if set(self.names) & set(POSE_INPUTS[3:]):
@@ -92,7 +92,7 @@ class Inputs:
         return torch.stack(columns, -1)
 
     def combination(self, name: str) -> tuple[str, list[float]]:
-        """Return function ("" for none) and joint factors of an input; the factors are empty for a coordinate.
+        """Return the function of an input ("" for none), and its integer factors by joint; empty for a coordinate.
 
         Raises:
             RecipeError: the name is not valid.

@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt training of Pi-Sigma networks: many small problems, one per output and start, in parallel."""
+"""Levenberg-Marquardt training of Pi-Sigma networks, in parallel for all outputs and starts."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,16 +17,18 @@ DAMPING_FALL, DAMPING_RISE = 0.2, 3.0
 WINDOW = 5
 """Number of iterations between checks of convergence."""
 CONVERGED_SHARE = 0.02
-"""A problem has converged if its cost decreased by less than this share within a window, ..."""
+"""Relative decrease of the cost within a window below which a problem has converged."""
 CONVERGED_COST = 1e-11
-"""... or by less than this: an RMS of 4e-6 of the range of the targets, in the scaling of `build_network`."""
+"""Decrease of the cost within a window below which a problem has converged: an RMS of 4e-6 of the range of the
+targets, in the scaling of `build_network`."""
 
 _PROBE = 0.1
 """Share of a step for the finite difference of the curvature along it."""
 _BEND = 0.75
-"""Largest ratio of twice the second-order correction to the step (Transtrum and Sethna 2012)."""
+"""Largest ratio of twice the second-order correction to the step at which the correction is used (Transtrum and
+Sethna 2012)."""
 _CHUNK = 8_000_000
-"""Largest number of Jacobian entries that are in memory at once."""
+"""Largest number of entries of the Jacobian that are in memory at a time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,19 +51,21 @@ class LevenbergMarquardt(nn.Module):
 
     Steps solve `(J^T J + λ diag(J^T J)) δ = J^T r` with the Jacobian in closed form (Marquardt 1963), with a
     second-order correction: `δ - 1/2 (J^T J + λ diag(J^T J))⁻¹ J^T y''`, where y'' is the second derivative along δ
-    (geodesic acceleration, Transtrum and Sethna 2012). Factors of a product can be scaled against each other, and
-    first-order steps are very short along such valleys. λ decreases after a step that lowers the cost and increases
-    after one that does not, which is rejected. All state is in buffers, so that a training resumes exactly.
+    (geodesic acceleration, Transtrum and Sethna 2012). The second-order correction lengthens steps along curved
+    valleys, which exist because factors of a product can be scaled against each other. λ decreases after a step that
+    lowers the cost; any other step is rejected, and λ increases. The whole state is in buffers, so that a training
+    resumes exactly.
 
     Attributes:
         parameters_now: `(starts, outputs, units, inputs + 1)`: weights and, last, the bias.
-        damping: `(starts, outputs)`: λ.
-        cost: `(starts, outputs)`: cost of the fitted patterns, including the ridge.
+        damping: `(starts, outputs)`: damping λ.
+        cost: `(starts, outputs)`: cost of the fitted patterns, including the ridge penalty.
         window_cost: `(starts, outputs)`: cost at the last check of convergence.
-        moving: `(starts, outputs)`: problems that have not converged.
+        moving: `(starts, outputs)`: mask of the problems that have not converged.
         iterations: number of steps.
         best: parameters of every start with the lowest validation error so far.
-        best_error: `(starts, outputs)`: that error, the sum of squares over the validation patterns.
+        best_error: `(starts, outputs)`: lowest validation error so far, the sum of squares over the validation
+            patterns.
     """
 
     fixed: Tensor
@@ -77,7 +81,7 @@ class LevenbergMarquardt(nn.Module):
     def __init__(
         self, network: PiSigma, starts: int, spread: float, ridge: float, generator: torch.Generator
     ) -> None:
-        """Draw the starts like `PiSigma.initialise`.
+        """Draw the initial weights and biases of all starts like `PiSigma.initialise`.
 
         Args:
             network: network with the structure and the fixed weights; it is not changed until `write_best`.
@@ -105,7 +109,7 @@ class LevenbergMarquardt(nn.Module):
 
     @torch.no_grad()
     def iterate(self, patterns: Patterns) -> Float[Tensor, " outputs"]:
-        """Perform one step for every start and output.
+        """Perform one step of every start and output.
 
         Returns:
             Energy (eq. 3, all patterns) of the best start of every output.
@@ -149,7 +153,7 @@ class LevenbergMarquardt(nn.Module):
         return weigh_sums(x, parameters[..., :-1], parameters[..., -1], self.fixed)
 
     def _residual(self, patterns: Patterns, parameters: Tensor) -> Tensor:
-        """Return `d - y` as `(patterns, starts, outputs)`."""
+        """Return the residuals `d - y` as `(patterns, starts, outputs)`."""
         return patterns.d[:, None, :] - sum_of_products(self._weigh(patterns.x, parameters), self.orders)
 
     def _cost(self, residual: Tensor, parameters: Tensor, fitted: Tensor) -> Tensor:
@@ -157,7 +161,7 @@ class LevenbergMarquardt(nn.Module):
         return ((residual.square() * fitted[:, None, None]).sum(0) + pull) / 2
 
     def _step(self, patterns: Patterns, fitted: Tensor) -> Tensor:
-        """Return the step of every problem, with the second-order correction if that is small."""
+        """Return the step of every problem, including the second-order correction if it is small."""
         weighted = self._weigh(patterns.x, self.parameters_now)
         pull = torch.full_like(self.parameters_now, self.ridge)
         pull[..., -1] = 0.0
@@ -212,7 +216,7 @@ class LevenbergMarquardt(nn.Module):
             self.window_cost = self.cost.clone()
 
     def _remember(self, patterns: Patterns, residual: Tensor, changed: Tensor) -> None:
-        """Keep the parameters that are best on the validation patterns, or on all if there are none."""
+        """Keep the parameters with the lowest error on the validation patterns, or without any on all patterns."""
         chosen = patterns.validation if patterns.validation.any() else torch.ones_like(patterns.validation)
         error = (residual.square() * chosen[:, None, None]).sum(0)
         better = changed & (error < self.best_error)

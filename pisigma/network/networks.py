@@ -33,12 +33,12 @@ def fit_networks(
 
     Args:
         networks: one network per joint group.
-        patterns: their scaled patterns.
+        patterns: scaled patterns of every network.
         labels: names of the joints of every group.
         fit: method and settings.
-        checkpoints: folder and settings of checkpoints; None writes none.
+        checkpoints: folder and settings of checkpoints; None writes no checkpoints.
         show_progress: whether to draw a progress bar on stderr if it is a terminal.
-        logs: folder for the energies of every epoch as `metrics.csv`; None writes none.
+        logs: folder for the energies of every epoch as `metrics.csv`; None writes no file.
 
     Raises:
         TrainingError: a pattern is not finite, the training diverged, or there is no checkpoint with these settings
@@ -85,7 +85,7 @@ class WholeBatches:
         self._batch, self._count = batch, count
 
     def __iter__(self) -> Iterator[list[Tensor]]:
-        """Yield the batches of an epoch."""
+        """Yield the batch of all patterns once per step of an epoch."""
         for _ in range(self._count):
             yield self._batch
 
@@ -116,7 +116,7 @@ class ShuffledBatches(Sampler[Tensor]):
 
 
 class NetworkTraining(lightning.LightningModule):
-    """Trains the networks of all joint groups in parallel, each output independently.
+    """Lightning module that trains the networks of all joint groups in parallel, each output independently.
 
     Attributes:
         energies: `(epochs, joints)`: see `TrainingHistory`; NaN for epochs that are not completed.
@@ -155,7 +155,7 @@ class NetworkTraining(lightning.LightningModule):
         self.register_buffer("epochs_done", torch.zeros((), dtype=torch.int64))
 
     def configure_optimizers(self) -> Any:
-        """Make the optimiser of the method."""
+        """Return the optimiser of the training method."""
         if not isinstance(self.fit, MiniBatchSection):
             # `_descend` writes gradients times rates. Solvers write none, but Lightning needs an optimiser to count
             # steps and save checkpoints.
@@ -165,7 +165,7 @@ class NetworkTraining(lightning.LightningModule):
         return {"optimizer": optimiser, "lr_scheduler": {"scheduler": falling, "interval": "step"}}
 
     def training_step(self, batch: list[Tensor], batch_idx: int) -> Tensor | None:
-        """Perform one step.
+        """Perform one step on a batch.
 
         Raises:
             TrainingError: the training diverged.
@@ -179,12 +179,12 @@ class NetworkTraining(lightning.LightningModule):
         return None
 
     def on_train_epoch_end(self) -> None:
-        """Count an epoch of mini-batches."""
+        """Count a completed epoch of mini-batches."""
         if isinstance(self.fit, MiniBatchSection):
             self._count(self.energies[int(self.epochs_done)].clone())
 
     def on_train_start(self) -> None:
-        """Stop at once if a resumed training had already ended."""
+        """Stop immediately if a resumed training was already complete."""
         self._stop_when_done()
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
@@ -192,9 +192,9 @@ class NetworkTraining(lightning.LightningModule):
         self.resumed_from = int(checkpoint["state_dict"]["epochs_done"])
 
     def write_networks(self) -> None:
-        """Write the parameters of the best start into every network after the training.
+        """Write the parameters of the best start into every network, after the training.
 
-        This is not a hook, because Lightning runs none when a completed training is resumed.
+        This is not a hook, because Lightning does not run hooks when a completed training is resumed.
 
         Raises:
             TrainingError: a weight is not finite, because the last step diverged.
@@ -209,7 +209,7 @@ class NetworkTraining(lightning.LightningModule):
 
     @property
     def history(self) -> Float[Tensor, "epochs joints"]:
-        """Energies of the completed epochs."""
+        """Energies of the completed epochs, as a `TrainingHistory`."""
         return self.energies[: int(self.epochs_done)].clone()
 
     def _descend(self, patterns: list[Patterns]) -> Tensor:

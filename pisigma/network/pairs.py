@@ -1,4 +1,4 @@
-"""Training pairs of inverse calibration: a measured pose and the joint correction that explains it."""
+"""Training pairs of inverse calibration: measured poses, and the joint corrections that explain them."""
 
 from dataclasses import dataclass
 
@@ -24,10 +24,10 @@ class TrainingPairs:
         T: measured poses T_base_tool.
         q_nominal: nominal joint values of these poses on the branch nearest to the commanded values [rad or m].
         target: `Δ = q - q_nominal`, wrapped to (-pi, pi] for revolute joints.
-        used: rows that are used for training.
-        singular: rows left out because they are near a singularity.
-        unreachable: rows left out because the nominal robot cannot reach the measured pose.
-        branches: branches of the used rows, the most frequent first; empty without a closed-form inverse.
+        used: mask of the rows that are used for training.
+        singular: mask of the rows that are left out because they are near a singularity.
+        unreachable: mask of the rows that are left out because the nominal robot cannot reach the measured pose.
+        branches: names of the branches of the used rows, most frequent first; empty without a closed-form inverse.
     """
 
     T: Float64[Tensor, "rows 4 4"]
@@ -40,7 +40,7 @@ class TrainingPairs:
 
     @property
     def left_out(self) -> str:
-        """Number of left-out rows and the reason, in words; "" if none was left out."""
+        """Text with the numbers of rows that were left out, and the reasons; "" if no row was left out."""
         counts = (
             (self.singular, "near a singularity"),
             (self.unreachable, "not reachable by the nominal robot"),
@@ -49,7 +49,7 @@ class TrainingPairs:
 
 
 def build_pairs(robot: Robot, measurements: Measurements, singular_below: float | None) -> TrainingPairs:
-    """Convert measured poses to pairs: `Δθ = θ_measured - θ_analytic` (Jeong et al. 1998, eq. 5).
+    """Convert measured poses to training pairs: `Δθ = θ_measured - θ_analytic` (Jeong et al. 1998, eq. 5).
 
     The true joint values are not needed: θ_measured are the commanded joint values q, and θ_analytic is the nominal
     inverse kinematics of the measured pose on the branch nearest to q.
@@ -57,7 +57,7 @@ def build_pairs(robot: Robot, measurements: Measurements, singular_below: float 
     Args:
         robot: robot with the base and tool of the measured poses.
         measurements: rows with poses.
-        singular_below: `singularity_measure` below which a row is not used; None uses all rows.
+        singular_below: `singularity_measure` below which a row is not used; None to use all rows.
 
     Raises:
         MeasurementError: no poses were measured.

@@ -17,8 +17,8 @@ from pisigma.network.sections import NetworkSection
 from pisigma.robot.description import Robot
 
 TARGET_RANGE = 1.25
-"""Products start near 1, so targets are scaled to [0, 1.25]: the start is among them, and no product has to change its
-sign. With [-1, 1] some starts end in poor minima, with [0, 2] the paper's learning rates diverge."""
+"""Range to which targets are scaled. It contains 1, near which products start, and no negative values, so no product
+has to change its sign. With [-1, 1] some starts end in poor minima; with [0, 2] the paper's learning rates diverge."""
 
 _MIN_INPUT_RANGE = 1e-9
 """Range of an input [m, rad or 1] below which it is treated as constant."""
@@ -68,13 +68,13 @@ def build_patterns(
     groups_of_rows: Int64[Tensor, " rows"],
     generator: torch.Generator,
 ) -> list[Patterns]:
-    """Scaled patterns of every joint group; the validation rows are drawn once for all.
+    """Return the scaled patterns of every joint group; all groups have the same validation rows.
 
     Args:
         network: network built by `build_network` from the same pairs.
         pairs: training pairs.
         validation_share: share of the used rows that are held out for validation.
-        groups_of_rows: group index of every row; groups are not divided.
+        groups_of_rows: group index of every row; groups are not split.
         generator: generator for the choice of validation rows.
 
     Raises:
@@ -102,7 +102,7 @@ def _check_varying(names: Sequence[str], width: Float64[Tensor, " inputs"], rows
 
 
 def _check_count(group: JointGroup, network: PiSigma, fitted: int) -> None:
-    """Check that there are as many rows as free parameters; scaling of factors against each other is not one."""
+    """Check that there are as many rows as free parameters, without those that scale factors against each other."""
     free = sum(network.orders) * (network.inputs + 1) - sum(order - 1 for order in network.orders)
     if fitted < free:
         raise IdentificationError(
@@ -117,7 +117,7 @@ def _check_count(group: JointGroup, network: PiSigma, fitted: int) -> None:
 def _draw_validation(
     used: Bool[Tensor, " rows"], groups: Int64[Tensor, " rows"], share: float, generator: torch.Generator
 ) -> Bool[Tensor, " rows"]:
-    """Draw whole groups of rows at random until their share is reached; one group is always fitted."""
+    """Draw whole groups of rows at random until they have the requested share; at least one group is fitted."""
     present, counts = torch.unique(groups[used], return_counts=True)
     order = torch.randperm(len(present), generator=generator)
     before = counts[order].cumsum(0) - counts[order]

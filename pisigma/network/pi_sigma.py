@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 
 class PiSigma(nn.Module):
-    """Network whose outputs are sums of products of linear sums.
+    """Pi-Sigma network, whose outputs are sums of products of linear sums of the inputs.
 
     For every output k and every unit u of order m_u, with inputs x and outputs y in scaled form::
 
@@ -22,9 +22,9 @@ class PiSigma(nn.Module):
     Scaling is part of the network: inputs and outputs of `forward` are in physical units.
 
     Attributes:
-        weight: `(outputs, summing_units, inputs)`: w.
-        bias: `(outputs, summing_units)`: b.
-        fixed: `(outputs, summing_units)`: W, a buffer.
+        weight: `(outputs, summing_units, inputs)`: weights w.
+        bias: `(outputs, summing_units)`: biases b.
+        fixed: `(outputs, summing_units)`: fixed weights W, a buffer.
         input_offset, input_scale: `(inputs,)`: scaled input = (input - offset) / scale.
         output_offset, output_scale: `(outputs,)`: output = offset + scale · y.
     """
@@ -98,11 +98,11 @@ class PiSigma(nn.Module):
             parameter.copy_(centre + draw_uniform(parameter, spread, generator))
 
     def scale_inputs(self, x: Float[Tensor, "*batch inputs"]) -> Float[Tensor, "*batch inputs"]:
-        """Scale inputs for the summing units."""
+        """Return inputs scaled for the summing units."""
         return (x - self.input_offset) / self.input_scale
 
     def scale_targets(self, y: Float[Tensor, "*batch outputs"]) -> Float[Tensor, "*batch outputs"]:
-        """Scale target outputs for comparison with the products."""
+        """Return target outputs scaled for comparison with the products."""
         return (y - self.output_offset) / self.output_scale
 
     def products(self, scaled: Float[Tensor, "*batch inputs"]) -> Float[Tensor, "*batch outputs"]:
@@ -115,7 +115,7 @@ class PiSigma(nn.Module):
 
 
 def draw_uniform(like: Tensor, spread: float, generator: torch.Generator) -> Tensor:
-    """Draw uniform numbers in ±spread of the shape of `like`, in float64 so that they are the same for every dtype."""
+    """Draw uniform numbers in ±spread with the shape of `like`, in float64 so that they do not depend on the dtype."""
     uniform = torch.rand(like.shape, generator=generator, dtype=torch.float64, device=generator.device)
     return (spread * (2 * uniform - 1)).to(like)
 
@@ -135,7 +135,7 @@ def weigh_sums(
 def sum_of_products(
     weighted: Float[Tensor, "*batch units"], orders: Sequence[int]
 ) -> Float[Tensor, "*batch"]:
-    """Sum the product units (eq. 2), whose summing units are consecutive."""
+    """Return the sum of the product units (eq. 2), whose summing units are consecutive."""
     total: Tensor | None = None
     for unit in torch.split(weighted, list(orders), dim=-1):
         factors = unit.unbind(-1)
@@ -150,7 +150,7 @@ def sum_of_products(
 def products_of_others(
     weighted: Float[Tensor, "*batch units"], orders: Sequence[int]
 ) -> Float[Tensor, "*batch units"]:
-    """Return for every summing unit the product of the others in its product unit, exact even if factors are zero.
+    """Return for every summing unit the product of the others in its product unit, exact even for zero factors.
 
     This is `Π_{i≠j} W_ki h_i` in the derivative of eq. (4).
     """

@@ -1,4 +1,4 @@
-"""Recipe sections for networks and their training."""
+"""Sections of recipes for networks and their training."""
 
 from collections.abc import Iterable, Sequence
 from typing import Annotated, Literal
@@ -51,7 +51,7 @@ class GradientDescentSection(Section):
     Attributes:
         method: "gradient_descent".
         learning_rate: η of every joint, by name.
-        epochs: number of steps.
+        epochs: number of gradient steps.
         seed: random seed of the initial weights.
         spread: half width of the uniform start of weights (around 0) and biases (around 1).
     """
@@ -63,7 +63,7 @@ class GradientDescentSection(Section):
     spread: PositiveFloat = 0.3
 
     def rates(self, joints: Sequence[str]) -> Float64[Tensor, " outputs"]:
-        """Return the learning rates in the order of the joints.
+        """Return the learning rate of every joint, in the order of the joints.
 
         Raises:
             RecipeError: a joint has no rate.
@@ -81,14 +81,14 @@ class GradientDescentSection(Section):
 
 
 class LevenbergMarquardtSection(Section):
-    """Least squares for every output, from several starts; the best by validation error is kept.
+    """Least squares for every output from several starts, of which the one with the lowest validation error is kept.
 
     Attributes:
         method: "levenberg_marquardt".
-        epochs: largest number of iterations; fewer if the weights converge.
+        epochs: largest number of iterations; the training ends earlier if the weights converge.
         starts: number of starts of every output.
-        validation_share: share of the patterns that only choose between starts.
-        ridge: pull of the weights (not the biases) towards 0, relative to a mean square of 1.
+        validation_share: share of the patterns that are held out to choose between starts.
+        ridge: ridge penalty of the weights (not the biases), relative to a mean square of 1.
         seed: random seed of initial weights and validation patterns.
         spread: half width of the uniform start of weights (around 0) and biases (around 1).
     """
@@ -105,7 +105,7 @@ class LevenbergMarquardtSection(Section):
 class MiniBatchSection(Section):
     """Stochastic gradient descent on mini-batches, for data with many rows.
 
-    The learning rate falls along half a cosine to 0 at the last step.
+    The learning rate decreases along half a cosine to 0 at the last step.
 
     Attributes:
         method: "mini_batches".
@@ -126,7 +126,7 @@ class MiniBatchSection(Section):
     spread: PositiveFloat = 0.3
 
     def build(self, parameters: Iterable[nn.Parameter]) -> torch.optim.Optimizer:
-        """Make the optimiser for these parameters."""
+        """Return the optimiser for the given parameters."""
         if self.optimiser == "sgd":
             return torch.optim.SGD(parameters, lr=self.learning_rate, momentum=0.9)
         kind = torch.optim.Adam if self.optimiser == "adam" else torch.optim.AdamW

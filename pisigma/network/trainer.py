@@ -23,7 +23,7 @@ from pisigma.files.errors import Place, TrainingError
 from pisigma.files.output_file import write_failure
 
 SAVED = 20
-"""Number of checkpoints of a training."""
+"""Approximate number of checkpoints that a training writes."""
 
 _NAME = "last"
 _FINGERPRINT = "pisigma_fingerprint"
@@ -40,7 +40,7 @@ _HARMLESS = (
 
 @dataclass(frozen=True)
 class Checkpoints:
-    """Checkpoints of a training.
+    """Folder and settings of the checkpoints of a training.
 
     Attributes:
         folder: folder of the checkpoints.
@@ -113,13 +113,13 @@ def train(
     show_progress: bool = False,
     logs: Path | None = None,
 ) -> None:
-    """Train a module in place.
+    """Train a Lightning module in place.
 
     Args:
         module: module to train.
         data: loader of the batches of an epoch.
         epochs: largest number of epochs; about `SAVED` checkpoints are written, and one at the end.
-        checkpoints: folder and settings of checkpoints; None writes none.
+        checkpoints: folder and settings of checkpoints; None writes no checkpoints.
         show_progress: whether to draw Lightning's progress bar on stderr if it is a terminal.
         logs: folder for Lightning's logs: `metrics.csv`, and TensorBoard events if that is installed.
 
@@ -176,7 +176,7 @@ def _loggers(folder: Path | None) -> list[Logger]:
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """Compute on one thread: for a hundred patterns, a second thread costs more than it saves."""
+    """Compute on one thread in the block; for a hundred patterns, a second thread costs more than it saves."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -204,7 +204,7 @@ def _quiet() -> Iterator[None]:
 
 @contextmanager
 def _keyboard_interrupts() -> Iterator[None]:
-    """Turn Ctrl-C into `KeyboardInterrupt`: Lightning would exit with status 1 and ignore all later interrupts."""
+    """Raise `KeyboardInterrupt` on Ctrl-C; Lightning would exit with status 1 and ignore later interrupts."""
     handler = signal.getsignal(signal.SIGINT)
     try:
         yield

@@ -1,4 +1,4 @@
-"""Simulation: error sources of a true robot, and measurements of sensors on it."""
+"""Simulation of a true robot with error sources, and of sensors that measure it."""
 
 from pisigma.simulation.distances import SimulatedDistances, SimulatedPairs, SimulatedSockets
 from pisigma.simulation.measure import SimulatedMeasurements, SimulatedSensors, simulate

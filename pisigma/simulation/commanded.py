@@ -1,4 +1,4 @@
-"""Commanded joint values: drawn at random, or those with which the true robot reaches desired poses."""
+"""Commanded joint values, either random or such that the true robot reaches desired poses."""
 
 import torch
 from jaxtyping import Bool, Float64
@@ -18,13 +18,13 @@ from pisigma.simulation.true_robot import TrueRobot
 
 
 class BranchSection(Section):
-    """The branch of the inverse kinematics, the same for all poses of a simulation.
+    """Branch of the inverse kinematics, common to all poses of a simulation.
 
     Attributes:
         name: name of a branch of the nominal robot's closed form, instead of joint values.
-        near_deg: joint values by name of a revolute joint [deg], 0 by default. With a closed form, its nearest
+        near_deg: joint values by name of a revolute joint [deg], 0 by default. With a closed form, the nearest
             reachable solution is used; without one, they are the start of the numeric solution.
-        near_mm: the same for prismatic joints [mm].
+        near_mm: joint values by name of a prismatic joint [mm], 0 by default.
     """
 
     name: str | None = None
@@ -40,7 +40,7 @@ class BranchSection(Section):
         return self
 
     def start(self, robot: Robot, T: Float64[Tensor, "poses 4 4"]) -> Float64[Tensor, "poses dof"]:
-        """Return joint values [rad or m] near which the true robot reaches the poses.
+        """Return joint values [rad or m] near which the true robot reaches the desired poses.
 
         Args:
             robot: the nominal robot.
@@ -72,7 +72,7 @@ class BranchSection(Section):
     def find(
         self, robot: Robot, T: Float64[Tensor, "poses 4 4"]
     ) -> tuple[Float64[Tensor, "poses dof"], Bool[Tensor, " poses"]]:
-        """Return joint values [rad or m] of the nominal robot at poses, of which some may be unreachable.
+        """Return joint values [rad or m] of the nominal robot at poses, some of which may be unreachable.
 
         Args:
             robot: the nominal robot.
@@ -95,7 +95,7 @@ class BranchSection(Section):
         return _nearest(solutions, robot, near, reached).nan_to_num(), reached.any(-1)
 
     def _near(self, robot: Robot) -> Float64[Tensor, " dof"]:
-        """Return the joint values of `near_deg` and `near_mm` [rad or m], which are the controller's values."""
+        """Return the controller values of `near_deg` and `near_mm` [rad or m]."""
         fields = ("near_deg", "near_mm")
         stated = stated_joints(robot, self.near_deg or {}, self.near_mm, fields, "branch", axes=True)
         values = [axis.from_file_unit(stated.get(index, 0.0)) for index, axis in enumerate(robot.axes)]
@@ -105,7 +105,7 @@ class BranchSection(Section):
     def _solutions(
         self, solver: AbstractClosedForm | None, robot: Robot, T: Float64[Tensor, "poses 4 4"]
     ) -> InverseSolutions:
-        """Return all solutions, or only those of the named branch."""
+        """Return the solutions of all branches, or of the named branch only."""
         if solver is None:
             raise RecipeError(
                 f"robot '{robot.name}' has no closed form and therefore no branch '{self.name}'",
@@ -127,14 +127,14 @@ def _nearest(
     near: Float64[Tensor, " dof"],
     allowed: Bool[Tensor, "poses branches"],
 ) -> Float64[Tensor, "poses dof"]:
-    """Return the nearest of the allowed solutions."""
+    """Return the allowed solutions that are nearest to reference values."""
     difference = wrapped_difference(robot, solutions.q, near)
     distance = torch.where(allowed, (difference * difference).sum(-1), torch.inf)
     return torch.take_along_dim(solutions.q, distance.argmin(-1)[:, None, None], 1)[:, 0]
 
 
 class AbstractCommandedJoints(Section):
-    """Base of sections that measure at poses.
+    """Base class of sections of sensors that measure at poses.
 
     Attributes:
         poses: desired poses, or joint values to command.
@@ -155,10 +155,10 @@ class AbstractCommandedJoints(Section):
         return self
 
     def commanded_joints(self, robot: TrueRobot) -> Float64[Tensor, "rows dof"]:
-        """Return the joint values to command [rad or m], the same at every call. See `joints_for_poses`."""
+        """Return the joint values to command [rad or m], the same at every call; see `joints_for_poses`."""
         if isinstance(self.poses, JointsRandom):
             return self.poses.joints(robot.nominal)
-        assert self.branch is not None  # checked by the validator
+        assert self.branch is not None  # the validator has checked this
         T = self.poses.transforms()
         return joints_for_poses(robot, T, self.branch.start(robot.nominal, T))
 
@@ -166,10 +166,10 @@ class AbstractCommandedJoints(Section):
 def joints_for_poses(
     robot: TrueRobot, T: Float64[Tensor, "poses 4 4"], start: Float64[Tensor, "poses dof"]
 ) -> Float64[Tensor, "poses dof"]:
-    """Return joint values with which the true robot reaches desired poses.
+    """Return the commanded joint values [rad or m] with which the true robot reaches desired poses.
 
-    Encoder steps are ignored: the joint values would reach the poses exactly without an encoder; with one, the robot
-    stops at the nearest pulse, so measured poses differ slightly from desired ones.
+    Encoder steps are ignored: the joint values would reach the poses exactly without an encoder. With an encoder,
+    the robot stops at the nearest pulse, so measured poses differ slightly from desired poses.
 
     Args:
         robot: the true robot.
@@ -177,7 +177,7 @@ def joints_for_poses(
         start: joint values [rad or m] near the solution.
 
     Raises:
-        UnreachablePoseError: the true robot does not reach a pose near its start.
+        UnreachablePoseError: the true robot does not reach a pose near the start values.
         RecipeError: joint values are outside the limits of the robot.
     """
     q, inside = wrap_into_limits(robot.nominal, robot.without_encoder().inverse(T, start))

@@ -1,4 +1,4 @@
-"""Simulated distances and sockets: a draw wire from an anchor, a ball bar between two poses, a ball in sockets."""
+"""Simulated distances and sockets: a draw wire from an anchor, a ball bar between two poses, and a ball in sockets."""
 
 from typing import Literal
 
@@ -22,7 +22,7 @@ class SocketSection(Section):
 
     Attributes:
         name: name of the socket.
-        point_mm: its position in the base frame [mm], which measurements do not state.
+        point_mm: position of the socket in the base frame [mm], which measurements do not state.
     """
 
     name: str = Field(min_length=1)
@@ -30,16 +30,16 @@ class SocketSection(Section):
 
 
 class SimulatedSockets(Section):
-    """Recipe section of sockets in which the ball sits, and of the tool's orientations there.
+    """Section of a recipe for sockets in which the ball sits, and for the tool's orientations there.
 
     Attributes:
         kind: "sockets".
         sockets: the sockets.
         poses_per_socket: number of orientations of the tool in every socket.
-        orientation: orientations of the tool, drawn from one generator in the order of the sockets.
+        orientation: orientations of the tool, which are drawn from one generator in the order of the sockets.
         seed: random seed of the orientations.
         branch: branch of the nominal robot's inverse kinematics.
-        noise: noise, with `sensor_mm` the play of the ball per axis; none by default.
+        noise: noise, where `sensor_mm` is the play of the ball per axis; no noise by default.
     """
 
     kind: Literal["sockets"]
@@ -87,9 +87,9 @@ class AnchorSection(Section):
 
     Attributes:
         name: name of the anchor.
-        point_mm: its position in the base frame [mm].
+        point_mm: position of the anchor in the base frame [mm].
         zero_mm: zero offset of the sensor [mm].
-        known: whether measurements state its position.
+        known: whether measurements state the position of the anchor.
     """
 
     name: str = Field(min_length=1)
@@ -99,12 +99,12 @@ class AnchorSection(Section):
 
 
 class SimulatedDistances(AbstractCommandedJoints):
-    """Recipe section of distances from an anchor.
+    """Section of a recipe for distances from an anchor.
 
     Attributes:
         kind: "distances".
         anchor: the anchor.
-        noise: noise of sensor and robot; none by default.
+        noise: noise of sensor and robot; no noise by default.
     """
 
     kind: Literal["distances"]
@@ -135,12 +135,12 @@ class SimulatedDistances(AbstractCommandedJoints):
 
 
 class SimulatedPairs(AbstractCommandedJoints):
-    """Recipe section of distances between pairs of poses: the first and the second, and so on.
+    """Section of a recipe for distances between pairs of poses: the first and the second pose, and so on.
 
     Attributes:
         kind: "pairs".
-        name: name of the pairs, followed by their number from 0.
-        noise: noise of the sensor and of the robot in both poses; none by default.
+        name: name of the pairs, to which their number from 0 is appended.
+        noise: noise of the sensor and of the robot in both poses; no noise by default.
     """
 
     kind: Literal["pairs"]

@@ -1,4 +1,4 @@
-"""Simulated measurements of the true robot: of a tracker, or of several sensors."""
+"""Simulated measurements of the true robot by a tracker or by several sensors."""
 
 from dataclasses import replace
 from typing import Annotated, Literal
@@ -19,14 +19,14 @@ from pisigma.simulation.true_robot import TrueRobot
 
 
 class SimulatedMeasurements(AbstractCommandedJoints):
-    """Recipe section of a tracker that measures the true robot.
+    """Section of a recipe for a tracker that measures the true robot.
 
     Attributes:
         poses: desired poses, or joint values to command.
         branch: branch of the inverse kinematics for desired poses; not for joint values.
         kind: "tracker", the default.
         sensor: "pose" (position and orientation) or "position".
-        noise: noise of the sensor; none by default.
+        noise: noise of the sensor; no noise by default.
         frame: name of the tracker's frame, which is the robot's base frame.
         target: name of the measured target on the robot.
     """
@@ -38,7 +38,7 @@ class SimulatedMeasurements(AbstractCommandedJoints):
     target: str = ""
 
     def measure(self, robot: TrueRobot) -> Measurements:
-        """Simulate the measurements, the same at every call. See `simulate`."""
+        """Return simulated measurements, the same at every call; see `simulate`."""
         measured = simulate(robot, self.commanded_joints(robot), self.sensor, self.noise)
         rows = measured.rows
         return replace(measured, frame=(self.frame,) * rows, target=(self.target,) * rows)
@@ -54,12 +54,12 @@ def simulate(
 
     Args:
         robot: the true robot.
-        q: commanded joint values [rad or m], as the controller counts them.
+        q: commanded joint values [rad or m], with the sign and zero of the controller.
         sensor: "pose" to measure orientations in addition to positions. The sensor's frame is the robot's base frame.
         noise: noise of the sensor; None for exact measurements.
 
     Returns:
-        One row per commanded joint vector, with the standard deviations of the noise if there is any, and with random
+        One row per commanded joint vector, with the standard deviations of the noise, if any, and with random
         directions of approach if joints have backlash.
 
     Raises:
@@ -85,7 +85,7 @@ def _sigma(q: Float64[Tensor, "rows dof"], sigma: float) -> Float64[Tensor, " ro
 
 
 def kind(section: object) -> object:
-    """Return the kind of a section, by default that of a tracker."""
+    """Return the kind of a section; "tracker" if it states none."""
     return section.get("kind", "tracker") if isinstance(section, dict) else getattr(section, "kind", None)
 
 
@@ -93,17 +93,17 @@ SimulatedPoses = Annotated[
     Annotated[SimulatedMeasurements, Tag("tracker")] | Annotated[SimulatedImages, Tag("images")],
     Discriminator(kind),
 ]
-"""Sections of sensors that measure poses: a tracker (default) or images."""
+"""Section of a sensor that measures poses: a tracker (default) or images."""
 
 SimulatedSensor = Annotated[
     SimulatedMeasurements | SimulatedTouches | SimulatedSockets | SimulatedDistances | SimulatedPairs,
     Field(discriminator="kind"),
 ]
-"""Sections of sensors, distinguished by `kind`: tracker, touches, sockets, distances or pairs."""
+"""Section of a sensor, distinguished by `kind`: tracker, touches, sockets, distances or pairs."""
 
 
 class SimulatedSensors(Section):
-    """Recipe section of several sensors that measure the same true robot.
+    """Section of a recipe for several sensors that measure the same true robot.
 
     Attributes:
         sensors: one or more sensors, whose rows are concatenated.
@@ -112,5 +112,5 @@ class SimulatedSensors(Section):
     sensors: tuple[SimulatedSensor, ...] = Field(min_length=1)
 
     def measure(self, robot: TrueRobot) -> Measurements:
-        """Simulate all sensors and concatenate their rows, the same at every call. See `pisigma.measurement.join`."""
+        """Return the rows of all sensors, the same at every call, joined by `pisigma.measurement.join`."""
         return join([sensor.measure(robot) for sensor in self.sensors])

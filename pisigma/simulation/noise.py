@@ -42,7 +42,7 @@ class MeasurementNoise(Section):
         return float(torch.deg2rad(torch.tensor(self.orientation_deg, dtype=torch.float64)))
 
     def apply(self, T: Float64[Tensor, "rows 4 4"]) -> Float64[Tensor, "rows 4 4"]:
-        """Return measured poses, the same at every call.
+        """Return measured poses: true poses with noise, the same at every call.
 
         Args:
             T: true poses in the frame of measurement.
@@ -56,11 +56,11 @@ class MeasurementNoise(Section):
 
 @dataclass(frozen=True, eq=False)
 class NoiseDraws:
-    """Random deviations.
+    """Random deviations of sensor and robot, one row per measurement.
 
     Attributes:
         sensor: deviations of the sensor [m]; sensors of one value use the first column.
-        robot: deviations of the tool point from the commanded one, in the base frame [m].
+        robot: deviations of the tool point from the commanded point, in the base frame [m].
     """
 
     sensor: Float64[Tensor, "rows 3"]
@@ -70,8 +70,8 @@ class NoiseDraws:
 class SensorNoise(Section):
     """Normal deviations, independent from row to row and axis to axis.
 
-    From one generator with `seed`, (rows, 3) standard normal numbers are drawn for the sensor, of which a
-    sensor of one value uses the first column, then (rows, 3) for the robot.
+    From one generator with `seed`, (rows, 3) standard normal numbers are drawn for the sensor, where a sensor of one
+    value uses the first column, then (rows, 3) for the robot.
 
     Attributes:
         sensor_mm: standard deviation of a measured length, or of every axis of a ball in its socket [mm].
@@ -85,22 +85,22 @@ class SensorNoise(Section):
     seed: Seed
 
     def draw(self, rows: int) -> NoiseDraws:
-        """Return the deviations of `rows` rows, the same at every call."""
+        """Return random deviations of the given number of rows, the same at every call."""
         generator = torch.Generator().manual_seed(self.seed)
         draws = torch.randn(2, rows, 3, generator=generator, dtype=torch.float64)
         return NoiseDraws(self.sensor_mm / 1e3 * draws[0], self.repeatability_mm / 1e3 * draws[1])
 
     def sigma(self, points: int = 1) -> float:
-        """Return the standard deviation of a length that depends on `points` tool points [m]."""
+        """Return the standard deviation [m] of a length that depends on the given number of tool points."""
         return float((self.sensor_mm**2 + points * self.repeatability_mm**2) ** 0.5) / 1e3
 
 
 def draw_noise(noise: SensorNoise | None, rows: int) -> NoiseDraws:
-    """Return the deviations of `rows` rows; 0 without noise."""
+    """Return random deviations of the given number of rows; 0 without noise."""
     return (noise or SensorNoise(seed=0)).draw(rows)
 
 
 def row_sigma(noise: SensorNoise | None, rows: int, points: int = 1) -> Float64[Tensor, " rows"] | None:
-    """Return the standard deviation of the noise in every row [m], or None without noise."""
+    """Return the standard deviation of the noise of every row [m]; None without noise."""
     sigma = 0.0 if noise is None else noise.sigma(points)
     return torch.full((rows,), sigma, dtype=torch.float64) if sigma else None

@@ -1,4 +1,4 @@
-"""Poses to measure at: desired poses on grids or at random, or random joint values."""
+"""Poses to measure: desired poses on grids or at random, or random joint values."""
 
 import math
 from abc import ABC, abstractmethod
@@ -20,14 +20,14 @@ Triple = tuple[float, float, float]
 
 
 class OrientationSection(Section):
-    """`R = R_home · RotZ(roll) · RotY(pitch) · RotX(yaw)`, each angle uniform in +-spread.
+    """Orientations `R_home · RotZ(roll) · RotY(pitch) · RotX(yaw)`, with each angle uniform in ±spread.
 
     Source: Jeong, Kim and Kwak 1998, section 4.2.1 and appendix B.
 
     Attributes:
         home_rpy_deg: R_home as roll, pitch, yaw [deg].
-        home_rotation: R_home as the three rows of a rotation matrix, instead.
-        spread_deg: half the range of roll, pitch and yaw [deg]; 0 for the home orientation at all poses.
+        home_rotation: R_home as the three rows of a rotation matrix, instead of `home_rpy_deg`.
+        spread_deg: half the range of roll, pitch and yaw [deg]; with 0 all poses have the home orientation.
     """
 
     home_rpy_deg: Triple | None = None
@@ -55,7 +55,7 @@ class OrientationSection(Section):
 
         Args:
             count: number of orientations.
-            generator: source of roll, pitch, yaw, drawn as one (count, 3) block; not used without a spread.
+            generator: random generator of roll, pitch, yaw, drawn as one (count, 3) block; not used without a spread.
         """
         if self.home_rotation is not None:
             home = torch.tensor(self.home_rotation, dtype=torch.float64)
@@ -69,10 +69,10 @@ class OrientationSection(Section):
 
 
 EXTRA_DRAWS = 9
-"""Number of additional draws per joint vector for coupled joints with stops, which exclude some."""
+"""Number of additional draws per joint vector for coupled joints, whose stops exclude some draws."""
 
 Range = tuple[float, float]
-"""Smallest and largest value."""
+"""Smallest and largest value of a range."""
 
 
 class JointsRandom(Section):
@@ -83,8 +83,8 @@ class JointsRandom(Section):
         count: number of joint vectors.
         seed: random seed.
         share: fraction of the range between the joint limits, about its centre, that is used.
-        range_deg: by name of a revolute joint, smallest and largest value [deg], instead of the share.
-        range_mm: by name of a prismatic joint, smallest and largest value [mm], instead of the share.
+        range_deg: smallest and largest value [deg] by name of a revolute joint, instead of the share.
+        range_mm: smallest and largest value [mm] by name of a prismatic joint, instead of the share.
     """
 
     kind: Literal["joints_random"]
@@ -95,9 +95,9 @@ class JointsRandom(Section):
     range_mm: dict[str, Range] = Field(default_factory=dict)
 
     def joints(self, robot: Robot) -> Float64[Tensor, "count dof"]:
-        """Return joint values to command [rad or m], the same at every call.
+        """Return the joint values to command [rad or m], the same at every call.
 
-        They are drawn as the controller's values and converted to joint values.
+        The controller's values are drawn and converted to joint values.
 
         Raises:
             RecipeError: a joint is unknown, has a range in the wrong unit or outside its limits, or has no limits.
@@ -126,7 +126,7 @@ class JointsRandom(Section):
 
     def _bounds(self, robot: Robot) -> Float64[np.ndarray, "axes 2"]:
         limits = robot.axis_limits
-        with np.errstate(invalid="ignore"):  # joints without limits are refused below
+        with np.errstate(invalid="ignore"):  # joints without limits are refused later
             middle, half = limits.mean(1, keepdims=True), np.diff(limits) / 2
             bounds: np.ndarray = middle + self.share * half * np.array([-1.0, 1.0])
         fields = ("range_deg", "range_mm")
@@ -158,10 +158,10 @@ def _check_count(count: int) -> None:
 
 
 class AbstractPoses(Section, ABC):
-    """Desired tool poses.
+    """Base class of sections of desired tool poses.
 
-    Random values come from one generator with the section's seed, positions before orientations. Grids need a seed only
-    for a spread of orientations.
+    Random values come from one generator with the section's seed, positions before orientations. Grids need a seed
+    only if orientations have a spread.
     """
 
     orientation: OrientationSection = OrientationSection()
@@ -185,7 +185,7 @@ class AbstractPoses(Section, ABC):
 
 
 class PolarGrid(AbstractPoses):
-    """Equal steps of radius and angle at one height: `x = r cos(phi)`, `y = r sin(phi)`; phi varies fastest.
+    """Grid with equal steps of radius and angle at one height: `x = r cos(phi)`, `y = r sin(phi)`; phi varies fastest.
 
     Source: Jeong, Kim and Kwak 1998, section 4.1.1 and Fig. 4.
 
@@ -220,7 +220,7 @@ class PolarGrid(AbstractPoses):
 
 
 class CubeGrid(AbstractPoses):
-    """Equal steps along x, y and z; z varies fastest.
+    """Grid with equal steps along x, y and z; z varies fastest.
 
     Source: Jeong, Kim and Kwak 1998, section 4.2.1, after ISO 9283.
 
@@ -251,9 +251,9 @@ class CubeGrid(AbstractPoses):
 
 
 class PolarRandom(AbstractPoses):
-    """Random poses in a polar region, uniform in radius and angle (so denser towards the centre).
+    """Random poses in a polar region, uniform in radius and angle, and therefore denser towards the centre.
 
-    Drawn as a (count, 2) block for r and phi, then the orientations.
+    First a (count, 2) block of numbers is drawn for r and phi, then the orientations.
 
     Attributes:
         kind: "polar_random".
@@ -280,7 +280,7 @@ class PolarRandom(AbstractPoses):
 class CubeRandom(AbstractPoses):
     """Random poses in a cuboid, uniform in x, y and z.
 
-    Drawn as a (count, 3) block for x, y and z, then the orientations.
+    First a (count, 3) block of numbers is drawn for x, y and z, then the orientations.
 
     Attributes:
         kind: "cube_random".
@@ -306,7 +306,7 @@ class CubeRandom(AbstractPoses):
 WhereToMeasure = Annotated[
     PolarGrid | CubeGrid | PolarRandom | CubeRandom | JointsRandom, Field(discriminator="kind")
 ]
-"""Sections of desired poses or joint values to command, distinguished by `kind`."""
+"""Section of desired poses or joint values to command, distinguished by `kind`."""
 
 
 def _linspace(bounds: Range, steps: int) -> Float64[Tensor, " steps"]:

@@ -1,4 +1,4 @@
-"""Placements of jigs, and possible touches there: a face, a point on it and a tilt of the torch."""
+"""Placements of jigs, and possible touches on them: a face, a point on the face and a tilt of the torch."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -22,7 +22,7 @@ from pisigma.simulation.commanded import BranchSection
 
 
 class JigPlacement(Section):
-    """The placement of a jig, nominal and true.
+    """Nominal and true placement of a jig.
 
     `T_jig_base = Trans(x, y, z) · RotZ(roll) · RotY(pitch) · RotX(yaw)` is the pose of the robot's base in the frame of
     the jig (Lim et al., eq. 1). A jig on the floor that is rotated about the vertical has a roll.
@@ -31,7 +31,7 @@ class JigPlacement(Section):
         name: name of the placement, and of the frame of its touches.
         jig: name of a jig that comes with pisigma, or a YAML file.
         base: nominal T_jig_base.
-        true_base: true T_jig_base; the nominal one by default.
+        true_base: true T_jig_base; equal to the nominal one by default.
     """
 
     name: str = Field(min_length=1)
@@ -40,7 +40,7 @@ class JigPlacement(Section):
     true_base: FrameSection | None = None
 
     def load_jig(self) -> Jig:
-        """Return the jig.
+        """Return the jig that is placed.
 
         Raises:
             MeasurementError: there is no such jig.
@@ -77,15 +77,15 @@ def check_names(placements: Sequence[JigPlacement]) -> None:
 
 
 MAX_DRAWS = 20
-"""Number of draws after which the search for candidates fails."""
+"""Largest number of draws, after which the search for candidates fails."""
 CANDIDATES_PER_DRAW = 8192
 """Number of candidates per draw."""
 MAX_ITERATIONS = 10
-"""Iterations of the numeric inverse kinematics to an end of the travel; it needs about five."""
+"""Largest number of iterations of the numeric inverse kinematics to an end of the travel; about five are needed."""
 END_TOLERANCE = 1e-8
-"""[m and rad] Tolerance of the inverse kinematics at the ends of the travel."""
+"""Tolerance of the inverse kinematics at the ends of the travel [m and rad]."""
 MAX_JOINT_MOTION = 1.5
-"""[rad or m] Motion of a joint within the travel above which it has changed its branch."""
+"""Motion of a joint within the travel [rad or m] above which the branch must have changed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,14 +93,14 @@ class TouchCandidates:
     """Touches that the nominal robot can make at the nominal placements of the jigs.
 
     Attributes:
-        placements: names of the placements, which are the frames.
+        placements: names of the placements, which are the frames of the touches.
         placement: index of every candidate's placement.
-        face: index of its face on the jig of that placement.
-        axis: index of the axis along which it touches.
+        face: index of every candidate's face on the jig of that placement.
+        axis: index of the axis along which the candidate touches.
         sign: +1 or -1, outward direction of the face along that axis.
         coordinate: coordinate of the face along that axis in the frame of the jig [m].
         T_jig_tool: pose of the tool at the touch in the frame of the jig.
-        q: joint values [rad or m] of the nominal robot there.
+        q: joint values [rad or m] of the nominal robot at the touch.
     """
 
     placements: tuple[str, ...]
@@ -119,26 +119,26 @@ class TouchCandidates:
 
     @property
     def frame(self) -> tuple[str, ...]:
-        """Name of every candidate's placement."""
+        """Name of the placement of every candidate."""
         return tuple(self.placements[number] for number in self.placement.tolist())
 
     @property
     def touch_axis(self) -> tuple[str, ...]:
-        """Name of every candidate's axis."""
+        """Name of the touched axis of every candidate."""
         return tuple("xyz"[axis] for axis in self.axis.tolist())
 
     def select(self, index: Int64[Tensor, " chosen"] | Bool[Tensor, " candidates"]) -> "TouchCandidates":
-        """Return the candidates of an index, in the order of the index, or of a mask."""
+        """Return the candidates that an index, in its order, or a mask selects."""
         return replace(self, **{name: getattr(self, name)[index] for name in _ARRAYS})
 
     @staticmethod
     def concatenate(parts: Sequence["TouchCandidates"]) -> "TouchCandidates":
-        """Concatenate candidates, with the placements of the first ones."""
+        """Concatenate candidates; the placements are those of the first part."""
         arrays = {name: torch.cat([getattr(part, name) for part in parts]) for name in _ARRAYS}
         return TouchCandidates(parts[0].placements, **arrays)
 
     def as_measurements(self) -> Measurements:
-        """Return the measurements of the nominal robot at the nominal placements, for planning."""
+        """Return the measurements that the nominal robot would give at the nominal placements, for planning."""
         return Measurements(
             q=self.q,
             frame=self.frame,
@@ -152,11 +152,11 @@ _ARRAYS = ("placement", "face", "axis", "sign", "coordinate", "T_jig_tool", "q")
 
 
 class TouchCandidatesSection(Section):
-    """Random candidates of touches, the same number for each of the axes x, y and z.
+    """Section of random candidates of touches, with the same number for each of the axes x, y and z.
 
-    A face of the axis and a point on it are drawn uniformly. The tool's z axis, along which the wire leaves the torch,
-    points down the jig's z axis except for a tilt; tilt and azimuth are drawn uniformly over the cone, and so is the
-    rotation about the wire. Candidates that the nominal robot cannot reach are drawn again.
+    For every axis a face and a point on it are drawn uniformly. The tool's z axis, along which the wire leaves the
+    torch, points down the jig's z axis except for a tilt; tilt and azimuth are drawn uniformly over the cone, and
+    the rotation about the wire uniformly. Candidates that the nominal robot cannot reach are drawn again.
 
     Attributes:
         count: number of candidates per placement.
@@ -164,9 +164,10 @@ class TouchCandidatesSection(Section):
         tilt_deg: largest tilt of the torch from vertical [deg].
         least_lean_deg: smallest angle between the torch and the face [deg], so that its tip touches first.
         margin_mm: smallest distance of the point from edges of the face and from blocks on it [mm].
-        travel_mm: distance before and behind the face that the tip must be able to move along its normal, because true
-            robot and placement differ from the nominal ones [mm].
-        shaft_mm: length of the torch behind its tip, as a straight line, that must be clear of the jig [mm].
+        travel_mm: distance before and behind the face that the tip must be able to move along its normal, because
+            true robot and placement differ from nominal robot and placement [mm].
+        shaft_mm: length of a straight line behind the tip, which represents the torch and must be clear of the jig
+            [mm].
         least_singular_value: smallest singularity measure of the robot; see `singularity_measure`.
         branch: branch of the inverse kinematics.
     """
@@ -182,7 +183,7 @@ class TouchCandidatesSection(Section):
     branch: BranchSection = BranchSection(near_deg={})
 
     def find(self, robot: Robot, placements: Sequence[JigPlacement]) -> TouchCandidates:
-        """Draw candidates, the same at every call; those of the first placement come first.
+        """Return random candidates, the same at every call, in the order of the placements.
 
         Args:
             robot: the nominal robot.
@@ -202,7 +203,7 @@ class TouchCandidatesSection(Section):
     def _of_placement(
         self, robot: Robot, placement: JigPlacement, generator: torch.Generator
     ) -> TouchCandidates:
-        """Return candidates on one placement, with the same number for every axis."""
+        """Return candidates on one placement of a jig, with the same number for every axis."""
         jig = placement.load_jig()
         axes = sorted(set(jig.axis.tolist()))
         share = {axis: (self.count + len(axes) - 1 - place) // len(axes) for place, axis in enumerate(axes)}
@@ -226,7 +227,7 @@ class TouchCandidatesSection(Section):
         )
 
     def _draw(self, jig: Jig, name: str, dof: int, generator: torch.Generator) -> TouchCandidates:
-        """Draw faces, points and torches that are clear of the jig, reachable or not."""
+        """Draw faces, points and orientations of the torch that are clear of the jig, but may be unreachable."""
         u = torch.rand(CANDIDATES_PER_DRAW, 7, generator=generator, dtype=torch.float64)
         face = _draw_faces(jig, u[:, 0])
         lower, upper = (bound[face] for bound in jig.extent)
@@ -250,7 +251,7 @@ class TouchCandidatesSection(Section):
         return sampled.select(self._is_clear(jig, sampled))
 
     def _is_clear(self, jig: Jig, sampled: TouchCandidates) -> Bool[Tensor, " candidates"]:
-        """Return whether the tip touches the face first, at the touch and during the approach."""
+        """Return whether no other part of the torch meets the jig, at the touch and during the approach."""
         point, shaft = sampled.T_jig_tool[:, :3, 3], -sampled.T_jig_tool[:, :3, 2]
         outward = jig.outward[sampled.face]
         lean = torch.arcsin((shaft * outward).sum(-1).clamp(-1, 1))
@@ -281,7 +282,7 @@ class TouchCandidatesSection(Section):
 
 
 def _draw_faces(jig: Jig, u: Float64[Tensor, " candidates"]) -> Int64[Tensor, " candidates"]:
-    """Return faces by numbers in [0, 1): all axes are equally likely, and all faces of an axis."""
+    """Return the face for every random number in [0, 1): axes, and faces of an axis, are equally likely."""
     per_axis = torch.bincount(jig.axis, minlength=3)
     weight = 1.0 / per_axis[jig.axis].to(u.dtype)
     bounds = weight.cumsum(0) / weight.sum()

@@ -1,4 +1,4 @@
-"""Simulated touches: the robot moves along a face's normal until the true tip meets the face."""
+"""Simulated touches, in which the robot moves along the normal of a face until the true tip meets the face."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -25,19 +25,19 @@ from pisigma.simulation.true_robot import TrueRobot
 OnMiss = Literal["error", "leave_out"]
 
 CONTACT_TOLERANCE = 1e-13
-"""[m] Distance of the tip from the coordinate of the touch at which the approach ends."""
+"""Distance of the tip from the coordinate of the touch [m] at which the approach ends."""
 MAX_ITERATIONS = 50
-"""Iterations after which the approach fails; it needs about ten."""
+"""Largest number of iterations, after which the approach fails; about ten are needed."""
 
 
 class SimulatedTouches(Section):
-    """Recipe section of touches on faces of jigs.
+    """Section of a recipe for touches on faces of jigs.
 
     Attributes:
         kind: "touches".
-        placements: placements of the jigs; each is a frame.
+        placements: placements of the jigs; each placement is a frame.
         candidates: touches on every placement.
-        noise: noise of the touches and of the robot; none by default.
+        noise: noise of the touches and of the robot; no noise by default.
         on_miss: "error", or "leave_out" to continue without touches that miss their face and to report them.
     """
 
@@ -48,7 +48,7 @@ class SimulatedTouches(Section):
     on_miss: OnMiss = "error"
 
     def measure(self, robot: TrueRobot) -> Measurements:
-        """Simulate the touches, the same at every call. See `simulate_touches`."""
+        """Return the simulated touches, the same at every call; see `simulate_touches`."""
         candidates = self.candidates.find(robot.nominal, self.placements)
         travel = self.candidates.travel_mm / 1e3
         return simulate_touches(robot, self.placements, candidates, self.noise, travel, self.on_miss)
@@ -67,14 +67,15 @@ def simulate_touches(
     The controller moves the tool along the normal of the face with constant orientation, by the nominal inverse
     kinematics and the nominal placement of the jig. It stops when the true tip is at the coordinate of the face in the
     frame of the jig at its true placement: `e_axis · T_jig_base · FK_true(q) = coordinate + n`. The row contains the
-    joint values commanded there and the coordinate of the face, which is known from the jig; n is the noise of the
-    touch, and the robot's repeatability shifts its tip during the whole approach. Encoder steps are ignored.
+    joint values commanded at the contact, and the coordinate of the face, which is known from the jig; n is the
+    noise of the touch, and the robot's repeatability shifts the tip during the whole approach. Encoder steps are
+    ignored.
 
     Args:
         robot: the true robot.
         placements: placements of the jigs, in the order of `candidates.placements`.
         candidates: the touches.
-        noise: noise of the touches and of the robot; None for exact ones.
+        noise: noise of the touches and of the robot; None for no noise.
         travel: distance [m] before and behind the expected position of the face within which it is searched for.
         on_miss: "error" or "leave_out" for touches that do not meet their face within the travel or miss its edges.
 
@@ -108,10 +109,10 @@ def simulate_touches(
 
 @dataclass(frozen=True, eq=False)
 class _Contact:
-    """The ends of the approaches.
+    """State of robot and tip at the ends of the approaches.
 
     Attributes:
-        q: joint values commanded there [rad or m].
+        q: joint values commanded at the end of the approach [rad or m].
         tip: true tip in the frame of the jig at its true placement [m].
         moved: distance by which the controller moved inward of the expected contact [m].
         met: whether the tip reached the coordinate of the face within the travel.
@@ -130,9 +131,9 @@ def _approach(
     draws: NoiseDraws,
     travel: float,
 ) -> _Contact:
-    """Move the commanded tips by the gaps of the true tips until these are closed.
+    """Move the commanded tips by the gaps of the true tips until the gaps are closed.
 
-    The true tip moves almost as far as the commanded one, so every iteration leaves a few percent of the gap.
+    The true tip moves almost as far as the commanded tip, so every iteration reduces the gap to a few percent.
     """
     Ts_jig_base = torch.stack([p.T_jig_base for p in placements])[candidates.placement]
     true_Ts_jig_base = torch.stack([p.true_T_jig_base for p in placements])[candidates.placement]
@@ -176,7 +177,7 @@ def _on_faces(
 
 
 def _miss(candidates: TouchCandidates, row: int, contact: _Contact) -> Fault:
-    """Return what is wrong with a touch that misses; the value is its tip [mm] if it reached the coordinate."""
+    """Return the fault of a touch that misses; its value is the tip [mm] if the tip reached the coordinate."""
     name = f"touch {row} (counted from 0) along {candidates.touch_axis[row]} of jig '{candidates.frame[row]}'"
     if bool(contact.met[row]):
         tip = ", ".join(f"{value:.1f}" for value in (1e3 * contact.tip[row]).tolist())

@@ -1,4 +1,4 @@
-"""The true robot of a simulation: a nominal robot with the sum of several error sources."""
+"""True robot of a simulation: a nominal robot with the sum of several error sources."""
 
 import zlib
 from collections.abc import Sequence
@@ -42,7 +42,7 @@ ERROR_SOURCES: dict[str, type[AbstractErrorSource]] = {
     "coupling": CouplingDeviation,
     "guide": Guide,
 }
-"""All error sources by kind."""
+"""Classes of all error sources by kind."""
 
 ErrorSource = Annotated[AbstractErrorSource, OneOf(ERROR_SOURCES)]
 """A recipe section of any registered error source, distinguished by `kind`."""
@@ -50,18 +50,18 @@ ErrorSource = Annotated[AbstractErrorSource, OneOf(ERROR_SOURCES)]
 Source = TypeVar("Source", bound=AbstractErrorSource)
 
 MAX_ITERATIONS = 200
-"""Iterations after which solving for the commanded joints fails; errors of a real robot need about ten."""
+"""Largest number of iterations when solving for commanded joint values; errors of a real robot need about ten."""
 
 
 def register_error_source(source: type[Source]) -> type[Source]:
-    """Register an error source for recipes by its kind; also a class decorator.
+    """Register an error source for recipes by its kind; usable as a class decorator.
 
     Args:
         source: subclass of `AbstractJointSource`, `AbstractGeometrySource` or `AbstractPlaySource` whose `kind` is a
             `Literal`.
 
     Raises:
-        RecipeError: the class has no kind, or another source has the same one.
+        RecipeError: the class has no kind, or another source has the same kind.
     """
     kinds = get_args(source.model_fields["kind"].annotation)
     if len(kinds) != 1:
@@ -82,11 +82,11 @@ def register_error_source(source: type[Source]) -> type[Source]:
 
 
 class TrueRobotSection(Section):
-    """Recipe section of the true robot.
+    """Section of a recipe for the true robot.
 
     Attributes:
         robot: catalogue name or robot file of the nominal robot.
-        errors: error sources of the true robot, which are added.
+        errors: error sources of the true robot, whose errors are added.
     """
 
     robot: str
@@ -106,12 +106,12 @@ class TrueRobotSection(Section):
 class TrueRobot:
     """A true robot: `T_base_tool = FK(q + Σ e_i(q) - half_play · approach; nominal geometry + Σ changes)`.
 
-    The approach of a joint is +1 if its value increased before it stopped, -1 if it decreased, and 0, the middle of its
-    play, if it is not given.
+    The approach of a joint is +1 if its value increased before it stopped, -1 if it decreased, and 0, for the middle
+    of the play, if it is not given.
 
     Every joint error e_i, including the rounding of the encoder, is evaluated at the commanded joints q and on the
-    nominal geometry, and all are added. Their order therefore does not matter, and the effect of one source does not
-    depend on the others.
+    nominal geometry, and all errors are added. Their order therefore does not matter, and the effect of one source
+    does not depend on the others.
 
     Attributes:
         nominal: the nominal robot.
@@ -127,7 +127,7 @@ class TrueRobot:
     _joint_errors: tuple[JointErrorFunction, ...] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        """Add up the geometric errors and bind the joint errors to the robot."""
+        """Sum the geometric errors, and bind the joint errors to the robot."""
         dh, base, tool = self.nominal.dh.copy(), self.nominal.base.copy(), self.nominal.tool.copy()
         joint_errors: list[JointErrorFunction] = []
         half_play = torch.zeros(self.nominal.dof, dtype=torch.float64)
@@ -158,7 +158,7 @@ class TrueRobot:
 
     @property
     def has_encoder(self) -> bool:
-        """Whether a joint has encoder steps."""
+        """Whether any joint has encoder steps."""
         return any(_steps(source) for source in self.errors)
 
     def without_encoder(self) -> "TrueRobot":
@@ -173,7 +173,7 @@ class TrueRobot:
         if not bool(self.half_play.any()):
             return None
         seeds = [source.seed for source in self.errors if isinstance(source, AbstractPlaySource)]
-        # a hash of the joint values as seed: equal calls agree, and other joint values get other directions
+        # the seed is a hash of the joint values: equal calls agree, and other joint values get other directions
         seed = zlib.crc32(q.numpy(force=True).tobytes(), sum(seeds))
         generator = torch.Generator().manual_seed(seed)
         return (2 * torch.randint(0, 2, q.shape, generator=generator) - 1).to(q)
@@ -184,7 +184,7 @@ class TrueRobot:
         """Return actual minus commanded joint values [rad or m].
 
         Args:
-            q: commanded joint values [rad or m], as the controller counts them.
+            q: commanded joint values [rad or m], with the sign and zero of the controller.
             approach: direction of approach of every joint; None for the middle of all play.
 
         Raises:
@@ -199,13 +199,13 @@ class TrueRobot:
     def actual_joints(
         self, q: Float[Tensor, "*batch dof"], approach: Float[Tensor, "*batch dof"] | None = None
     ) -> Float[Tensor, "*batch dof"]:
-        """Return the actual joint values [rad or m] when commanded to q: `q + joint_error(q, approach)`."""
+        """Return the actual joint values [rad or m] for commanded values q: `q + joint_error(q, approach)`."""
         return q + self.joint_error(q, approach)
 
     def forward(
         self, q: Float[Tensor, "*batch dof"], approach: Float[Tensor, "*batch dof"] | None = None
     ) -> Float[Tensor, "*batch 4 4"]:
-        """Return the true T_base_tool when commanded to q [rad or m], without measurement noise.
+        """Return the true T_base_tool [m] for commanded joint values q, without measurement noise.
 
         Args:
             q: commanded joint values [rad or m].
@@ -214,11 +214,11 @@ class TrueRobot:
         return forward_kinematics(self.geometry, self.actual_joints(q, approach))
 
     def commanded_joints(self, actual: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch dof"]:
-        """Return the joint values to command [rad or m] such that the actual ones are `actual`.
+        """Return the joint values to command [rad or m] such that the actual joint values are `actual`.
 
-        Solves `q + joint_error(q) = actual` by the fixed-point iteration `q <- actual - joint_error(q)` until q changes
-        by less than 1e-14 (16 machine epsilons in lower precision). Its rate of convergence is the slope of the joint
-        errors, a few percent.
+        The method solves `q + joint_error(q) = actual` by the fixed-point iteration `q <- actual - joint_error(q)`
+        until q changes by less than 1e-14 (16 machine epsilons in lower precision). Its rate of convergence is the
+        slope of the joint errors, a few percent.
 
         Raises:
             PoseError: the number of columns of `actual` is not the robot's number of joints.
@@ -250,10 +250,10 @@ class TrueRobot:
     def inverse(
         self, T: Float[Tensor, "*batch 4 4"], start: Float[Tensor, "*starts dof"]
     ) -> Float[Tensor, "*batch dof"]:
-        """Return the joint values [rad or m] to command such that the true robot reaches the poses T.
+        """Return the joint values to command [rad or m] such that the true robot reaches the poses T.
 
-        The actual joint values are computed on the true geometry by Newton steps from `start` (on its branch), and
-        then the commanded ones, see `commanded_joints`.
+        The actual joint values are computed on the true geometry by Newton steps from `start` (on its branch),
+        followed by the commanded joint values, see `commanded_joints`.
 
         Args:
             T: desired T_base_tool.
@@ -281,5 +281,5 @@ class TrueRobot:
 
 
 def _steps(source: AbstractErrorSource) -> bool:
-    """Return whether a joint has encoder steps by this source."""
+    """Return whether a source gives any joint encoder steps."""
     return isinstance(source, AbstractJointSource) and bool(source.stepped_joints)

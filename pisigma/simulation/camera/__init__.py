@@ -1,1 +1,1 @@
-"""Simulated cameras: images of a board on a true robot."""
+"""Simulated images of a board, taken by cameras on a true robot."""

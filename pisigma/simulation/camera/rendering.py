@@ -1,4 +1,4 @@
-"""Bent and warped boards, and images of them."""
+"""Boards that are bent or have a wrong scale, and rendering of their images."""
 
 from dataclasses import dataclass
 
@@ -11,32 +11,34 @@ from pisigma.measurement.camera.camera import Camera
 from pisigma.measurement.camera.pattern import Pattern, board_pattern
 
 NODE_STEP = 16
-"""[px] Distance of the nodes at which rays are undistorted; the cubic spline between them is accurate to 1e-4 px."""
+"""Distance [px] of the nodes at which rays are undistorted; a cubic spline between them is accurate to 1e-4 px."""
 SURFACE_ITERATIONS = 4
-"""Fixed-point iterations from the plane to a bowed surface, each of which reduces the error to a few percent."""
+"""Number of fixed-point iterations from the plane to a bowed surface; each reduces the error to a few percent."""
 SUBPIXELS = 4
-"""Number of subpixels of a pixel across an edge, in each direction."""
+"""Number of subpixels in each direction of a pixel that contains an edge."""
 BLUR_LEVELS = 4
-"""Number of blurred images from the sharpest to the most blurred part, between which pixels are interpolated."""
+"""Number of blurred images, from the sharpest to the most blurred, between which pixels are interpolated."""
 MIN_BLUR_STEP = 1e-3
-"""[px] Smallest difference between the levels, for images of constant blur."""
+"""Smallest difference between blur levels [px], for images of constant blur."""
 MIN_COSINE = 1e-9
-"""Lower bound of the cosine between a ray and the board's normal; rays along the board meet it far away."""
+"""Lower bound of the cosine of the angle between a ray and the board's normal, for rays almost parallel to the
+board."""
 FAR = 1e6
-"""[m] Depth of rays that do not meet the board."""
+"""Depth [m] that is assigned to rays that do not meet the board."""
 OUTLINE = 20
-"""Number of points per edge of the sheet, whose pixels bound the image of the board."""
+"""Number of points per edge of the sheet from which the bounds of its image are computed."""
 
 
 @dataclass(frozen=True)
 class TrueBoard:
-    """A printed board that differs from the given one.
+    """A printed board that differs from its description.
 
-    Its surface is `z = bow · r² / R²` with r the distance from the centre of the corners and R that of the farthest.
+    The surface is `z = bow · r² / R²`, where r is the distance from the centre of the corners and R is the distance
+    of the farthest corner.
 
     Attributes:
-        stated: the given board.
-        scale: true lengths relative to given ones.
+        stated: the board as described in its file.
+        scale: ratio of true to described lengths.
         bow: height of the farthest corners above the plane at the centre [m], along z.
     """
 
@@ -52,7 +54,7 @@ class TrueBoard:
 
     @property
     def pattern(self) -> Pattern:
-        """The printed pattern, at its true size."""
+        """Printed pattern of the board at its true size."""
         stated = board_pattern(self.stated)
         return Pattern(self.scale * stated.black, self.scale * stated.sheet)
 
@@ -67,18 +69,18 @@ class TrueBoard:
 
 @dataclass(frozen=True)
 class Exposure:
-    """Light and optics of an image.
+    """Light and optics with which an image is taken.
 
     A lens with the aperture A, focused at the distance F, images a point at the distance z as a disc with the diameter
     `f A |1/z - 1/F|`, with f the focal length [px]; here it is a normal density with the same variance.
 
     Attributes:
-        black: gray level of print, of 255.
-        white: gray level of paper.
-        background: gray level around the board.
+        black: gray level of the print, from 0 to 255.
+        white: gray level of the paper, from 0 to 255.
+        background: gray level around the board, from 0 to 255.
         blur: standard deviation of the blur in focus [px].
         focus: distance in focus [m].
-        aperture: diameter of the lens's opening [m].
+        aperture: diameter of the aperture of the lens [m].
         vignetting: relative loss of light in the corners of the image.
         gradient: change of the light from the left to the right edge of the image, relative to its mean.
         noise: standard deviation of the gray level of a pixel.
@@ -109,10 +111,10 @@ def render_image(
         board: the true board.
         T_camera_board: pose of the board [m].
         exposure: light and optics.
-        rng: source of the noise.
+        rng: random generator of the noise.
 
     Returns:
-        Gray levels from 0 to 255.
+        Gray level of every pixel, from 0 to 255.
     """
     gray = np.full((camera.height, camera.width), exposure.background, dtype=np.float32)
     left, top, right, bottom = _bounds(camera, board, T_camera_board, exposure)
@@ -127,7 +129,7 @@ def render_image(
 
 
 def _blur(camera: Camera, exposure: Exposure, depth: np.ndarray) -> np.ndarray:
-    """Return the standard deviation of the blur [px] at a depth [m]; that of a disc is a quarter of its diameter."""
+    """Return the standard deviation of the blur [px] at a depth [m], a quarter of a blurred disc's diameter."""
     disc = camera.fx * exposure.aperture * np.abs(1 / depth - 1 / exposure.focus)
     blur: np.ndarray = np.hypot(exposure.blur, disc / 4)
     return blur
@@ -136,7 +138,7 @@ def _blur(camera: Camera, exposure: Exposure, depth: np.ndarray) -> np.ndarray:
 def _bounds(
     camera: Camera, board: TrueBoard, T_camera_board: np.ndarray, exposure: Exposure
 ) -> tuple[int, int, int, int]:
-    """Return the range of pixels that the blurred board covers; the whole image if its outline leaves the view."""
+    """Return the range of pixels that the blurred board covers; the whole image if the board leaves the view."""
     left, top, right, bottom = board.pattern.sheet
     along = np.linspace(0, 1, OUTLINE)
     x, y = left + along * (right - left), top + along * (bottom - top)
@@ -149,7 +151,7 @@ def _bounds(
     if (points[:, 2] <= 0).any():
         return 0, 0, camera.width, camera.height
     pixels = camera.project(points)[0]
-    if (np.abs(pixels - size / 2) > size).any():  # far outside, the distortion is not monotonic
+    if (np.abs(pixels - size / 2) > size).any():  # far outside of the image, the distortion is not monotonic
         return 0, 0, camera.width, camera.height
     margin = 2 + 4 * float(_blur(camera, exposure, points[:, 2]).max())
     first = np.maximum(np.floor(pixels.min(0) - margin), 0).astype(int)
@@ -161,7 +163,7 @@ def _rays(camera: Camera, u: np.ndarray, v: np.ndarray) -> Float64[np.ndarray, "
     """Return x / z and y / z of the rays of a grid of pixels."""
     from scipy.interpolate import (
         RectBivariateSpline,
-    )  # here, because it takes 0.3 s of every recipe to import
+    )  # imported here, because it takes 0.3 s, which other recipes do not need
 
     nodes_u, nodes_v = (np.linspace(at[0], at[-1], 4 + int((at[-1] - at[0]) / NODE_STEP)) for at in (u, v))
     at_nodes = camera.undistort(np.stack(np.meshgrid(nodes_u, nodes_v), -1))
@@ -171,7 +173,7 @@ def _rays(camera: Camera, u: np.ndarray, v: np.ndarray) -> Float64[np.ndarray, "
 def _on_surface(
     board: TrueBoard, T_camera_board: np.ndarray, rays: np.ndarray
 ) -> tuple[Float64[np.ndarray, "2 v u"], Float64[np.ndarray, "v u"]]:
-    """Return where rays meet the board in its frame [m], and their depths [m]; `FAR` for those that do not."""
+    """Return the points at which rays meet the board, in its frame [m], and their depths [m]; `FAR` if they do not."""
     R, t = T_camera_board[:3, :3], T_camera_board[:3, 3]
     origin = -R.T @ t
     along = [R[0, axis] * rays[0] + R[1, axis] * rays[1] + R[2, axis] for axis in range(3)]
@@ -207,12 +209,12 @@ def _reflected(surface: "_Surface", xy: Float64[np.ndarray, "2 v u"]) -> Float64
 
 @dataclass(frozen=True, eq=False)
 class _Surface:
-    """Gray levels of a sheet as a grid of rectangular cells, and their integral.
+    """Gray levels of a sheet as a grid of rectangular cells, with their integral.
 
     Attributes:
         x: edges between columns of cells [m].
         y: edges between rows of cells [m].
-        gray: gray level of every cell, including those around the sheet.
+        gray: gray level of every cell, including cells around the sheet.
         integral: integral of gray minus background over the area left of and above every intersection of edges [m²].
         background: gray level around the sheet.
     """
@@ -225,7 +227,7 @@ class _Surface:
 
     @staticmethod
     def from_pattern(pattern: Pattern, exposure: Exposure) -> "_Surface":
-        """Build the grid from the sheet and its printed pattern."""
+        """Return the grid of a sheet with a printed pattern."""
         rectangles = np.concatenate([pattern.sheet[None], pattern.black])
         x, y = np.unique(rectangles[:, [0, 2]]), np.unique(rectangles[:, [1, 3]])
         columns, rows = np.searchsorted(x, rectangles[:, [0, 2]]), np.searchsorted(y, rectangles[:, [1, 3]])
@@ -238,7 +240,7 @@ class _Surface:
         return _Surface(x, y, gray, integral, exposure.background)
 
     def cell(self, xy: np.ndarray) -> np.ndarray:
-        """Return the number of the cell that contains a point."""
+        """Return the indices of the cell that contains a point."""
         column, row = np.searchsorted(self.x, xy[0]), np.searchsorted(self.y, xy[1])
         number: np.ndarray = row * self.gray.shape[1] + column
         return number
@@ -262,7 +264,7 @@ class _Surface:
 
 
 def _cell(edges: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the number of the cell that contains a coordinate, and the relative position in it, from 0 to 1."""
+    """Return the index of the cell that contains a coordinate, and the relative position in it, from 0 to 1."""
     at = np.clip(at, edges[0], edges[-1])
     index = np.clip(np.searchsorted(edges, at) - 1, 0, len(edges) - 2)
     return index, (at - edges[index]) / (edges[index + 1] - edges[index])
@@ -279,7 +281,7 @@ def _blurred(sharp: np.ndarray, blur: np.ndarray) -> np.ndarray:
 
 
 def _light(camera: Camera, exposure: Exposure) -> Float[np.ndarray, "height width"]:
-    """Return the light at every pixel, relative to that at the centre of the image."""
+    """Return the light at every pixel, relative to the light at the centre of the image."""
     u = (np.arange(camera.width, dtype=np.float32) + 0.5) / camera.width - 0.5
     v = (np.arange(camera.height, dtype=np.float32) + 0.5) / camera.height - 0.5
     radius = (u**2 * camera.width**2 + v[:, None] ** 2 * camera.height**2) * (

@@ -1,4 +1,4 @@
-"""Recipe section of the images that a camera takes on the true robot."""
+"""Section of a recipe for images of a board that a camera takes on the true robot."""
 
 import os
 from collections.abc import Iterator, Sequence
@@ -29,16 +29,16 @@ from pisigma.simulation.camera.rendering import Exposure, TrueBoard, render_imag
 from pisigma.simulation.true_robot import TrueRobot
 
 CANDIDATES = 8
-"""Number of candidates per view, of which those far apart in joint space are chosen."""
+"""Number of candidates per view; candidates that are far apart in joint space are chosen."""
 MAX_ATTEMPTS = 100
-"""Number of draws per candidate, because some cannot be reached."""
+"""Largest number of draws per candidate; some draws cannot be reached."""
 GIVEN_FILES = ("joints.csv", "camera.yaml", "board.yaml")
 
 
 class RandomViews(Section):
     """Random views of a complete board on random branches, far apart in joint space.
 
-    Every joint vector is the candidate that is farthest from the previous ones, in sines and cosines.
+    Every joint vector is the candidate that is farthest from all previous ones, measured in sines and cosines.
 
     Attributes:
         count: number of views.
@@ -55,12 +55,12 @@ class RandomViews(Section):
     def joints(
         self, robot: Robot, camera: Camera, board: Board, is_fixed: bool = False
     ) -> Float64[Tensor, "count dof"]:
-        """Return joint values to command [rad or m], the same at every call.
+        """Return the joint values to command [rad or m]; they are the same at every call.
 
         Args:
             robot: the robot, with its base from the board to the base and its tool from the flange to the camera (for
                 a fixed camera: from the camera to the base, and from the flange to the board).
-            camera: the camera, which has the complete board in view with half a square around its corners.
+            camera: the camera, in whose images the board is complete, with half a square around its corners.
             board: the board, seen from its printed side, with its z axis pointing away.
             is_fixed: whether the camera is fixed and the board is on the flange.
 
@@ -92,7 +92,7 @@ class RandomViews(Section):
         """Return the closed-form inverse kinematics for the views.
 
         Raises:
-            RecipeError: the robot has none.
+            RecipeError: the robot has no closed form.
         """
         solver = closed_form_solver(robot)
         if solver is None:
@@ -123,7 +123,7 @@ def _is_whole(camera: Camera, board: Board, T_camera_board: Float64[np.ndarray, 
 
 
 def select_far_apart(q: Float64[Tensor, "rows dof"], count: int) -> Float64[Tensor, "count dof"]:
-    """Choose joint values [rad] by farthest-point sampling in sines and cosines, the first one first."""
+    """Choose joint values [rad] by farthest-point sampling in sines and cosines, starting with the first row."""
     points = torch.cat([q.cos(), q.sin()], 1)
     chosen, distance = [0], (points - points[0]).norm(dim=1)
     while len(chosen) < count:
@@ -133,7 +133,7 @@ def select_far_apart(q: Float64[Tensor, "rows dof"], count: int) -> Float64[Tens
 
 
 class CornerNoise(Section):
-    """Normal deviations of corners, and of the robot's pose from image to image.
+    """Normal noise of corners, and of the robot's pose from image to image.
 
     Attributes:
         corner_px: standard deviation of u and v of every corner [px].
@@ -154,11 +154,11 @@ class CornerNoise(Section):
 
 
 class BoardErrors(Section):
-    """Differences of the true board from the given one.
+    """Differences of the true board from its description.
 
     Attributes:
-        scale_percent: relative error of all of its lengths [%].
-        bow_mm: height of its farthest corners above the plane at its centre [mm].
+        scale_percent: relative error of all lengths of the board [%].
+        bow_mm: height of the farthest corners above the plane at the centre of the board [mm].
     """
 
     scale_percent: float = Field(default=0.0, gt=-100)
@@ -166,7 +166,7 @@ class BoardErrors(Section):
 
 
 class JointReadingDelay(Section):
-    """Joint values of a moving arm that are read after the image was taken.
+    """Delay with which joint values of a moving arm are read after an image was taken.
 
     Attributes:
         delay_ms: delay from the image to the reading [ms].
@@ -178,21 +178,21 @@ class JointReadingDelay(Section):
 
 
 class SimulatedImages(Section):
-    """Recipe section of a camera that takes images of a board.
+    """Section of a recipe for a camera that takes images of a board.
 
     The base of the true robot (an error source of the recipe) is the transform from the board to the robot, and its
-    tool that from the flange to the camera; for a fixed camera, from the camera to the robot and from the flange to the
-    board. Joints with play stop in its middle.
+    tool is the transform from the flange to the camera; for a fixed camera, they are the transforms from the camera
+    to the robot and from the flange to the board. Joints with play stop in the middle of the play.
 
     Attributes:
         kind: "images".
         poses: views of the board.
-        camera: the given camera, as in its file.
-        board: the given board, as in its file.
+        camera: the camera as described in its file.
+        board: the board as described in its file.
         noise: noise of corners and robot.
-        camera_errors: true minus given intrinsics.
-        board_errors: errors of size and flatness.
-        late_joints: joint values that are read after the image; those of the image by default.
+        camera_errors: true minus described intrinsics.
+        board_errors: errors of size and flatness of the board.
+        late_joints: delay of the joint values; by default they are read when the image is taken.
     """
 
     kind: Literal["images"]
@@ -206,12 +206,12 @@ class SimulatedImages(Section):
 
     @property
     def frame(self) -> str:
-        """Frame of the rows."""
+        """Name of the frame of the rows."""
         return self.camera.name if self.camera.is_fixed else self.board.name
 
     @property
     def target(self) -> str:
-        """Target of the rows."""
+        """Name of the target of the rows."""
         return self.board.name if self.camera.is_fixed else self.camera.name
 
     def measure(self, robot: TrueRobot) -> Measurements:
@@ -254,7 +254,7 @@ class SimulatedImages(Section):
         return q + late * torch.randn(q.shape, generator=generator, dtype=torch.float64)
 
     def _true(self) -> tuple[Camera, TrueBoard]:
-        """Return the true camera and the true board."""
+        """Return the true camera and the true board, including their errors."""
         stated = self.camera.camera()
         camera = stated.with_intrinsics(stated.intrinsics + np.array(self.camera_errors.numbers))
         errors = self.board_errors
@@ -263,7 +263,7 @@ class SimulatedImages(Section):
 
 @dataclass(frozen=True)
 class ImageNoise:
-    """Noise of an image.
+    """Noise of corners in images, and of the robot's pose.
 
     Attributes:
         corner: standard deviation of u and v of every corner [px].
@@ -281,14 +281,14 @@ def draw_board_poses(
     generator: torch.Generator,
     is_fixed: bool = False,
 ) -> Float64[Tensor, "images 4 4"]:
-    """Return T_camera_board of the images of a true robot, with its repeatability.
+    """Return T_camera_board [m] of every image of a true robot, with random errors of its repeatability.
 
     Args:
         robot: the true arm, with its base from the board to the base and its tool from the flange to the camera (for a
             fixed camera: from the camera to the base, and from the flange to the board).
         q: joint values of the images [rad or m].
         repeatability: repeatability of the robot.
-        generator: source of the pose errors.
+        generator: random generator of the pose errors.
         is_fixed: whether the camera is fixed and the board is on the flange.
     """
     T = forward_kinematics(robot, q)
@@ -301,7 +301,7 @@ def draw_board_poses(
 def project_corners(
     camera: Camera, board: Board | TrueBoard, T_camera_board: Float64[Tensor, "images 4 4"]
 ) -> tuple[Float64[np.ndarray, "images corners 2"], Bool[np.ndarray, "images corners"]]:
-    """Return the pixels of corners [px], and which of them are in front of the camera and inside its images."""
+    """Return the pixels of corners [px], and the mask of corners in front of the camera and inside its images."""
     corners = torch.from_numpy(board.corners)
     points = (corners @ T_camera_board[:, :3, :3].mT + T_camera_board[:, None, :3, 3]).numpy()
     pixels = camera.project(points)[0]
@@ -330,7 +330,7 @@ def simulate_images(
         is_fixed: whether the camera is fixed and the board is on the flange.
 
     Returns:
-        The corners that are in front of the camera and inside its images.
+        The images, with the corners that are in front of the camera and inside its images.
     """
     T_camera_board = draw_board_poses(robot, q, noise.repeatability, generator, is_fixed)
     pixels, inside = project_corners(camera, board, T_camera_board)
@@ -343,12 +343,12 @@ def simulate_images(
 def images_of(
     q: Float64[Tensor, "images dof"], corners: Sequence[np.ndarray], pixels: Sequence[np.ndarray]
 ) -> Images:
-    """Return simulated corners, image by image.
+    """Return simulated corners as images.
 
     Args:
         q: joint values of every image [rad or m].
         corners: numbers of the corners in every image.
-        pixels: their pixels [px].
+        pixels: pixels of the corners in every image [px].
     """
     names = tuple(f"{number:04d}" for number in range(len(q)))
     return Images("simulated images", names, q, (0,) * len(q), tuple(corners), tuple(pixels))
@@ -358,9 +358,9 @@ def write_images(images: SimulatedImages, robot: TrueRobot, folder: str | os.Pat
     """Render images as `0000.png` and so on, with the given `joints.csv`, `camera.yaml` and `board.yaml`.
 
     Args:
-        images: section of a recipe.
+        images: section of a recipe that describes the images.
         robot: the true robot.
-        folder: folder to write, completely or not at all; it must not exist or be empty.
+        folder: folder to write, completely or not at all; it must be empty or missing.
 
     Returns:
         The number of images.

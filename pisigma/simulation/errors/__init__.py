@@ -1,1 +1,1 @@
-"""Error sources: differences of a true robot from the nominal one, one file each."""
+"""Error sources, one file per source: differences of a true robot from the nominal robot."""

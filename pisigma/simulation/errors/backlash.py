@@ -1,4 +1,4 @@
-"""Backlash: joints that stop on the side of their play from which they approach."""
+"""Backlash, by which joints stop on the side of their play from which they approach."""
 
 from typing import Annotated, Literal
 
@@ -14,9 +14,9 @@ from pisigma.simulation.errors.source import AbstractPlaySource, joint_values
 class Backlash(AbstractPlaySource):
     """Backlash by which every joint stops short by half of its play: `e_j = -play_j / 2 · approach_j`.
 
-    The approach is +1 if the joint's value increased before it stopped and -1 if it decreased. Simulated trackers and
-    distances draw it at random for every row and joint, and state it; touches and sockets, which are approached until
-    they fit, are in the middle of the play.
+    The approach is +1 if the joint's value increased before it stopped and -1 if it decreased. Simulated trackers
+    and distances draw a random direction for every row and joint, and state it. Touches and sockets are approached
+    until they fit, so their joints are in the middle of the play.
 
     Source: Whitney, Lozinski and Rourke, "Industrial robot forward calibration method and results", ASME
     Journal of Dynamic Systems, Measurement, and Control 108(1), 1986, 1-8.
@@ -34,6 +34,6 @@ class Backlash(AbstractPlaySource):
     seed: Seed = 0
 
     def half_play(self, robot: Robot, place: str) -> Float64[np.ndarray, " dof"]:
-        """Return half the play of every joint [rad or m]. See `AbstractPlaySource.half_play`."""
+        """Return half the play of every joint [rad or m]; see `AbstractPlaySource.half_play`."""
         stated = joint_values(robot, self.play_deg, self.play_mm, ("play_deg", "play_mm"), place)
         return np.where(robot.revolute, np.deg2rad(stated), stated / 1e3) / 2

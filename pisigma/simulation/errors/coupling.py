@@ -1,4 +1,4 @@
-"""Errors of a coupling of joints: its factors, and lengths of its linkage."""
+"""Errors of a coupling of joints: factors, and lengths of its linkage."""
 
 from dataclasses import replace
 from typing import Literal
@@ -15,21 +15,21 @@ from pisigma.simulation.errors.source import AbstractJointSource, JointErrorFunc
 
 
 class CouplingDeviation(AbstractJointSource):
-    """A true coupling of joints that differs from that of the robot's file.
+    """A true coupling of joints that differs from the coupling in the robot's file.
 
-    `e = f_true(C_true q + b_true) - f(C q + b)` with q the controller's values: gears with another ratio, or a
-    parallelogram with bars of different lengths, which is a general four-bar linkage.
+    `e = f_true(C_true q + b_true) - f(C q + b)` with q the controller's values: for example gears with another
+    ratio, or a parallelogram whose bars differ in length, which is a general four-bar linkage.
 
     Attributes:
         kind: "coupling".
-        coupling: entries that replace those of the robot's file for the same joints.
+        coupling: entries that replace the entries in the robot's file for the same joints.
     """
 
     kind: Literal["coupling"]
     coupling: tuple[CoupledJointSection, ...] = Field(min_length=1)
 
     def bind(self, robot: Robot, place: str) -> JointErrorFunction:
-        """Return the differences as a function of the joint values. See `AbstractJointSource.bind`."""
+        """Return the joint errors as a function of the joint values; see `AbstractJointSource.bind`."""
         if robot.coupling is None:
             raise RecipeError(
                 f"robot '{robot.name}' has no coupled joints",

@@ -13,10 +13,10 @@ from pisigma.simulation.errors.source import AbstractJointSource, JointErrorFunc
 
 
 class EncoderQuantisation(AbstractJointSource):
-    """Quantisation: the servo can hold a joint only at whole pulses of its encoder.
+    """Quantisation of joint values: the servo can hold a joint only at whole pulses of its encoder.
 
     `e_j = step_j · round(q_j / step_j) - q_j` with `step_j = 360 deg / pulses_j`, so |e_j| <= step_j / 2.
-    Halves are rounded to the even multiple.
+    Halves are rounded to the nearest even multiple.
 
     Source: Jeong, Kim and Kwak 1998, J. KSPE, sections 4.1.2 and 4.2.2 (resolver of 2048, encoder of 2500
     pulses per revolution); servo errors also in Judd and Knasinski, "A technique to calibrate industrial
@@ -26,7 +26,7 @@ class EncoderQuantisation(AbstractJointSource):
     Attributes:
         kind: "encoder".
         pulses_per_revolution: pulses per revolution of the joint, by name of a revolute joint (for an encoder on the
-            motor: its pulses times the gear ratio).
+            motor, its pulses times the gear ratio).
         step_mm: travel per pulse, by name of a prismatic joint [mm].
     """
 
@@ -40,7 +40,7 @@ class EncoderQuantisation(AbstractJointSource):
         return frozenset(self.pulses_per_revolution) | frozenset(self.step_mm)
 
     def bind(self, robot: Robot, place: str) -> JointErrorFunction:
-        """Return the quantisation as a function of the joint values. See `AbstractJointSource.bind`."""
+        """Return the quantisation error as a function of the joint values; see `AbstractJointSource.bind`."""
         fields = ("pulses_per_revolution", "step_mm")
         stated = joint_values(robot, self.pulses_per_revolution, self.step_mm, fields, place)
         quantised = torch.from_numpy(stated > 0)

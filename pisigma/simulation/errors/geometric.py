@@ -1,4 +1,4 @@
-"""Errors of the geometry of links, base and tool: given, or random."""
+"""Given or random errors of the geometry of links, base and tool."""
 
 from typing import Literal
 
@@ -37,7 +37,7 @@ class GeometricDeviation(AbstractGeometrySource):
     tool: FrameSection = FrameSection()
 
     def parameter_errors(self, robot: Robot, place: str) -> GeometryChange:
-        """Return the given errors in SI units. See `AbstractGeometrySource.parameter_errors`."""
+        """Return the given errors [rad or m]; see `AbstractGeometrySource.parameter_errors`."""
         dh = np.zeros_like(robot.dh)
         for name, error in self.rows.items():
             dh[row_index(robot, name, place)] = error.to_si()
@@ -53,7 +53,7 @@ class RandomGeometricDeviation(AbstractGeometrySource):
 
     `p_true = p_nominal + s · u`, with s the size for lengths or angles and u uniform in [-1, 1), or standard normal.
     From one generator with `seed`, (rows, 5) values are drawn for the DH rows (theta, d, a, alpha, beta), then 6 for
-    the base and 6 for the tool, also for sizes of 0, so that the errors of other parameters do not depend on them.
+    the base and 6 for the tool, also for sizes of 0, so that a size does not change the errors of other parameters.
 
     Source: the parameters are those of Hayati and Mirmirani, Journal of Robotic Systems 2(4), 1985,
     397-413; random errors on all of them are the usual way to test an identification, for example in
@@ -82,7 +82,7 @@ class RandomGeometricDeviation(AbstractGeometrySource):
     tool_angle_deg: float = Field(default=0.0, ge=0)
 
     def parameter_errors(self, robot: Robot, place: str) -> GeometryChange:
-        """Return the random errors, the same at every call; see `AbstractGeometrySource.parameter_errors`."""
+        """Return the random errors [rad or m], the same at every call; see `AbstractGeometrySource`."""
         generator = torch.Generator().manual_seed(self.seed)
         dh = self._draw(generator, len(robot.rows), 5)
         base, tool = self._draw(generator, 6), self._draw(generator, 6)

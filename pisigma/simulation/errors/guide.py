@@ -1,4 +1,4 @@
-"""Errors of a linear guide: joint errors that vary slowly along the travel of an axis."""
+"""Errors of a linear guide, joint errors that vary slowly along the travel of an axis."""
 
 from typing import Literal
 
@@ -41,16 +41,17 @@ class GuideWave(Section):
 
 
 class Guide(AbstractJointSource):
-    """Straightness and angular errors of a rail along its travel, as errors of joints after it.
+    """Straightness and angular errors of a rail along its travel, as errors of the joints after the rail.
 
     `e_j = Σ A · sin(harmonic · pi · q / travel + phase)` with q the controller's value of the axis and its travel
-    between its limits. In the robot's file, the joints with errors are after the rail and coupled to it with factor 0.
+    between its limits. In the robot's file, the joints with errors follow the rail and are coupled to it with the
+    factor 0.
 
     Source: error motions of a linear axis of ISO 230-1:2012, 3.4 (straightness and angular error motions).
 
     Attributes:
         kind: "guide".
-        along: name of the axis, which is prismatic and has limits.
+        along: name of the axis of the rail, which is prismatic and has limits.
         waves: waves of the joint errors.
     """
 
@@ -59,7 +60,7 @@ class Guide(AbstractJointSource):
     waves: tuple[GuideWave, ...] = Field(min_length=1)
 
     def bind(self, robot: Robot, place: str) -> JointErrorFunction:
-        """Return the waves as a function of the joint values. See `AbstractJointSource.bind`."""
+        """Return the joint errors as a function of the joint values; see `AbstractJointSource.bind`."""
         names = [axis.name for axis in robot.axes]
         if self.along not in names:
             raise RecipeError(

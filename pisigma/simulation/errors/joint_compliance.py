@@ -34,8 +34,8 @@ class JointCompliance(AbstractJointSource):
 
     `e_j = c_j · tau_j(q)` with `tau_j = Σ_k z_j · ((r_k - p_j) x m_k g)` over all masses k beyond joint j,
     where z_j and p_j are the joint's axis and origin and r_k the centre of mass; for a prismatic joint the
-    force `tau_j = Σ_k z_j · m_k g`. The torque is that of the nominal geometry at the commanded joints, without the
-    deflection: first order in the compliance.
+    force `tau_j = Σ_k z_j · m_k g`. The torque is computed for the nominal geometry at the commanded joint values,
+    without the deflection, which is exact to first order in the compliance.
 
     Source: Whitney, Lozinski and Rourke, ASME Journal of Dynamic Systems, Measurement, and Control
     108(1), 1986, 1-8; Judd and Knasinski, IEEE Transactions on Robotics and Automation 6(1), 1990, 20-30.
@@ -48,7 +48,7 @@ class JointCompliance(AbstractJointSource):
         compliance_m_per_N: compliance by name of a prismatic joint [m/N].
         links: masses and centres of mass of links by row name.
         payload: mass and centre of mass of the payload.
-        gravity_m_per_s2: gravitational acceleration [m/s^2] in the frame of the first row (so without `base`).
+        gravity_m_per_s2: gravitational acceleration [m/s^2] in the frame of the first row (excluding `base`).
     """
 
     kind: Literal["joint_compliance"]
@@ -59,7 +59,7 @@ class JointCompliance(AbstractJointSource):
     gravity_m_per_s2: Triple = (0.0, 0.0, -9.81)
 
     def bind(self, robot: Robot, place: str) -> JointErrorFunction:
-        """Return the deflection as a function of the joint values. See `AbstractJointSource.bind`."""
+        """Return the deflection as a function of the joint values; see `AbstractJointSource.bind`."""
         fields = ("compliance_rad_per_Nm", "compliance_m_per_N")
         stated = joint_values(robot, self.compliance_rad_per_Nm, self.compliance_m_per_N, fields, place)
         compliance = torch.from_numpy(stated)

@@ -1,4 +1,4 @@
-"""Offsets of joint zeros."""
+"""Constant offsets of joint zeros."""
 
 from typing import Literal
 
@@ -29,7 +29,7 @@ class JointOffset(AbstractJointSource):
     offset_mm: dict[str, float] = Field(default_factory=dict)
 
     def bind(self, robot: Robot, place: str) -> JointErrorFunction:
-        """Return the offsets as a function of the joint values. See `AbstractJointSource.bind`."""
+        """Return the offsets as a function of the joint values; see `AbstractJointSource.bind`."""
         stated = joint_values(robot, self.offset_deg, self.offset_mm, ("offset_deg", "offset_mm"), place)
         offset = torch.from_numpy(np.where(robot.revolute, np.deg2rad(stated), stated / 1e3))
         return lambda q: torch.zeros_like(q) + offset.to(q)

@@ -1,4 +1,4 @@
-"""The interface of error sources: recipe sections that change the geometry or the joint values of a robot."""
+"""Interface of error sources, recipe sections that change the geometry or the joint values of a robot."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
@@ -16,7 +16,7 @@ from pisigma.robot.description import Robot
 Value = TypeVar("Value")
 
 JointErrorFunction = Callable[[Tensor], Tensor]
-"""Maps commanded joint values `(*batch, dof)` to their errors [rad or m], of the same shape."""
+"""Function that maps commanded joint values `(*batch, dof)` to joint errors [rad or m] of the same shape."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,21 +35,21 @@ class GeometryChange:
 
 
 class AbstractErrorSource(Section, ABC):
-    """An error source; concrete ones are an `AbstractGeometrySource`, `AbstractJointSource` or `AbstractPlaySource`.
+    """Base class of error sources: `AbstractGeometrySource`, `AbstractJointSource` and `AbstractPlaySource`.
 
     Attributes:
-        kind: its name in recipes, a `Literal` of one text.
+        kind: name of the source in recipes, a `Literal` of one text.
     """
 
     kind: str
 
 
 class AbstractGeometrySource(AbstractErrorSource):
-    """An error source that changes geometric parameters; the changes of several sources are added."""
+    """Base class of sources that change geometric parameters; the changes of several sources are added."""
 
     @abstractmethod
     def parameter_errors(self, robot: Robot, place: str) -> GeometryChange:
-        """Return the errors of the parameters of the nominal robot.
+        """Return the errors of the geometric parameters of the nominal robot.
 
         Args:
             robot: the nominal robot.
@@ -61,11 +61,11 @@ class AbstractGeometrySource(AbstractErrorSource):
 
 
 class AbstractJointSource(AbstractErrorSource):
-    """An error source that changes commanded joint values; several sources are added."""
+    """Base class of sources that change commanded joint values; the errors of several sources are added."""
 
     @property
     def stepped_joints(self) -> frozenset[str]:
-        """Names of the joints with encoder steps by this source, which cannot reach arbitrary values."""
+        """Names of the joints that have encoder steps by this source, so that they cannot reach arbitrary values."""
         return frozenset()
 
     @abstractmethod
@@ -82,7 +82,7 @@ class AbstractJointSource(AbstractErrorSource):
 
 
 class AbstractPlaySource(AbstractErrorSource):
-    """An error source by which joints stop on the side of their approach; several sources are added.
+    """Base class of sources of backlash, by which joints stop on the side of their approach; their plays are added.
 
     Attributes:
         seed: random seed of the directions of approach of simulated rows.
@@ -118,7 +118,7 @@ def row_index(robot: Robot, name: str, place: str) -> int:
 
 
 def joint_index(robot: Robot, name: str, place: str) -> int:
-    """Return the index of the joint `name` among the rows that are not fixed. See `row_index`."""
+    """Return the index of the joint `name` among the rows that are not fixed; see `row_index`."""
     return _index(robot, [joint.name for joint in robot.joints], name, "joint", place)
 
 
@@ -141,7 +141,7 @@ def stated_joints(
     place: str,
     axes: bool = False,
 ) -> dict[int, Value]:
-    """Return the values of two mappings of a recipe, by index of the joint.
+    """Return the values of two mappings in a recipe by joint index.
 
     Args:
         robot: the robot.
@@ -149,7 +149,7 @@ def stated_joints(
         for_prismatic: values of prismatic joints, by name.
         fields: keys of the two mappings in the recipe, revolute first.
         place: position in the recipe, for messages.
-        axes: whether the values are of the controller's axes, `robot.axes`, instead of the joints.
+        axes: whether the mappings are by names of the controller's axes, `robot.axes`, instead of joints.
 
     Raises:
         RecipeError: a joint is unknown, or in the mapping of the other type.
@@ -179,7 +179,7 @@ def joint_values(
     fields: tuple[str, str],
     place: str,
 ) -> Float64[np.ndarray, " dof"]:
-    """Return one value per joint, 0 if not given. See `stated_joints`."""
+    """Return one value per joint [rad or m], 0 if not given; see `stated_joints`."""
     stated = stated_joints(robot, for_revolute, for_prismatic, fields, place)
     return np.array([stated.get(index, 0.0) for index in range(robot.dof)])
 
@@ -187,7 +187,7 @@ def joint_values(
 def amplitude_of(
     robot: Robot, joint: str, deg: float | None, mm: float | None, place: str
 ) -> Float64[np.ndarray, " dof"]:
-    """Return the amplitude of a wave [rad or m] in the column of its joint, 0 elsewhere. See `stated_joints`.
+    """Return one value per joint: the amplitude of a wave [rad or m] for its joint, 0 for other joints.
 
     Args:
         robot: the robot.

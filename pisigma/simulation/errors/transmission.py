@@ -1,4 +1,4 @@
-"""Transmission errors: periodic functions of the joint angles."""
+"""Transmission errors, periodic functions of the joint angles."""
 
 from typing import Literal
 
@@ -26,7 +26,7 @@ class Harmonic(Section):
         joint: joint with the error.
         amplitude_deg: amplitude of a revolute joint [deg].
         amplitude_mm: amplitude of a prismatic joint [mm].
-        harmonic: multiple m of the joint's angle, or of the angle of a prismatic joint's screw.
+        harmonic: multiple m of the joint angle, or of the angle of a prismatic joint's screw.
         lead_mm: travel of a prismatic joint per revolution of its screw [mm], with `harmonic`.
         joints: multiples of the angles of revolute joints by name, instead of `harmonic`: gears of a coupled wrist
             rotate by sums of joint angles.
@@ -76,7 +76,7 @@ class TransmissionHarmonics(AbstractJointSource):
     terms: tuple[Harmonic, ...] = Field(min_length=1)
 
     def bind(self, robot: Robot, place: str) -> JointErrorFunction:
-        """Return the sum of the terms as a function of the joint values. See `AbstractJointSource.bind`."""
+        """Return the joint errors as a function of the joint values; see `AbstractJointSource.bind`."""
         places = [f"{place}, terms[{index}]" for index in range(len(self.terms))]
         stated = list(zip(self.terms, places, strict=True))
         # (terms, dof): amplitudes of the joint errors, and multiples of the joint values inside the sine
@@ -110,7 +110,7 @@ def _multiple(robot: Robot, term: Harmonic, place: str) -> np.ndarray:
                 )
             multiple[index] = value
         return multiple
-    assert term.harmonic is not None  # checked by the validator
+    assert term.harmonic is not None  # the validator has checked this
     index = joint_index(robot, term.joint, place)
     if robot.revolute[index] != (term.lead_mm is None):
         remedy = "remove lead_mm" if robot.revolute[index] else "add the lead_mm of its screw"
