@@ -118,10 +118,12 @@ class BoardViews:
         left, top, right, bottom = board_sheet(self.sight.board)
         fills = camera.fx * min(right - left, bottom - top) / min(camera.width, camera.height)
         least, most = max(self.nearest, fills), min(self.farthest, MAX_DEPTH_RATIO * fills)
+        # From where the board fills the image to where it is too small in it, within the stated distances.
         depth = least + (most - least) * draws[:, 2:3]
         middle = depth * torch.cat([rays, torch.ones_like(depth)], 1)
         direction, turn = 2 * math.pi * draws[:, 3:5].t()
         nothing = torch.zeros_like(turn)
+        # Roll is the direction of the tilt and pitch its size; then the board is turned in its own plane.
         R = rotation_from_rpy(torch.stack([direction, self.oblique * draws[:, 5], nothing], 1))
         R = R @ rotation_from_rpy(torch.stack([turn, nothing, nothing], 1))
         return transform(R, middle - R @ self._middle)

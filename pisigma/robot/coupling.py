@@ -211,6 +211,7 @@ def dh_limits(coupling: Coupling) -> Float64[np.ndarray, "dof 2"]:
     Raises:
         RobotError: a four-bar linkage does not close everywhere within the limits.
     """
+    # Every DH value is a sum over the axes, so it is extreme where each term is, at one of the ends of its axis.
     ends = coupling.matrix[..., None] * np.where(np.isfinite(coupling.limits), coupling.limits, 0.0)
     unbounded = ((coupling.matrix != 0) & ~np.isfinite(coupling.limits).all(1)).any(1)
     lower, upper = ends.min(-1).sum(1) + coupling.offset, ends.max(-1).sum(1) + coupling.offset

@@ -139,8 +139,10 @@ def _evidence_of_direction(
     """Compute the evidence from a fit with separate masses for each of the `AXES`, without their prior."""
     count = len(AXES)
     weights = slice(design.weights_of(0).start, design.weights_of(count - 1).stop)
+    # Inverting the block of the covariance marginalises geometry and series; minus the prior, data alone are left.
     root = fit.covariance_root(posterior).as_matrix[weights].cpu()
     total, prior = torch.linalg.inv(root @ root.t()), posterior.prior.precision[weights].cpu()
+    # In units of the prior sizes, the prior precision of the masses is 1 for every direction.
     size = prior.reshape(count, -1)[0].rsqrt()
     normal = (total - prior.diag()).reshape(count, len(size), count, len(size))
     normal = (normal * size[:, None, None] * size).transpose(1, 2)
@@ -155,6 +157,7 @@ def _most_probable(log_evidence: _EvidenceOfDirection) -> tuple[Direction, float
         The direction in the base frame, and the share of the half sphere that the rows leave for it.
     """
     number = torch.arange(STARTS, dtype=torch.float64)
+    # Fibonacci lattice: equal steps of height are equal areas, and the golden angle spreads the directions evenly.
     height, turn = (number + 0.5) / STARTS, math.pi * (3 - math.sqrt(5)) * number
     level = (1 - height.square()).sqrt()
     tried = torch.stack([height, level * turn.cos(), level * turn.sin()], 1)
@@ -162,8 +165,11 @@ def _most_probable(log_evidence: _EvidenceOfDirection) -> tuple[Direction, float
         c = tried[log_evidence(tried).argmax()]
         gradient, hessian = log_evidence.derivatives(c)
         curvature, along = torch.linalg.eigh(hessian)
+        # The absolute curvature makes the step point uphill where the Hessian is not negative; the factor 0 keeps c.
         step = along @ (along.t() @ gradient / curvature.abs())
         tried = c + step * torch.tensor([[0.0], [0.125], [0.25], [0.5], [1.0]]).to(c)
+    # Laplace: with the information H per squared radian along two tangents, the posterior covers an area of
+    # 2 π det(H)^-1/2 of the 2 π of the half sphere, at most all of it.
     across = torch.linalg.svd(c[None]).Vh[1:] * c.norm()
     information = -across @ log_evidence.derivatives(c)[1] @ across.t()
     x, y, z = (c / c.norm() @ c.new_tensor(AXES)).tolist()

@@ -118,7 +118,10 @@ class NormalEquations(PrimalRegression, AbstractDesignRegression):
             block = whitened[first : first + len(r[-1])].view(columns.shape)
             torch.mul(columns, root[..., None], out=block).mul_(solved.scale)
             first += len(r[-1])
+            # The columns are the largest arrays, so only one copy of them is kept.
             del columns
+        # M = I - X C X^T with C = L^-T L^-1: the inverse factor is lower triangular, so each block of its rows only
+        # needs the columns up to its end.
         M = torch.eye(first, dtype=x.dtype, device=x.device)
         for rows in row_blocks(len(x), BLOCK):
             S = solved.inverse[rows, : rows.stop] @ whitened[:, : rows.stop].t()

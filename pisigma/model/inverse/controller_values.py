@@ -118,6 +118,7 @@ class ControllerValues:
         found = solve_from(
             self._motion, rows, starts, lambda q: self.coupling.is_within_limits(self.coupling.to_dh(q))
         )
+        # The nominal solution starts at the corrected one, so that both belong to the same branch.
         nominal = solve(partial(self._motion, nominal=True), rows, found.q)
         q, q_nominal = found.mask_unreached(found.q), nominal.mask_unreached(nominal.q)
         solution = Solution(
@@ -131,6 +132,7 @@ class ControllerValues:
             np.full(batch, np.nan),
             owner,
         )
+        # A solution outside the limits is only left where no start leads to one within them.
         outside = found.reached & ~self.coupling.is_within_limits(self.coupling.to_dh(found.q))
         beyond = int(Status.OUTSIDE_JOINT_LIMITS)
         solution = replace(solution, status=np.where(outside.reshape(batch), beyond, solution.status))

@@ -188,6 +188,7 @@ class NumericIK:
             starts = torch.cat([starts, few], 1)
         unknown = branch.new_full((len(T), starts.shape[1] - branch.shape[1]), -1)
         every, rank = self._solved(T, starts, torch.cat([branch, unknown], 1), near)
+        # Only poses that no start solves get further starts.
         lost = ((_among(every, rank, requested) >= _OUTSIDE).all(1) & plausible).nonzero()[:, 0]
         if not len(lost):
             return every, rank
@@ -204,10 +205,13 @@ class NumericIK:
         """
         if self._solver is None:
             return T.new_zeros(len(T), 0, self.model.robot.dof), torch.zeros(len(T), 0, dtype=torch.int64)
+        # A SCARA cannot tilt its tool: where the tilt is ignored, its closed form gets the upright pose.
         if len(self.model.robot.joints) == 4 and all(self.task_axes.tolerance[3:5]):
             T = self._solver.upright_poses(T)
         q, near_rows = self._solver.solve(T.float() if single else T).q.double(), self._solver.start_values(T)
         reached, robot = torch.isfinite(q).all(-1), self.model.identified
+        # The calibrated arm may reach what the nominal one just misses: start at its nearest joint values, unless they miss
+        # the pose by far more than geometric errors explain. Lengths are divided by the reach to add up with angles.
         each = T[:, None].expand(*near_rows.shape[:-1], 4, 4).reshape(-1, 4, 4)
         off, _ = task_error(self.task_axes, each, forward_kinematics(robot, near_rows.reshape(-1, robot.dof)))
         off = off * off.new_tensor([*[1 / robot.reach] * 3, 1, 1, 1]) * off.new_tensor(self._arm.weights)

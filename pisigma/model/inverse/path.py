@@ -133,6 +133,7 @@ def _guide(ik: AbstractInverse, T: Array, near: Array | None, branch: str | None
     reached = np.flatnonzero(np.isfinite(q).all(-1).any(-1))
     if not len(reached):
         return np.tile(np.clip(0.0, ik.limits[:, 0], ik.limits[:, 1]) if near is None else near, (len(T), 1))
+    # Cost of starting on each branch: by the statement of the caller, the joint motion from `near`, or the usual order.
     first = np.zeros(len(ik.branches))
     for place, index in enumerate(ik.order):
         first[index] = _LATER * place
@@ -143,6 +144,7 @@ def _guide(ik: AbstractInverse, T: Array, near: Array | None, branch: str | None
     q, status = q[reached], status[reached]
     chosen = choose_branches(q, status, _jumps(ik, T[reached], q), first, ik.revolute)
     rolled, _ = unwrap_path(q[np.arange(len(q)), chosen], ik.limits, ik.revolute, near)
+    # Poses without a solution are guided by the last reached pose before them, or by the first one.
     before = np.maximum(np.searchsorted(reached, np.arange(len(T)), side="right") - 1, 0)
     return rolled[before]
 

@@ -210,6 +210,7 @@ class RowModel:
             start += block.numel()
             (angle if sensor.unit == "rad" else length)[one.row] = block.norm(dim=1)
             if isinstance(sensor, CornerSensor):
+                # Residuals of corners are multiplied by weights; undo this to get lengths and angles.
                 block = torch.linalg.solve(sensor.weight.permute(2, 0, 1)[one.row], block[..., None])[..., 0]
                 length[one.row], angle[one.row] = block[:, :3].norm(dim=1), block[:, 3:].norm(dim=1)
             if sensor.name in ("position", "corner"):

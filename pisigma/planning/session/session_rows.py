@@ -235,6 +235,7 @@ class FurtherPoses:
         posterior = so_far.posterior
         if not len(first) or not 0 < count <= len(new):
             return None
+        # The robot is already on its way to the next pose: it counts as measured, unless it only tests the model.
         if not bool(plan.check[first]):
             posterior = posterior.after_measuring(plan.q[first])
         seen, tool = posterior.sensitivities(self.q), posterior.tool(self.task)
@@ -242,10 +243,12 @@ class FurtherPoses:
             if count > len(new):
                 return None
             chosen = new[select_poses(seen[new], tool, count, plan.settings.criterion)]
+            # Poses that test the model are spread among the others, so that a session that ends early has both kinds.
             use = order_of_use(count, len(check))
             q = torch.cat([self.q[chosen], plan.q[check]])[use]
             way = plan_tour(self.motions, q, plan.settings.pace, plan.q[first[0]], stages=(AHEAD,))
             left_out = use[way.left_out]
+            # Poses that no collision-free way reaches are replaced by the next best ones.
             shut_in = left_out[left_out < count]
             new = new[~torch.isin(new, chosen[shut_in])]
             if not len(shut_in):

@@ -165,6 +165,7 @@ class ArmInSurroundings:
             bounds = [abs(bound) for bound in (row.lower, row.upper) if math.isfinite(bound)]
             strokes[index] = max(bounds, default=0.0) if row.type == "prismatic" else 0.0
             strokes[index] += float(np.linalg.norm(row.urdf_origin))
+        # A point is at most the sum of all lengths behind an axis away from it, so it moves by at most this per radian.
         lengths = np.append(np.hypot(d + strokes, self.robot.dh[:, 2]), np.linalg.norm(self.robot.tool[:3]))
         beyond = np.cumsum(lengths[::-1])[::-1][list(self.robot.joint_rows)]
         return torch.from_numpy(np.where(self.robot.revolute, beyond, 1.0))

@@ -33,6 +33,7 @@ def wrap_into_limits(
         inside is unchanged.
     """
     limits = torch.from_numpy(robot.limits).to(q)
+    # Values in float32 are rounded by more than LIMIT_TOLERANCE.
     tolerance = max(LIMIT_TOLERANCE, 8 * torch.finfo(q.dtype).eps)
     lower, upper = limits[:, 0] - tolerance, limits[:, 1] + tolerance
     turn = 2 * torch.pi * torch.tensor(robot.revolute).to(q)
@@ -41,6 +42,7 @@ def wrap_into_limits(
     moved = q + (up - down) * turn
     inside = (moved >= lower) & (moved <= upper)
     moved, every = torch.where(inside, moved, q), inside.all(-1)
+    # A full turn of a coupled joint turns others too, so the controller's values decide which turns are possible.
     if robot.coupling is None:
         return moved, every
     turned, allowed = robot.coupling.wrapped_within_limits(

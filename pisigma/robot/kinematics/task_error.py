@@ -31,6 +31,7 @@ def task_error(
     zero = torch.zeros_like(T[:, :3, :3])
     turn, D = reached[:, :3, :3].mT, reached[:, :3, :3].mT @ T[:, :3, :3]
     rotation, k = turn, axes.pivot
+    # Shifts along the axes of the target tool, rotations about those of the reached one.
     error = pose_error(T, reached)
     error = torch.cat(
         [(T[:, :3, :3].mT @ error[:, :3, None])[..., 0], (turn @ error[:, 3:, None])[..., 0]], -1
@@ -38,11 +39,13 @@ def task_error(
     if k >= 0:
         i, j = (k + 1) % 3, (k + 2) % 3
         sine = torch.hypot(D[:, i, k], D[:, j, k])
+        # angle / sine tends to 1 at 0; at 180 deg the axis of the swing is arbitrary, so no swing is asked for there.
         straight = torch.where(D[:, k, k] > 0, 1.0, 0.0).to(D)
         safe = torch.where(sine > 1e-12, sine, 1.0)
         factor = torch.where(sine > 1e-12, torch.atan2(sine, D[:, k, k]) / safe, straight)
         error[:, 3 + i], error[:, 3 + j] = -factor * D[:, j, k], factor * D[:, i, k]
         error[:, 3 + k] = torch.atan2(D[:, j, i] - D[:, i, j], D[:, i, i] + D[:, j, j])
+        # (k + Dk) / (1 + k · Dk), with the component along k of exactly 1; the clamp bounds steps near 180 deg.
         direction = D[:, :, k] / (1 + D[:, k, k]).clamp(min=0.05)[:, None]
         direction[:, k] = 1.0
         rotation = turn.clone()

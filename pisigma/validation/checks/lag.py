@@ -76,11 +76,13 @@ def find_lag(rows: OrderedRows, measurements: Measurements) -> Lag | None:
     found = []
     for before, motion in zip((True, False), _motions(measurements), strict=True):
         z = (rows.joint_derivative @ motion[rows.number][..., None]).reshape(len(r), -1)[:, 0]
+        # What the calibration could not absorb of the lag: only this part can show in the residuals (Frisch-Waugh).
         free = z - X @ (covariance @ (X.T @ z))
         information = float(free @ free)
         if information <= 1e-12 * float(z @ z):
             continue
         share = float(free @ left) / information
+        # The share of squares that the lag leaves; its log Bayes factor by Schwarz's criterion with one more parameter.
         ratio = max(1 - share**2 * information / float(left @ left), 1e-12)
         gain = (
             -rows.degrees_of_freedom / 2 * math.log(ratio) - math.log(max(rows.degrees_of_freedom, 2.0)) / 2

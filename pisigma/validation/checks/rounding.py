@@ -97,6 +97,7 @@ def joint_rounding(result: CalibrationResult, measurements: Measurements) -> Rou
     q = measurements.q.cpu().numpy()
     coupling = result.robot.coupling
     steps = np.zeros(q.shape[1])
+    # Coupled axes are rounded before the coupling, so the DH values have no common step.
     if coupling is None:
         unit = np.where(result.robot.revolute, math.degrees(1), 1e3)
         steps = np.array([_common_step(column[:, None]) for column in (q * unit).T]) / unit
@@ -104,6 +105,7 @@ def joint_rounding(result: CalibrationResult, measurements: Measurements) -> Rou
     if rows is None or len(rows.residual) < MIN_ROWS:
         return None
     made = rows.joint_derivative * steps / math.sqrt(12)
+    # Residuals of a fit are too small, because its parameters absorbed a part of the errors.
     left = rows.residual_after_fit * math.sqrt(
         rows.values / max(rows.values - rows.effective_parameters, 1.0)
     )

@@ -133,6 +133,7 @@ def common_scale(result: CalibrationResult) -> CommonScale | None:
     lengths = np.where(erring & (np.abs(nominal) > USUAL_LENGTH), nominal, 0.0)
     if not lengths.any():
         return None
+    # At the solution, (N + P) (x - nominal) = b, because the nominal values are the mean of the prior.
     right = here.normal.numpy() @ (here.point - problem.nominal)[problem.active].numpy()
     data = here.normal.numpy() - np.diag(precision)
     plain, estimate, information = np.empty((3, len(LENGTH_ERRORS)))
@@ -140,14 +141,17 @@ def common_scale(result: CalibrationResult) -> CommonScale | None:
         precision[erring] = error**-2
         normal = data + np.diag(precision)
         diagonal = normal.diagonal()
+        # Unit diagonal: metres and radians otherwise make the matrix too ill-conditioned for a Cholesky factor.
         column = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
         scaled_normal = normal * column * column[:, None]
         root = np.linalg.cholesky(scaled_normal + UNDETERMINED * np.eye(len(column)))
+        # `pull` is the change of the right-hand side per unit of s: the prior is centred at (1 + s) L instead of L.
         pull = precision * lengths
         u, v = np.linalg.solve(root, (column * np.stack([right, pull])).T).T
         plain[k] = np.log(precision[erring]).sum() / 2 - np.log(root.diagonal() / column).sum() + u @ u / 2
         information[k] = lengths @ pull - v @ v
         estimate[k] = u @ v / information[k]
+    # A normal prior and a normal likelihood of s: their product integrates in closed form.
     ratio = np.square(SCALE_SIGMAS)[:, None] * information
     gain = (np.square(estimate) * information * ratio / (1 + ratio) - np.log1p(ratio)) / 2
     scaled = plain + gain
@@ -215,6 +219,7 @@ def _fit(
     """Solve least squares; return the RMS length of the residuals [m], the last unknown, and its standard deviation."""
     scale = A.norm(dim=0).clamp(min=1e-300)
     U, size, V = torch.linalg.svd(A / scale, full_matrices=False)
+    # Where rotations are alike, shifts of base and tool have equal effects: leave out what the rows do not determine.
     certain = size > 1e-6 * size[0]
     U, size, V = U[:, certain], size[certain], V[certain]
     x = V.t() @ (U.t() @ error / size)

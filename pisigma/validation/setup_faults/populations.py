@@ -185,13 +185,17 @@ class _Mixture:
         """Fit the mixture to some rows from several starts, and assign all rows to a population."""
         r, X, Z = self.rows.residual[some], self.rows.jacobian[some], self.Z[some]
         rng = np.random.default_rng(0)
+        # Expectation maximisation finds local maxima: start with alternating rows (two arms in turns) and at random.
         starts = [np.arange(len(some)) % 2 * 0.8 + 0.1, *rng.uniform(0, 1, (STARTS - 1, len(some)))]
+        # The same errors and prior without a difference: what the mixture has to beat.
         alone = _Em(r, X, Z[:, :, :0], np.r_[self.rows.precision])
         one = alone.run(alone.start(np.zeros(len(some))), MAX_ITERATIONS)
         em = _Em(r, X, Z, np.r_[self.rows.precision, self.precision])
         states = [em.run(em.start(start), FIRST_ITERATIONS) for start in starts]
         state = em.run(max(states, key=lambda state: state.log_likelihood), MAX_ITERATIONS)
         difference = state.x[X.shape[2] :]
+        # A difference present in a share p of the rows has the variance p (1 - p) times its square; the variance of a t
+        # distribution is its squared scale times TAILS / (TAILS - 2).
         made = float(np.square(Z @ difference).mean()) * state.share * (1 - state.share)
         left = state.variance * r.size / max(r.size - state.used, 1.0) * TAILS / (TAILS - 2)
         every = _Em(self.rows.residual, self.rows.jacobian, self.Z, em.precision)

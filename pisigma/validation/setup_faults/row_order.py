@@ -270,6 +270,7 @@ class _Search:
         A[candidate.index, :, size:] = candidate.columns
         A = A.reshape(-1, size + motions)
         held = np.diag(np.concatenate([self.rows.precision, np.zeros(motions)]))
+        # Fitted residuals are too small by the root of the share of values that the parameters leave free.
         left = max(1 - (self.rows.effective_parameters + motions) / self.rows.values, 1e-2)
         weight, scale = np.ones_like(self.rows.residual), np.ones(self.rows.residual.shape[1] // 3)
         for _ in range(MAX_ITERATIONS):

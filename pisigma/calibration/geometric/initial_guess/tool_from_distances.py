@@ -280,9 +280,11 @@ def _distances_of(measurements: Measurements, T: Tensor, target: str) -> _Distan
     distance = measurements.distance.cpu()
     own = torch.tensor([name == target for name in measurements.target]) & torch.isfinite(distance)
     number = numbers_of(measurements.anchor, distinct_names(measurements.anchor), measurements.rows)
+    # An anchor has four unknowns (position and zero offset), so few distances say nothing about the tool.
     known, counts = torch.unique(number[own & (number >= 0)], return_counts=True)
     wires = own & torch.isin(number, known[counts >= MIN_DISTANCES])
     anchor = torch.unique(number[wires], return_inverse=True)[1]
+    # The rows of pairs come first, the two rows of a pair after each other.
     first = torch.arange(0, 2 * len(distinct_names(measurements.pair)), 2)
     first = first[own[first] & own[first + 1]]
     return _Distances(
