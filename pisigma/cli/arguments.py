@@ -30,9 +30,6 @@ def complete_export(incomplete: str) -> list[str]:
     return [name for name in export_names() if name.startswith(incomplete)]
 
 
-ModelFolder = Annotated[Path, typer.Argument(help="Model folder.", autocompletion=complete_model)]
-"""The argument of commands that change one model."""
-
 ModelOrCell = Annotated[
     Path, typer.Argument(metavar="MODEL|CELL", help="Model folder, or a cell.", autocompletion=complete_model)
 ]

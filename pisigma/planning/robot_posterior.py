@@ -178,7 +178,7 @@ class RobotPosterior:
         """
         columns = self.columns(q)[:, :3]
         if self.instrument.sight is not None:
-            # Project out the six rigid motions of all points: shifts, and rotations about their mean for good conditioning.
+            # Project out the rigid motions of all points: shifts, and rotations about their mean for good conditioning.
             points = forward_kinematics(self.uncertainty.geometry.robot, self.corrected_joints(q))[:, :3, 3]
             shifts = torch.eye(3).to(points).expand(len(points), 3, 3)
             rigid = torch.linalg.qr(torch.cat([shifts, skew(points - points.mean(0))], -1).flatten(0, 1)).Q

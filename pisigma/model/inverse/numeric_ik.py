@@ -210,8 +210,8 @@ class NumericIK:
             T = self._solver.upright_poses(T)
         q, near_rows = self._solver.solve(T.float() if single else T).q.double(), self._solver.start_values(T)
         reached, robot = torch.isfinite(q).all(-1), self.model.identified
-        # The calibrated arm may reach what the nominal one just misses: start at its nearest joint values, unless they miss
-        # the pose by far more than geometric errors explain. Lengths are divided by the reach to add up with angles.
+        # The calibrated arm may reach what the nominal one just misses: start at its nearest joint values, unless they
+        # miss the pose by far more than geometric errors explain. Divided by the reach, lengths add up with angles.
         each = T[:, None].expand(*near_rows.shape[:-1], 4, 4).reshape(-1, 4, 4)
         off, _ = task_error(self.task_axes, each, forward_kinematics(robot, near_rows.reshape(-1, robot.dof)))
         off = off * off.new_tensor([*[1 / robot.reach] * 3, 1, 1, 1]) * off.new_tensor(self._arm.weights)

@@ -307,12 +307,6 @@ class RowJudgement:
     model: RowModel | None = None
     errors: LeaveOneOutErrors | None = None
 
-    @property
-    def is_predictable(self) -> Bool[Tensor, " rows"]:
-        """Rows that can be predicted from the others."""
-        none = torch.zeros_like(self.counts)
-        return none if self.errors is None else self.errors.chance.isfinite()
-
 
 def judge_rows(
     robot: Robot, rows: Measurements, sigma: float | None, trusted: Bool[Tensor, " rows"]
