@@ -1,1 +1,1 @@
-"""Calibration: the geometric calibrator, and the hybrid one, which also learns joint corrections."""
+"""Calibration: the geometric calibrator, and the hybrid calibrator, which also learns joint corrections."""

@@ -1,1 +1,1 @@
-"""Geometric calibration: initial guess, parameters, least squares, identifiability, result."""
+"""Geometric calibration: initial guess, parameters, least squares, identifiability and result."""

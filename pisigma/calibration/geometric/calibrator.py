@@ -45,36 +45,37 @@ from pisigma.robot.robot_class import CLASSES
 from pisigma.robot.row import FRAME_COLUMNS
 
 ROUGH_ROWS = 4_096
-"""Rows used for the initial guess and the first steps."""
+"""Largest number of rows used for the first steps."""
 ROUGH_STEPS = 3
-"""Steps without the prior, which show the noise relative to which the prior is then weighted."""
+"""Number of steps without the prior; they determine the noise relative to which the prior is weighted."""
 
 
 @dataclass(frozen=True)
 class GeometricCalibrator:
-    """Identifies DH + Hayati parameters, base and tool from measured poses or positions by least squares.
+    """Calibrator that identifies DH and Hayati parameters, base and tool from measurements by least squares.
 
-    No initial guess is needed: base and tool start from a closed-form solution, the arm at its nominal values.
+    No initial guess is needed: base and tool start from a closed-form solution, the parameters of the arm at their
+    nominal values.
 
     Attributes:
         robot: the nominal robot.
         free: "identifiable" (all that the data determine), "joint_offsets" (theta of revolute and d of prismatic
             joints), or names of parameters, such as "a_2". Base and tool are added to these, see below.
-        base: "free", or "fixed" to that of the robot (then only those of its parameters that are named in `free` are
-            estimated).
-        tool: the same for the tool; "position" frees x, y and z only.
+        base: "free", or "fixed" to the base of the robot (only parameters of the base that are named in `free` are
+            then estimated).
+        tool: "free" or "fixed", as for the base; "position" frees x, y and z of the tool only.
         elimination: how redundant parameters are removed: "exact" (rank and pivoted QR), "pairwise" (Pearson
             correlation, as in Park et al. 2022), or "none". The predicted poses do not depend on it.
-        prior: standard deviations of the errors of the parameters, or None. With a prior, parameters that the data do
-            not determine stay at their nominal values.
+        prior: standard deviations of the errors of the parameters, or None. With a prior, parameters that the data
+            do not determine keep their nominal values.
         prior_sizes: "estimated" (one factor on the prior is estimated for each of joint offsets, lengths, lengths that
             are nominally 0, and angles between axes), "widened" (one factor >= 1 for lengths and one for angles), or
-            "stated" (the prior is used as it is).
+            "stated" (the prior is used unchanged).
         frames: approximate base in frames with touches: x, y, z [m], roll, pitch, yaw [rad], such as the planned
-            placement of a jig. Needed only if the touches do not determine it.
+            placement of a jig. It is needed only if the touches do not determine the base.
         socket_distances: distances between two sockets [m], which determine the scale:
             `{("plate/0", "plate/1"): 0.05}`.
-        socket_sigma: standard deviation of these distances [m].
+        socket_sigma: standard deviation of the distances between sockets [m].
         loss: `HampelLoss()` reduces the weight of outliers, down to 0; `SquaredLoss()` does not.
         maximum_iterations: maximum number of steps.
         robot_class: "industrial", "cobot" or "hobby", which limits the errors; None to derive it from the manufacturer
@@ -132,7 +133,7 @@ class GeometricCalibrator:
 
     @torch.inference_mode()
     def fit(self, measurements: Measurements) -> CalibrationResult:
-        """Calibrate; see `solve` for the errors raised."""
+        """Calibrate and return the result; see `solve` for the errors raised."""
         return self.solve(measurements).result()
 
     def solve(self, measurements: Measurements) -> SolvedCalibration:
@@ -159,7 +160,7 @@ class GeometricCalibrator:
         return SolvedCalibration(measurements, setup, problem, rough.continued_by(fine), findings, geometry)
 
     def build(self, measurements: Measurements) -> CalibrationSetup:
-        """Build the problem and its start values, without solving it.
+        """Build the problem and its start values, without solving the problem.
 
         Raises:
             IdentificationError: there are no usable measurements, or too few for base and tool.
@@ -177,7 +178,7 @@ class GeometricCalibrator:
         return build_setup(self.robot, measurements, options, self.prior, self.loss)
 
     def _finds(self, group: str) -> bool:
-        """Return whether bases or tools need a start: they are free, or named (all six parameters of a base)."""
+        """Return whether bases or tools need start values, because they are free, or named (all six of a base)."""
         if getattr(self, group) != "fixed":
             return True
         if isinstance(self.free, str):
@@ -186,7 +187,7 @@ class GeometricCalibrator:
         return {f"{group}_{column}" for column in columns} <= set(self.free)
 
     def candidates(self, space: ParameterSpace) -> list[int]:
-        """List the indices of the parameters that may be estimated.
+        """Return the indices of the parameters that may be estimated.
 
         Raises:
             IdentificationError: `free` names a parameter that does not exist.
@@ -204,13 +205,14 @@ class GeometricCalibrator:
         return sorted(chosen)
 
     def _choose(self, setup: CalibrationSetup, source: str) -> tuple[RankFindings, list[int], list[int]]:
-        """Choose the parameters to start with.
+        """Analyse the rank, and choose the parameters that are estimated first.
 
         Returns:
-            Result of the rank analysis, indices of the parameters that may be estimated, and of those that are.
+            Result of the rank analysis, indices of the parameters that may be estimated, and indices of the chosen
+            parameters.
 
         Raises:
-            IdentificationError: the measurements do not determine them.
+            IdentificationError: the measurements do not determine the parameters.
         """
         problem, unknowns = setup.problem, setup.free_unknowns
         candidates, explicit = self.candidates(problem.space), not isinstance(self.free, str)
@@ -231,7 +233,7 @@ class GeometricCalibrator:
         sizes: Float64[np.ndarray, " candidates"],
         redundancy: Redundancy,
     ) -> list[int]:
-        """List the indices of the parameters to start with."""
+        """Return the indices of the parameters that are estimated first."""
         if self.elimination == "exact":
             return [space.index(name) for name in redundancy.kept]
         names = redundancy.names
@@ -242,9 +244,10 @@ class GeometricCalibrator:
     def _solve_roughly(
         self, setup: CalibrationSetup, findings: RankFindings, candidates: list[int], active: list[int]
     ) -> tuple[Solution[Tensor], RankFindings, list[int]]:
-        """Take some steps without the prior, and add parameters that the data determine there.
+        """Perform some steps without the prior, and add the parameters that the data then determine.
 
-        These steps show the noise relative to which the prior is weighted; a few thousand rows suffice for them.
+        The steps determine the noise relative to which the prior is weighted; a few thousand rows are sufficient for
+        them.
 
         Returns:
             The solution after these steps, the findings with the added parameters, and indices of all free parameters.

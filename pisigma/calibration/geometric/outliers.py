@@ -1,4 +1,4 @@
-"""Outliers of a calibration."""
+"""Outliers of a calibration: rows with a small robust weight."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -13,14 +13,14 @@ from pisigma.measurement.sensors.sensor import AbstractSensor
 
 @dataclass(frozen=True)
 class Outlier:
-    """A row with less than half of the full weight.
+    """A row with less than half of the full robust weight.
 
     Attributes:
-        row: number in the measurements, from 0.
+        row: index of the row in the measurements, from 0.
         place: file and line, or source and row, as in error messages.
         sensor: kind of sensor of the value.
         residual: length of the residual [m or rad].
-        deviations: the same in standard deviations of one value.
+        deviations: length of the residual in standard deviations of one value.
         unit: "m" or "rad".
     """
 
@@ -41,15 +41,15 @@ def outliers_of(
     deviations: Float64[Tensor, " values"],
     weight: Float64[Tensor, " values"],
 ) -> list[Outlier]:
-    """List the rows of a sensor with less than half of the full weight.
+    """Return the rows of a sensor with less than half of the full weight.
 
     Args:
-        setup: setup with the problem of the rows.
-        measurements: measurements that the setup was made from.
+        setup: setup of the problem that contains the rows.
+        measurements: measurements from which the setup was made.
         sensor: the sensor.
-        rows: numbers of the rows in the problem.
-        length: lengths of their residuals [m or rad].
-        deviations: the same in standard deviations of one value.
+        rows: indices of the rows in the problem.
+        length: lengths of the residuals of these rows [m or rad].
+        deviations: length of the residual in standard deviations of one value.
         weight: weights of the rows.
     """
     outliers = []

@@ -1,4 +1,4 @@
-"""Table of parameters: nominal and estimated values, standard errors, and a remark on each."""
+"""Table of parameters with nominal and estimated values, standard errors and a remark."""
 
 from dataclasses import dataclass
 
@@ -20,9 +20,9 @@ from pisigma.robot.row import FRAME_COLUMNS
 from pisigma.robot.se3 import wrap_to_pi
 
 LOST = 1e-10
-"""Smallest eigenvalue of the scaled information (unit diagonal) below which a direction is undetermined."""
+"""Eigenvalue of the scaled information (unit diagonal) below which a direction is undetermined."""
 HELD = 0.7
-"""Standard error over the prior standard deviation above which the data hardly determine a parameter."""
+"""Ratio of standard error to prior standard deviation above which the data hardly determine a parameter."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class ParameterEstimate:
         estimated: estimated value.
         change: estimated minus nominal value.
         standard_error: standard error of the estimate; NaN if it was not estimated.
-        remark: "identified", the combination that is identified, or why it was not estimated.
+        remark: "identified", the combination that is identified, or the reason why it was not estimated.
         label: the remark in a few words, for tables.
     """
 
@@ -51,7 +51,7 @@ class ParameterEstimate:
 
     @property
     def free(self) -> bool:
-        """Whether it was estimated."""
+        """Whether the parameter was estimated."""
         return not np.isnan(self.standard_error)
 
 
@@ -63,7 +63,7 @@ def parameter_table(
     geometry: IdentifiedGeometry,
     covariance: Float64[np.ndarray, "parameters parameters"],
 ) -> tuple[ParameterEstimate, ...]:
-    """List all parameters with their nominal and estimated values, standard errors and a remark.
+    """Return all parameters with their nominal and estimated values, standard errors and a remark.
 
     Args:
         setup: the problem at its start.
@@ -71,7 +71,7 @@ def parameter_table(
         findings: result of the rank analysis.
         here: linearisation of the problem at the solution.
         geometry: the solution in the user's coordinates.
-        covariance: covariance of all parameters in these coordinates.
+        covariance: covariance of all parameters in the user's coordinates.
     """
     space, robot = problem.space, problem.space.robot
     bases, tools = np.tile(robot.base, (len(space.frames), 1)), np.tile(robot.tool, (len(space.targets), 1))
@@ -105,9 +105,9 @@ def parameter_table(
 def _without_rows(
     problem: CalibrationProblem, normal: Float64[Tensor, "active active"], findings: RankFindings
 ) -> list[int]:
-    """List free parameters that the rows without outliers do not determine, although all rows together would.
+    """Return free parameters that the rows without outliers do not determine, although all rows together would.
 
-    These are parameters without effect in these rows, and bases that they determine only partially.
+    These are parameters without effect in the rows without outliers, and bases that they determine only partially.
     """
     active = problem.active.cpu()
     names = [problem.space.names[i] for i in active.tolist()]
@@ -126,13 +126,13 @@ def _without_rows(
 
 
 def _determines_all(information: Float64[Tensor, "own own"]) -> bool:
-    """Return whether information determines its parameters in every direction."""
+    """Return whether an information matrix determines its parameters in every direction."""
     scale = information.diagonal().clamp(min=1e-300).rsqrt()
     return float(torch.linalg.eigvalsh(information * scale * scale[:, None])[0]) >= LOST
 
 
 def _prior_precision(problem: CalibrationProblem, here: Linearisation[Tensor]) -> np.ndarray:
-    """Return the prior precision (1 / variance) of all parameters; 0 for those that are not free."""
+    """Return the prior precision (1 / variance) of all parameters; 0 for parameters that are not free."""
     full = torch.zeros_like(problem.precision)
     full[problem.active] = sensor_view_of(here).scaled_precision(
         problem.precision[problem.active], problem.prior_group
@@ -142,7 +142,7 @@ def _prior_precision(problem: CalibrationProblem, here: Linearisation[Tensor]) -
 
 
 def _remark(name: str, free: bool, extended: bool, redundancy: Redundancy) -> tuple[str, str]:
-    """Write the remark on a parameter, as a sentence and in a few words."""
+    """Return the remark on a parameter, as a clause and in a few words."""
     if name not in redundancy.names:
         remark = "identified" if free else "fixed"
         return remark, remark

@@ -15,16 +15,16 @@ from pisigma.files.errors import IdentificationError, nearest_choice
 
 @dataclass(frozen=True, eq=False)
 class ParameterPosterior:
-    """Normal distribution of all parameters, in the user's coordinates.
+    """Posterior normal distribution of all parameters, in the user's coordinates.
 
     The parameters are the geometry, the bases of all frames, the tools of all targets, and the unknowns of the sensors
     (sockets, anchors, zeros) in the frame of their owner.
 
     Attributes:
         parameters: the parameters in order, with names and units.
-        mean: their values [m or rad]; NaN if a model of an earlier version does not store one.
-        root: root `R` of the covariance `R R^T` [m and rad] of all parameters (0 for those that were not free),
-            followed by the weights of a joint correction, if there is one, which have no names.
+        mean: values of the parameters [m or rad]; NaN if a model of an earlier version does not store a value.
+        root: root `R` of the covariance `R R^T` [m and rad] of all parameters (0 for parameters that were not free),
+            followed by the weights of a joint correction, if any, which have no names.
     """
 
     parameters: tuple[Parameter, ...]
@@ -35,7 +35,7 @@ class ParameterPosterior:
     def from_geometry(
         space: ParameterSpace, geometry: IdentifiedGeometry, root: Float64[Tensor, "unknowns directions"]
     ) -> "ParameterPosterior":
-        """Make the posterior of the parameters of a space, with their values in the user's coordinates."""
+        """Return the posterior of the parameters of a space, with their values in the user's coordinates."""
         return ParameterPosterior(space.parameters, geometry.values_of(space), root)
 
     @cached_property
@@ -45,7 +45,7 @@ class ParameterPosterior:
 
     @property
     def weights(self) -> int:
-        """Number of weights of a joint correction, which follow the parameters."""
+        """Number of weights of a joint correction, which follow the parameters in the covariance."""
         return len(self.root) - len(self.parameters)
 
     @cached_property
@@ -55,12 +55,12 @@ class ParameterPosterior:
 
     @property
     def standard_errors(self) -> Float64[Tensor, " parameters"]:
-        """Standard deviation of every parameter [m or rad]; 0 if it was not free."""
+        """Standard deviation of every parameter [m or rad]; 0 for parameters that were not free."""
         errors: Tensor = torch.linalg.vector_norm(self.root[: len(self.parameters)], dim=1)
         return errors
 
     def select(self, names: Sequence[str]) -> "ParameterPosterior":
-        """Return the marginal distribution of some of the parameters.
+        """Return the marginal distribution of the named parameters.
 
         Raises:
             IdentificationError: there is no parameter with one of the names.

@@ -1,4 +1,4 @@
-"""Predicted poses of targets, in the frames of measurements."""
+"""Predict poses of targets, in the frames of measurements."""
 
 import numpy as np
 import torch
@@ -18,7 +18,7 @@ def predicted_poses(
     tools: dict[str, Float64[np.ndarray, " 6"]],
     measurements: Measurements,
 ) -> Float64[Tensor, "rows 4 4"]:
-    """Predict the poses of the targets, each in the frame of its row.
+    """Return predicted poses of the targets, each in the frame of its row [m].
 
     Args:
         robot: the robot; its base and tool are not used.

@@ -14,7 +14,7 @@ from pisigma.calibration.geometric.problem.problem import CalibrationProblem
 
 @dataclass(frozen=True)
 class PriorRatio:
-    """Estimated size of the errors of a group of parameters over their prior standard deviation.
+    """Ratio of the estimated size of the errors of a group of parameters to their prior standard deviation.
 
     Attributes:
         kind: "length" or "angle".
@@ -33,12 +33,12 @@ class PriorRatio:
 
     @property
     def size(self) -> float:
-        """The estimated standard deviation of the errors [m or rad]."""
+        """Estimated standard deviation of the errors [m or rad]."""
         return self.value * self.prior
 
     @property
     def size_at_least(self) -> float:
-        """The same minus two standard deviations [m or rad]."""
+        """The estimated standard deviation of the errors minus two of its own standard deviations [m or rad]."""
         return self.at_least * self.prior
 
 
@@ -47,7 +47,7 @@ def prior_ratios_of(problem: CalibrationProblem, here: Linearisation[Tensor]) ->
 
     Args:
         problem: the problem with its free parameters.
-        here: the problem at its solution.
+        here: the problem linearised at its solution.
     """
     view = sensor_view_of(here)
     precision, group = problem.precision[problem.active], problem.prior_group

@@ -1,4 +1,4 @@
-"""Result of a geometric calibration: the robot, its parameters with their errors, and what is not identifiable."""
+"""Result of a geometric calibration: robot, parameters with standard errors, and what is not identifiable."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -40,19 +40,19 @@ from pisigma.measurement.sensors.registry import measured_errors
 from pisigma.robot.description import Robot
 
 DISAGREEING = 10.0
-"""Factor on the variance of angles above which a warning is given."""
+"""Factor on the variance of angles above which the calibration gives a warning."""
 
 
 @dataclass(frozen=True)
 class SensorNoise:
-    """Noise of one kind of sensor, estimated from the residuals.
+    """Noise of a kind of sensor, estimated from the residuals.
 
     Attributes:
         sensor: "position", "rotation", "touch", "socket", "distance", "pair", or the name of a registered sensor.
-        sigma: standard deviation of one value [m or rad], or the factor on those that the rows state.
+        sigma: standard deviation of one value [m or rad], or the factor on the standard deviations that the rows state.
         unit: "m" or "rad", or "stated" for a factor.
         values: number of measured values.
-        used: effective number of parameters estimated from them.
+        used: effective number of parameters that are estimated from the values.
         rms: root mean square length of the residuals of all rows [m or rad].
         quantity: "m" for lengths, "rad" for angles.
         components: number of values per row.
@@ -74,9 +74,9 @@ class SolvedCalibration:
 
     Attributes:
         measurements: all rows, including those that could not be used.
-        setup: start values, and the frames that bases and tools are relative to.
+        setup: start values, and the frames to which bases and tools are relative.
         problem: the problem with its free parameters.
-        solution: its solution.
+        solution: solution of the least-squares problem.
         findings: result of the rank analysis.
         geometry: the solution in the user's coordinates.
     """
@@ -95,21 +95,21 @@ class SolvedCalibration:
 
     @cached_property
     def refined(self) -> Linearisation[Tensor]:
-        """The problem at its solution, with the noise estimated from all rows without outliers."""
+        """The problem linearised at its solution, with the noise estimated from all rows without outliers."""
         return self.problem.with_refined_noise(self.solution.linearisation)
 
     @cached_property
     def covariance(self) -> Float64[np.ndarray, "parameters parameters"]:
-        """Covariance of all parameters in the user's coordinates (SI); 0 for those that were not free."""
+        """Covariance of all parameters in the user's coordinates (SI); 0 for parameters that were not free."""
         change = self.geometry.coordinate_jacobian[:, self.problem.active.cpu()]
         covariance: np.ndarray = (change @ covariance_of(self.refined.normal).cpu() @ change.mT).numpy()
         return covariance
 
     @cached_property
     def root(self) -> Float64[Tensor, "parameters directions"]:
-        """`R` with the covariance `R R^T` of all parameters in the user's coordinates."""
+        """Root `R` of the covariance `R R^T` of all parameters in the user's coordinates."""
         covariance = covariance_of(self.refined.normal).cpu()
-        # The eigenvectors of the correlation matrix: those of the covariance would mix metres and radians.
+        # Eigenvectors of the correlation matrix, because eigenvectors of the covariance would mix metres and radians.
         scale = covariance.diagonal().clamp(min=0.0).sqrt()
         inverse = torch.where(scale > 0, 1 / scale, 0.0)
         values, axes = torch.linalg.eigh(covariance * inverse * inverse[:, None])
@@ -120,7 +120,7 @@ class SolvedCalibration:
 
 @dataclass(frozen=True, eq=False)
 class CalibrationResult:
-    """A geometric calibration. Everything that predictions do not need is computed on demand.
+    """A geometric calibration; what predictions do not need is computed on demand.
 
     Attributes:
         robot: the calibrated robot, with the base of the first frame and the tool of the first target.
@@ -139,7 +139,7 @@ class CalibrationResult:
 
     @cached_property
     def parameters(self) -> tuple[ParameterEstimate, ...]:
-        """All parameters, free or not."""
+        """Table of all parameters, free or not."""
         solved = self.solved
         return parameter_table(
             solved.setup, solved.problem, solved.findings, solved.refined, solved.geometry, solved.covariance
@@ -147,7 +147,7 @@ class CalibrationResult:
 
     @property
     def covariance(self) -> Float64[np.ndarray, "parameters parameters"]:
-        """Covariance of all parameters in their order (SI); 0 for those that were not free."""
+        """Covariance of all parameters in their order (SI); 0 for parameters that were not free."""
         return self.solved.covariance
 
     @cached_property
@@ -158,22 +158,22 @@ class CalibrationResult:
 
     @cached_property
     def residuals(self) -> dict[str, Float64[np.ndarray, "rows components"]]:
-        """Residuals of every row by sensor, measured minus predicted [m or rad]; NaN where it has no value."""
+        """Residuals of every row by sensor, measured minus predicted values [m or rad]; NaN in rows without a value."""
         return _residuals(self.solved)
 
     @cached_property
     def outliers(self) -> tuple[Outlier, ...]:
-        """Rows with less than half of the full weight, the worst first."""
+        """Rows with less than half of the full robust weight, worst first."""
         return _outliers(self.solved)
 
     @cached_property
     def noise(self) -> tuple[SensorNoise, ...]:
-        """Noise of every sensor with measured values (not stated ones)."""
+        """Noise of every sensor whose values are measured, not given."""
         return _noise(self.solved)
 
     @property
     def redundancy(self) -> Redundancy:
-        """Rank, identifiable parameters and dependencies at the start."""
+        """Rank, identifiable parameters and dependencies at the start of the fit."""
         return self.solved.findings.redundancy
 
     @cached_property
@@ -190,7 +190,7 @@ class CalibrationResult:
 
     @cached_property
     def weak_directions(self) -> tuple[str, ...]:
-        """Weakly identifiable directions, one sentence each; they stay near their nominal values."""
+        """Sentences about weakly identifiable directions, which remain near their nominal values."""
         return find_weak_directions(self.solved.problem, self.solved.refined)
 
     @cached_property
@@ -198,7 +198,7 @@ class CalibrationResult:
         """Indices O1 to O5 of the free parameters at the solution."""
         problem, here = self.solved.problem, self.solved.refined
         gram = sum((sums.normal for sums in sensor_view_of(here).sums), torch.zeros_like(here.normal))
-        usual = problem.step_scale * 1e3  # to rows in mm and mrad, columns per 1 mm and 1 mrad
+        usual = problem.step_scale * 1e3  # converted to rows in mm and mrad, and columns per 1 mm and 1 mrad
         poses = int(torch.stack([sensor.present for sensor in problem.sensors]).any(0).sum())
         return observability_of(gram * usual * usual[:, None], poses)
 
@@ -209,22 +209,22 @@ class CalibrationResult:
 
     @property
     def cost(self) -> float:
-        """Cost at the solution: sum of squared residuals over variances, with loss and prior."""
+        """Cost at the solution: sum of squared residuals divided by variances, with loss and prior."""
         return float(self.solved.refined.cost)
 
     @property
     def status(self) -> SolutionStatus:
-        """Why the search ended."""
+        """Reason why the search ended."""
         return self.solved.solution.status
 
     @cached_property
     def rms_path(self) -> tuple[float, ...]:
-        """RMS residual length of the first sensor at every accepted point, starting with the start [m or rad]."""
+        """RMS residual length of the first sensor at the start and at every accepted point [m or rad]."""
         return self.solved.solution.path
 
     @cached_property
     def warning_details(self) -> tuple[CalibrationWarning, ...]:
-        """Warnings on what the measurements do not determine, what to measure next, and what does not fit."""
+        """Warnings about what the measurements do not determine, what to measure next, and what does not fit."""
         return (
             *measurement_advice(self.solved.setup, self.solved.findings.estimated),
             *_warnings(self.solved),
@@ -232,19 +232,19 @@ class CalibrationResult:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """The sentences of `warning_details`."""
+        """Sentences of the warnings in `warning_details`."""
         return tuple(warning.sentence for warning in self.warning_details)
 
     @cached_property
     def prior_ratios(self) -> tuple[PriorRatio, ...]:
-        """Estimated errors over their prior standard deviations, by group of parameters with a prior."""
+        """Ratios of estimated errors to their prior standard deviations, by group of parameters with a prior."""
         return prior_ratios_of(self.solved.problem, self.solved.refined)
 
     @property
     def rank(self) -> int:
         """Number of independent combinations of the parameters that the data determine at the nominal geometry.
 
-        The sensors' unknowns are eliminated and not counted.
+        Unknowns of sensors are eliminated and not counted.
         """
         return self.redundancy.rank
 
@@ -259,10 +259,10 @@ class CalibrationResult:
         return tuple(parameter.name for parameter in self.parameters if parameter.free)
 
     def parameter(self, name: str) -> ParameterEstimate:
-        """Return the row of the parameter table with a name.
+        """Return the parameter with the given name.
 
         Raises:
-            KeyError: there is none.
+            KeyError: there is no such parameter.
         """
         for parameter in self.parameters:
             if parameter.name == name:
@@ -270,14 +270,14 @@ class CalibrationResult:
         raise KeyError(name)
 
     def predicted_poses(self, measurements: Measurements) -> Float64[Tensor, "rows 4 4"]:
-        """Predict the poses of the targets, each in the frame of its row; see `prediction.predicted_poses`."""
+        """Return predicted poses of the targets, each in the frame of its row; see `prediction.predicted_poses`."""
         return predicted_poses(self.robot, self.bases, self.tools, measurements)
 
     def errors_of(self, measurements: Measurements) -> dict[str, Float64[Tensor, "rows components"]]:
-        """Compute the errors of any measurements in calibrated frames with calibrated targets, such as held-out rows.
+        """Compute the errors of measurements, such as held-out rows, in calibrated frames with calibrated targets.
 
         Returns:
-            Measured minus predicted by sensor [m or rad]; NaN where a row has no value; see
+            Measured minus predicted values by sensor [m or rad]; NaN in rows without a value; see
             `pisigma.measurement.sensors.registry.measured_errors`. A socket that was not calibrated is at the mean
             predicted position of its rows.
 
@@ -288,7 +288,7 @@ class CalibrationResult:
 
 
 def _warnings(solved: SolvedCalibration) -> tuple[CalibrationWarning, ...]:
-    """Warn of angles that disagree with lengths, and of frames that do not fit."""
+    """Return warnings about angles that disagree with lengths, and about frames that do not fit."""
     disagreement = float(sensor_view_of(solved.refined).disagreement.max())
     warnings = []
     if disagreement > DISAGREEING:
@@ -302,7 +302,7 @@ def _warnings(solved: SolvedCalibration) -> tuple[CalibrationWarning, ...]:
 
 
 def _residuals(solved: SolvedCalibration) -> dict[str, Float64[np.ndarray, "rows components"]]:
-    """Rotate the residuals back into the measuring frames."""
+    """Return the residuals, rotated back into the measuring frames."""
     measurements, setup, problem = solved.measurements, solved.setup, solved.problem
     R = setup.anchors.bases[:, :3, :3].to(problem.frame.device)[problem.frame]
     residuals = {}

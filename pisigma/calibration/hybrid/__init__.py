@@ -1,1 +1,1 @@
-"""Hybrid calibration: geometry and a Pi-Sigma joint correction, fitted together through the kinematics."""
+"""Hybrid calibration: geometry and a Pi-Sigma joint correction that are fitted together through the kinematics."""

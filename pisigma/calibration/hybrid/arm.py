@@ -1,4 +1,4 @@
-"""Calibrated arm with its joint correction, and the measured ranges of its joint values."""
+"""Calibrated arm with joint correction, and the measured ranges of its joint values."""
 
 import math
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.kinematics.tolerances import MEASURED_ROUNDING
 
 LARGEST_GAP = math.radians(60)
-"""[rad] Largest distance of two measured joint values between which all values are treated as measured."""
+"""Largest distance of two measured joint values [rad] between which all values are treated as measured."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,11 +23,11 @@ class JointCoverage:
     """Measured ranges of every joint's values, as angles (see `angle_per_joint_value`).
 
     Attributes:
-        joint: number of the joint of every range.
+        joint: index of the joint of every range.
         middle: middle of every range [rad].
-        half: half its length [rad].
+        half: half the length of every range [rad].
         rate: angle per joint value, per joint [rad/rad or rad/m].
-        turning: whether values that differ by 2π are the same, per joint.
+        turning: whether values of a joint that differ by 2π are equivalent, per joint.
     """
 
     joint: Int64[Tensor, " stretches"]
@@ -38,7 +38,7 @@ class JointCoverage:
 
     @staticmethod
     def from_joints(robot: Robot, q: Float64[Tensor, "rows dof"]) -> "JointCoverage":
-        """Compute the ranges covered by measured joint values."""
+        """Return the ranges that are covered by measured joint values."""
         rate = torch.from_numpy(angle_per_joint_value(robot))
         turning = tuple(bool(turns) for turns in robot.revolute)
         return JointCoverage._around(list((q.cpu() * rate).t()), rate, turning)
@@ -51,7 +51,7 @@ class JointCoverage:
         return JointCoverage(joint, ends.mean(1), (ends[:, 1] - ends[:, 0]) / 2, rate, turning)
 
     def with_rows(self, q: Float64[Tensor, "rows dof"]) -> "JointCoverage":
-        """Compute the ranges covered by these and more measured joint values."""
+        """Return the ranges that are covered by these and further measured joint values."""
         angles = []
         for j in range(len(self.turning)):
             of_joint = [(q[:, j] * self.rate[j]).cpu()]
@@ -74,12 +74,12 @@ class JointCoverage:
         return torch.stack(columns, -1)
 
     def contains(self, q: Float[Tensor, "*batch dof"]) -> Bool[Tensor, "*batch"]:
-        """Return whether all joint values are in measured ranges, up to rounding; NaN never is."""
+        """Return whether all joint values are in measured ranges, up to rounding; False for NaN."""
         return self.distance_outside(q).amax(-1) <= MEASURED_ROUNDING
 
 
 def _stretches(angles: np.ndarray, turns: bool) -> list[tuple[float, float]]:
-    """Find the lowest and highest angle of every range without a large gap; one may extend beyond 2π."""
+    """Return the lowest and highest angle of every range without a large gap; a range may extend beyond 2π."""
     values = np.unique(np.mod(angles, 2 * np.pi) if turns else angles)
     breaks = np.flatnonzero(np.diff(values) > LARGEST_GAP)
     lows = values[np.concatenate([[0], breaks + 1])]
@@ -95,14 +95,15 @@ def _stretches(angles: np.ndarray, turns: bool) -> list[tuple[float, float]]:
 class HybridArm:
     """`T(q) = base · Π A_i(q_i + Δ_i(q)) · tool` with the geometry and Δ that were fitted together.
 
-    It is defined at all joint values. Outside the measured ranges it is an extrapolation, whose accuracy is given by
-    the posterior; see `PositionUncertainty`.
+    The arm is defined at all joint values. Outside the measured ranges its correction is an extrapolation, whose
+    accuracy is given by the posterior; see `PositionUncertainty`.
 
     Attributes:
         robot: the robot with the geometry that was fitted together with the correction.
         correction: the joint correction Δ.
         coverage: the measured ranges of joint values.
-        approach: direction of approach of every joint, +1 or -1, or 0 if it is not stated; None if none is stated.
+        approach: direction of approach of every joint, +1 or -1, or 0 if it is not stated; None if no direction is
+            stated.
     """
 
     robot: Robot
@@ -123,7 +124,7 @@ class HybridArm:
 
         Args:
             q: joint values [rad or m].
-            approach: see `JointCorrection.forward`; None for that of the arm.
+            approach: see `JointCorrection.forward`; None for the directions of the arm.
         """
         with torch.no_grad():
             delta = self.joint_correction(q) if approach is None else self.correction(q, approach)

@@ -1,4 +1,4 @@
-"""Hybrid calibration: geometry, base, tool, sensor unknowns and a Pi-Sigma joint correction together."""
+"""Hybrid calibration: geometry, base, tool, unknowns of sensors and a Pi-Sigma joint correction are fitted together."""
 
 import math
 from collections.abc import Callable
@@ -50,9 +50,9 @@ from pisigma.measurement.groups import groups_of_equal_joints, held_out_groups
 from pisigma.robot.description import Robot
 
 SEARCHED_ROWS = 4_000
-"""Rows used to select features; the final fit uses all rows."""
+"""Largest number of rows used to select features; the final fit uses all rows."""
 GROSS = 50.0
-"""[standard deviations of the geometric calibration] Rows with larger residuals are not used for the first model."""
+"""Largest residual of rows used for the first model, in standard deviations of the geometric calibration."""
 
 _NOTHING_FOUND = "The data show nothing beyond the geometry, so the geometric calibration is kept."
 
@@ -69,18 +69,18 @@ _NOTHING_HELPS = (
 
 @dataclass(frozen=True)
 class HybridCalibrator:
-    """Fits `T(q) = base · Π A_i(q_i + Δ_i(q); dh_i + ε_i) · tool` to measurements, with a Pi-Sigma network Δ.
+    """Calibrator that fits `T(q) = base · Π A_i(q_i + Δ_i(q); dh_i + ε_i) · tool` with a Pi-Sigma network Δ.
 
     All unknowns have normal priors with nominal means. The prior sizes of weights maximise the evidence; those of
     geometric errors are taken from the geometric calibration. Features that do not raise the evidence, or that increase
-    the held-out errors, are rejected. The remaining ones must predict rows that are held out of exact fits better than
-    the geometric calibration does; if none remain, the result is the geometric calibration.
+    the held-out errors, are rejected. The remaining features must predict rows that are held out of exact fits
+    better than the geometric calibration does; if no feature remains, the result is the geometric calibration.
 
     Attributes:
-        robot: the nominal robot, or its geometric calibrator if that needs settings other than the defaults.
+        robot: the nominal robot, or its geometric calibrator if this requires settings other than the defaults.
         features: names of the features to try, see `joint_correction.registry.FEATURES`.
         harmonics: numbers of harmonics of the Fourier series, tried in this order.
-        products: whether to try product units, which need two joints; without them the correction is additive.
+        products: whether to try product units, which require two joints; without them the correction is additive.
         gravity: direction of gravity in the frame of the robot's base; None for the direction with the highest
             evidence.
     """
@@ -111,7 +111,7 @@ class HybridCalibrator:
 
     @property
     def geometric(self) -> GeometricCalibrator:
-        """Geometric calibrator, whose sensors, prior and loss are used."""
+        """Geometric calibrator whose prior, loss and settings of sensors are used."""
         return GeometricCalibrator(self.robot) if isinstance(self.robot, Robot) else self.robot
 
     def fit(
@@ -121,7 +121,7 @@ class HybridCalibrator:
 
         Args:
             measurements: the measurements.
-            progress: called with the current trial or step.
+            progress: callback that is called with the current trial or step.
 
         Raises:
             IdentificationError: see `GeometricCalibrator.solve`.
@@ -157,7 +157,7 @@ class HybridCalibrator:
         return HybridResult(solved.result(), learned, uncertainty, trials, verdict)
 
     def _learned(self, solved: SolvedCalibration, refined: RefinedFit) -> LearnedPart:
-        """Return the correction with the geometry fitted together with it, and its measured ranges."""
+        """Return the correction, the geometry that was fitted together with it, and its measured ranges."""
         noise = zip(solved.problem.sensors, refined.posterior.noise, strict=True)
         return LearnedPart(
             geometry=with_aligned_frames(solved, refined),
@@ -178,8 +178,8 @@ class HybridCalibrator:
         Rows that the geometric calibration does not explain need not be outliers. Therefore a first hybrid model is
         fitted to all rows except those with errors that no robot has, and rows are weighted by their residuals from it.
 
-        If gravity seems to act in a direction other than down, both are tried, because torques along other axes may
-        imitate products.
+        If gravity seems to act in a direction other than down, both directions are tried, because torques along
+        other axes may imitate products.
         """
         problem, view = solved.problem, sensor_view_of(solved.solution.linearisation)
         noise, prior_scale = tuple(view.noise.tolist()), tuple(view.prior_scale.tolist())
@@ -222,7 +222,7 @@ class HybridCalibrator:
         return max(choices, key=lambda choice: choice.best.posterior.log_evidence)
 
     def _lines(self, rows: Rows, best: FeatureFit) -> tuple[tuple[int, ...], ...]:
-        """Find the orders of the lines in the residuals of a fit, beyond the harmonics of its series."""
+        """Return the orders of spectral lines in the residuals of a fit, beyond the harmonics of its series."""
         if "lines" not in self.features:
             return ()
         lowest = 1 + (max((one.size for one in best.design.features), default=0) or USUAL_HARMONICS)
@@ -231,7 +231,7 @@ class HybridCalibrator:
     def _features(
         self, solved: SolvedCalibration, problem: CalibrationProblem, gravity: Direction
     ) -> tuple[list[AbstractFeature], list[AbstractFeature]]:
-        """List the features to try: one in increasing sizes, and one each of the other names.
+        """Return the features to try: one feature in increasing sizes, and the other features in one size.
 
         Raises:
             IdentificationError: two features have several sizes.
@@ -259,7 +259,7 @@ class HybridCalibrator:
 
 
 def _outliers(solved: SolvedCalibration, refined: RefinedFit) -> tuple[Outlier, ...]:
-    """List rows with less than half of the full weight under the hybrid, the worst first."""
+    """Return the rows with less than half of the full weight in the hybrid calibration, worst first."""
     problem, setup, found = solved.problem, solved.setup, []
     values = sensor_values(problem, refined.point, evaluate_in_chunks(refined.correction))
     weights = robust_weights(problem, values, refined.posterior.effective_unknowns)
@@ -271,7 +271,7 @@ def _outliers(solved: SolvedCalibration, refined: RefinedFit) -> tuple[Outlier, 
 
 
 def _kept_sentence(serving: FinalCorrection) -> str:
-    """Write which correction was kept, and how much better held-out rows are predicted with it."""
+    """Return a sentence about the correction that was kept and the resulting prediction of held-out rows."""
     best = serving.choice.best
     return (
         f"A joint correction was kept ({best.name}): held-out rows are predicted with {serving.held_out:.2f} times the "

@@ -1,4 +1,4 @@
-"""Choice of the final joint correction: the largest part of the selected one that increases no held-out error."""
+"""Choose the final joint correction: the largest part of the selected correction that increases no held-out error."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -28,26 +28,28 @@ from pisigma.joint_correction.feature import AbstractFeature
 from pisigma.measurement.groups import groups_of_equal_joints
 
 FOLDS, FOLDS_OF_FEW, FEW_GROUPS = 4, 8, 60
-"""Folds that are held out, the same for few groups, and the number of groups that are few."""
+"""Number of folds that are held out, number of folds for few groups, and number of groups up to which groups are
+few."""
 MANY_GROUPS = 600
-"""Groups up to which noise and prior sizes are updated for every fold."""
+"""Number of groups up to which noise and prior sizes are updated for every fold."""
 EXACT_GROUPS = 200
-"""Poses or positions up to which held-out rows are predicted by exact fits; those of other sensors always are."""
+"""Number of poses or positions up to which held-out rows are predicted by exact fits; rows of other sensors always
+are."""
 
 TOLERANCE = 1.005
 """Ratio of RMS errors above which errors are treated as larger; a smaller difference does not matter in practice."""
 REFITS = 10
-"""Gauss-Newton steps for unknowns that only held-out rows determine, such as the position of their socket."""
+"""Number of Gauss-Newton steps for unknowns that only held-out rows determine, such as the position of their socket."""
 
 
 @dataclass(frozen=True, eq=False)
 class SensorErrors:
-    """Errors of one sensor's rows, in the fit of all rows and in a fit without them.
+    """Errors of the rows of a sensor, in the fit of all rows and in fits without them.
 
     Attributes:
-        group: number of every row's group, see `Rows.group`.
+        group: index of every row's group, see `Rows.group`.
         fitted: lengths of the errors of all rows [m or rad], or in standard deviations if the rows state them.
-        held_out: the same under fits without the row's fold; NaN for rows that were in no fold.
+        held_out: lengths of the errors in fits without the row's fold; NaN for rows that were not held out.
         weight: robust weight, 1 for full weight and 0 for rejected rows.
     """
 
@@ -57,9 +59,9 @@ class SensorErrors:
     weight: Float64[Tensor, " values"]
 
     def compare(self, before: "SensorErrors") -> "Comparison":
-        """Compare with the errors of the same rows under another fit; rows that either fit uses are compared."""
+        """Return the comparison with errors under another fit, for the rows that either fit uses."""
         weight = torch.maximum(self.weight, before.weight)
-        judged = torch.isfinite(before.held_out)  # a fit without a prediction is worse than any other
+        judged = torch.isfinite(before.held_out)  # a fit that predicts no value is worse than any other fit
         fitted = [(weight * one.fitted.square()).sum() for one in (self, before)]
         squares = [(weight * one.held_out.square())[judged] for one in (self, before)]
         gain = torch.zeros(int(self.group.max()) + 1 if len(self.group) else 0).to(weight)
@@ -73,7 +75,7 @@ class SensorErrors:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Errors of one sensor under a fit over those under another.
+    """Ratios of the errors of a sensor under two fits.
 
     Attributes:
         fitted: ratio of the RMS errors of all rows.
@@ -87,7 +89,7 @@ class Comparison:
 
     @property
     def is_worse(self) -> bool:
-        """Whether the errors of rows or held-out rows are larger."""
+        """Whether the errors of all rows or of held-out rows are larger."""
         return not (self.fitted <= TOLERANCE and self.held_out <= TOLERANCE)
 
 
@@ -98,20 +100,20 @@ def held_out_rows(
     folds: Sequence[Int64[Tensor, " _groups"]],
     updates: int = 0,
 ) -> tuple[SensorErrors | None, ...]:
-    """Leave out each fold and predict its rows with an exact fit to the others.
+    """Leave out every fold, and predict its rows with an exact fit to the other folds.
 
-    The fit is linearised again until linearised and true residuals of its rows agree. Unknowns that only held-out rows
-    determine are fitted to these.
+    The fit is linearised again until linearised and true residuals of its rows agree. Unknowns that only held-out
+    rows determine are fitted to the held-out rows.
 
     Args:
         design: the unknowns.
         posterior: posterior from all rows.
         group: see `Rows.group`.
         folds: groups that are held out together.
-        updates: updates of noise and prior sizes for every fold.
+        updates: number of updates of noise and prior sizes for every fold.
 
     Returns:
-        Errors per sensor; None for certain sensors.
+        Errors per sensor; None for sensors whose values are given.
     """
     values = _values(design, posterior.x)
     weights = robust_weights(design.problem, values, posterior.effective_unknowns)
@@ -144,7 +146,7 @@ def held_out_rows(
 
 
 def _values(design: Design, x: Float64[Tensor, " unknowns"]) -> tuple[SensorValues, ...]:
-    """Linearise all rows at some unknowns."""
+    """Return all rows linearised at given unknowns."""
     problem = design.problem
     point = problem.nominal.index_add(0, problem.active, x[: design.active])
     return sensor_values(
@@ -159,7 +161,7 @@ def _with_own_unknowns(
     values: Sequence[SensorValues],
     held: Bool[Tensor, " rows"],
 ) -> Float64[Tensor, " unknowns"]:
-    """Fit the unknowns that only held-out rows depend on to these, starting with their values by all rows."""
+    """Fit unknowns on which only held-out rows depend to these rows, starting with their values from all rows."""
     moving = torch.zeros(design.active, dtype=torch.bool, device=x.device)
     for one in values:
         if not one.certain:
@@ -184,7 +186,7 @@ def _with_own_unknowns(
 
 
 def _ratio(after: Tensor, before: Tensor) -> float:
-    """Compute the ratio of root mean squares; 1 if both are 0."""
+    """Return the ratio of two root mean squares; 1 if both are 0."""
     return 1.0 if float(after) == float(before) == 0 else float((after / before).sqrt())
 
 
@@ -193,12 +195,13 @@ Errors = Sequence[SensorErrors | None]
 
 @dataclass(frozen=True, eq=False)
 class FinalCorrection:
-    """A joint correction that reduces held-out errors.
+    """The final joint correction, which reduces held-out errors.
 
     Attributes:
         choice: the choice, with the final features as its best.
         refined: the model fitted to the rows of the search.
-        held_out: held-out RMS error over that of the geometric calibration, for the sensor with the largest gain [1].
+        held_out: ratio of the held-out RMS errors with the correction and of the geometric calibration, for the
+            sensor with the largest gain [1].
     """
 
     choice: FeatureChoice
@@ -209,18 +212,18 @@ class FinalCorrection:
 def choose_final_correction(
     solved: SolvedCalibration, choice: FeatureChoice, progress: Callable[[str], None]
 ) -> FinalCorrection | None:
-    """Find the largest part of the selected features that increases no sensor's errors, with exact fits of each part.
+    """Return the largest part of the selected features that increases no sensor's errors, by exact fits of every part.
 
-    Held-out errors computed by linearisation equal those of an exact fit only if the linearisation is accurate, as it
-    is for many poses or positions. For few of them, or for other sensors, the rows of the search are held out again,
-    fold by fold, from exact fits with and without the correction. A part is accepted if it increases the errors and
-    held-out errors of no sensor, and clearly reduces the held-out errors of one.
+    Held-out errors computed by linearisation equal those of an exact fit only if the linearisation is accurate,
+    which is the case for many poses or positions. For few poses or positions, or for other sensors, the rows of the
+    search are held out again, fold by fold, from exact fits with and without the correction. A part is accepted if
+    it increases the errors and held-out errors of no sensor, and clearly reduces the held-out errors of one.
 
     Returns:
         The accepted part; None if the geometric calibration is to be kept.
     """
     problem = choice.rows.problem
-    # The search leaves out whole anchors and sockets; exact fits to the few others may then be undetermined.
+    # The search leaves out whole anchors and sockets; exact fits to the few remaining ones may be undetermined.
     group = choice.rows.group if problem.pairs else groups_of_equal_joints(problem.q)
     count = int(group.max()) + 1
     if count > EXACT_GROUPS and set(solved.setup.measurements.kinds) <= {"position", "rotation"}:
@@ -241,18 +244,18 @@ def choose_final_correction(
 
 
 def _held_out_in_search(choice: FeatureChoice) -> float:
-    """Return the ratio of held-out errors by the search, with linearised rows."""
+    """Return the ratio of held-out errors that the search computed with linearised rows."""
     return [trial.held_out for trial in choice.trials if trial.kept][-1]
 
 
 def _compared(errors: Errors, before: Errors) -> list[Comparison]:
-    """Compare the errors of every measuring sensor."""
+    """Return a comparison of the errors for every sensor with measured values."""
     pairs = zip(errors, before, strict=True)
     return [one.compare(other) for one, other in pairs if one is not None and other is not None]
 
 
 def _geometric_posterior(solved: SolvedCalibration, choice: FeatureChoice) -> Posterior:
-    """Compute the posterior of the geometric calibration with the rows of the search."""
+    """Return the posterior of the geometric calibration for the rows of the search."""
     problem, group = choice.rows.problem, choice.rows.group
     design, view = Design(problem, ()), sensor_view_of(solved.solution.linearisation)
     x = (solved.solution.linearisation.point - problem.nominal)[problem.active]
@@ -262,7 +265,7 @@ def _geometric_posterior(solved: SolvedCalibration, choice: FeatureChoice) -> Po
 
 
 def _parts(choice: FeatureChoice) -> Iterator[FeatureChoice]:
-    """Yield the selected features, then fewer and fewer of them, removing the one that was tried last."""
+    """Yield the selected features, then always one feature fewer, removing the feature that was tried last."""
     yield choice
     features = choice.best.design.features
     for count in range(len(features) - 1, 0, -1):
@@ -270,7 +273,7 @@ def _parts(choice: FeatureChoice) -> Iterator[FeatureChoice]:
 
 
 def _part(choice: FeatureChoice, features: tuple[AbstractFeature, ...]) -> FeatureChoice:
-    """Return the choice with some of its features as the best."""
+    """Return the choice with a subset of its features as the best fit."""
     best, design = choice.best, Design(choice.rows.problem, features)
     fit = (choice.regression or build_regression(best.design, choice.rows)).select(design)
     prior = design.prior_like(best.design, best.posterior.prior)

@@ -1,4 +1,4 @@
-"""Unknowns of a hybrid calibration, and the linearised values that they are fitted to."""
+"""Unknowns of a hybrid calibration, and the linearised values to which they are fitted."""
 
 import math
 from abc import abstractmethod
@@ -21,11 +21,11 @@ from pisigma.joint_correction.feature import AbstractFeature
 from pisigma.measurement.conditions import JointState
 
 CHUNK = 512
-"""Rows whose columns are in memory at a time."""
+"""Number of rows whose columns are in memory at a time."""
 FOLDS = 4
 FOLDS_OF_FEW = 20
 MAX_GROUPS = 400
-"""Groups of rows that are held out."""
+"""Largest number of groups of rows that are held out."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +47,7 @@ class Design:
 
     @property
     def classes(self) -> int:
-        """Number of classes of geometric parameters, whose prior sizes come first."""
+        """Number of classes of geometric parameters, whose prior sizes are the first ones."""
         return len(PriorGroup)
 
     @property
@@ -61,7 +61,7 @@ class Design:
         return slice(start, start + int(self.features[number].used.sum()))
 
     def correction(self, x: Float64[Tensor, " unknowns"], state: JointState) -> Float64[Tensor, "rows dof"]:
-        """Compute the joint corrections of rows for given unknowns [rad or m]."""
+        """Compute the joint corrections [rad or m] of rows for given unknowns."""
         total = torch.zeros_like(state.q)
         for number, chosen in enumerate(self.features):
             weight = (
@@ -73,7 +73,7 @@ class Design:
     def predicted_change(
         self, values: SensorValues, change: Float64[Tensor, " unknowns"]
     ) -> Float64[Tensor, "values components"]:
-        """Compute the change of a sensor's predicted values by a change of the unknowns, not weighted."""
+        """Compute the unweighted change of a sensor's predicted values for a change of the unknowns."""
         moved = values.geometry @ change[: self.active]
         if not self.features or not len(values.row):
             return moved
@@ -84,14 +84,14 @@ class Design:
         return moved
 
     def columns(self, values: SensorValues, rows: slice) -> Float64[Tensor, "values components unknowns"]:
-        """Compute the derivative of a sensor's values with respect to all unknowns, not weighted."""
+        """Compute the unweighted derivative of a sensor's values with respect to all unknowns."""
         state = self.problem.state
         blocks = [values.geometry[rows]]
         blocks += [values.feature_columns(chosen, state, rows) for chosen in self.features]
         return torch.cat(blocks, -1)
 
     def prior(self, prior_scale: Sequence[float]) -> GaussianPrior:
-        """Make the prior of all unknowns, with the prior scales of the geometric calibration.
+        """Return the prior of all unknowns, with the prior scales of the geometric calibration.
 
         The weights of a prismatic joint are lengths; their prior sizes are in radians times the reach.
         """
@@ -111,13 +111,13 @@ class Design:
         return GaussianPrior(torch.cat(base), torch.cat(group), torch.cat(sizes), classes)
 
     def usual_prior(self, prior_scale: Sequence[float]) -> GaussianPrior:
-        """Make the prior of all unknowns with the `usual_sizes` of the weights."""
+        """Return the prior of all unknowns, with the `usual_sizes` of the weights."""
         prior = self.prior(prior_scale)
         sizes = [size for chosen in self.features for size in chosen.usual_sizes]
         return replace(prior, sizes=torch.cat([prior.sizes[: prior.classes], prior.sizes.new_tensor(sizes)]))
 
     def prior_like(self, other: "Design", prior: GaussianPrior) -> GaussianPrior:
-        """Make the prior with the fitted sizes of another design as start; new bands have the size of its last one."""
+        """Return a prior with the fitted sizes of another design; new bands get the size of its last band."""
         prior_here = self.prior(prior.sizes[: prior.classes].tolist())
         sizes = prior_here.sizes.clone()
         others = zip(other.features, other.group_starts(prior.classes), strict=True)
@@ -130,12 +130,12 @@ class Design:
         return replace(prior_here, sizes=sizes)
 
     def group_starts(self, classes: int) -> list[int]:
-        """Return the number of the first prior size of every feature."""
+        """Return the index of the first prior size of every feature."""
         counts = [len(chosen.group_names) for chosen in self.features]
         return [classes + sum(counts[:k]) for k in range(len(counts))]
 
     def indices(self, features: Sequence[AbstractFeature]) -> Int64[Tensor, " chosen"]:
-        """Return the indices of the unknowns of a design with some of the features.
+        """Return the indices of the unknowns of a design that has a subset of the features.
 
         A smaller feature of the same name, such as a series with fewer harmonics, is a part of the larger one.
         """
@@ -151,13 +151,13 @@ class Design:
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """Linearised values of all sensors.
+    """Linearised rows of all sensors.
 
     Attributes:
         problem: free parameters and joint values.
         values: weighted values per sensor, with repeats of a pose as one row; residuals are those of the nominal
             parameters without a correction, by linearisation.
-        group: number of every row's group; rows of one group, such as one placement of sockets, are held out together.
+        group: index of every row's group; rows of a group, such as one placement of sockets, are held out together.
     """
 
     problem: CalibrationProblem
@@ -180,20 +180,20 @@ class Rows:
         )
 
     def select_groups(self, groups: Int64[Tensor, " chosen"]) -> "Rows":
-        """Return the rows of some groups."""
+        """Return the rows of the given groups."""
         mask = torch.zeros(self.groups, dtype=torch.bool, device=self.group.device)
         mask[groups.to(mask.device)] = True
         kept = tuple(sensor.select(mask[self.group[sensor.row]]) for sensor in self.values)
         return replace(self, values=kept)
 
     def held_out(self, groups: Int64[Tensor, " chosen"]) -> "Rows":
-        """Return the rows of some groups, without those of certain sensors."""
+        """Return the rows of the given groups, without sensors whose values are given."""
         rows = self.select_groups(groups)
         kept = [sensor.select(slice(0, 0)) if sensor.certain else sensor for sensor in rows.values]
         return replace(rows, values=tuple(kept))
 
     def folds(self, count: int, most_groups: int) -> tuple[Int64[Tensor, " _groups"], ...]:
-        """Draw the groups of every fold with a fixed random seed.
+        """Return the groups of every fold, drawn with a fixed random seed.
 
         Args:
             count: number of folds; one per group if there are fewer groups.
@@ -211,14 +211,14 @@ class Rows:
         weights: Sequence[Float64[Tensor, " _values"]],
         group: Int64[Tensor, " rows"],
     ) -> "Rows":
-        """Make rows from values that were linearised at some unknowns; repeats of a pose become one row.
+        """Return rows from values that were linearised at given unknowns; repeats of a pose become one row.
 
         Args:
             design: design of the unknowns.
             x: the unknowns, with parameters relative to nominal.
-            values: values of all rows, with residuals at these unknowns.
+            values: values of all rows, with residuals at the given unknowns.
             weights: weights of the rows of every sensor.
-            group: see the attributes.
+            group: index of every row's group, see the attributes.
         """
         problem, rows = design.problem, []
         for sensor, weight in zip(values, weights, strict=True):
@@ -233,7 +233,7 @@ class Rows:
     def squared_difference(
         self, other: "Rows", x: Float64[Tensor, " unknowns"], design: Design, noise: Sequence[float]
     ) -> float:
-        """Compute the sum of squared differences of weighted residuals over the noise; infinite for different rows.
+        """Compute the sum of squared differences of weighted residuals, divided by the noise; infinite for other rows.
 
         Args:
             other: the same rows, linearised at another point.
@@ -252,7 +252,7 @@ class Rows:
 
 
 def chunks(count: int, size: int | None = None) -> list[slice]:
-    """Split rows into chunks of a size, by default `CHUNK`."""
+    """Yield ranges that split rows into chunks of the given size, by default `CHUNK`."""
     size = size or CHUNK
     return [slice(start, start + size) for start in range(0, count, size)]
 
@@ -264,7 +264,7 @@ def robust_weights(
 
     Args:
         problem: the problem with the loss functions; the scale is estimated.
-        values: values that are not weighted.
+        values: unweighted values.
         effective: effective number of unknowns.
 
     Raises:
@@ -301,17 +301,17 @@ class AbstractDesignRegression(AbstractRegression):
 
     @abstractmethod
     def select(self, design: Design) -> "AbstractDesignRegression":
-        """Return the regression for a design with some of the features, or smaller ones."""
+        """Return the regression for a design with a subset of the features, or smaller features."""
 
     @abstractmethod
     def without_groups(self, groups: Int64[Tensor, " groups"]) -> "AbstractDesignRegression":
-        """Return the regression without the values of some groups of rows (see `Rows.group`), except certain ones."""
+        """Return the regression without the values of groups of rows (see `Rows.group`), except given values."""
 
     @abstractmethod
     def held_out_errors(
         self, posterior: Posterior, folds: Sequence[Int64[Tensor, " _groups"]]
     ) -> HeldOutErrors:
-        """Leave out each fold and predict it, with the prior sizes and the noise of a posterior.
+        """Return the errors of every fold, predicted without it, with the prior sizes and the noise of a posterior.
 
         Args:
             posterior: posterior from all values.
@@ -321,7 +321,7 @@ class AbstractDesignRegression(AbstractRegression):
     def held_out_errors_refitted(
         self, posterior: Posterior, folds: Sequence[Int64[Tensor, " _groups"]], updates: int
     ) -> HeldOutErrors:
-        """Leave out each fold, with updates of noise and prior sizes, which few rows leave uncertain."""
+        """Return the errors of every fold, predicted without it, with updated noise and prior sizes."""
         parts = []
         for groups in folds:
             rest = self.without_groups(groups).maximise_evidence(posterior.prior, posterior.noise, updates)
@@ -331,7 +331,7 @@ class AbstractDesignRegression(AbstractRegression):
     def evidence_gain(
         self, posterior: Posterior, design: Design, features: AbstractFeature
     ) -> tuple[float, Float64[Tensor, " groups"] | None]:
-        """Compute the gain of log evidence by additional features, with all other prior sizes and the noise fixed.
+        """Compute the gain of log evidence by additional features, with fixed noise and all other prior sizes fixed.
 
         Args:
             posterior: posterior without the features.
@@ -339,6 +339,6 @@ class AbstractDesignRegression(AbstractRegression):
             features: the additional features.
 
         Returns:
-            The gain, or infinity if a fit takes no longer; and start values of the prior sizes of the features.
+            The gain, or infinity if a fit is as fast; and start values of the prior sizes of the features.
         """
         return math.inf, None

@@ -1,4 +1,4 @@
-"""Direction of gravity, by the evidence for the axes of the base and for inclined directions."""
+"""Determine the direction of gravity by the evidence for the axes of the base and for inclined directions."""
 
 import math
 from collections.abc import Sequence
@@ -19,26 +19,27 @@ from pisigma.robot.description import Robot
 from pisigma.robot.se3 import rotation_from_rpy
 
 USUAL: Direction = (0.0, 0.0, -1.0)
-"""Gravity in the base frame of a robot on the floor."""
+"""Direction of gravity in the base frame of a robot on the floor."""
 FLOOR_ODDS = 100.0
-"""Prior odds of a robot on the floor against one that is mounted otherwise without a statement of the user; and of
-gravity along an axis of the base against an inclined direction. The measured UR10, which is on the floor, has a log
-evidence for an inclined direction that is 16 above that of the axes."""
+"""Prior odds of a robot on the floor against a robot that is mounted otherwise although the user does not state it;
+also of gravity along an axis of the base against an inclined direction. The measured UR10, which is on the floor,
+has a log evidence for an inclined direction that is 16 above that of the axes."""
 HARMONICS = 8
-"""Harmonics of a series that is fitted too: low harmonics of a gear look like torques of gravity along other axes."""
+"""Number of harmonics of a series that is fitted as well: low harmonics of a gear look like torques of gravity along
+other axes."""
 LEAST_INCLINATION = math.radians(30)
 """Angle to all axes above which a direction is inclined. Unmodelled errors of simulated arms on the floor, and of the
-measured UR10, look like an inclination by up to 24 deg, which predicts held-out rows better, but not those of another
+measured UR10, look like an inclination by up to 24 deg, which predicts held-out rows better, but not rows of another
 session; smaller inclinations have to be stated."""
 AXES: tuple[Direction, ...] = (USUAL, (-1.0, 0.0, 0.0), (0.0, -1.0, 0.0))
 STARTS = 64
-"""Directions of a half sphere, about 18 deg apart, the best of which is refined."""
+"""Number of directions on a half sphere, about 18 deg apart; the best of them is refined."""
 UPDATES = 8
-"""Steps of Newton's method; it converges in 3 to 6 on simulated arms."""
+"""Number of steps of Newton's method, which converges in 3 to 6 steps on simulated arms."""
 
 
 def to_first_row_frame(robot: Robot, direction: Direction) -> Direction:
-    """Transform a direction from the robot's base frame to the frame of its first row."""
+    """Return a direction in the robot's base frame, transformed to the frame of its first row."""
     turned = rotation_from_rpy(torch.tensor(robot.base[3:])).mT @ torch.tensor(direction).double()
     x, y, z = (turned + 0.0).tolist()
     return x, y, z
@@ -47,20 +48,20 @@ def to_first_row_frame(robot: Robot, direction: Direction) -> Direction:
 def gravity_by_evidence(
     robot: Robot, rows: Rows, noise: tuple[float, ...], prior_scale: Sequence[float]
 ) -> Direction:
-    """Find the direction of gravity in the base, for robots on walls, rails, ceilings and inclined pedestals.
+    """Find the direction of gravity in the base frame, for robots on walls, rails, ceilings and inclined pedestals.
 
     Geometry, a short series and the `GravityTorques` of each axis are fitted to the rows. Torques are linear in masses
-    of either sign, so the evidence and all predictions are the same for both directions of an axis; the direction is
-    the one with a positive sum of masses. Directions other than down must have a log evidence above that of the other
-    axes by `CLEARLY` plus the log prior odds against them; an inclined direction, which is fitted to the rows, also by
-    minus the logarithm of the share of the half sphere that the rows leave for it (Laplace's approximation), and must
-    not be near an axis (`LEAST_INCLINATION`).
+    of either sign, so the evidence and all predictions are the same for both directions of an axis; the direction
+    with a positive sum of masses is chosen. Directions other than down must have a log evidence above that of the
+    other axes by `CLEARLY` plus the log prior odds against them; an inclined direction, which is fitted to the rows,
+    also by minus the logarithm of the share of the half sphere that the rows leave for it (Laplace's approximation),
+    and must not be near an axis (`LEAST_INCLINATION`).
 
     Args:
         robot: the nominal robot.
         rows: rows linearised at the geometric calibration.
         noise: noise of the geometric calibration per sensor.
-        prior_scale: its prior scales.
+        prior_scale: prior scales of the geometric calibration.
 
     Returns:
         The direction in the robot's base frame.
@@ -91,10 +92,10 @@ def gravity_by_evidence(
 
 @dataclass(frozen=True, eq=False)
 class _EvidenceOfDirection:
-    """Log evidence for gravity along `Σ c_k a_k`, for the `AXES` a_k, with the same masses for all of them.
+    """Log evidence for gravity along `Σ c_k a_k`, for the `AXES` a_k, with the same masses for all axes.
 
-    With the precision `P = 1 + Σ c_k c_l N_kl` and the descent `d = Σ c_k d_k` of the masses, it is
-    `(d P^-1 d - log det P) / 2`. c may have any length, which scales the prior size of the masses.
+    With the precision `P = 1 + Σ c_k c_l N_kl` and the right side `d = Σ c_k d_k` of the normal equations of the
+    masses, it is `(d P^-1 d - log det P) / 2`. c may have any length, which scales the prior size of the masses.
 
     Attributes:
         normal: the matrices `N_kl + N_lk`.
@@ -105,14 +106,14 @@ class _EvidenceOfDirection:
     descent: Float64[Tensor, "3 masses"]
 
     def __call__(self, c: Float64[Tensor, "*batch 3"]) -> Float64[Tensor, "*batch"]:
-        """Compute the log evidence."""
+        """Return the log evidence for the coefficients c."""
         lower = torch.linalg.cholesky(self._precision(c))
         gain = torch.linalg.solve_triangular(lower, (c @ self.descent)[..., None], upper=False)
         value: Tensor = gain.square().sum((-2, -1)) / 2 - lower.diagonal(dim1=-2, dim2=-1).log().sum(-1)
         return value
 
     def derivatives(self, c: Float64[Tensor, " 3"]) -> tuple[Float64[Tensor, " 3"], Float64[Tensor, "3 3"]]:
-        """Compute gradient and Hessian by c."""
+        """Return gradient and Hessian of the log evidence with respect to c."""
         inverse = torch.linalg.inv(self._precision(c))
         x = inverse @ (c @ self.descent)
         slope = torch.einsum("kmln,l->kmn", self.normal.transpose(1, 2), c)
@@ -136,7 +137,7 @@ class _EvidenceOfDirection:
 def _evidence_of_direction(
     fit: AbstractDesignRegression, posterior: Posterior, design: Design
 ) -> _EvidenceOfDirection:
-    """Compute the evidence from a fit with separate masses for each of the `AXES`, without their prior."""
+    """Return the evidence from a fit with separate masses for each of the `AXES`, without their prior."""
     count = len(AXES)
     weights = slice(design.weights_of(0).start, design.weights_of(count - 1).stop)
     # Inverting the block of the covariance marginalises geometry and series; minus the prior, data alone are left.
@@ -154,7 +155,7 @@ def _most_probable(log_evidence: _EvidenceOfDirection) -> tuple[Direction, float
     """Find the direction with the highest evidence by Newton's method from the best of `STARTS` directions.
 
     Returns:
-        The direction in the base frame, and the share of the half sphere that the rows leave for it.
+        The direction in the base frame, and the share of the half sphere that is compatible with the rows.
     """
     number = torch.arange(STARTS, dtype=torch.float64)
     # Fibonacci lattice: equal steps of height are equal areas, and the golden angle spreads the directions evenly.
@@ -177,7 +178,7 @@ def _most_probable(log_evidence: _EvidenceOfDirection) -> tuple[Direction, float
 
 
 def gravity_in_base(robot: Robot, features: Sequence[AbstractFeature]) -> Direction | None:
-    """Return the direction of gravity in the base frame that the features assume; None if none depends on it."""
+    """Return the direction of gravity in the base frame that the features assume; None if no feature depends on it."""
     directions = [chosen.gravity for chosen in features if isinstance(chosen, GravityTorques)]
     if not directions:
         return None
@@ -187,7 +188,7 @@ def gravity_in_base(robot: Robot, features: Sequence[AbstractFeature]) -> Direct
 
 
 def gravity_sentence(robot: Robot, features: Sequence[AbstractFeature]) -> str:
-    """Write along which axis of the base gravity acts; empty if no feature depends on it."""
+    """Return a sentence about the axis of the base along which gravity acts; empty if no feature depends on it."""
     direction = gravity_in_base(robot, features)
     if direction is None:
         return ""

@@ -8,18 +8,19 @@ from pisigma.files.errors import MeasurementError
 from pisigma.measurement.sensors.sensor import AbstractSensor
 
 MAX_ABSOLUTE = 0.01
-"""[m or rad] In folders of earlier versions a larger noise is a factor on stated standard deviations."""
+"""Largest noise [m or rad]; in folders of earlier versions, a larger noise is a factor on stated standard
+deviations."""
 
 
 @dataclass(frozen=True)
 class CalibrationNoise:
-    """Noise of the sensors of a calibration: standard deviations, or factors on those stated in the rows.
+    """Noise of the sensors of a calibration: standard deviations, or factors on stated standard deviations.
 
     Attributes:
-        value: by sensor, the standard deviation of its readings [m or rad]; a factor on the stated ones where the rows
-            state them.
-        stated: by sensor whose rows state them, the median of the stated standard deviations [m or rad]; None for
-            folders of earlier versions, which do not store them.
+        value: standard deviation of the readings by sensor [m or rad]; a factor on the stated standard deviations if
+            the rows state them.
+        stated: median of the stated standard deviations [m or rad], by sensor whose rows state them; None for
+            folders of earlier versions, which do not store it.
     """
 
     value: Mapping[str, float] = field(default_factory=dict)
@@ -36,9 +37,11 @@ class CalibrationNoise:
         return math.nan if self.stated is None else self.value[name] * self.stated[name]
 
     def updated(self, other: "CalibrationNoise") -> "CalibrationNoise":
-        """Return the noise with that of the sensors of other rows replaced."""
+        """Return the noise, with the noise of the sensors in `other` replaced."""
         value = {**self.value, **other.value}
-        if self.stated is None and value.keys() != other.value.keys():  # not known of the sensors that stay
+        if (
+            self.stated is None and value.keys() != other.value.keys()
+        ):  # unknown for the sensors that are kept
             return CalibrationNoise(value, None)
         kept = {name: sigma for name, sigma in (self.stated or {}).items() if name not in other.value}
         return CalibrationNoise(value, kept | dict(other.stated or {}))
@@ -50,7 +53,7 @@ class CalibrationNoise:
             sensor: sensor with the rows.
 
         Raises:
-            MeasurementError: the calibration knows the noise only as a factor on stated standard deviations, and these
+            MeasurementError: the noise of the calibration is a factor on stated standard deviations, and the new
                 rows state none.
         """
         name = sensor.name
@@ -65,7 +68,7 @@ class CalibrationNoise:
                 )
             return usual
         if sensor.sigma is not None and not self.is_factor(name):
-            # a calibration never takes stated standard deviations for too large
+            # a calibration never reduces stated standard deviations
             return max(self.value[name] / median_sigma(sensor), 1.0)
         return self.value[name]
 

@@ -1,4 +1,4 @@
-"""Fit of the selected model to all rows: linearisation and posterior alternate until they agree."""
+"""Fit the selected model to all rows; linearisation and posterior alternate until they agree."""
 
 from dataclasses import dataclass, replace
 
@@ -24,10 +24,10 @@ from pisigma.robot.se3 import transform
 
 MAX_LINEARISATIONS = 5
 CONVERGENCE_TOLERANCE = 0.05
-"""Difference of linearised and true weighted residuals [variances], per effective unknown, at convergence."""
+"""Squared difference of linearised and true weighted residuals at convergence [variances], per effective unknown."""
 ARM = 0.1
-"""Distance from the tool's origin, as a share of the reach, of further points that are fitted, so that rotations
-count."""
+"""Distance from the tool's origin, as a share of the reach, of further points that are fitted, so that rotations are
+included."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,11 +36,11 @@ class RefinedFit:
 
     Attributes:
         rows: the rows, as last linearised and weighted.
-        design: all unknowns.
-        posterior: their posterior.
+        design: design of all unknowns.
+        posterior: posterior of the unknowns.
         regression: regression of the rows on the unknowns.
         point: all parameters of the problem.
-        correction: the network.
+        correction: the joint correction.
         rounds: number of linearisations.
         held_out: held-out predictions of the folds of the search; None if the model was fitted again after it.
     """
@@ -56,7 +56,7 @@ class RefinedFit:
 
 
 def refine(problem: CalibrationProblem, group: Int64[Tensor, " rows"], choice: FeatureChoice) -> RefinedFit:
-    """Fit the selected features to all rows.
+    """Return the selected features fitted to all rows.
 
     Args:
         problem: problem of all rows.
@@ -70,7 +70,7 @@ def refine(problem: CalibrationProblem, group: Int64[Tensor, " rows"], choice: F
         differs = there.squared_difference(rows, posterior.x, design, posterior.noise)
         if differs < CONVERGENCE_TOLERANCE * posterior.effective_unknowns:
             break
-        rows, fit = there, None  # only one system of equations in memory at a time, because they are large
+        rows, fit = there, None  # keep only one system of equations in memory, because they are large
         fit = build_regression(design, there)
         posterior = fit.maximise_evidence(posterior.prior, posterior.noise)
         rounds += 1
@@ -89,7 +89,7 @@ def _refined(
 
 
 def correction_from_weights(design: Design, x: Float64[Tensor, " unknowns"]) -> JointCorrection:
-    """Make the network with the weights of some unknowns; products of inputs become product units."""
+    """Return the joint correction with the weights of given unknowns; products of inputs become product units."""
     features = [chosen for chosen in design.features if not isinstance(chosen, InputProducts)]
     factors, linear = None, []
     for number, chosen in enumerate(design.features):
@@ -117,7 +117,7 @@ def evaluate_in_chunks(correction: JointCorrection) -> Shift:
 def linearise_rows(
     design: Design, x: Float64[Tensor, " unknowns"], effective: float, group: Int64[Tensor, " rows"]
 ) -> Rows:
-    """Linearise all rows at some unknowns, with robust weights from their residuals.
+    """Return all rows linearised at given unknowns, with robust weights from their residuals.
 
     Args:
         design: design of the unknowns.
@@ -137,12 +137,12 @@ def with_aligned_frames(solved: SolvedCalibration, refined: RefinedFit) -> Ident
     """Return the geometry of the hybrid, with floating frames moved onto those of the geometric calibration.
 
     Residuals of sockets, and of distances from anchors at unknown points, do not change if the whole frame is moved.
-    But nominal joint values and predictions of both calibrations must refer to the same base. Therefore every such
+    However, nominal joint values and predictions of both calibrations must refer to the same base. Therefore every such
     frame is moved so that the poses of the hybrid are nearest to the geometric ones.
 
     Args:
         solved: the geometric calibration.
-        refined: the hybrid one.
+        refined: the hybrid calibration.
     """
     setup, rows = solved.setup, solved.measurements
     geometry = identified_geometry(setup, refined.point)
@@ -168,13 +168,13 @@ def fit_rigid_motion(
     middle, middle_onto = points.mean(0), onto.mean(0)
     U, _, V = torch.linalg.svd((onto - middle_onto).t() @ (points - middle))
     turned = torch.ones(3, dtype=points.dtype, device=points.device)
-    turned[2] = torch.linalg.det(U @ V)  # -1 would be a reflection
+    turned[2] = torch.linalg.det(U @ V)  # a determinant of -1 would be a reflection
     R = U @ (turned[:, None] * V)
     return transform(R, middle_onto - R @ middle)
 
 
 def _points(geometry: IdentifiedGeometry, rows: Measurements) -> Float64[Tensor, "rows 4 3"]:
-    """Compute the tool's origin and a point along each of its axes, in the frame of the row."""
+    """Return the tool's origin and a point along each of its axes, in the frame of the row [m]."""
     T = predicted_poses(geometry.robot, geometry.bases, geometry.tools, rows)
     origin = T[:, None, :3, 3]
     return torch.cat([origin, origin + ARM * geometry.robot.reach * T[:, :3, :3].mT], 1)

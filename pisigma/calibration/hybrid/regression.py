@@ -1,4 +1,4 @@
-"""Regression of values on the unknowns of a design: by normal equations, or for few values by their covariance."""
+"""Regression of values on the unknowns of a design, by normal equations or, for few values, by their covariance."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -19,7 +19,7 @@ from pisigma.estimation.regression import Posterior, SensorCount
 from pisigma.joint_correction.feature import AbstractFeature
 
 NARROW = 64
-"""Rows whose columns are all in memory at a time, where only products with some of them are needed."""
+"""Number of rows whose columns are in memory at a time, if only products with some columns are needed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +36,7 @@ class NormalEquations(PrimalRegression, AbstractDesignRegression):
 
     @staticmethod
     def from_rows(design: Design, rows: Rows) -> "NormalEquations":
-        """Sum the rows, chunk by chunk.
+        """Return the normal equations of the rows, summed chunk by chunk.
 
         The columns of a joint's weights are its features times the derivative with respect to its value, `J_j f_jm`.
         Therefore, for two joints, `X_j^T X_i = f_j^T diag(J_j^T J_i) f_i`: the components of a value are summed before
@@ -51,7 +51,7 @@ class NormalEquations(PrimalRegression, AbstractDesignRegression):
         return NormalEquations(normal, descent, tuple(square), rows.sensors, design, rows)
 
     def select(self, design: Design) -> "NormalEquations":
-        """See `AbstractDesignRegression.select`."""
+        """Return the regression for a subset of the features; see `AbstractDesignRegression.select`."""
         if design.unknowns == self.design.unknowns and design.features == self.design.features:
             return self
         return_free_memory(design.unknowns)
@@ -62,7 +62,7 @@ class NormalEquations(PrimalRegression, AbstractDesignRegression):
         return replace(self, design=design, normal=normal, descent=self.descent[:, columns])
 
     def with_feature(self, design: Design) -> "NormalEquations":
-        """Return the equations for a design with some of the features and a new one as its last.
+        """Return the equations for a design with a subset of the features and a new last feature.
 
         Existing sums are copied.
         """
@@ -86,7 +86,7 @@ class NormalEquations(PrimalRegression, AbstractDesignRegression):
         return replace(self, design=design, normal=normal, descent=descent)
 
     def without_groups(self, groups: Int64[Tensor, " groups"]) -> "NormalEquations":
-        """See `AbstractDesignRegression.without_groups`."""
+        """Return the regression without groups of rows; see `AbstractDesignRegression.without_groups`."""
         other = NormalEquations.from_rows(self.design, self.rows.held_out(groups))
         counts = zip(self.sensors, other.sensors, strict=True)
         return replace(
@@ -100,12 +100,12 @@ class NormalEquations(PrimalRegression, AbstractDesignRegression):
     def held_out_errors(
         self, posterior: Posterior, folds: Sequence[Int64[Tensor, " _groups"]]
     ) -> HeldOutErrors:
-        """See `AbstractDesignRegression.held_out_errors`."""
+        """Return the errors of held-out folds; see `AbstractDesignRegression.held_out_errors`."""
         solved = self.solved_with(posterior.prior, posterior.noise)
         return HeldOutErrors.concatenate([self._held_out_errors(groups, solved) for groups in folds])
 
     def _held_out_errors(self, groups: Int64[Tensor, " groups"], solved: SolvedRegression) -> HeldOutErrors:
-        """Leave out one fold."""
+        """Return the errors of one fold, predicted without it."""
         return_free_memory(len(solved.x))
         test, x = self.rows.held_out(groups).values, solved.x
         whitened = x.new_empty((sum(sensor.residual.numel() for sensor in test), len(x)))
@@ -131,7 +131,7 @@ class NormalEquations(PrimalRegression, AbstractDesignRegression):
     def evidence_gain(
         self, posterior: Posterior, design: Design, features: AbstractFeature
     ) -> tuple[float, Tensor | None]:
-        """See `AbstractDesignRegression.evidence_gain`.
+        """Return the gain of log evidence by features; see `AbstractDesignRegression.evidence_gain`.
 
         The other unknowns are eliminated from the normal equations (Schur complement), so that only the weights of the
         features remain.
@@ -142,11 +142,11 @@ class NormalEquations(PrimalRegression, AbstractDesignRegression):
         normal = sum(N[new] * sigma**-2 for N, sigma in zip(self.normal, posterior.noise, strict=True))
         descent = sum(b * sigma**-2 for b, sigma in zip(self.descent, posterior.noise, strict=True))
         square = sum(total / sigma**2 for total, sigma in zip(self.square, posterior.noise, strict=True))
-        # Schur complement: what remains of the new columns after fitting the old ones.
+        # Schur complement: the remainder of the new columns after fitting the old columns.
         cross = normal[:, old]
         root = solved.inverse @ (cross * solved.scale).t()
         rest = square - float(descent[old] @ solved.x)
-        # The remaining square counts once with unit noise, because sensors were already weighted by their noise.
+        # The remaining squares have unit noise, because sensors were already weighted by their noise.
         alone = PrimalRegression(
             normal=(normal[:, new] - root.t() @ root)[None],
             descent=(descent[new] - cross @ solved.x)[None],
@@ -163,7 +163,7 @@ class NormalEquations(PrimalRegression, AbstractDesignRegression):
 
 
 def _add_sums(design: Design, sensor: SensorValues, N: Tensor, b: Tensor) -> float:
-    """Add normal matrix and right-hand side of one sensor's values in place; return the sum of their squares."""
+    """Add normal matrix and right side of a sensor's values in place; return the sum of the squared values."""
     active, dof = design.active, sensor.joints.shape[-1]
     count = sum(chosen.count for chosen in design.features)
     size = active + dof * count
@@ -194,7 +194,7 @@ def _add_sums(design: Design, sensor: SensorValues, N: Tensor, b: Tensor) -> flo
                 block = slice(active + j * count, active + (j + 1) * count)
                 normal[:active, block].addmm_(along[:, j].t(), f[:, j])
                 descent[block].addmv_(f[:, j].t(), pull[:, j])
-    # Not every joint uses every feature: unused weights are computed with the blocks and left out here.
+    # Not every joint uses every feature; unused weights are computed with the blocks and omitted here.
     order = torch.cat([torch.arange(active), active + _places(design, dof, count)])
     for rows in chunks(size):
         corner = normal[rows, rows]
@@ -206,13 +206,13 @@ def _add_sums(design: Design, sensor: SensorValues, N: Tensor, b: Tensor) -> flo
 
 
 def _copy_chosen(matrix: Tensor, chosen: Int64[Tensor, " chosen"], to: Tensor) -> None:
-    """Copy some rows and columns of a matrix, without a third matrix in memory."""
+    """Copy chosen rows and columns of a matrix, without a third matrix in memory."""
     for rows in chunks(len(chosen)):
         torch.index_select(matrix[chosen[rows]], 1, chosen, out=to[rows])
 
 
 def _feature_columns(design: Design, row: Tensor) -> Float64[Tensor, "rows dof columns"]:
-    """Compute the columns of all features at some rows of the problem, including those that a joint does not use."""
+    """Compute the columns of all features at rows of the problem, including columns that a joint does not use."""
     state = design.problem.state[row]
     return torch.cat([chosen.columns(state) for chosen in design.features], -1)
 
@@ -228,7 +228,7 @@ def _places(design: Design, dof: int, count: int) -> Int64[Tensor, " weights"]:
 
 
 MAX_VALUES = 1_000
-"""Values up to which their covariance is used; the matrices of all groups then take up to 200 MB."""
+"""Number of values up to which their covariance is used; the matrices of all groups then take up to 200 MB."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,7 +238,7 @@ class ValueCovariance(DualRegression, AbstractDesignRegression):
     Attributes:
         design: the unknowns.
         rows: linearised values.
-        group: group of the row of every value, see `Rows.group`; -1 for certain values.
+        group: group of the row of every value, see `Rows.group`; -1 for given values.
     """
 
     design: Design
@@ -247,7 +247,7 @@ class ValueCovariance(DualRegression, AbstractDesignRegression):
 
     @staticmethod
     def from_rows(design: Design, rows: Rows) -> "ValueCovariance":
-        """Make the matrices K of all rows."""
+        """Return the matrices K of all rows."""
         parts = []
         for k, sensor in enumerate(rows.values):
             X = design.columns(sensor, slice(None))
@@ -270,7 +270,7 @@ class ValueCovariance(DualRegression, AbstractDesignRegression):
         )
 
     def select(self, design: Design) -> "ValueCovariance":
-        """See `AbstractDesignRegression.select`."""
+        """Return the regression for a subset of the features; see `AbstractDesignRegression.select`."""
         columns = self.design.indices(design.features)
         X, prior = self.X[:, columns], design.prior((1.0,) * design.classes)
         before = self.prior.group[columns]
@@ -283,7 +283,7 @@ class ValueCovariance(DualRegression, AbstractDesignRegression):
         return replace(self, design=design, X=X, prior=prior, K=stack_groups(K, self.y))
 
     def without_groups(self, groups: Int64[Tensor, " groups"]) -> "ValueCovariance":
-        """See `AbstractDesignRegression.without_groups`."""
+        """Return the regression without groups of rows; see `AbstractDesignRegression.without_groups`."""
         kept = (~torch.isin(self.group, groups)).nonzero()[:, 0]
         sensor = self.sensor[kept]
         left, all_ = (
@@ -304,7 +304,7 @@ class ValueCovariance(DualRegression, AbstractDesignRegression):
     def held_out_errors(
         self, posterior: Posterior, folds: Sequence[Int64[Tensor, " _groups"]]
     ) -> HeldOutErrors:
-        """See `AbstractDesignRegression.held_out_errors`; the residual is `noise² P y`, `noise² P = I - X C X^T`."""
+        """Return the errors of held-out folds; the residual is `noise² P y` with `noise² P = I - X C X^T`."""
         if self.is_ill_conditioned(posterior.prior, posterior.noise):
             return self.normal_equations.held_out_errors(posterior, folds)
         sigma = self.y.new_tensor(posterior.noise)[self.sensor]
@@ -322,12 +322,12 @@ class ValueCovariance(DualRegression, AbstractDesignRegression):
 
     @cached_property
     def normal_equations(self) -> NormalEquations:
-        """Normal equations of the same values."""
+        """Return the normal equations of the same values."""
         return NormalEquations(*self.normal_equation_sums, self.sensors, self.design, self.rows)
 
     @cached_property
     def _values_of_groups(self) -> tuple[Tensor, ...]:
-        """Numbers of the values of every group of rows."""
+        """Indices of the values of every group of rows."""
         measured = (self.group >= 0).nonzero()[:, 0]
         group = self.group[measured]
         counts = torch.bincount(group, minlength=self.rows.groups).tolist()
@@ -335,7 +335,7 @@ class ValueCovariance(DualRegression, AbstractDesignRegression):
 
 
 def build_regression(design: Design, rows: Rows) -> AbstractDesignRegression:
-    """Make normal equations, or the covariance of the values if there are few values and more unknowns."""
+    """Return normal equations, or the covariance of the values if they are few and fewer than the unknowns."""
     values = sum(sensor.residual.numel() for sensor in rows.values)
     few = values <= min(MAX_VALUES, design.unknowns)
     return ValueCovariance.from_rows(design, rows) if few else NormalEquations.from_rows(design, rows)
@@ -344,7 +344,7 @@ def build_regression(design: Design, rows: Rows) -> AbstractDesignRegression:
 def extend_regression(
     before: AbstractDesignRegression, design: Design, rows: Rows
 ) -> AbstractDesignRegression:
-    """Return the regression of the same rows on a design with some of the features and a new one as its last."""
+    """Return the regression of the same rows on a design with a subset of the features and a new last feature."""
     return (
         before.with_feature(design) if isinstance(before, NormalEquations) else build_regression(design, rows)
     )

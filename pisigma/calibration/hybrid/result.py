@@ -23,14 +23,15 @@ class LearnedPart:
     """A joint correction and the geometry that was fitted together with it.
 
     Attributes:
-        geometry: geometry fitted together with the correction, which differs from that of the geometric calibration.
+        geometry: geometry fitted together with the correction, which differs from the geometry of the geometric
+            calibration.
         correction: the joint correction Δ.
         coverage: measured ranges of joint values; outside them the correction is an extrapolation.
-        noise: standard deviation per sensor [m or rad], or a factor on those that the rows state.
+        noise: standard deviation per sensor [m or rad], or a factor on the standard deviations that the rows state.
         unknowns: number of parameters and weights.
-        effective: effective number of parameters and weights; the others are determined by the prior.
+        effective: effective number of parameters and weights that the data determine; the prior determines the others.
         rounds: number of linearisations.
-        outliers: rows with less than half of the full weight, the worst first.
+        outliers: rows with less than half of the full weight, worst first.
     """
 
     geometry: IdentifiedGeometry
@@ -45,14 +46,14 @@ class LearnedPart:
 
 @dataclass(frozen=True, eq=False)
 class HybridResult:
-    """A hybrid calibration: the geometric one, and a learned joint correction.
+    """A hybrid calibration: a geometric calibration and a learned joint correction.
 
     Attributes:
         geometric: the calibration without a correction.
-        learned: the correction; None if none was kept, so the geometric calibration is the result.
+        learned: the correction; None if no correction was kept, so that the geometric calibration is the result.
         uncertainty: uncertainty of predicted positions.
-        trials: the trials, in order.
-        verdict: what was kept and why, as a sentence.
+        trials: the trials of features, in order.
+        verdict: a sentence that states what was kept and why.
     """
 
     geometric: CalibrationResult
@@ -63,18 +64,18 @@ class HybridResult:
 
     @property
     def outliers(self) -> tuple[Outlier, ...]:
-        """Rows with less than half of the full weight in the resulting calibration, the worst first."""
+        """Rows with less than half of the full weight in the resulting calibration, worst first."""
         return self.geometric.outliers if self.learned is None else self.learned.outliers
 
     def arm(self) -> HybridArm | None:
-        """Return the corrected arm, with base of the first frame and tool of the first target; None without one."""
+        """Return the corrected arm with the first base and the first tool; None without a correction."""
         if self.learned is None:
             return None
         learned = self.learned
         return HybridArm(learned.geometry.robot, learned.correction, learned.coverage)
 
     def predicted_poses(self, measurements: Measurements) -> Float64[Tensor, "rows 4 4"]:
-        """Predict the poses of the targets, each in the frame of its row.
+        """Return predicted poses of the targets, each in the frame of its row.
 
         Raises:
             IdentificationError: a row has a frame or a target that was not calibrated.
@@ -87,7 +88,7 @@ class HybridResult:
         return predicted_poses(geometry.robot, geometry.bases, geometry.tools, moved)
 
     def errors_of(self, measurements: Measurements) -> dict[str, Float64[Tensor, "rows components"]]:
-        """Compute measured minus predicted of any measurements; see `CalibrationResult.errors_of`."""
+        """Compute measured minus predicted values of measurements; see `CalibrationResult.errors_of`."""
         if self.learned is None:
             return self.geometric.errors_of(measurements)
         T = self.predicted_poses(measurements)
@@ -96,7 +97,7 @@ class HybridResult:
     def deviation(self, measurements: Measurements) -> Float64[Tensor, "rows 3"]:
         """Compute the standard deviation of predicted positions along the axes of the row's frame [m], without noise.
 
-        It is that of the posterior, inside the measured joint ranges and outside.
+        It is the standard deviation of the posterior, within the measured joint ranges and outside.
 
         Raises:
             IdentificationError: nothing was measured in metres.

@@ -22,37 +22,37 @@ from pisigma.estimation.regression import Posterior
 from pisigma.joint_correction.feature import AbstractFeature
 
 LEVEL = 1.03
-"""Held-out RMS error over the least so far above which features are rejected despite the evidence."""
+"""Ratio of the held-out RMS error to the lowest one so far above which features are rejected despite the evidence."""
 CLEARLY = 5.0
 """Increase of the log evidence needed to keep features (a Bayes factor of 150: very strong, Kass and Raftery 1995).
 
-A threshold of 3 gains nothing for arms with joint errors: on 16 to 30 positions of the measured UR5 and UR10 the errors
-are 0.998 and 1.001 times those at 5 in the mean of 80 fits each, on 20 to 30 of simulated arms 0.997 and 1.004 (120
-fits each). On simulated arms with errors of the geometry alone it costs 1.7 %."""
+A threshold of 3 gains nothing for arms with joint errors: on 16 to 30 positions of the measured UR5 and UR10 the
+errors are 0.998 and 1.001 times the errors at 5, on average over 80 fits each, on 20 to 30 of simulated arms 0.997
+and 1.004 (120 fits each). On simulated arms with errors of the geometry alone it costs 1.7 %."""
 CLEAR_GAIN = 1.0
-"""[standard errors] Decrease of the held-out squares that is regarded as an improvement."""
+"""Decrease of the held-out squared errors [standard errors] that is regarded as an improvement."""
 STRONGLY = 3.0
-"""Increase of the log evidence that is strong: a Bayes factor of 20, same source."""
+"""Increase of the log evidence that is strong: a Bayes factor of 20 (Kass and Raftery 1995)."""
 MAX_EFFECTIVE_SHARE = 0.75
 """Largest effective number of unknowns per value; with more, they cannot be separated from the noise."""
 MAX_USUAL_SHARE = 0.97
-"""The same if the prior sizes of the weights start with the usual ones, which regularise what few values do not
-determine."""
+"""Largest effective number of unknowns per value if the prior sizes of the weights start with their usual sizes,
+which regularise what few values do not determine."""
 MIN_USUAL_SCALE = 0.4
-"""Prior scale of the geometry that is tried too if the estimated one is smaller: without features, a geometric
-calibration of few rows takes their effect for noise, and underestimates small errors of the geometry."""
+"""Prior scale of the geometry that is also tried if the estimated scale is smaller: a geometric calibration of few
+rows attributes the effects of missing features to noise, and underestimates small errors of the geometry."""
 USUAL_UPDATES = 5
-"""Updates of the usual sizes; few values hardly determine them, so more updates are not useful."""
+"""Number of updates of the usual sizes; few values hardly determine them, so more updates are not useful."""
 ROUGHLY = 1.0
-"""Increase of the log evidence per update at convergence during the selection of features."""
+"""Increase of the log evidence per update below which fits have converged during the selection of features."""
 FEW_GROUPS = 200
-"""Groups up to which there are more folds."""
+"""Number of groups up to which more folds are used."""
 FEW_TOGETHER = 60
-"""Groups up to which all features are also tried together, starting with the usual sizes of their weights."""
+"""Number of groups up to which all features are also tried together, starting with the usual sizes of their weights."""
 FIRST_MODEL_SIZES = 3
-"""Number of the size of a growing feature in a model with all features."""
+"""Index of the size of a growing feature that is used in a model with all features."""
 MAX_FAILURES = 3
-"""Successive sizes without improvement after which no larger ones are tried."""
+"""Number of successive sizes without improvement after which larger sizes are not tried."""
 
 Progress = Callable[[str], None]
 
@@ -65,9 +65,9 @@ class Trial:
         name: features, such as "gravity + series 56 + products".
         unknowns: number of unknowns.
         log_evidence: log evidence up to a constant of the data.
-        held_out: held-out RMS error over that of the geometric calibration [1].
+        held_out: ratio of the held-out RMS error to that of the geometric calibration [1].
         seconds: duration [s].
-        kept: whether it was better than the best trial before it.
+        kept: whether the trial was better than all previous trials.
     """
 
     name: str
@@ -80,11 +80,11 @@ class Trial:
 
 @dataclass(frozen=True, eq=False)
 class FeatureFit:
-    """Fit of the geometry and some features.
+    """Fit of the geometry and a set of features.
 
     Attributes:
         design: the unknowns.
-        posterior: their posterior.
+        posterior: posterior of the unknowns.
         largest_share: largest allowed effective number of unknowns per value.
         held_out: held-out predictions of the folds; None if they were not computed.
     """
@@ -96,11 +96,11 @@ class FeatureFit:
 
     @property
     def name(self) -> str:
-        """Labels of its features, for tables."""
+        """Labels of the features, for tables."""
         return " + ".join(chosen.label for chosen in self.design.features) or "geometry"
 
     def gain(self, before: "FeatureFit") -> float:
-        """Compute the decrease of the held-out squares from another fit [standard errors]; 0 if none were held out."""
+        """Compute the decrease of the held-out squared errors from another fit [standard errors]; 0 without any."""
         if self.held_out is None or before.held_out is None:
             return 0.0
         return self.held_out.gain(self.posterior.noise, before.held_out, before.posterior.noise)
@@ -108,7 +108,7 @@ class FeatureFit:
 
 @dataclass(frozen=True, eq=False)
 class FeatureChoice:
-    """Result of a search.
+    """Result of a search for features.
 
     Attributes:
         rows: rows used for the selection.
@@ -126,7 +126,7 @@ class FeatureChoice:
 
 
 class FeatureSearch:
-    """Tries features one after the other on the same rows."""
+    """Search that tries features in sequence on the same rows."""
 
     def __init__(
         self,
@@ -136,14 +136,14 @@ class FeatureSearch:
         largest: Sequence[AbstractFeature],
         progress: Progress,
     ) -> None:
-        """Make the regression on all features.
+        """Build the regression on all features.
 
         Args:
             rows: the rows.
             noise: noise of the geometric calibration per sensor.
             prior_scale: prior scales of the geometric calibration.
-            largest: all features that `select_features` may try; growing ones in their largest size.
-            progress: called with the current trial.
+            largest: all features that `select_features` may try; growing features in their largest size.
+            progress: callback that is called with the current trial.
         """
         self.noise, self.prior_scale = noise, prior_scale
         self.trials: list[Trial] = []
@@ -164,11 +164,11 @@ class FeatureSearch:
 
         Args:
             features: the features.
-            near: another fit; None to start with those of the geometric calibration.
-            sizes: start values of the last prior sizes.
+            near: another fit; None to start with noise and prior sizes of the geometric calibration.
+            sizes: start values of the prior sizes of the last feature.
 
         Returns:
-            The fit, and the held-out RMS error over the noise of the geometric calibration.
+            The fit, and the ratio of the held-out RMS error to the noise of the geometric calibration.
         """
         design = Design(self.rows.problem, tuple(features))
         noise, prior = self.noise, design.prior(self.prior_scale)
@@ -182,7 +182,7 @@ class FeatureSearch:
         return FeatureFit(design, posterior, held_out=errors), errors.rms(posterior.noise, self.noise)
 
     def _note(self, tried: FeatureFit, share: float, began: float, kept: bool) -> None:
-        """Add a trial to the table."""
+        """Add a trial to the table of trials."""
         seconds, evidence = time.monotonic() - began, tried.posterior.log_evidence
         self.trials.append(Trial(tried.name, tried.design.unknowns, evidence, share, seconds, kept))
 
@@ -192,14 +192,14 @@ class FeatureSearch:
         others: Sequence[AbstractFeature],
         last: Sequence[AbstractFeature] = (),
     ) -> FeatureFit:
-        """Select features greedily: other features first, then growing ones as long as they improve the fit.
+        """Select features greedily: other features first, then growing features as long as they improve the fit.
 
-        With few rows, single features cannot be distinguished from the noise that the others cause, so all features are
-        also tried together.
+        With few rows, individual features cannot be distinguished from the noise that missing features cause, so all
+        features are also tried together.
 
         Args:
             growing: features of one name with increasing sizes.
-            others: features that are tried before these, and again after them if they did not help.
+            others: features that are tried before the growing features, and again after them if they did not help.
             last: features that are tried at the end; they must clearly reduce the held-out errors.
         """
         best = self.geometry
@@ -233,8 +233,8 @@ class FeatureSearch:
 
         Args:
             best: the best fit so far.
-            feature: feature that was chosen by its gain on the same rows; None for none.
-            odds: logarithm of the prior odds against it, which the evidence must exceed.
+            feature: feature that was chosen by its gain on the same rows; None for no feature.
+            odds: logarithm of the prior odds against the feature, which the gain of log evidence must exceed.
         """
         if feature is not None:
             largest = [*best.design.features, feature]
@@ -255,8 +255,8 @@ class FeatureSearch:
         odds: float = 0.0,
         least_gain: float = -math.inf,
     ) -> FeatureFit:
-        """Return the better of new features and the best fit so far, by evidence and held-out errors."""
-        # In the order of the largest design: its equations need no copy if all of its features are tried.
+        """Return the better of a fit with new features and the best fit so far, by evidence and held-out errors."""
+        # Use the order of the largest design, whose equations need not be copied if all features are tried.
         features = sorted(features, key=lambda one: self._order.index(one.name))
         self.progress(" + ".join(chosen.label for chosen in features))
         began = time.monotonic()
@@ -275,10 +275,10 @@ class FeatureSearch:
     def _from_usual_sizes(
         self, features: Sequence[AbstractFeature], prior_scale: Sequence[float], best: FeatureFit
     ) -> FeatureFit:
-        """Return the better of all features with about the usual sizes of the weights and the best fit so far.
+        """Return the better of a fit of all features, starting with usual sizes, and the best fit so far.
 
-        If features were kept before, strong evidence suffices, because few rows cannot give more. Without any, very
-        strong evidence is needed.
+        If features were kept before, strong evidence is sufficient, because few rows cannot give more. Without kept
+        features, very strong evidence is required.
         """
         self.progress(" + ".join(chosen.label for chosen in features))
         began = time.monotonic()

@@ -1,4 +1,4 @@
-"""Linearisation of all measured values at one point, with respect to geometry and joint values."""
+"""Linearise all measured values at a point, with respect to geometry and joint values."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -14,24 +14,24 @@ from pisigma.joint_correction.feature import AbstractFeature
 from pisigma.measurement.conditions import JointState
 
 Shift = Callable[[JointState], Tensor]
-"""Joint corrections [rad or m] as a function of joint values and stated conditions."""
+"""Function that returns joint corrections [rad or m] for joint values and stated conditions."""
 
 
 @dataclass(frozen=True, eq=False)
 class SensorValues:
-    """The rows with values of one sensor.
+    """Linearised rows with values of one sensor.
 
     Attributes:
         name: name of the sensor.
-        row: number of every row in the problem.
+        row: index of every row in the problem.
         geometry: derivative of the predicted values with respect to the free parameters.
         joints: derivative of the predicted values with respect to the joint values.
-        residual: measured minus predicted.
-        root: 1 / standard deviation if the rows state it, else 1.
+        residual: measured minus predicted values.
+        root: 1 / standard deviation if the rows state it, otherwise 1.
         stated: whether the rows state their standard deviations.
-        certain: whether the values are certain (stated), not measured.
-        other_row: number of the other row for distances between the targets of two rows; else None.
-        other_joints: derivative with respect to the joint values of that row.
+        certain: whether the values are given, not measured.
+        other_row: index of the other row for distances between the targets of two rows; otherwise None.
+        other_joints: derivative with respect to the joint values of the other row.
         repetition: factor >= 1 on the variance, because values of several targets in one configuration share the
             errors of the model (design effect, Kish 1965).
     """
@@ -50,7 +50,7 @@ class SensorValues:
 
     @property
     def row_derivatives(self) -> list[tuple[Tensor, Tensor]]:
-        """Rows and derivatives with respect to their joint values; two of each for distances between rows."""
+        """Return rows and derivatives with respect to their joint values; two of each for distances between rows."""
         sides = [(self.row, self.joints)]
         if self.other_row is not None and self.other_joints is not None:
             sides.append((self.other_row, self.other_joints))
@@ -64,7 +64,7 @@ class SensorValues:
         Args:
             chosen: the feature.
             state: joint state of all rows of the problem.
-            rows: the rows of this sensor to use.
+            rows: rows of this sensor to use.
         """
         blocks = [
             weight_columns(joints[rows], chosen, state[row[rows]]) for row, joints in self.row_derivatives
@@ -77,7 +77,7 @@ class SensorValues:
         return self.residual.shape[1]
 
     def select(self, chosen: Tensor | slice) -> "SensorValues":
-        """Select some of the rows, by index or mask."""
+        """Return the rows that an index or mask selects."""
         return replace(
             self,
             row=self.row[chosen],
@@ -90,12 +90,12 @@ class SensorValues:
         )
 
     def apply_weights(self, weight: Float64[Tensor, " values"]) -> "SensorValues":
-        """Multiply the weights of the rows; rows with weight 0 are removed."""
+        """Return the rows with weights multiplied; rows with weight 0 are removed."""
         kept = weight > 0
         return replace(self.select(kept), root=(self.root * weight.sqrt())[kept])
 
     def merge_repeats(self, pose: Int64[Tensor, " rows"]) -> "SensorValues":
-        """Join repeats of a pose to one row with the sum of their weights.
+        """Return the rows with repeats of a pose joined to one row that has the sum of their weights.
 
         Repeats of a pose share the errors of the model, so they are not independent. Rows of a pose that measure
         something different, such as touches along another axis or distances from another anchor, have other derivatives
@@ -127,7 +127,7 @@ class SensorValues:
         )
 
     def downweight_correlated(self, configuration: Int64[Tensor, " rows"]) -> "SensorValues":
-        """Reduce the weights if the residuals of several targets in a configuration are correlated."""
+        """Return the rows with smaller weights if residuals of several targets in a configuration are correlated."""
         if not len(self.row) or self.certain or self.other_row is not None:
             return self
         key = renumber(configuration[self.row])
@@ -145,7 +145,7 @@ class SensorValues:
         return replace(self, repetition=repetition, root=self.root * repetition**-0.5)
 
     def _sights(self) -> Int64[Tensor, " values"]:
-        """Number the rows by their derivatives, equal for equal ones."""
+        """Return an index for every row that is equal for rows with equal derivatives."""
         # A fixed generic linear combination distinguishes derivatives, up to rounding.
         key = self.geometry.new_zeros(len(self.row))
         for J in (self.geometry.flatten(1), self.joints.flatten(1)):
@@ -171,12 +171,12 @@ def weight_columns(
 def sensor_values(
     problem: CalibrationProblem, point: Float64[Tensor, " parameters"], shift: Shift | None = None
 ) -> tuple[SensorValues, ...]:
-    """Linearise every sensor at a point.
+    """Return the values of every sensor, linearised at a point.
 
     Args:
         problem: rows, sensors and free parameters.
         point: values of all parameters.
-        shift: joint corrections at the point; None for none.
+        shift: joint corrections at the point; None for no correction.
     """
     robot = problem.space.robot
     moved = problem if shift is None else replace(problem, q=problem.q + shift(problem.state))
@@ -215,7 +215,7 @@ def sensor_values(
 
 
 def joint_columns(space: ParameterSpace) -> Int64[Tensor, " dof"]:
-    """Return the parameter that acts like every joint value: theta of revolute, d of prismatic joints."""
+    """Return for every joint the parameter that acts like its value: theta of a revolute, d of a prismatic joint."""
     robot = space.robot
     return torch.tensor(
         [5 * row + (0 if turns else 1) for row, turns in zip(robot.joint_rows, robot.revolute, strict=True)]

@@ -1,4 +1,4 @@
-"""Lines in the spectrum of joint errors: high harmonics in the residuals of a first model."""
+"""Find lines in the spectrum of joint errors: high harmonics in the residuals of a first model."""
 
 import math
 
@@ -11,27 +11,28 @@ from pisigma.estimation.regression import Posterior
 from pisigma.joint_correction.feature import angle_per_joint_value
 
 HIGHEST = 3_000
-"""[1/turn] Motors with 10 pole pairs and gears of 1:101 have cogging at 2,020; an error of 0.1 mrad shifts the phase of
-the highest order by 0.3 rad."""
+"""Highest order of a line [1/turn]. Motors with 10 pole pairs and gears of 1:101 have cogging at 2,020; an error of
+0.1 mrad shifts the phase of the highest order by 0.3 rad."""
 MAX_LINES = 8
-"""Lines per joint."""
+"""Largest number of lines per joint."""
 ALIKE = 0.9
 """Correlation of two harmonics at the measured joint values above which they cannot be distinguished."""
 BLOCK = 64
-"""Powers of `exp(i angle)` that are computed directly; the others are products of these."""
+"""Number of powers of `exp(i angle)` that are computed directly; higher powers are products of these."""
 
 
 def find_spectral_lines(
     design: Design, rows: Rows, posterior: Posterior, lowest: int
 ) -> tuple[tuple[int, ...], ...]:
-    """Find the orders of the lines of every joint, the strongest first.
+    """Find the orders of the spectral lines of every joint, strongest first.
 
     The periodogram of unevenly sampled values (Scargle 1982, The Astrophysical Journal 263, 835-853) of the joint
     motions that would cancel the residuals gives the increase of the log likelihood by sine and cosine of each order.
     For pure noise, this gain has an exponential distribution with mean 1. The mean is estimated from the median,
     because joints cause noise in addition to that of the sensors. Orders whose gain exceeds the prior odds against them
-    are lines with a probability above 1/2, and these predict best (median probability model: Barbieri and Berger 2004,
-    The Annals of Statistics 32(3), 870-897). The evidence for all of them together decides whether there are lines.
+    are lines with a probability above 1/2, and such lines predict best (median probability model: Barbieri and
+    Berger 2004, The Annals of Statistics 32(3), 870-897). The evidence for all lines together decides whether there
+    are lines.
 
     Args:
         design: design of a first model.
@@ -57,7 +58,7 @@ def log_number_of_orders(joints: int) -> float:
 def _slope_and_curvature(
     design: Design, rows: Rows, posterior: Posterior
 ) -> tuple[Float64[Tensor, "rows dof"], Float64[Tensor, "rows dof"]]:
-    """Compute first and minus second derivatives of the rows' log likelihood with respect to the joint values."""
+    """Return first and negative second derivatives of the rows' log likelihood with respect to the joint values."""
     slope, curvature = torch.zeros_like(design.problem.q), torch.zeros_like(design.problem.q)
     for sensor, sigma in zip(rows.values, posterior.noise, strict=True):
         if not sensor.certain:
@@ -76,7 +77,7 @@ def _lines_of_joint(
     lowest: int,
     least: float,
 ) -> tuple[int, ...]:
-    """Find the orders with the largest gains above `least` one by one, subtracting each from the residuals."""
+    """Find the orders with the largest gains above `least` one by one, subtracting each line from the residuals."""
     G = _sums(angle, curvature, 2 * HIGHEST + 1)
     candidates = _distinguishable(G, lowest)
     if not bool(candidates.any()):
@@ -96,7 +97,7 @@ def _lines_of_joint(
         order = int(gain.argmax())
         chance = max(
             float(gain[candidates].median()) / math.log(2), 1.0
-        )  # mean of an exponential distribution
+        )  # mean of an exponential distribution, from its median
         if float(gain[order]) < least * chance:
             break
         orders.append(order)
@@ -106,11 +107,11 @@ def _lines_of_joint(
 
 
 def _distinguishable(G: Complex128[Tensor, " _orders"], lowest: int) -> Bool[Tensor, " _orders"]:
-    """Return which orders can be distinguished: on a grid of joint values, up to half of the constant harmonic.
+    """Return the mask of orders that can be distinguished: on a grid, up to half the order that looks constant.
 
     Args:
-        G: sums of the curvature times powers of `exp(i angle)`, near G_0 for powers that are equal at all values.
-        lowest: lowest order; a joint whose values are too near to each other has no distinguishable orders.
+        G: sums of the curvature times powers of `exp(i angle)`, near G_0 for powers that are equal at all joint values.
+        lowest: lowest order; a joint whose values are too close together has no distinguishable orders.
     """
     orders = torch.arange(HIGHEST + 1)
     constant = (G.abs() > ALIKE * G[0].real).nonzero()[:, 0]

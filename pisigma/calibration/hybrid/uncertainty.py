@@ -28,16 +28,16 @@ from pisigma.measurement.sensors.sensor import numbers_of
 from pisigma.robot.kinematics.parameter_jacobian import identification_jacobian
 
 CHUNK = 128
-"""Rows whose columns are in memory at a time."""
+"""Number of rows whose columns are in memory at a time."""
 FEW_GROUPS = 600
-"""Groups up to which noise and prior sizes are estimated again for every fold that is held out."""
+"""Number of groups up to which noise and prior sizes are estimated again for every fold that is held out."""
 VERY_FEW_GROUPS = 60
-"""Groups up to which `FOLDS_OF_FEW` folds are held out: without a quarter of so few rows a calibration is much worse
-than with all of them, so its errors are not representative."""
+"""Number of groups up to which `FOLDS_OF_FEW` folds are held out: a calibration without a quarter of so few rows is
+much worse than with all rows, so its errors are not representative."""
 FOLD_UPDATES, FEWER_UPDATES, SOME_GROUPS = 3, 1, 150
-"""Updates of noise and prior sizes for every fold, the same for more groups, and the number of groups between both.
-With one update, 0.9 % fewer of 30 rows are in the predicted 95 % intervals, 0.4 % of 100 rows and 0.3 % of 300 rows;
-fitting these then takes four fifths of the time."""
+"""Number of updates of noise and prior sizes for every fold, for few and for more groups, and the number of groups
+up to which the first applies. With one update, 0.9 % fewer of 30 rows are in the predicted 95 % intervals, 0.4 % of
+100 rows and 0.3 % of 300 rows; fitting 300 rows then takes four fifths of the time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,9 +48,9 @@ class PositionUncertainty:
         space: the parameters.
         geometry: geometry at which the derivative is taken.
         features: features of the weights.
-        covariance_root: `R` with `C = R R^T` for all parameters of the space (0 for those that were not free), followed
-            by all weights, scaled so that predicted and observed held-out errors agree.
-        prior_scale: factor on the variances by this scaling.
+        covariance_root: root `R` of `C = R R^T` for all parameters of the space (0 for parameters that were not
+            free), followed by all weights, scaled so that predicted and observed held-out errors agree.
+        prior_scale: factor on the variances that results from this scaling.
         noise: noise of the sensors; empty in folders of earlier versions.
     """
 
@@ -100,8 +100,8 @@ class PositionUncertainty:
         Args:
             state: commanded joint values and stated conditions.
             q_moved: joint values with their corrections [rad or m].
-            frame: number of the frame.
-            target: number of the target.
+            frame: index of the frame.
+            target: index of the target.
         """
         space = self.space
         base, tool = list(self.geometry.bases.values())[frame], list(self.geometry.tools.values())[target]
@@ -129,7 +129,7 @@ def position_uncertainty(
     geometry: IdentifiedGeometry,
     held_out: HeldOutErrors | None = None,
 ) -> PositionUncertainty:
-    """Compute the uncertainty of positions predicted by a posterior, scaled by held-out errors.
+    """Return the uncertainty of positions predicted by a posterior, scaled by held-out errors.
 
     Args:
         rows: linearised values.
@@ -137,8 +137,8 @@ def position_uncertainty(
         fit: regression of the rows on the unknowns.
         posterior: posterior of the unknowns.
         geometry: geometry in the user's coordinates.
-        held_out: held-out predictions of this fit, if available; used if there are too many groups to estimate noise
-            and prior sizes again for every fold.
+        held_out: held-out predictions of this fit, if available; they are used if there are too many groups to
+            estimate noise and prior sizes again for every fold.
     """
     folds = rows.folds(FOLDS if rows.groups > VERY_FEW_GROUPS else FOLDS_OF_FEW, MAX_GROUPS)
     if rows.groups <= FEW_GROUPS:

@@ -1,1 +1,1 @@
-"""Identifiability: which parameters the data determine, and whether a fit is plausible."""
+"""Identifiability of parameters, sufficiency of the measurements, and plausibility of a fit."""

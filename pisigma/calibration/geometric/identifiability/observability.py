@@ -11,9 +11,9 @@ from pisigma.calibration.geometric.problem.noise import sensor_view_of
 from pisigma.calibration.geometric.problem.problem import CalibrationProblem
 
 ROUNDING = 1e-12
-"""Eigenvalue of the information over the largest one below which it is zero to rounding."""
+"""Ratio of an eigenvalue of the information to the largest one below which it is zero up to rounding."""
 SHOWN = 0.25
-"""Component of a direction above which its parameter is named."""
+"""Component of a direction above which the sentence names its parameter."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Observability:
 
 
 def observability_of(gram: Float64[Tensor, "chosen chosen"], poses: int) -> Observability:
-    """Compute the indices from a Gram matrix `J^T J`; all are 0 if the data do not determine one parameter.
+    """Compute the indices from a Gram matrix `J^T J`; all are 0 if the data do not determine every parameter.
 
     Args:
         gram: Gram matrix of the Jacobian, scaled as in `Observability`.
@@ -63,14 +63,14 @@ def observability_of(gram: Float64[Tensor, "chosen chosen"], poses: int) -> Obse
 
 
 def find_weak_directions(problem: CalibrationProblem, here: Linearisation[Tensor]) -> tuple[str, ...]:
-    """Find directions of the free arm parameters that the prior determines better than the data, one sentence each.
+    """Return a sentence for every direction of the free arm parameters that the prior determines better than the data.
 
     Base and tool are marginalised. The directions are eigenvectors of the data's information in units of the prior
     standard deviations (1 mm and 1 mrad if there is no prior).
 
     Args:
         problem: the problem with its free parameters.
-        here: its linearisation at the solution.
+        here: linearisation of the problem at the solution.
     """
     view, stated = sensor_view_of(here), problem.precision[problem.active]
     precision = view.scaled_precision(stated, problem.prior_group)
@@ -105,7 +105,7 @@ def find_weak_directions(problem: CalibrationProblem, here: Linearisation[Tensor
 
 
 def _in_words(vector: Tensor, names: list[str]) -> str:
-    """Write the large components of a direction, in units of the tolerances."""
+    """Return a text with the large components of a direction, in units of the tolerances."""
     order = vector.abs().argsort(descending=True).tolist()
     sign = 1.0 if float(vector[order[0]]) > 0 else -1.0
     text = ""

@@ -15,7 +15,7 @@ PAPER_ORDER = ("a", "d", "alpha", "theta", "beta", "base", "tool")
 
 @dataclass(frozen=True, eq=False)
 class CorrelationTable:
-    """Pearson correlations of the columns of parameters of one unit.
+    """Pearson correlations of the Jacobian's columns, for parameters of the same unit.
 
     Attributes:
         names: names of the parameters.
@@ -26,7 +26,7 @@ class CorrelationTable:
     values: Float64[np.ndarray, "parameters parameters"]
 
     def __str__(self) -> str:
-        """Write the table as text, in the form of the paper."""
+        """Return the table as text, in the form used by Park et al. 2022."""
         width = max(8, *(len(name) + 2 for name in self.names))
         lines = [" " * width + "".join(name.rjust(width) for name in self.names)]
         for name, row in zip(self.names, self.values, strict=True):
@@ -37,14 +37,15 @@ class CorrelationTable:
 
 @dataclass(frozen=True, eq=False)
 class PairwiseRedundancy:
-    """Parameters that are redundant in pairs.
+    """Parameters that are redundant in pairs, by the method of Park et al. 2022.
 
     Attributes:
         lengths: correlations of the length parameters.
         angles: correlations of the angle parameters.
-        sets: sets of parameters with proportional columns; a leading "-" marks the opposite sign of the first one.
+        sets: sets of parameters with proportional columns; a leading "-" marks the opposite sign relative to the
+            first one.
         no_effect: parameters that change no measured value.
-        kept: all parameters without the redundant ones; one of each set is kept.
+        kept: all parameters that are not redundant, with one of each set.
         tolerance: see `CORRELATION_TOLERANCE`.
     """
 
@@ -61,7 +62,7 @@ def find_pairwise_redundancy(
     sizes: Float64[np.ndarray, " parameters"],
     tolerance: float = CORRELATION_TOLERANCE,
 ) -> PairwiseRedundancy:
-    """Find redundant pairs by Park et al. 2022, section 3.2: |r| = 1 between columns of the Jacobian.
+    """Find pairs of parameters whose columns of the Jacobian have |r| = 1 (Park et al. 2022, section 3.2).
 
     Lengths and angles are compared separately. Dependencies of three or more parameters without dependent pairs are
     not found; `find_redundancy` finds them.
@@ -111,7 +112,7 @@ def _correlations(centred: np.ndarray, acting: np.ndarray) -> np.ndarray:
 
 
 def _sets(correlations: np.ndarray, tolerance: float) -> list[tuple[list[int], list[int]]]:
-    """Find sets of two or more parameters with proportional columns: their indices, and signs relative to the first."""
+    """Return sets of two or more parameters with proportional columns: indices, and signs relative to the first."""
     sets, taken = [], set()
     for first in range(len(correlations)):
         if first in taken:

@@ -1,4 +1,4 @@
-"""Detection of fits that no calibration error explains: another robot, wrong units, or swapped frame names."""
+"""Detect fits that no calibration error explains: another robot, wrong units, or swapped frame names."""
 
 import numpy as np
 import torch
@@ -12,31 +12,31 @@ from pisigma.calibration.geometric.problem.problem import CalibrationProblem
 from pisigma.files.errors import ImplausibleError, Place
 
 IMPLAUSIBLE_SHARE = 0.01
-"""Median residual as a share of the reach above which a fitted arm is implausible."""
+"""Median residual, as a share of the reach, above which a fitted arm is implausible."""
 
 DISTANCES = ("distance", "pair")
-"""Sensors of distances, which are judged as positions."""
+"""Sensors that measure distances, which are tested like positions."""
 
 LONG_SHARE = 0.1
-"""Length of a link as a share of the reach above which the link is long."""
+"""Length of a link, as a share of the reach, above which the link is long."""
 RUINED_SHARE = 0.5
-"""Relative change of a long link above which the fit is implausible."""
+"""Relative change of the length of a long link above which the fit is implausible."""
 FAR_OFF = 10.0
-"""Residual over the median residual of the other frames above which a row is far off."""
+"""Ratio of a residual to the median residual of the other frames above which the row does not fit."""
 NOTICED = 1e-6
-"""[m] Smaller residuals are never far off."""
+"""Residual below which a row always fits [m]."""
 OFF_SHARE = 0.2
-"""Share of a frame's rows that must be far off."""
+"""Share of a frame's rows that must not fit before a warning is given."""
 
 
 def refuse_implausible(problem: CalibrationProblem, here: Linearisation[Tensor], source: str) -> None:
     """Refuse a fit of the arm with large residuals of most positions or distances, or with impossible links.
 
-    If no parameter of the arm is free (only base and tool), nothing is refused. Touches and corners are not judged.
+    If no parameter of the arm is free (only base and tool), nothing is refused. Touches and corners are not tested.
 
     Args:
         problem: the problem with its free parameters.
-        here: its linearisation at the solution.
+        here: linearisation of the problem at the solution.
         source: name of the measurements in error messages.
 
     Raises:
@@ -67,7 +67,7 @@ def refuse_implausible(problem: CalibrationProblem, here: Linearisation[Tensor],
 
 
 def _refuse_ruined_links(problem: CalibrationProblem, point: Tensor, source: str) -> None:
-    """Refuse an arm with long links that changed by half, as with metres in a column of millimetres.
+    """Refuse an arm with long links that changed by half, for example because metres are in a column of millimetres.
 
     Raises:
         ImplausibleError: a long link changed by more than half of its length.
@@ -92,11 +92,11 @@ def _refuse_ruined_links(problem: CalibrationProblem, point: Tensor, source: str
 def misfitting_frames(
     problem: CalibrationProblem, here: Linearisation[Tensor]
 ) -> tuple[CalibrationWarning, ...]:
-    """Warn of frames with far larger residuals than the others.
+    """Return warnings about frames with far larger residuals than the other frames.
 
     Args:
         problem: the problem with its free parameters.
-        here: its linearisation at the solution.
+        here: linearisation of the problem at the solution.
     """
     frames = problem.space.frames
     if len(frames) < 2:
@@ -126,7 +126,7 @@ def misfitting_frames(
 
 
 def residual_sizes(problem: CalibrationProblem, here: Linearisation[Tensor]) -> Float64[Tensor, " rows"]:
-    """Compute the length of every row's residual per component [m]; NaN where no length was measured."""
+    """Compute the length of every row's residual per component [m]; NaN if no length was measured."""
     sizes = problem.q.new_full((problem.rows,), torch.nan)
     for sensor, sums in zip(problem.sensors, sensor_view_of(here).sums, strict=True):
         if sensor.unit == "m" and not sensor.certain:

@@ -11,29 +11,29 @@ from pisigma.calibration.geometric.problem.information import Information
 from pisigma.calibration.geometric.problem.parameters import Parameter
 
 RANK_TOLERANCE = 1e-6
-"""Singular value of the column-scaled Jacobian over the largest one below which it is treated as zero."""
+"""Ratio of a singular value of the column-scaled Jacobian to the largest one below which it is treated as zero."""
 NO_EFFECT = 1e-9
-"""Length of a column over the longest one below which it is treated as zero."""
+"""Ratio of the length of a column to the longest one below which it is treated as zero."""
 PREFERENCE = ("base", "tool", "theta", "a", "d", "alpha", "beta")
-"""Order in which parameters are kept; each class has ten times the weight of the next."""
+"""Order in which kinds of parameters are preferred; each has ten times the weight of the next."""
 _WEIGHT = {group: 10.0**-rank for rank, group in enumerate(PREFERENCE)}
 CLEARLY_SEEN = 1.0
-"""Standard deviation [mm or mrad] by the data alone below which a parameter is added."""
+"""Standard deviation [mm or mrad] from the data alone below which a parameter is added."""
 EXPLAINED = 0.5
-"""Share of the residual sum of squares that all further parameters must explain to be added,"""
+"""Share of the residual sum of squares that further parameters must explain in order to be added."""
 SIGNIFICANT = 20.0
-"""and the F statistic that this must have."""
+"""F statistic that further parameters must reach in order to be added."""
 VISIBLE = 1e-7
 """Share of a column's length orthogonal to the kept columns below which it is treated as dependent."""
 
 
 @dataclass(frozen=True)
 class Dependency:
-    """A linear combination of parameters that is identifiable although the single parameters are not.
+    """A linear combination of parameters that is identifiable although the individual parameters are not.
 
     Attributes:
-        names: the parameter that is kept, followed by those that depend on it.
-        coefficients: coefficients of the combination in SI units; 1 for the first.
+        names: the parameter that is kept, followed by the parameters that depend on it.
+        coefficients: coefficients of the combination in SI units; 1 for the first parameter.
         sentence: the dependency as a sentence.
     """
 
@@ -44,16 +44,16 @@ class Dependency:
 
 @dataclass(frozen=True, eq=False)
 class Redundancy:
-    """Redundancy of the parameters by the Jacobian at the start.
+    """Redundancy of the parameters, determined from the Jacobian at the start.
 
-    Angles of base and tool are small rotations about their own axes.
+    Angles of base and tool are small rotations about the axes of base and tool.
 
     Attributes:
         information: the condensed Jacobian.
         rank: number of independent combinations of parameters that the data determine.
         tolerance: tolerance of the rank, relative to the largest singular value.
-        kept: the identifiable subset that was chosen, with `rank` parameters.
-        removed: parameters whose columns are combinations of those of the kept ones.
+        kept: the chosen identifiable subset of `rank` parameters.
+        removed: parameters whose columns are linear combinations of columns of kept parameters.
         no_effect: parameters that change no measured value.
     """
 
@@ -78,11 +78,11 @@ class Redundancy:
 
     @cached_property
     def dependencies(self) -> tuple[Dependency, ...]:
-        """The identifiable combinations, one for every kept parameter with dependent ones."""
+        """Identifiable combinations, one for every kept parameter on which others depend."""
         return _dependencies(self.information, self.kept, self.removed)
 
     def dependency_sentence_of(self, name: str) -> str | None:
-        """Return the (shortest) sentence on the dependency of a parameter; None if there is none."""
+        """Return the shortest sentence about a dependency of a parameter; None if it has no dependency."""
         having = [dependency for dependency in self.dependencies if name in dependency.names]
         return min(having, key=lambda dependency: len(dependency.names)).sentence if having else None
 
@@ -93,8 +93,8 @@ class RankFindings:
 
     Attributes:
         sizes: values of the candidates at the start.
-        redundancy: their redundancy there.
-        extended: indices of parameters that were added later.
+        redundancy: redundancy of the candidates at the start.
+        extended: indices of parameters that were added after the start.
         estimated: number of unknowns to estimate; see `sufficiency.free_parameters`.
     """
 
@@ -105,22 +105,22 @@ class RankFindings:
 
     @property
     def information(self) -> Information:
-        """The condensed Jacobian of the candidates at the start."""
+        """Condensed Jacobian of the candidates at the start."""
         return self.redundancy.information
 
 
 def find_redundancy(
     information: Information, sizes: Float64[np.ndarray, " parameters"], tolerance: float = RANK_TOLERANCE
 ) -> Redundancy:
-    """Find the rank, an identifiable subset of the parameters and the dependencies of the others on it.
+    """Find the rank, an identifiable subset of the parameters, and the dependencies of the other parameters on it.
 
     The rank is that of the Jacobian with columns of unit length. The subset is the first `rank` pivots of a QR
     factorisation with column pivoting (Businger and Golub 1965) of these columns times their preference.
 
     Args:
         information: the condensed Jacobian.
-        sizes: nominal values. Of parameters with equal columns the one with the larger value is kept: parallel axes
-            keep the d that is a real offset.
+        sizes: nominal values. Of parameters with equal columns, the one with the larger value is kept: of parallel
+            axes, the d that is a real offset.
         tolerance: see `RANK_TOLERANCE`.
     """
     jacobian, names = information.jacobian, np.array(information.names)
@@ -128,7 +128,7 @@ def find_redundancy(
     scale = np.divide(preference, lengths, out=np.zeros_like(lengths), where=lengths > 0)
     triangle, pivots = pivoted_qr(jacobian * scale)
     rank = _rank(triangle / preference[pivots], tolerance)
-    acting = int((lengths > 0).sum())  # the others are the last pivots
+    acting = int((lengths > 0).sum())  # the dependent columns are the last pivots
 
     def named(columns: Int64[np.ndarray, " some"]) -> tuple[str, ...]:
         return tuple(names[np.sort(columns)].tolist())
@@ -152,9 +152,9 @@ def _singular_values(A: Float64[np.ndarray, "rows columns"]) -> Float64[np.ndarr
 def _rank(R: Float64[np.ndarray, "rank columns"], tolerance: float) -> int:
     """Compute the numerical rank of a triangle with columns of unit length (or zero).
 
-    The largest singular value is between 1 and the square root of the number of columns. So the rank is k if the block
+    The largest singular value is between 1 and the square root of the number of columns, so the rank is k if the block
     below row k is shorter than the tolerance and the inverse of the leading k x k block is short enough. This bound
-    nearly always decides, so the singular values need not be computed.
+    is nearly always conclusive, so the singular values need not be computed.
     """
     from scipy.linalg.lapack import dtrtri  # imported here, because models are loaded without scipy
 
@@ -170,7 +170,7 @@ def _rank(R: Float64[np.ndarray, "rank columns"], tolerance: float) -> int:
 def selection_weights(
     parameters: Sequence[Parameter], sizes: Float64[np.ndarray, " parameters"]
 ) -> Float64[np.ndarray, " parameters"]:
-    """Compute the weights that decide which parameters are kept; of equal ones, the first is kept."""
+    """Compute the weights by which parameters are selected; of parameters with equal weights, the first is kept."""
     weights = np.array([_WEIGHT[parameter.group] for parameter in parameters])
     result: np.ndarray = weights * (1 + 1e-3 * (np.abs(sizes) > 1e-9) - 1e-6 * np.arange(len(weights)))
     return result
@@ -195,7 +195,7 @@ def _dependencies(
     kept, removed = ([number[name] for name in names] for names in (kept_names, removed_names))
     J = information.jacobian
     lengths = np.linalg.norm(J, axis=0)
-    # Every removed column as a combination of the kept ones, all with unit length so that 1e-6 is negligible.
+    # Every removed column is a combination of kept ones; all have unit length, so that 1e-6 is negligible.
     scaled, *_ = np.linalg.lstsq(J[:, kept] / lengths[kept], J[:, removed] / lengths[removed], rcond=None)
     usual = np.array([parameter.usual_error for parameter in information.parameters])
     dependencies = []
@@ -216,7 +216,7 @@ def _dependencies(
 
 
 def dependency_sentence(members: list[Parameter], coefficients: list[float]) -> str:
-    """Write that only a combination is identifiable: "d_2 + d_3 + d_4 is identified, the single values are not"."""
+    """Return a sentence such as "d_2 + d_3 + d_4 is identified, the single values are not"."""
     terms = sorted(zip(members, coefficients, strict=True), key=lambda term: (term[1] < 0, term[0].name))
     text = ""
     for member, coefficient in terms:
@@ -230,20 +230,20 @@ def dependency_sentence(members: list[Parameter], coefficients: list[float]) -> 
 
 
 def additional_columns(information: Information, kept: int) -> list[int]:
-    """Find columns that the data determine in addition to the kept ones.
+    """Find columns that the data determine in addition to the kept columns.
 
-    Nominal axes are exactly parallel or intersect exactly, but real ones do not, so dependencies of the nominal robot
-    are only approximate for the real one. Columns are added one by one while the standard error of the next one is
-    below a typical error, or all of them if the residuals show that they are needed (as with exact data).
+    Nominal axes are exactly parallel or intersect exactly, but real axes do not, so dependencies of the nominal
+    robot are only approximate for the real robot. Columns are added one by one while the standard error of the next
+    one is below a typical error, or all of them if the residuals show that they are needed (as with exact data).
 
     Args:
         information: information on all candidates near the solution, with rows in standard deviations.
-        kept: number of leading columns that are estimated anyway.
+        kept: number of leading columns that are already estimated.
 
     Returns:
         Columns to add, the best determined first.
     """
-    # Below the rows of the kept columns, the triangle contains the components orthogonal to these.
+    # Below the rows of the kept columns, the triangle contains the components orthogonal to these columns.
     rest, left = information.jacobian[kept:, kept:], information.residual[kept:]
     pivots = _pivots(rest, VISIBLE * np.linalg.norm(information.jacobian[:, kept:], axis=0))
     clear = sum(size >= 1 / CLEARLY_SEEN for _, size in pivots)
@@ -253,7 +253,7 @@ def additional_columns(information: Information, kept: int) -> list[int]:
 
 
 def _pivots(rest: np.ndarray, rounding: np.ndarray) -> list[tuple[int, float]]:
-    """Compute the pivots of a QR factorisation with column pivoting, and their lengths orthogonal to earlier ones."""
+    """Compute the pivots of a QR factorisation with column pivoting, and their lengths orthogonal to earlier pivots."""
     rest = rest.copy()
     pivots: list[tuple[int, float]] = []
     while rest.shape[1]:

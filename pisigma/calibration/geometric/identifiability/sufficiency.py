@@ -1,4 +1,4 @@
-"""Sufficiency of measurements for the free parameters: what they leave undetermined, and what to measure next."""
+"""Check whether measurements are sufficient for the free parameters, and advise what to measure next."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -18,11 +18,11 @@ from pisigma.robot.kinematics.forward import forward_kinematics
 
 @dataclass(frozen=True)
 class CalibrationWarning:
-    """Something that the measurements do not determine, or that does not fit, and what to do about it.
+    """A warning about what measurements do not determine, or what does not fit, with the action to take.
 
     Attributes:
         kind: kind of the warning.
-        subject: name of the joint, target or frame concerned; empty if it concerns all measurements.
+        subject: name of the joint, target or frame concerned; empty if the warning concerns all measurements.
         sentence: the warning as a sentence.
     """
 
@@ -43,15 +43,16 @@ class CalibrationWarning:
 
 
 LITTLE_MOTION = 0.1
-"""[rad or m] Range of a joint below which its errors are hardly identifiable."""
+"""Range of a joint [rad or m] below which its errors are hardly identifiable."""
 NEAR_AXIS = 5e-3
-"""Distance of a target from the last axis, as a share of the reach, below which that joint's errors hardly show."""
+"""Distance of a target from the last axis, as a share of the reach, below which errors of this joint have little
+effect."""
 GOOD_RATIO = 3
-"""Values per parameter that a calibration should have."""
+"""Number of values per parameter that a calibration should have."""
 MIN_EFFECT = 1e-3
-"""Length of a parameter's column over the longest one above which the parameter can determine the scale."""
+"""Ratio of the length of a parameter's column to the longest one above which the parameter can determine the scale."""
 SAME_FACE = 1e-6
-"""[m] Largest difference of coordinates on one face."""
+"""Largest difference of coordinates [m] on one face."""
 TOUCHES_WITHOUT_SCALE = (
     "the touches of every frame and axis are at one coordinate, which a robot of any size fits, so the scale stays "
     "nominal; touch faces at different coordinates along an axis."
@@ -67,7 +68,7 @@ def free_parameters(redundancy: Redundancy, explicit: bool, unknowns: int) -> in
 
     Args:
         redundancy: redundancy of the candidates at the start.
-        explicit: whether the candidates were named one by one.
+        explicit: whether the candidates were named individually.
         unknowns: number of the sensors' unknowns, such as the positions of sockets.
     """
     acting = len(redundancy.names) - len(redundancy.no_effect)
@@ -92,7 +93,7 @@ def refuse_too_few(
     values = distinct_values(problem)
     if values > free_parameters(redundancy, explicit, unknowns):
         return
-    # Not the rank, which is at most the number of values.
+    # The rank cannot be used, because it is at most the number of values.
     most = free_parameters(redundancy, True, unknowns)
     raise IdentificationError(
         f"expected more values than the {most} free parameters, got {values} values from {distinct_rows(problem)} "
@@ -105,7 +106,7 @@ def refuse_too_few(
 
 
 def measurement_advice(setup: CalibrationSetup, estimated: int) -> tuple[CalibrationWarning, ...]:
-    """Warn of free parameters that the data hardly determine, and say what to measure next.
+    """Return warnings about free parameters that the data hardly determine, with advice on what to measure next.
 
     Args:
         setup: the problem at its start.
@@ -135,18 +136,18 @@ def _missing_poses(problem: CalibrationProblem, estimated: int) -> int:
 
 
 def distinct_rows(problem: CalibrationProblem) -> int:
-    """Count the rows that differ in joint values, frame or target."""
+    """Return the number of rows that differ in joint values, frame or target."""
     return problem.q.shape[0] if problem.pose is None else int(problem.pose.max()) + 1
 
 
 def distinct_values(problem: CalibrationProblem) -> int:
-    """Count the measured values, with repeats counted once."""
+    """Return the number of measured values, with repeats counted once."""
     share = distinct_rows(problem) / problem.q.shape[0]
     return round(sum(problem.values_measured) * share)
 
 
 def _unexcited_joints(robot: Robot, problem: CalibrationProblem) -> list[CalibrationWarning]:
-    """Warn of every joint that hardly moves."""
+    """Yield a warning for every joint that hardly moves."""
     span = (problem.q.amax(0) - problem.q.amin(0)).tolist()
     warnings = []
     for joint, moved in zip(robot.joints, span, strict=True):
@@ -161,7 +162,7 @@ def _unexcited_joints(robot: Robot, problem: CalibrationProblem) -> list[Calibra
 
 
 def _targets_on_axis(robot: Robot, problem: CalibrationProblem) -> list[CalibrationWarning]:
-    """Warn if all targets are too near to the last axis and only positions were measured."""
+    """Yield a warning if all targets are too near to the last axis and only positions were measured."""
     if any(sensor.turning for sensor in problem.sensors) or robot.joints[-1].type != "revolute":
         return []
     last = robot.joint_rows[-1]
@@ -185,7 +186,7 @@ def _targets_on_axis(robot: Robot, problem: CalibrationProblem) -> list[Calibrat
 
 
 def _undetermined(setup: CalibrationSetup) -> tuple[CalibrationWarning, ...]:
-    """Warn of what a setup cannot determine with any poses, and say what to measure for it."""
+    """Yield warnings about what a setup cannot determine with any poses, and what to measure instead."""
     return (*_scale(setup), *_touched_frames(setup), *_floating_frames(setup))
 
 
@@ -193,7 +194,7 @@ def determines_scale(setup: CalibrationSetup) -> bool:
     """Return whether the measurements determine the scale.
 
     Sockets fit a robot of any size; touches determine lengths by faces at different coordinates. Orientations alone do
-    not determine the scale, but lengths then have no effect either, so nothing must be fixed.
+    not determine the scale, but lengths then have no effect either, so no length has to be fixed.
     """
     data = setup.measurements
     lengths = _lengths(setup)
@@ -212,8 +213,9 @@ def candidates_at_start(
 ) -> tuple[list[int], Information]:
     """Compute the information on the candidates at the start, with the sensors' unknowns eliminated.
 
-    If the data do not determine the scale, the longest length with an effect keeps its nominal value. Otherwise errors
-    of the nominal geometry would seem to determine it, and a robot that shrinks to a point fits all sockets.
+    If the data do not determine the scale, the longest length with an effect keeps its nominal value. Otherwise
+    errors of the nominal geometry would seem to determine the scale, and a robot that shrinks to a point would fit
+    all sockets.
 
     Args:
         setup: the problem at its start.
@@ -255,7 +257,7 @@ def without_sensor_unknowns(setup: CalibrationSetup, information: Information) -
 
 
 def _scale_of_boards(setup: CalibrationSetup) -> str:
-    """Write that only boards determine the scale, and how accurately."""
+    """Yield a warning if only boards determine the scale, which states how accurately."""
     stated = [float(text) for text in texts_of(setup.measurements, SCALE_COLUMN) if text]
     how_sure = (
         f"the stated standard deviation of its squares is {max(stated):.2g} of their length, which is "
@@ -270,7 +272,7 @@ def _scale_of_boards(setup: CalibrationSetup) -> str:
 
 
 def _lengths(setup: CalibrationSetup) -> set[str]:
-    """List the sensors that measure lengths."""
+    """Return the sensors that measure lengths."""
     stated = (IntrinsicsSensor.name, BoardScaleSensor.name)
     return {
         sensor.name for sensor in setup.problem.sensors if sensor.unit == "m" and sensor.name not in stated
@@ -288,7 +290,7 @@ def _scale(setup: CalibrationSetup) -> list[CalibrationWarning]:
 
 
 def _touched_frames(setup: CalibrationSetup) -> list[CalibrationWarning]:
-    """Warn of every frame that is touched along some axes only."""
+    """Yield a warning for every frame that is touched along some axes only."""
     data = setup.measurements
     if data.touch is None or data.touch_axis is None or not setup.problem.space.indices_of("base"):
         return []
@@ -309,7 +311,7 @@ def _touched_frames(setup: CalibrationSetup) -> list[CalibrationWarning]:
 
 
 def floating_frames(setup: CalibrationSetup) -> list[str]:
-    """List the frames in which no measurement has a stated position, so that everything in them may move together."""
+    """Return the frames without a measurement at a stated position, in which everything may move together."""
     data, sensors = setup.measurements, setup.problem.sensors
     if all(sensor.holds_frame for sensor in sensors):
         return []
@@ -321,7 +323,7 @@ def floating_frames(setup: CalibrationSetup) -> list[str]:
 
 
 def floating_bases(setup: CalibrationSetup) -> list[int]:
-    """List the indices of the parameters of bases in floating frames, which keep their start values."""
+    """Return the indices of the parameters of bases in floating frames, which keep their start values."""
     space, floating = setup.problem.space, floating_frames(setup)
     return [
         index

@@ -1,1 +1,1 @@
-"""Initial guesses of bases, tools, sockets and anchors, so that the user need not give any."""
+"""Initial guesses of bases, tools, sockets and anchors, which the user therefore need not state."""

@@ -27,20 +27,20 @@ from pisigma.robot.se3 import (
 )
 
 GUESS_STEPS = 2
-"""Steps that refine a closed-form guess with large residuals."""
+"""Number of steps that refine a closed-form guess with large residuals."""
 CLEAR_FIT = 5e-3
-"""RMS residual as a share of the reach below which a result is accepted without trying other starts."""
+"""RMS residual, as a share of the reach, below which a result is accepted without trying other starts."""
 
 
 @dataclass(frozen=True, eq=False)
 class BaseToolFit:
-    """Base and tool that fit the measurements best, with a fixed arm.
+    """Base and tool that fit the measurements best with a fixed arm.
 
     Attributes:
-        robot: the robot with base and tool set; with several targets the tool of the first.
+        robot: the robot with the fitted base and tool; with several targets, the tool of the first target.
         tools: tool of every target: x, y, z [m], roll, pitch, yaw [rad].
         problem: the least-squares problem.
-        solution: its solution.
+        solution: solution of the least-squares problem.
     """
 
     robot: Robot
@@ -86,14 +86,15 @@ def fit_base_and_tool(
     """Fit base and tool of a robot to measured poses or positions; no initial guess is needed.
 
     A closed-form start (see `base_and_tool_starts`) is refined by least squares on base (6) and tool: 6 parameters if
-    rotations were measured; else the position of every target, with the orientation of the tool fixed. The weights are
-    1 / sigma if the measurements state it; otherwise the inverse of the scatter of positions and of rotations.
+    rotations were measured; otherwise the position of every target, with the orientation of the tool fixed. The
+    weights are 1 / sigma if the measurements state it; otherwise the inverse of the scatter of positions and of
+    rotations.
 
     Args:
-        robot: the robot; its base and tool are not used as a guess, they only set what the data do not determine.
+        robot: the robot; its base and tool are not used as a guess, but only for what the data do not determine.
         measurements: rows with `position`, and `rotation` if measured, all in one frame.
-        free_base: whether to fit the base; else that of the robot is used.
-        free_tool: whether to fit the tool; else that of the robot is used.
+        free_base: whether to fit the base; otherwise the base of the robot is used.
+        free_tool: whether to fit the tool; otherwise the tool of the robot is used.
         maximum_iterations: maximum number of steps.
 
     Raises:
@@ -167,7 +168,7 @@ def _solved(robot: Robot, problem: BaseToolProblem, maximum_iterations: int) -> 
 
 
 def _off(robot: Robot, problem: BaseToolProblem, solution: Solution[BaseToolState]) -> tuple[float, bool]:
-    """Compute the size of the residuals of a solution [m], and say whether those of positions are small.
+    """Return the size of the residuals of a solution [m], and whether residuals of positions are small.
 
     Angles are converted to lengths at the reach of the arm. The cost cannot be compared, because every search divides
     it by its own noise.
@@ -189,13 +190,13 @@ def _rms_rotation(problem: BaseToolProblem, state: BaseToolState) -> float:
 
 
 MIN_TOUCHES = 4
-"""Touches along an axis needed to determine its direction."""
+"""Smallest number of touches along an axis that determine its direction."""
 MIN_SPREAD_RATIO = 0.03
-"""Smallest over largest spread of the tips needed to determine a direction."""
+"""Ratio of the smallest to the largest spread of the tips that is needed to determine a direction."""
 REFINEMENTS = 10
-"""Gauss-Newton steps after the linear solution of a touched frame."""
+"""Number of Gauss-Newton steps after the linear solution of a touched frame."""
 MAX_RMS_SHARE = 0.05
-"""Largest RMS residual of the touches with a guess, as a share of the reach."""
+"""Largest RMS residual of the touches for an accepted guess, as a share of the reach."""
 BASE_UNKNOWNS = 6
 
 

@@ -1,4 +1,4 @@
-"""Closed-form starts for base and tool, which need no guess."""
+"""Closed-form start values for base and tool, which require no guess."""
 
 import itertools
 from collections.abc import Iterator
@@ -13,17 +13,17 @@ from pisigma.robot.se3 import nearest_rotation, rotation_from_rpy
 
 MAX_ITERATIONS = 60
 LINEAR_ROWS = 13
-"""Rows that determine base and tool by a linear system."""
+"""Smallest number of rows that determine base and tool by a linear system."""
 DEPENDENT = 1e-9
-"""Singular value of the linear system over the largest one below which it is treated as zero."""
+"""Ratio of a singular value of the linear system to the largest one below which it is treated as zero."""
 UNDETERMINED = 1e-9
-"""Relative weight of the given rotation, which sets what points do not determine."""
+"""Relative weight of the given rotation, which is used for what points do not determine."""
 SINGLE = 0.9
-"""Second over first singular value above which the rotations may not be unique."""
+"""Ratio of the second to the first singular value above which the rotations may not be unique."""
 
 
 def base_and_tool_starts(robot: Robot, problem: BaseToolProblem) -> Iterator[BaseToolState]:
-    """Yield starts to refine and compare; one suffices except for positions of few or special poses.
+    """Yield starts to refine and compare; one is sufficient except for positions of few or special poses.
 
     Args:
         robot: the robot, whose base and tool are used if they are not free or not determined.
@@ -32,7 +32,7 @@ def base_and_tool_starts(robot: Robot, problem: BaseToolProblem) -> Iterator[Bas
     like = problem.position
     R_tool, R_base = (rotation_from_rpy(like.new_tensor(frame[3:])) for frame in (robot.tool, robot.base))
     point, p_base = like.new_tensor(robot.tool[:3]), like.new_tensor(robot.base[:3])
-    # Rows with a rotation determine both frames; positions of several targets share a base only, so one target is used.
+    # Rows with a rotation determine both frames; positions of several targets share only a base, so one target is used.
     rows = problem.rotated if problem.has_rotations else problem.target == problem.target.mode().values
     R_flange, p_flange = problem.R_flange[rows], problem.p_flange[rows]
     position, rotation = problem.position[rows], problem.rotation[rows]
@@ -79,8 +79,8 @@ def start_from_poses(
     `K vec(Z) = rows · vec(R_base)` with `K = Σ R_measured ⊗ R_flange` (Shah 2013, J. Mechanisms Robotics 5(3), in
     row-major order). If the leading singular value of K is not single (all axes parallel, as in a SCARA), its vectors
     are not rotations. Therefore the pair that maximises `vec(R_base)^T K vec(Z)` is found by alternating projections
-    onto the rotations, starting at the singular vector and, if this is not unique, also at the nominal tool, which is
-    preferred among equal ones, and the 24 rotations of a cube. The translations are then linear.
+    onto the rotations, starting at the singular vector and, if this is not unique, also at the nominal tool, which
+    is preferred among equally good pairs, and the 24 rotations of a cube. The translations are then linear.
 
     Returns:
         R_base, p_base [m], R_tool, p_tool [m].
@@ -102,7 +102,7 @@ def start_from_poses(
         agreement = ((R_base.reshape(-1, 9) @ K) * Z.reshape(-1, 9)).sum(-1)
         if (agreement - before).abs().max() < 1e-12:
             break
-    # The first of the equally good ones: the nominal tool comes first, then the singular vectors.
+    # Take the first of equally good pairs: the nominal tool comes first, then the singular vectors.
     best = int((agreement > agreement.max() - 1e-9).nonzero()[0, 0])
     p_base, p_tool = _translations(R_base[best], R_flange, p_flange, position)
     return R_base[best], p_base, Z[best].mT, p_tool
@@ -117,9 +117,9 @@ def starts_from_positions(
 ) -> Iterator[tuple[Float64[Tensor, "3 3"], Float64[Tensor, " 3"], Float64[Tensor, " 3"]]]:
     """Yield starts for `position = R_base (R_flange · point + p_flange) + p_base`, to refine and compare.
 
-    The first is that of `start_from_products`, if there are enough rows. The others assume a point (the nominal one,
-    zero, a tenth of the reach along each axis) and fit the base by Procrustes analysis, for singular linear systems, as
-    with parallel axes or few rows.
+    The first start is from `start_from_products`, if there are enough rows. The others assume a point (the nominal
+    point, zero, a tenth of the reach along each axis) and fit the base by Procrustes analysis, for singular linear
+    systems, for example of parallel axes or few rows.
 
     Yields:
         R_base, p_base [m], point [m].
@@ -159,7 +159,7 @@ def fit_base_to_points(
 ) -> tuple[Float64[Tensor, "3 3"], Float64[Tensor, " 3"]]:
     """Fit rotation and position [m] of the base to points in the base and their measured positions.
 
-    If the points are on one line, or fewer than three, `like` sets the rotation that they do not determine.
+    If the points are on one line, or there are fewer than three, `like` determines the rest of the rotation.
     """
     R_base = _procrustes(points, position, like)
     return R_base, (position - points @ R_base.mT).mean(0)
@@ -175,7 +175,7 @@ def _tool_start(
     turned: bool,
     R_tool: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Fit the tool with a fixed base, as the mean over the rows."""
+    """Return the tool for a fixed base, as the mean over the rows."""
     in_base = (position - p_base) @ R_base
     point = (R_flange.mT @ (in_base - p_flange)[..., None])[..., 0].mean(0)
     if turned:
@@ -184,7 +184,7 @@ def _tool_start(
 
 
 def _mean_turn(R_base: Tensor, R_flange: Tensor, rotation: Tensor) -> Tensor:
-    """Fit the rotation of the tool with a fixed rotation of the base."""
+    """Return the rotation of the tool for a fixed rotation of the base."""
     return nearest_rotation((R_flange.mT @ R_base.mT @ rotation).sum(0))
 
 
@@ -199,8 +199,7 @@ def _least_squares(
 ) -> Float64[Tensor, "columns values"]:
     """Solve `A x = b` in least squares; the minimum-norm solution if columns are dependent.
 
-    The singular values needed for that are only computed if the inverse of the triangle does not already show that
-    none is negligible.
+    Singular values are computed only if the inverse of the triangle does not show that none of them is negligible.
     """
     Q, R = torch.linalg.qr(A)
     inverse = torch.linalg.solve_triangular(R, torch.eye(R.shape[-1]).to(R), upper=True)
@@ -216,7 +215,7 @@ def _translations(
     p_flange: Float64[Tensor, "rows 3"],
     position: Float64[Tensor, "rows 3"],
 ) -> tuple[Float64[Tensor, " 3"], Float64[Tensor, " 3"]]:
-    """Fit the positions of base and tool with a fixed rotation of the base, which is a linear problem.
+    """Return the positions of base and tool for a fixed rotation of the base, which is a linear problem.
 
     In the axes of the base, the regressor of a row is `[1 R_flange]`. As rotations are orthogonal, the normal matrix
     depends only on the mean of R_flange.

@@ -1,4 +1,4 @@
-"""Base and tool of a fixed arm as a small least-squares problem."""
+"""Fit of base and tool of a fixed arm as a small least-squares problem."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -19,7 +19,7 @@ from pisigma.robot.se3 import rotation_from_vector, skew
 
 @dataclass(frozen=True, eq=False)
 class BaseToolState:
-    """Base and tool during the fit.
+    """Values of base and tool during the fit.
 
     Attributes:
         R_base: rotation of the base.
@@ -36,7 +36,7 @@ class BaseToolState:
 
 @dataclass(frozen=True, eq=False)
 class _View:
-    """Normal matrix, descent and cost of positions and of rotations, and their standard deviations."""
+    """Normal matrix, right side and cost of positions and of rotations, and their standard deviations."""
 
     blocks: tuple[tuple[Tensor, Tensor, float], ...]
     noise: tuple[float, float]
@@ -44,17 +44,17 @@ class _View:
 
 @dataclass(frozen=True, eq=False)
 class BaseToolProblem(AbstractLeastSquares[BaseToolState]):
-    """Flange poses and measurements.
+    """Least-squares problem of flange poses and measurements.
 
     The unknowns are the shift [m] and rotation [rad] of the base (about its origin, in the measuring frame), and the
     points (3 per target) [m] and the rotation [rad] of the tool in the frame of the last row.
 
     Attributes:
         R_flange: rotations of the last row's frame in the first row's frame.
-        p_flange: its positions [m].
+        p_flange: positions of the last row's frame in the first row's frame [m].
         position: measured positions [m].
-        rotation: measured rotations where `rotated`, the identity elsewhere.
-        rotated: whether a row has a measured rotation.
+        rotation: measured rotations; the identity in rows without one.
+        rotated: mask of the rows with a measured rotation.
         target: index of every row's target.
         targets: names of the targets.
         sigma_position: standard deviation of every row [m]; None to estimate the scatter.
@@ -92,7 +92,7 @@ class BaseToolProblem(AbstractLeastSquares[BaseToolState]):
 
     @cached_property
     def step_scale(self) -> Float64[Tensor, " active"]:
-        """1 mm and 1 mrad."""
+        """Typical size of every unknown: 1 mm or 1 mrad."""
         return torch.full((len(self.active),), 1e-3, dtype=torch.float64, device=self.position.device)
 
     def residuals(self, state: BaseToolState) -> tuple[Float64[Tensor, "rows 3"], Float64[Tensor, "rows 3"]]:
@@ -152,7 +152,7 @@ class BaseToolProblem(AbstractLeastSquares[BaseToolState]):
         return Linearisation(point, cost, descent, normal, cost, rounding, view)
 
     def apply_step(self, point: BaseToolState, step: Float64[Tensor, " active"]) -> BaseToolState:
-        """Rotate and shift base and tool."""
+        """Return base and tool after a step."""
         full = step.new_zeros(9 + 3 * len(self.targets)).index_copy(0, self.active, step)
         return BaseToolState(
             R_base=rotation_from_vector(full[3:6]) @ point.R_base,
@@ -251,7 +251,7 @@ def build_base_and_tool_problem(
 
 
 def _rotations(measurements: Measurements, keep: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the measured rotations of the rows to keep (the identity without one), and where there is one."""
+    """Return the measured rotations of the rows to keep (or the identity), and the mask of measured rotations."""
     eye = torch.eye(3, dtype=measurements.q.dtype, device=measurements.q.device)
     if measurements.rotation is None:
         count = int(keep.sum())
@@ -262,7 +262,7 @@ def _rotations(measurements: Measurements, keep: Tensor) -> tuple[Tensor, Tensor
 
 
 def _given(sigma: Tensor | None, keep: Tensor, used: Tensor) -> Tensor | None:
-    """Return the standard deviations of the rows to keep; None if not all used ones are stated."""
+    """Return the standard deviations of the rows to keep; None if not all used values state one."""
     if sigma is None or not bool(torch.isfinite(sigma[keep][used]).all()):
         return None
     return torch.where(used, sigma[keep], 1.0)

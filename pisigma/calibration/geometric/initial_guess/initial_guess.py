@@ -1,4 +1,4 @@
-"""Initial guess of bases, tools and the sensors' unknowns, with the nominal arm."""
+"""Initial guess of bases, tools and unknowns of sensors, with the nominal arm."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -33,25 +33,25 @@ from pisigma.robot.se3 import (
 )
 
 GUESS_ROWS = 1_024
-"""Rows used to guess base and tool."""
+"""Largest number of rows used to guess base and tool."""
 MIN_POSITIONS = 9
-"""Positions below which a frame's base is guessed with the tools of other frames."""
+"""Number of positions below which a frame's base is guessed with the tools of other frames."""
 MIN_POSITIONS_TOUCHED = 5
-"""Positions in a touched frame that suffice for base and tool in closed form."""
+"""Number of positions in a touched frame that are sufficient for base and tool in closed form."""
 MIN_TURN = 0.02
 """Singular value per row below which orientations in sockets do not determine a direction of the tool, which then
-stays nominal."""
+keeps its nominal value."""
 
 
 @dataclass(frozen=True, eq=False)
 class InitialGuess:
-    """Initial values in the user's coordinates.
+    """Initial values of bases, tools and unknowns of sensors, in the user's coordinates.
 
     Attributes:
         bases: base in every frame: x, y, z [m], roll, pitch, yaw [rad].
         tools: tool of every target, in the same form.
         unknowns: unknowns of every owner in its frame, by group of the sensors' unknowns [m or rad].
-        free_unknowns: which of them are to be identified; the others are stated by the measurements.
+        free_unknowns: mask of the unknowns to identify; measurements state the other values.
     """
 
     bases: Float64[np.ndarray, "frames 6"]
@@ -73,18 +73,18 @@ def guess(
     Frames with positions get base and tool in closed form. Then sockets, wires and pairs determine the remaining tools;
     touches, and wires from anchors at stated positions, determine their frame with the tool; and the sensors guess
     their unknowns, such as sockets at the mean position of the tool and anchors by multilateration. A frame without
-    any of these (only sockets and unknown anchors) does not determine the base and starts at the robot's.
+    any of these (only sockets and unknown anchors) does not determine the base, which starts at the robot's base.
 
     Args:
         space: names and robot.
         measurements: usable rows; those of pairs come first.
-        free_base: whether to identify bases; else they are as stated, or the robot's.
+        free_base: whether to identify bases; otherwise stated bases, or the robot's base, are used.
         free_tool: whether to identify tools.
-        turn_tool: whether to identify their rotations.
+        turn_tool: whether to identify the rotations of tools.
         stated: bases of frames that the user states.
 
     Raises:
-        IdentificationError: there are too few measurements for a guess, or implausible ones.
+        IdentificationError: there are too few measurements for a guess, or they are implausible.
     """
     _check_frame_names(stated, space.frames, measurements.source)
     if free_base:
@@ -205,7 +205,7 @@ def _from_sockets(
     T_flange: Float64[Tensor, "rows 4 4"],
     tools: Mapping[str, np.ndarray],
 ) -> dict[str, np.ndarray]:
-    """Add tools without a guess, from the sockets that their ball was measured in."""
+    """Add guesses of tools that have none, from the sockets in which their ball was measured."""
     tools = dict(tools)
     socket = numbers_of(measurements.socket, distinct_names(measurements.socket), measurements.rows)
     target = numbers_of(measurements.target, space.targets, measurements.rows)
@@ -259,7 +259,7 @@ def tool_from_sockets(
     Args:
         R: orientations of the flange in the rows of one target.
         p: positions of the flange [m].
-        socket: number of every row's socket.
+        socket: index of every row's socket.
         guess: nominal position of the ball [m].
     """
     turn = _centred(R.flatten(1), socket).view(-1, 3, 3).flatten(0, 1)

@@ -25,31 +25,32 @@ from pisigma.robot.se3 import rotation_from_rpy, rpy_from_rotation
 
 MAX_ITERATIONS = 60
 CONVERGENCE_TOLERANCE = 1e-6
-"""[m] Length of a step at convergence."""
+"""Length of a step at convergence [m]."""
 WEAK = 0.01
-"""Weight per row of the nominal tool, which holds directions that distances hardly determine."""
+"""Weight per row of the nominal tool, which determines directions that distances hardly determine."""
 HELD = 1e4
-"""The same if the tool is known."""
+"""Weight per row of the nominal tool if the tool is known."""
 OUTLYING = 3.0
-"""Error over the median error above which the weight of a distance is reduced, so that single mistakes have little
-effect."""
+"""Ratio of an error to the median error above which the weight of a distance is reduced, so that single mistakes
+have little effect."""
 FAR_START = 0.3
-"""[reach] Distance from the nominal tool, in both directions of its axes, of further starts."""
+"""Distance of further starts from the nominal tool, in both directions of its axes, as a share of the reach."""
 MAX_SHIFT, MAX_CLEAR_SHIFT = 0.35, 1.0
-"""[reach] Largest distance of a tool from the nominal one, and the same if many distances agree clearly with it."""
+"""Largest distance of a tool from the nominal tool, as a share of the reach: in general, and if many distances agree
+clearly with it."""
 MANY_TIMES = 3
-"""Distances per unknown that leave no doubt."""
+"""Number of distances per unknown above which a tool is accepted at a larger distance from the nominal tool."""
 DOUBTFUL = 0.01
-"""Median error of the distances over the median motion of the tool above which other units are tried."""
+"""Ratio of the median error of the distances to the median motion of the tool above which other units are tried."""
 COLLAPSED = 0.25
-"""Share of the errors that may remain in another unit."""
+"""Largest share of the errors that may remain in another unit."""
 MAX_WRONG_SHARE = 0.25
 """Share of the distances that may be off by more than `MAX_NOMINAL_ERROR`."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Distances:
-    """Distances of one target's rows to anchors, and to the other rows of pairs (anchor -1).
+    """Distances of one target's rows from anchors, and from the other rows of pairs (anchor -1).
 
     The length of `R · tool + p - anchor` is measured; for pairs, R and p are the differences between the two rows.
     """
@@ -61,7 +62,7 @@ class _Distances:
 
     @property
     def unknowns(self) -> int:
-        """Number of unknowns: the tool, and every anchor with its zero offset."""
+        """Number of unknowns: three of the tool, and four of every anchor with its zero offset."""
         return 3 + 4 * (int(self.anchor.max()) + 1)
 
     def points(self, tool: Float64[Tensor, "*batch 3"]) -> Float64[Tensor, "*batch rows 3"]:
@@ -69,7 +70,7 @@ class _Distances:
         return (self.R @ tool[..., None, :, None])[..., 0] + self.p
 
     def start(self, tool: Float64[Tensor, "*batch 3"]) -> Float64[Tensor, "*batch unknowns"]:
-        """Return a tool and the anchors fitted with it."""
+        """Return a tool and the anchors that are fitted with this tool."""
         points = self.points(tool)
         anchors = [
             anchor_from_distances(points[..., self.anchor == k, :], self.measured[..., self.anchor == k])
@@ -80,7 +81,7 @@ class _Distances:
     def linearised(
         self, unknown: Float64[Tensor, "*batch unknowns"]
     ) -> tuple[Float64[Tensor, "*batch rows"], Float64[Tensor, "*batch rows unknowns"]]:
-        """Return measured minus predicted distances [m] and the derivative of the predicted ones."""
+        """Return measured minus predicted distances [m], and the derivatives of the predicted distances."""
         wires = (self.anchor >= 0).nonzero()[:, 0]
         away, zero = self.points(unknown[..., :3]), torch.zeros_like(self.measured)
         anchors = unknown[..., 3:].reshape(*unknown.shape[:-1], -1, 4)[..., self.anchor[wires], :]
@@ -102,7 +103,7 @@ class _Distances:
         held: bool,
         reach: float,
     ) -> tuple[Float64[Tensor, "units 3"], Float64[Tensor, "units rows"]]:
-        """Fit the tool to the distances times each factor, starting near the nominal one, then far off.
+        """Fit the tool to the distances times each factor, from starts near to and far from the nominal tool.
 
         Returns:
             For every factor, the tool and the residuals [m].
@@ -136,7 +137,7 @@ class _Distances:
     def _refined(
         self, start: Float64[Tensor, "*batch 3"], nominal_tool: Float64[Tensor, " 3"], held: bool
     ) -> tuple[Float64[Tensor, "*batch 3"], Float64[Tensor, "*batch rows"]]:
-        """Refine tools by robust Levenberg-Marquardt steps, all at once; return them and the residuals [m]."""
+        """Refine a batch of tools by robust Levenberg-Marquardt steps; return the tools and the residuals [m]."""
         unknown = self.start(start)
         pull, nominal = torch.zeros(2, unknown.shape[-1]).double()
         pull[:3], nominal[:3] = (HELD if held else WEAK) ** 2 * self.measured.shape[-1], nominal_tool
@@ -144,7 +145,7 @@ class _Distances:
         residual, J = self.linearised(unknown)
         for _ in range(MAX_ITERATIONS):
             limit = OUTLYING * residual.abs().median(-1, keepdim=True).values.clamp(min=1e-9)
-            weighted = J.mT * (limit / residual.abs()).clamp(max=1.0)[..., None, :]  # Huber's
+            weighted = J.mT * (limit / residual.abs()).clamp(max=1.0)[..., None, :]  # weights of Huber's loss
             normal = weighted @ J + torch.diag(pull)
             gradient = weighted @ residual[..., None] - (pull * (unknown - nominal))[..., None]
             scale = normal.diagonal(dim1=-2, dim2=-1).clamp(min=1e-12)
@@ -167,7 +168,7 @@ def tools_from_distances(
     tools: Mapping[str, np.ndarray],
     free_tool: bool,
 ) -> dict[str, np.ndarray]:
-    """Add tools without a guess, fitted to wires and pairs together with the anchors.
+    """Add guesses of tools that have none, by fitting them to wires and pairs together with the anchors.
 
     Distances between points of one arm do not depend on the base. Single wrong distances have little effect.
 
@@ -214,7 +215,7 @@ def base_from_anchors(
     tip: Float64[Tensor, "rows 3"],
     nominal_base: Float64[np.ndarray, " 6"],
 ) -> Float64[np.ndarray, " 6"]:
-    """Compute T_frame_robot from anchors at stated positions, whose positions in the robot's base the wires determine.
+    """Compute T_frame_robot from anchors at stated positions; wires determine their positions in the robot's base.
 
     Args:
         measurements: the rows.
@@ -248,7 +249,7 @@ def _refuse_other_units(
     start: tuple[Float64[Tensor, " 3"], bool],
     source: str,
 ) -> None:
-    """Refuse distances that fit far better in another unit; errors are compared in the measured unit.
+    """Refuse distances that fit far better in another unit; errors are compared in the unit of the measurements.
 
     Raises:
         ImplausibleError: the distances fit far better in another unit.
@@ -273,7 +274,7 @@ def _refuse_other_units(
 
 
 def _distances_of(measurements: Measurements, T: Tensor, target: str) -> _Distances:
-    """Collect wires with enough distances, and pairs of which both rows have the target."""
+    """Collect wires with enough distances, and pairs whose rows both have the target."""
     R, p = T[:, :3, :3], T[:, :3, 3]
     if measurements.distance is None:
         return _Distances(R[:0], p[:0], torch.zeros(0, dtype=torch.int64), p[:0, 0])
@@ -296,6 +297,6 @@ def _distances_of(measurements: Measurements, T: Tensor, target: str) -> _Distan
 
 
 def _cost(residual: Tensor, limit: Tensor) -> Tensor:
-    """Compute Huber's cost: quadratic up to a limit, then linear."""
+    """Compute Huber's cost, which is quadratic up to a limit and then linear."""
     size = residual.abs()
     return torch.where(size <= limit, size.square(), 2 * limit * size - limit.square()).sum(-1)

@@ -1,1 +1,1 @@
-"""Geometric calibration as a least-squares problem, and its solver."""
+"""Geometric calibration as a least-squares problem, and the solver."""

@@ -1,4 +1,4 @@
-"""Identification Jacobian of a whole data set, condensed to a small triangular matrix."""
+"""Identification Jacobian of a data set, condensed to a small triangular matrix."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -14,19 +14,19 @@ from pisigma.calibration.geometric.problem.parameters import Parameter
 from pisigma.calibration.geometric.problem.problem import CalibrationProblem
 
 DEPENDENT = 1e-10
-"""Share of a column's length outside the span of others below which it is in the span."""
+"""Share of a column's length outside the span of other columns below which the column is treated as dependent."""
 
 
 @dataclass(frozen=True, eq=False)
 class Information:
-    """Information of the data on each parameter, in units of its usual error (1 mm, 1 mrad).
+    """Information of the data on the parameters, in units of their usual errors (1 mm, 1 mrad).
 
     With the identification Jacobian J of all rows (in mm and mrad, or in standard deviations) and the residuals r,
     `[J r 1] = Q · root`.
 
     Attributes:
         parameters: parameters of the columns of J.
-        root: upper triangular matrix; its last column belongs to the ones, and the one before it to the residuals.
+        root: upper triangular matrix; its last column belongs to the ones, the previous column to the residuals.
         values: number of rows of J minus the number of eliminated directions.
         poses: number of measured rows.
     """
@@ -43,17 +43,17 @@ class Information:
 
     @property
     def jacobian(self) -> Float64[np.ndarray, "rank parameters"]:
-        """Small matrix with the same Gram matrix as J."""
+        """Condensed Jacobian: a small matrix with the same Gram matrix as J."""
         return self.root[:, :-2]
 
     @property
     def residual(self) -> Float64[np.ndarray, " rank"]:
-        """Small vector whose products with `jacobian` and with itself equal those of r with J and with itself."""
+        """Condensed residuals: products with `jacobian` and with itself equal those of r with J and with itself."""
         return self.root[:, -2]
 
     @property
     def centred_jacobian(self) -> Float64[np.ndarray, "rank parameters"]:
-        """The condensed Jacobian after subtracting the mean of every column of J."""
+        """Condensed Jacobian after subtraction of the mean of every column of J."""
         ones_first: np.ndarray = np.linalg.qr(np.roll(self.root, 1, axis=1), mode="r")  # type: ignore[assignment]
         return ones_first[1:, 1:-1]
 
@@ -63,11 +63,11 @@ class Information:
         return replace(self, parameters=parameters, root=np.delete(self.root, column, 1))
 
     def eliminate(self, nuisance: list[int], silent: Sequence[int] = ()) -> "Information":
-        """Eliminate nuisance parameters: project the other columns onto the complement of theirs.
+        """Eliminate nuisance parameters by projecting the other columns onto the complement of their columns.
 
         Args:
-            nuisance: numbers of columns that are eliminated and removed.
-            silent: numbers of columns that are eliminated and kept as zeros.
+            nuisance: indices of columns that are eliminated and removed.
+            silent: indices of columns that are eliminated and kept as zeros.
         """
         if not nuisance and not silent:
             return self
@@ -79,9 +79,9 @@ class Information:
         kept = [i for i in range(len(self.parameters)) if i not in set(nuisance)]
         rest = np.delete(self.root, nuisance, 1)
         sizes = np.linalg.norm(rest, axis=0)
-        for _ in range(2):  # twice is enough: one projection leaves rounding errors of the size of the column
+        for _ in range(2):  # one projection leaves rounding errors relative to the column's length
             rest = rest - U @ (U.T @ rest)
-        # What is left of a dependent column is rounding, which must not look identifiable.
+        # The remainder of a dependent column is a rounding error, which must not look identifiable.
         rest[:, np.linalg.norm(rest, axis=0) <= DEPENDENT * sizes] = 0.0
         rest[:, [kept.index(column) for column in silent]] = 0.0
         root: np.ndarray = np.linalg.qr(rest, mode="r")  # type: ignore[assignment]
@@ -97,7 +97,7 @@ def information(
 ) -> Information:
     """Condense the Jacobian at a point by QR factorisations, chunk by chunk.
 
-    Normal equations are avoided, so that singular values down to 1e-15 of the largest remain accurate.
+    Normal equations are avoided, so that singular values down to 1e-15 of the largest value are accurate.
 
     Args:
         problem: rows and sensors; the prior is not used.
@@ -119,13 +119,13 @@ def information(
             if not problem.measured_in_every_row[k]:
                 present = sensor.present[rows]
                 J, r, weight = J[..., present], r[:, present], weight[present]
-            # Residual and weight are two more columns, so that R contains misfit and weighted means as well.
+            # Residual and weight are two further columns, so that R also contains misfit and weighted means.
             block = r.new_empty((len(candidates) + 2, *r.shape))
             torch.mul(J, weight, out=block[:-2])
             torch.mul(r, weight, out=block[-2])
             block[-1] = weight
             blocks.append(block.flatten(1))
-        # R has the same J^T J as all rows so far and replaces them: memory does not grow with the rows.
+        # R has the same J^T J as all rows so far and replaces them, so memory does not grow with the rows.
         blocks = [torch.linalg.qr(torch.cat(blocks, 1).t(), mode="r").R.t()]
     usual = np.append(problem.space.usual_errors[candidates], (1.0, 1.0))
     present = torch.stack([sensor.present for sensor in problem.sensors]).any(0)
@@ -137,7 +137,7 @@ def information(
 def _row_weights(
     problem: CalibrationProblem, view: SensorView, number: int, rows: slice
 ) -> Float64[Tensor, " poses"]:
-    """Compute 1 / standard deviation of each row for a sensor [1/m or 1/rad]; 0 where it has no value."""
+    """Compute 1 / standard deviation of every row for a sensor [1/m or 1/rad]; 0 in rows without a value."""
     sensor = problem.sensors[number]
     distance = view.sums[number].distance[rows] / view.scales[number]
     root = problem.loss_for_sensor(sensor).weight(distance, sensor.components).sqrt()

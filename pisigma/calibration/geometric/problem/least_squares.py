@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt method on normal equations, with separate problem, solver and solution."""
+"""Levenberg-Marquardt method with normal equations, with separate classes for problem, solver and solution."""
 
 import math
 from abc import ABC, abstractmethod
@@ -17,15 +17,15 @@ START_DAMPING = 1e-3
 SMALLEST_DAMPING = 1e-9
 LARGEST_DAMPING = 1e12
 MAX_NOISE_UPDATES = 50
-"""Steps after which the noise is no longer updated: with few rows it may oscillate between two estimates."""
+"""Number of steps after which the noise is no longer updated; with few rows it may oscillate between two estimates."""
 MAX_UPHILL_STEPS = 2
-"""Steps that may raise the cost before the search returns to the best point."""
+"""Number of steps that may raise the cost before the search returns to the best point."""
 SHORTEST_STEP = 1e-3
-"""[standard errors] Length of a step below which the search has converged."""
+"""Length of a step, in standard errors, below which the search has converged."""
 
 
 class SolutionStatus(Enum):
-    """Reason for which a search ended; the value is the predicate of a sentence."""
+    """Reason why a search ended; the value is the predicate of a sentence."""
 
     CONVERGED = "converged: the last step changed no parameter by more than 0.001 of its standard error"
     EXACT = "converged: the residuals are at rounding level"
@@ -36,7 +36,7 @@ class SolutionStatus(Enum):
 
     @property
     def is_minimum(self) -> bool:
-        """Whether the point is a minimum."""
+        """Whether the search ended at a minimum."""
         return self in (SolutionStatus.CONVERGED, SolutionStatus.EXACT)
 
 
@@ -45,13 +45,13 @@ class Linearisation(Generic[Point]):
     """A least-squares problem with cost `Σ (r / sigma)²`, linearised at a point.
 
     Attributes:
-        point: the point.
+        point: the point of linearisation.
         cost: cost at the point [1].
         descent: minus half the gradient of the cost with respect to the unknowns.
-        normal: half its Gauss-Newton Hessian, whose inverse is the covariance of the unknowns.
+        normal: half the Gauss-Newton Hessian of the cost, whose inverse is the covariance of the unknowns.
         misfit: part of the cost due to the data; the remainder is due to the prior.
-        rounding: misfit that rounding errors alone can cause.
-        detail: data of the problem, for its own use.
+        rounding: misfit that can be caused by rounding errors alone.
+        detail: further data that the problem stores for later calls.
     """
 
     point: Point
@@ -64,7 +64,7 @@ class Linearisation(Generic[Point]):
 
 
 class AbstractLeastSquares(ABC, Generic[Point]):
-    """Interface of a problem for the solver."""
+    """Interface of least-squares problems for the solver."""
 
     @abstractmethod
     def linearise(self, point: Point, like: Linearisation[Point] | None) -> Linearisation[Point]:
@@ -76,7 +76,7 @@ class AbstractLeastSquares(ABC, Generic[Point]):
 
     @abstractmethod
     def with_updated_noise(self, linearisation: Linearisation[Point]) -> tuple[Linearisation[Point], bool]:
-        """Estimate the noise from the residuals; return the linearisation with it, and whether it has converged."""
+        """Estimate the noise from the residuals; return the updated linearisation, and whether it has converged."""
 
     @abstractmethod
     def apply_step(self, point: Point, step: Float[Tensor, " unknowns"]) -> Point:
@@ -85,10 +85,10 @@ class AbstractLeastSquares(ABC, Generic[Point]):
     @property
     @abstractmethod
     def step_scale(self) -> Float[Tensor, " unknowns"]:
-        """Usual size of every unknown, relative to which the damping is defined."""
+        """Typical size of every unknown, to which the damping is relative."""
 
     def rms(self, linearisation: Linearisation[Point]) -> Float[Tensor, ""]:
-        """Return the size of the residuals for the path of a search, by default in standard deviations."""
+        """Return the size of the residuals, by default in standard deviations, for the path of a search."""
         return linearisation.misfit.sqrt()
 
 
@@ -99,8 +99,8 @@ class Solution(Generic[Point]):
     Attributes:
         linearisation: the problem linearised at the best point, with the noise estimated there.
         iterations: number of steps tried.
-        status: why the search ended.
-        path: size of the residuals at every accepted point, starting with the start; see `AbstractLeastSquares.rms`.
+        status: reason why the search ended.
+        path: size of the residuals at the start and at every accepted point; see `AbstractLeastSquares.rms`.
     """
 
     linearisation: Linearisation[Point]
@@ -121,18 +121,18 @@ def levenberg_marquardt(
 ) -> Solution[Point]:
     """Minimise by Levenberg-Marquardt steps `(normal + damping / step_scale²) step = descent`.
 
-    The damping is relative to `step_scale` in units of the noise, which is estimated again at every point. It shrinks
-    with the residuals, so convergence for exact data is quadratic even if the normal matrix is singular (Yamashita and
-    Fukushima 2001). The linear system is solved by Cholesky factorisation after column scaling. A step that raises the
-    cost is accepted once or twice, because the search can leave a curved valley and meet it again; if the cost does not
-    fall below the best one, the search returns to the best point with a hundred times larger damping (watchdog
-    technique, Chamberlain et al. 1982).
+    The damping is relative to `step_scale` in units of the noise, which is estimated again at every point. It
+    decreases with the residuals, so convergence for exact data is quadratic even if the normal matrix is singular
+    (Yamashita and Fukushima 2001). The linear system is solved by Cholesky factorisation after column scaling. A
+    step that raises the cost is accepted once or twice, because the search can leave a curved valley and meet it
+    again; if the cost does not fall below the lowest cost, the search returns to the best point with a hundred times
+    larger damping (watchdog technique, Chamberlain et al. 1982).
 
     Args:
         problem: the problem to minimise.
-        start: start point, or the problem linearised there.
+        start: start point, or the problem linearised at the start point.
         maximum_iterations: maximum number of steps.
-        close_enough: length of a step [standard errors] below which it is not taken and the search has converged.
+        close_enough: length of a step [standard errors] below which the step is not taken and the search has converged.
 
     Returns:
         The best point, with the reason for stopping (see `SolutionStatus`).
@@ -157,10 +157,10 @@ class _Search(Generic[Point]):
 
     Attributes:
         best: the best point.
-        here: start of the next step.
-        at_best: whether that is the best point.
+        here: point from which the next step starts.
+        at_best: whether the next step starts at the best point.
         iterations: number of steps tried.
-        decrement: decrease of the cost by the next step for a linear problem [squared standard errors].
+        decrement: decrease of the cost that the next step would cause in a linear problem [squared standard errors].
         path: size of the residuals at every accepted point.
     """
 
@@ -176,7 +176,7 @@ class _Search(Generic[Point]):
         self.decrement = float((self.here.normal @ self.step) @ self.step)
 
     def try_step(self) -> SolutionStatus | None:
-        """Try the step, and choose the start of the next one, or return why the search has ended."""
+        """Try the step, and choose the start of the next step, or return the reason why the search has ended."""
         self.iterations += 1
         there = self.problem.linearise(self.problem.apply_step(self.here.point, self.step), self.best)
         if not bool(there.cost <= self.best.cost):
@@ -198,7 +198,7 @@ class _Search(Generic[Point]):
         return settled
 
     def _climb(self, there: Linearisation[Point]) -> SolutionStatus | None:
-        """Accept a higher cost or return to the best point, or return why the search has ended."""
+        """Accept a higher cost, return to the best point, or return the reason why the search has ended."""
         small = self.decrement <= max(SHORTEST_STEP**2, 1e-10 * float(self.best.cost))
         if bool(self.best.misfit <= 1e4 * self.best.rounding):
             return SolutionStatus.EXACT
@@ -228,7 +228,7 @@ def solve_damped(
     """
     normal, descent = linearisation.normal, linearisation.descent
     diagonal = normal.diagonal()
-    # The product of two columns is finite if their squares are, so the diagonal suffices.
+    # The product of two columns is finite if their squares are finite, so checking the diagonal is sufficient.
     if not math.isfinite(float((diagonal + descent).sum())):
         raise IdentificationError(
             "the normal equations are not finite",
@@ -237,7 +237,7 @@ def solve_damped(
     while True:
         damped = diagonal + damping / step_scale.square()
         scale = damped.rsqrt()
-        # Unit diagonal: metres and radians become comparable, and the factorisation as stable as it can be.
+        # A unit diagonal makes metres and radians comparable, and the factorisation as stable as possible.
         scaled = normal * (scale * scale[:, None])
         scaled.diagonal().copy_(damped * scale.square() + 1e-14)
         factor, failed = torch.linalg.cholesky_ex(scaled)
@@ -248,7 +248,7 @@ def solve_damped(
 
 
 def covariance_of(normal: Float64[Tensor, "active active"]) -> Float64[Tensor, "active active"]:
-    """Invert a normal matrix with column scaling; undetermined directions get variance 0."""
+    """Return the inverse of a normal matrix, computed with column scaling; undetermined directions get variance 0."""
     diagonal = normal.diagonal()
     scale = diagonal.masked_fill(diagonal <= 0, 1.0).rsqrt_()
     scales = scale * scale[:, None]

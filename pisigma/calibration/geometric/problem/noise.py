@@ -1,4 +1,4 @@
-"""Estimation of the noise of sensors from residuals: robust scales, repeated poses, angles against lengths."""
+"""Estimate the noise of sensors from residuals: robust scales, repeated poses, and angles against lengths."""
 
 import math
 from collections.abc import Sequence
@@ -16,26 +16,26 @@ from pisigma.estimation.loss import AbstractLoss
 from pisigma.measurement.sensors.sensor import AbstractSensor
 
 SMALLEST_NOISE = 1e-14
-"""[m or rad] Floor of the estimated noise: rounding errors of a pose."""
+"""Lower bound of the estimated noise [m or rad]: rounding errors of a pose."""
 ALWAYS_GOOD = 1e-10
-"""[m or rad] Residuals below this are never outliers."""
+"""Residual below which a row is never an outlier [m or rad]."""
 
 
 UNDETERMINED = 1e-12
-"""Information added to that of lengths, relative to the total, where lengths determine nothing."""
+"""Information, relative to the total, that is added in directions that lengths do not determine."""
 MAX_DISAGREEMENT = 1e6
-"""Largest factor on the variance of angles, with which they have no effect."""
+"""Largest factor on the variance of angles, with which angles have no effect."""
 
 
 @dataclass(frozen=True, eq=False)
 class SensorSums:
-    """Contribution of one sensor at one point, before division by the variance of its noise.
+    """Contribution of a sensor to the normal equations at a point, before division by the variance of its noise.
 
     Attributes:
-        normal: `Σ w J J^T / sigma_row²` over its rows.
-        descent: `Σ w J r / sigma_row²`.
-        residual: measured minus predicted [m or rad]; 0 where nothing was measured.
-        distance: length of the residual over sigma_row; 0 where nothing was measured.
+        normal: `Σ w J J^T / sigma_row²` over the rows of the sensor.
+        descent: `Σ w J r / sigma_row²`, the right side of the normal equations.
+        residual: measured minus predicted values [m or rad]; 0 in rows without a value.
+        distance: length of the residual divided by sigma_row; 0 in rows without a value.
         measured: number of measured rows.
     """
 
@@ -53,7 +53,7 @@ class SensorSums:
 
 
 def joined_sums(chunks: Sequence[SensorSums]) -> SensorSums:
-    """Join the contributions of a sensor in successive chunks of rows."""
+    """Return the sum of the contributions of a sensor in successive chunks of rows."""
     first, *others = chunks
     if not others:
         return first
@@ -68,14 +68,15 @@ def joined_sums(chunks: Sequence[SensorSums]) -> SensorSums:
 
 @dataclass(frozen=True, eq=False)
 class SensorView:
-    """All sensors at one point, with their estimated noise.
+    """Contributions of all sensors at a point, with their estimated noise.
 
     Attributes:
         sums: contributions per sensor.
-        noise: standard deviation per sensor [m or rad], or a factor >= 1 on those that the rows state.
+        noise: standard deviation per sensor [m or rad], or a factor >= 1 on the standard deviations that the rows
+            state.
         repetition: factor >= 1 on the variance per sensor, because repeats of a pose and several targets in it share
             the errors of the model and are not independent; see `group_variance_ratio`.
-        disagreement: factor >= 1 on the variance per sensor with which angles agree with the measured lengths; see
+        disagreement: factor >= 1 on the variance per sensor that makes angles agree with the measured lengths; see
             `angle_disagreement`.
         prior_scale: scale of the prior standard deviations, per group of parameters.
     """
@@ -88,19 +89,19 @@ class SensorView:
 
     @staticmethod
     def without_noise(sums: tuple[SensorSums, ...]) -> "SensorView":
-        """Return all sensors with standard deviations of 1 and the stated prior."""
+        """Return the contributions with standard deviations of 1 and the stated prior."""
         ones = sums[0].normal.new_ones(max(len(sums), len(PriorGroup)))
         sensors = ones[: len(sums)]
         return SensorView(sums, sensors, sensors, sensors, ones[: len(PriorGroup)])
 
     @cached_property
     def scales(self) -> Float64[Tensor, " sensors"]:
-        """Scales of the distances for the loss."""
+        """Scale of the distances of every sensor, for the loss."""
         return self.noise.clamp(min=ALWAYS_GOOD)
 
     @cached_property
     def variances(self) -> Float64[Tensor, " sensors"]:
-        """Variances of the sensors' values, with all factors."""
+        """Variance of the values of every sensor, including all factors."""
         return self.noise.square() * self.repetition * self.disagreement
 
     def scaled_precision(
@@ -111,7 +112,7 @@ class SensorView:
 
 
 def sensor_view_of(linearisation: Linearisation[Tensor]) -> SensorView:
-    """Return the sensors' part of a linearisation of a `CalibrationProblem`."""
+    """Return the contributions of the sensors in a linearisation of a `CalibrationProblem`."""
     assert isinstance(linearisation.detail, SensorView)
     return linearisation.detail
 
@@ -119,7 +120,7 @@ def sensor_view_of(linearisation: Linearisation[Tensor]) -> SensorView:
 def parameters_used(
     view: SensorView, covariance: Float64[Tensor, "active active"]
 ) -> Float64[Tensor, " sensors"]:
-    """Compute the effective number of parameters estimated from every sensor's values (Förstner 1979)."""
+    """Compute the effective number of parameters that are estimated from every sensor's values (Förstner 1979)."""
     used = [(sums.normal * covariance).sum() for sums in view.sums]
     return torch.stack(used) / view.variances
 
@@ -131,14 +132,14 @@ def loss_scale(
     used: Float64[Tensor, " sensors"],
     refine: bool,
 ) -> Float64[Tensor, " sensors"]:
-    """Estimate the standard deviation of every sensor's values, or a factor >= 1 on those that its rows state.
+    """Estimate the standard deviation of every sensor's values, or a factor >= 1 on stated standard deviations.
 
     Args:
         sensors: the sensors.
         loss: loss function, which defines the estimators.
         view: residuals and current noise.
         used: effective number of parameters per sensor.
-        refine: use all rows without outliers instead of the median.
+        refine: whether to use all rows without outliers instead of the median.
     """
     scales = []
     for k, sensor in enumerate(sensors):
@@ -157,7 +158,7 @@ def loss_scale(
 
 
 def rejects_rows(sensors: Sequence[AbstractSensor], losses: Sequence[AbstractLoss], view: SensorView) -> bool:
-    """Return whether the loss gives any row of a sensor weight 0."""
+    """Return whether the loss gives any row the weight 0."""
     of_each = zip(sensors, losses, view.sums, view.scales, strict=True)
     return any(
         bool((loss.weight(sums.distance / scale, sensor.components) == 0).any())
@@ -166,7 +167,7 @@ def rejects_rows(sensors: Sequence[AbstractSensor], losses: Sequence[AbstractLos
 
 
 def renumber(keys: Int64[Tensor, " rows"]) -> Int64[Tensor, " rows"]:
-    """Map keys to numbers from 0, equal for equal keys."""
+    """Return an index from 0 for every key, equal for equal keys."""
     numbers: Tensor = torch.unique(keys, return_inverse=True)[1]
     return numbers
 
@@ -179,18 +180,18 @@ def group_variance_ratio(
     pose: Int64[Tensor, " rows"] | None,
     configuration: Int64[Tensor, " rows"] | None = None,
 ) -> Float64[Tensor, " sensors"]:
-    """Compute the variance of mean residuals of poses over that of independent rows (design effect, Kish 1965).
+    """Compute the ratio of the variances of mean residuals of poses and of independent rows (design effect, Kish 1965).
 
-    Targets on one tool share the model's errors of the joints. Therefore the ratio is multiplied by the variance of
-    mean residuals of configurations over that of poses, if it is larger than 1.
+    Targets on one tool share the model's errors of the joints. Therefore the ratio is multiplied by the ratio of the
+    variances of mean residuals of configurations and of poses, if that is larger than 1.
 
     Args:
         sensors: the sensors, with the rows that have values.
         loss: loss function for the weights of rows within a pose.
         view: residuals and noise.
         used: effective number of parameters per sensor, which reduces the degrees of freedom of the poses.
-        pose: number of every row's pose; None if none is repeated.
-        configuration: number of every row's joint values and frame; None if none has several targets.
+        pose: index of every row's pose; None if no pose is repeated.
+        configuration: index of every row's joint values and frame; None if no configuration has several targets.
     """
     ratios = []
     for k, (sensor, sums) in enumerate(zip(sensors, view.sums, strict=True)):
@@ -224,16 +225,16 @@ def angle_disagreement(
     Orientation errors that the geometry does not explain, such as the wobble of a wrist, depend on the pose. If rows
     are treated as independent, they seem to determine the geometry far better than they do, and pull the predicted
     positions away from the measured ones. Let x be the parameters estimated from lengths and prior alone, with the
-    information A, and y those estimated from angles too. Including the angles changes predicted lengths by
-    `(x - y)^T Q (x - y)`, with the information Q of the lengths alone, while `tr(Q (cov x - cov y))` is expected. The
-    factor, which is at least 1, makes both equal. It is the moment estimator of random-effects meta-analysis
+    information A, and y the parameters estimated also from angles. Including the angles changes predicted lengths by
+    `(x - y)^T Q (x - y)`, with the information Q of the lengths alone, while `tr(Q (cov x - cov y))` is expected.
+    The factor, which is at least 1, makes both equal. It is the moment estimator of random-effects meta-analysis
     (DerSimonian and Laird 1986, Controlled Clinical Trials 7(3), 177-188), weighted by the cost of predicted lengths.
 
     Args:
         sensors: the sensors.
         view: normal equations and noise.
         held: prior precision of every free parameter.
-        pull: contribution of the prior to the descent.
+        pull: contribution of the prior to the right side of the normal equations.
     """
     angular = [sensor.unit == "rad" and not sensor.certain for sensor in sensors]
     lengths = [sensor.unit != "rad" and not sensor.certain for sensor in sensors]
@@ -262,19 +263,19 @@ def _angle_disagreement(
     angles: Float64[np.ndarray, " active"],
     held: Float64[np.ndarray, " active"],
 ) -> float:
-    """Compute the factor from normal matrix and descent of lengths, those of angles, and the prior precision."""
+    """Compute the factor from the normal equations of lengths and of angles, and the prior precision."""
     A = Q + np.diag(held)
     scale = (A + R).diagonal()
     scale = 1 / np.sqrt(np.where(scale > 0, scale, 1.0))
     root = np.linalg.cholesky(A * scale * scale[:, None] + UNDETERMINED * np.eye(len(scale)))
     white = np.linalg.inv(root) * scale
-    # In these coordinates A is the identity and R diagonal, so a factor on R costs no new factorisation.
+    # In these coordinates A is the identity and R is diagonal, so a factor on R needs no new factorisation.
     gain, axes = np.linalg.eigh(white @ R @ white.T)
     white = axes.T @ white
     Q, lengths, angles = white @ Q @ white.T, white @ lengths, white @ angles
 
     def excess(logarithm: float) -> float:
-        """Compute observed minus expected change of the lengths for a factor `exp(logarithm)` on the variance."""
+        """Return the observed minus the expected change of lengths for a factor `exp(logarithm)` on the variance."""
         # With A = I and R = diag(gain) / factor: cov x - cov y = diag(share), and moved = x - y.
         share = gain.clip(0.0) / (gain.clip(0.0) + math.exp(logarithm))
         moved = share * lengths - (1 - share) * angles * math.exp(-logarithm)
@@ -295,7 +296,7 @@ def _group_squares(
     weight: Float64[Tensor, " rows"],
     group: Int64[Tensor, " rows"] | None,
 ) -> tuple[Float64[Tensor, ""], Int64[Tensor, ""]]:
-    """Sum the squared weighted mean residuals of groups of rows; return the sum and its number of values."""
+    """Return the sum of the squared weighted mean residuals of groups of rows, and its number of values."""
     components = residual.shape[0]
     if group is None:
         return (residual.square() * weight).sum(), (weight > 0).sum() * components

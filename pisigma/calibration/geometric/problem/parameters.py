@@ -21,17 +21,17 @@ from pisigma.robot.row import DH_COLUMNS, FRAME_COLUMNS
 
 LENGTHS = frozenset({"d", "a", "x", "y", "z"})
 EVERYWHERE, NOWHERE = -1, -2
-"""In place of the index of a frame or target: the parameter moves the tool in all rows, or in none."""
+"""Values instead of the index of a frame or target: the parameter moves the tool in all rows, or in no row."""
 USUAL_LENGTH = 1e-3
-"""[m] Scale of length parameters without a prior."""
+"""Scale of length parameters without a prior [m]."""
 USUAL_ANGLE = 1e-3
-"""[rad] Scale of angle parameters without a prior."""
+"""Scale of angle parameters without a prior [rad]."""
 USUAL_ERRORS: dict[ParameterUnit, float] = {"m": USUAL_LENGTH, "rad": USUAL_ANGLE, "px": 1.0, "1": 1e-3}
 SMALLEST_PRIOR = 1e-12
-"""[m or rad] Smallest prior standard deviation; leave more certain parameters out of `free`."""
+"""Smallest prior standard deviation [m or rad]; parameters that are more certain should not be in `free`."""
 
 PriorSizes = Literal["stated", "widened", "estimated"]
-"""Whether the prior scales are 1, at least 1, or estimated."""
+"""Whether the prior scales are 1, at least 1, or estimated without bounds."""
 
 
 @dataclass(frozen=True)
@@ -41,11 +41,11 @@ class Prior:
     Base and tool have no prior.
 
     Attributes:
-        theta: joint offsets [rad].
-        d: link offsets [m].
-        a: link lengths [m].
-        alpha: twists [rad].
-        beta: Hayati's angles [rad].
+        theta: standard deviation of joint offsets [rad].
+        d: standard deviation of link offsets [m].
+        a: standard deviation of link lengths [m].
+        alpha: standard deviation of twists [rad].
+        beta: standard deviation of Hayati's angles [rad].
     """
 
     theta: float = 1e-3
@@ -74,9 +74,9 @@ class Parameter:
 
     Attributes:
         name: name, such as "theta_1", "d_EE", "base_x" or, with several targets, "tool_B_x".
-        group: "theta", "d", "a", "alpha", "beta", "base", "tool", or that of a sensor's unknowns, such as "socket".
+        group: "theta", "d", "a", "alpha", "beta", "base", "tool", or a group of a sensor's unknowns, such as "socket".
         unit: "m", "rad", "px", or "1" for a number without unit.
-        owner: row, frame, target or object (such as a socket) that it belongs to.
+        owner: row, frame, target or object (such as a socket) to which the parameter belongs.
     """
 
     name: str
@@ -86,18 +86,18 @@ class Parameter:
 
     @property
     def usual_error(self) -> float:
-        """Usual size of its error, for scaling: 1 mm, 1 mrad, 1 px or 1e-3."""
+        """Usual size of the parameter's error, for scaling: 1 mm, 1 mrad, 1 px or 1e-3."""
         return USUAL_ERRORS[self.unit]
 
 
 @dataclass(frozen=True, eq=False)
 class ParameterSpace:
-    """All parameters of a robot that is measured in some frames with some targets, in order.
+    """All parameters of a robot that is measured in given frames with given targets, in a fixed order.
 
     Attributes:
         robot: the nominal robot.
-        frames: names of the measuring frames, each with its own base.
-        targets: names of the targets, each with its own tool.
+        frames: names of the measuring frames; every frame has a base.
+        targets: names of the targets; every target has a tool.
         unknowns: unknowns of the sensors, such as the positions of sockets.
     """
 
@@ -108,7 +108,7 @@ class ParameterSpace:
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
-        """Rows x (theta, d, a, alpha, beta), frames x base, targets x tool, then owners x unknowns, group by group."""
+        """All parameters: those of the rows, then of bases and tools, then the unknowns of sensors by group."""
         parameters = []
         for label, row in zip(row_labels(self.robot), self.robot.rows, strict=True):
             parameters += [_parameter(column, f"{column}_{label}", column, row.name) for column in DH_COLUMNS]
@@ -148,7 +148,7 @@ class ParameterSpace:
 
     @cached_property
     def motion_columns(self) -> Int64[Tensor, "3 parameters"]:
-        """Per parameter: its column in a `ToolMotion`, the number of its frame and that of its target."""
+        """Per parameter, the column in a `ToolMotion`, the index of the frame and the index of the target."""
         order = motion_order(len(self.robot.rows))
         arm, frames, targets = order[:-12], len(self.frames), len(self.targets)
         others = len(self.parameters) - len(arm) - 6 * (frames + targets)
@@ -166,22 +166,22 @@ class ParameterSpace:
 
     @cached_property
     def prior_groups(self) -> Int64[Tensor, "2 parameters"]:
-        """Prior group of every parameter if it is nominally 0, and if not; see `prior_group_of`."""
+        """Prior group of every parameter, for nominal values of 0 and for other values; see `prior_group_of`."""
         others = [int(PriorGroup.JOINT_OFFSET)] * (len(self.parameters) - self.arm_size)
         of_row = ([prior_group_of(column, nonzero) for column in DH_COLUMNS] for nonzero in (False, True))
         return torch.tensor([groups * len(self.robot.rows) + others for groups in of_row])
 
     @property
     def always_moving(self) -> bool:
-        """Whether every parameter moves the tool in all rows."""
+        """Mask of the parameters that move the tool in all rows."""
         return len(self.frames) == len(self.targets) == 1 and not self.unknowns
 
     def most_independent(self, turning: bool) -> int:
         """Return the largest number of identifiable parameters of arm, bases and tools, for any measurements.
 
-        A revolute axis is a line in space (4 parameters), a prismatic one a direction (2), a target a pose (6) or a
-        point (3), and every frame except the first a pose (6). With one frame and one pose this is `4 R + 2 P + 6` for
-        R revolute and P prismatic joints (Everett, Driels and Mooring 1987, ICRA).
+        A revolute axis is a line in space (4 parameters), a prismatic axis a direction (2), a target a pose (6) or a
+        point (3), and every frame except the first a pose (6). With one frame and one pose this is `4 R + 2 P + 6`
+        for R revolute and P prismatic joints (Everett, Driels and Mooring 1987, ICRA).
 
         Args:
             turning: whether the orientation of the tool is measured.
@@ -239,7 +239,7 @@ class ParameterSpace:
         tools: Float64[np.ndarray, "targets 6"],
         unknowns: Mapping[str, Float64[np.ndarray, "owners columns"]] = MappingProxyType({}),
     ) -> Float64[Tensor, " parameters"]:
-        """Join the robot's rows and these values to a vector of all parameters; missing groups of unknowns are 0."""
+        """Return a vector of all parameters: the robot's rows and the given values; missing unknowns are 0."""
         blocks = [self.robot.dh, bases, tools]
         for own in self.unknowns:
             blocks.append(unknowns.get(own.name, np.zeros((len(own.owners), len(own.columns)))))
@@ -252,14 +252,14 @@ class ParameterSpace:
         Float64[Tensor, "frames 6"],
         Float64[Tensor, "targets 6"],
     ]:
-        """Split a vector of all parameters into rows, bases and tools."""
+        """Return rows, bases and tools in a vector of all parameters."""
         bases, tools = (
             values[self.indices_of(group).start : self.indices_of(group).stop] for group in ("base", "tool")
         )
         return values[: self.arm_size].view(-1, 5), bases.view(-1, 6), tools.view(-1, 6)
 
     def sensor_unknowns(self, values: Float64[Tensor, " parameters"]) -> Unknowns:
-        """Return the sensors' unknowns of a vector of all parameters."""
+        """Return the sensors' unknowns in a vector of all parameters."""
         return {
             own.name: values[self.indices_of(own.name).start : self.indices_of(own.name).stop]
             .view(-1, len(own.columns))
@@ -270,7 +270,7 @@ class ParameterSpace:
     def positions_of(
         self, group: str, active: Int64[Tensor, " active"]
     ) -> tuple[Int64[Tensor, " own"], Int64[Tensor, " own"], Int64[Tensor, " own"]]:
-        """Find the parameters of a group of unknowns among some: position, index of the owner, and column."""
+        """Return position, owner's index and column of the active parameters in a group of unknowns."""
         size = next(len(own.columns) for own in self.unknowns if own.name == group)
         stretch = self.indices_of(group)
         positions = ((active >= stretch.start) & (active < stretch.stop)).nonzero()[:, 0]
@@ -278,7 +278,7 @@ class ParameterSpace:
         return positions, number // size, number % size
 
     def precision(self, prior: Prior | None) -> Float64[np.ndarray, " parameters"]:
-        """Return the prior precision (1 / variance) of every parameter; 0 for those without a prior."""
+        """Return the prior precision (1 / variance) of every parameter; 0 for parameters without a prior."""
         precision = np.zeros(len(self.parameters))
         if prior is not None:
             of_row = [getattr(prior, column) ** -2 for column in DH_COLUMNS]

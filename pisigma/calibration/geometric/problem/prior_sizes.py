@@ -1,4 +1,4 @@
-"""Scales of the prior: sizes of the parameter errors over their prior standard deviations, by group of parameters."""
+"""Prior scales: ratios of the sizes of parameter errors to their prior standard deviations, by group of parameters."""
 
 from enum import IntEnum
 
@@ -9,7 +9,7 @@ from torch import Tensor
 from pisigma.calibration.geometric.problem.least_squares import covariance_of
 
 MAX_ITERATIONS, CONVERGENCE_TOLERANCE = 8, 1e-3
-"""Iterations of the prior scales at one point, and their relative change at convergence."""
+"""Largest number of iterations of the prior scales at a point, and their relative change at convergence."""
 MIN_EFFECTIVE = 0.1
 """Effective number of parameters of a group below which its prior scale is not estimated."""
 SMALLEST_PRIOR = 0.03
@@ -19,31 +19,33 @@ SMALLEST_PRIOR = 0.03
 class PriorGroup(IntEnum):
     """Groups of parameters whose errors have a common prior scale, because they have the same cause.
 
-    There are few groups, because a scale needs several parameters: one for every parameter (relevance vectors, Tipping
-    2001) fits the noise. Lengths that are nominally 0 have their own group, because joining them with the others made
-    calibrations of weak data worse; it made no difference whether d and a, or alpha and beta, are separated.
+    There are few groups, because a scale needs several parameters; one scale per parameter (relevance vectors,
+    Tipping 2001) fits the noise. Lengths that are nominally 0 have their own group, because calibrations of weak
+    data were worse when they were joined with the others; it made no difference whether d and a, or alpha and beta,
+    are separated.
     """
 
     JOINT_OFFSET = 0
-    """theta: zeros of the joints."""
+    """Group of theta, the zeros of the joints."""
     LENGTH = 1
-    """d and a that are nominally not 0: lengths of links."""
+    """Group of d and a that are nominally not 0, the lengths of links."""
     NO_LENGTH = 2
-    """d and a that are nominally 0 or below their tolerance: distances of axes that should meet or be in line."""
+    """Group of d and a that are nominally 0 or below their tolerance, the distances of axes that should meet or be
+    in line."""
     BETWEEN_AXES = 3
-    """alpha and beta: angles between axes."""
+    """Group of alpha and beta, the angles between axes."""
 
 
 LENGTH_GROUPS = (PriorGroup.LENGTH, PriorGroup.NO_LENGTH)
-"""Groups of lengths; the others are of angles."""
+"""Groups of lengths; the other groups are groups of angles."""
 
 
 def prior_group_of(column: str, nonzero: bool) -> int:
     """Return the group of a parameter.
 
     Args:
-        column: "theta", "d", "a", "alpha" or "beta"; others have no prior, so their group does not matter.
-        nonzero: whether its nominal value is larger than its tolerance.
+        column: "theta", "d", "a", "alpha" or "beta"; other parameters have no prior, so their group is arbitrary.
+        nonzero: whether the nominal value is larger than its tolerance.
     """
     if column in ("d", "a"):
         return PriorGroup.LENGTH if nonzero else PriorGroup.NO_LENGTH
@@ -62,7 +64,7 @@ def effective_parameters(
 
     Args:
         precision: 1 / variance of the stated prior; 0 for parameters without a prior.
-        group: every parameter's group.
+        group: index of every parameter's group.
         prior_scale: scale of the prior per group.
         covariance: posterior covariance of the parameters.
     """
@@ -95,17 +97,17 @@ def prior_scales(
     covariance: Float64[Tensor, "active active"],
     floor: float = 1.0,
 ) -> Float64[Tensor, " groups"]:
-    """Estimate the prior scale of every group: its errors over their stated standard deviations.
+    """Estimate the prior scale of every group, the ratio of its errors to their stated standard deviations.
 
     This is MacKay's update (1992, Neural Computation 4(3), eq. 4.7) with the `effective_parameters` of every group.
 
     Args:
         off: difference of the parameters from their nominal values [m or rad].
         precision: 1 / variance of the stated prior; 0 for parameters without a prior.
-        group: every parameter's group.
+        group: index of every parameter's group.
         before: current scale of the prior.
         covariance: posterior covariance of the parameters.
-        floor: smallest scale; 1 if errors smaller than stated should not narrow the prior.
+        floor: smallest scale; with 1, errors that are smaller than stated do not narrow the prior.
     """
     squares = _group_totals(off.square() * precision, group)
     least = 1.0 if floor == 1.0 else MIN_EFFECTIVE
@@ -122,7 +124,7 @@ def converged_prior_scales(
     before: Float64[Tensor, " groups"],
     floor: float,
 ) -> Float64[Tensor, " groups"]:
-    """Iterate the prior scales together with the step that they lead to, until convergence.
+    """Iterate the prior scales and the step that results from them until convergence.
 
     Args:
         normal: normal matrix of the data, without the prior.
@@ -134,7 +136,7 @@ def converged_prior_scales(
     """
     scale = before
     for _ in range(MAX_ITERATIONS):
-        # The linearised problem has its solution `covariance @ pull` at hand, so no new residuals are needed.
+        # The solution of the linearised problem is `covariance @ pull`, so no new residuals are needed.
         held, before = normal.clone(), scale
         held.diagonal().add_(scaled_precision(precision, group, before))
         covariance = covariance_of(held)

@@ -39,13 +39,13 @@ from pisigma.robot.kinematics.parameter_jacobian import JACOBIAN_CHUNK, ToolMoti
 
 CERTAIN_LOSS = SquaredLoss()
 CONVERGENCE_TOLERANCE = 1e-2
-"""Relative change of noise and prior scales from point to point at convergence."""
+"""Relative change of noise and prior scales between points at convergence."""
 
 
 class MotionMemory:
-    """Cache of the tool motion at the last point, which the rank analysis, the search and its next stage all need.
+    """Cache of the tool motion at the last point, which rank analysis and search both need.
 
-    The inputs of the motion are compared by identity; therefore points are replaced and never changed in place.
+    The inputs of the motion are compared by identity; therefore points must be replaced, not changed in place.
     """
 
     def __init__(self) -> None:
@@ -53,27 +53,27 @@ class MotionMemory:
         self._motion: ToolMotion | None = None
 
     def motion(self, made_from: tuple[object, ...], make: Callable[[], ToolMotion]) -> ToolMotion:
-        """Return the cached motion if it was made from the same objects, or else a new one.
+        """Return the cached motion if it was computed from the same objects, otherwise a new motion.
 
         Args:
-            made_from: the objects.
+            made_from: the objects from which the motion is computed.
             make: function that computes the motion.
         """
         same = len(made_from) == len(self._made_from) and all(
             one is other for one, other in zip(made_from, self._made_from, strict=True)
         )
         if not same or self._motion is None:
-            self._made_from, self._motion = made_from, None  # release the memory before more is allocated
+            self._made_from, self._motion = made_from, None  # release memory before more is allocated
             self._motion = make()
         return self._motion
 
 
 @dataclass(frozen=True, eq=False)
 class CalibrationProblem(AbstractLeastSquares[Tensor]):
-    """Rows, sensors, free parameters and their prior.
+    """Least-squares problem of a calibration: rows, sensors, free parameters and their prior.
 
     Attributes:
-        space: the parameters; a point is a vector of all of them.
+        space: the parameters; a point is a vector of all parameters.
         q: joint values of the rows [rad or m].
         frame: index of every row's frame.
         target: index of every row's target.
@@ -82,11 +82,11 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         nominal: prior means of all parameters.
         precision: prior precision (1 / variance); 0 for parameters without a prior.
         active: indices of the free parameters.
-        pose: number of every row's pose (joint values, frame, target); None if no pose is repeated.
-        configuration: number of every row's joint values and frame; None if none has several targets.
+        pose: index of every row's pose (joint values, frame, target); None if no pose is repeated.
+        configuration: index of every row's joint values and frame; None if no configuration has several targets.
         pairs: number of pairs of rows that are measured together, which come first.
         stated: conditions stated in the rows (see `JointState`), for corrections that depend on them.
-        prior_sizes: "stated": prior scales of 1; "widened": at least 1; "estimated": any.
+        prior_sizes: "stated": prior scales are 1; "widened": at least 1; "estimated": estimated without bounds.
         memory: cache of the last motion, shared by problems that differ only in free parameters or prior.
     """
 
@@ -108,7 +108,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
 
     @cached_property
     def step_scale(self) -> Float64[Tensor, " active"]:
-        """1 mm and 1 mrad."""
+        """Typical size of every unknown: 1 mm or 1 mrad."""
         return torch.from_numpy(self.space.usual_errors).to(self.q.device)[self.active]
 
     @property
@@ -123,7 +123,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
 
     @cached_property
     def prior_group(self) -> Int64[Tensor, " active"]:
-        """Group of the prior scale of every free parameter: its `PriorGroup`, or one for lengths and one for angles."""
+        """Group of the prior scale of every free parameter: its `PriorGroup`, or one for lengths or angles."""
         active = self.active
         if self.prior_sizes != "estimated":
             return self.space.is_length.to(active.device)[active].long()
@@ -139,7 +139,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         return replace(self, precision=torch.zeros_like(self.precision))
 
     def with_partners(self, rows: Int64[Tensor, " chosen"]) -> Int64[Tensor, " _rows"]:
-        """Add the other rows of pairs to some rows; in ascending order if there are pairs."""
+        """Return rows with the other rows of their pairs, in ascending order if there are pairs."""
         if not self.pairs:
             return rows
         partner = torch.where(rows < 2 * self.pairs, rows ^ 1, rows)
@@ -147,7 +147,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         return both
 
     def select(self, rows: Int64[Tensor, " chosen"]) -> "CalibrationProblem":
-        """Select some of the rows, with both rows of a pair."""
+        """Return the problem with some of the rows, including both rows of a pair."""
         rows = self.with_partners(rows)
         return replace(
             self,
@@ -164,11 +164,11 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
 
     @cached_property
     def state(self) -> JointState:
-        """Joint values and stated conditions of the rows."""
+        """Joint values and stated conditions of the rows, as a `JointState`."""
         return JointState(self.q, self.stated)
 
     def apply_step(self, point: Tensor, step: Tensor) -> Tensor:
-        """Return the parameters after a step of the free ones."""
+        """Return all parameters after a step of the free parameters."""
         return point.index_add(0, self.active, step)
 
     def rms(self, linearisation: Linearisation[Tensor]) -> Float64[Tensor, ""]:
@@ -203,7 +203,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         return self._renewed(linearisation, refine=False)
 
     def with_refined_noise(self, linearisation: Linearisation[Tensor]) -> Linearisation[Tensor]:
-        """Estimate the same with the noise from all rows without outliers, for the end of a search."""
+        """Estimate noise and prior scales from all rows without outliers, for the end of a search."""
         return self._renewed(linearisation, refine=True)[0]
 
     def _renewed(
@@ -238,9 +238,9 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
     def _prior_scales(
         self, view: SensorView, off: Tensor, covariance: Tensor, refine: bool
     ) -> Float64[Tensor, " groups"]:
-        """Estimate the prior scales; during a search, jointly with the step that they lead to.
+        """Estimate the prior scales; during a search, jointly with the step that results from them.
 
-        Residuals are linearised for that.
+        Residuals are linearised for this purpose.
         """
         floor, prior = (
             1.0 if self.prior_sizes == "widened" else SMALLEST_PRIOR,
@@ -254,7 +254,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
 
     @cached_property
     def _sized(self) -> bool:
-        """Whether there is a prior with estimated scales."""
+        """Whether the problem has a prior with estimated scales."""
         return self.prior_sizes != "stated" and bool((self._prior > 0).any())
 
     def _off(self, point: Tensor) -> Float64[Tensor, " active"]:
@@ -266,12 +266,12 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         return CERTAIN_LOSS if sensor.certain else self.loss
 
     def chunks(self) -> list[slice]:
-        """Split the rows into chunks that are processed together."""
+        """Return the rows in chunks that are processed together."""
         starts = range(0, self.rows, JACOBIAN_CHUNK)
         return [slice(start, min(start + JACOBIAN_CHUNK, self.rows)) for start in starts]
 
     def motion(self, point: Tensor, rows: slice, active: Tensor) -> ToolMotion:
-        """Compute the tool poses of some rows and their derivatives with respect to some parameters.
+        """Compute the tool poses of rows, and their derivatives with respect to the active parameters.
 
         The columns are 0 for bases and tools in rows of other frames and targets, and for parameters that do not move
         the tool.
@@ -290,7 +290,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         return ToolMotion(motion.position, motion.rotation, J)
 
     def _motion(self, point: Tensor, rows: slice) -> ToolMotion:
-        """Compute the tool poses of some rows and their derivatives with respect to every kind of parameter."""
+        """Compute the tool poses of rows, and their derivatives with respect to every kind of parameter."""
         dh, bases, tools = self.space.split(point)
         frame, target = (
             None if len(owners) == 1 else number[rows]
@@ -312,7 +312,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         return J
 
     def combine_sums(self, point: Tensor, view: SensorView) -> Linearisation[Tensor]:
-        """Combine the sensors' sums, divided by their variances, and the prior into a linearisation."""
+        """Return the linearisation from the sensors' sums, divided by their variances, and the prior."""
         off = self._off(point)
         precision = view.scaled_precision(self._prior, self.prior_group)
         pull = off * precision
@@ -331,7 +331,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
     def _data_sums(
         self, view: SensorView
     ) -> tuple[Float64[Tensor, "active active"], Float64[Tensor, " active"]]:
-        """Add up the sensors' sums, divided by their variances, without the prior."""
+        """Return the total of the sensors' sums, divided by their variances, without the prior."""
         terms = [
             (sums.normal / variance, sums.descent / variance)
             for sums, variance in zip(view.sums, view.variances, strict=True)
@@ -344,7 +344,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
 
     @cached_property
     def _rounding(self) -> Float64[Tensor, " sensors"]:
-        """Sum of squared residuals that rounding causes, per sensor [m² or rad²]."""
+        """Sum of squared residuals that rounding errors cause, per sensor [m² or rad²]."""
         sizes = (self.space.robot.reach if sensor.unit == "m" else 1.0 for sensor in self.sensors)
         pairs = zip(self.values_measured, sizes, strict=True)
         epsilon = torch.finfo(self.q.dtype).eps
@@ -352,7 +352,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
 
     @cached_property
     def needs_rotation(self) -> bool:
-        """Whether any sensor needs the tool's rotation."""
+        """Whether any sensor requires the rotation of the tool."""
         return any(sensor.turning for sensor in self.sensors)
 
     @cached_property
@@ -361,7 +361,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
 
     @cached_property
     def measured_in_every_row(self) -> tuple[bool, ...]:
-        """Per sensor, whether it has a value in every row."""
+        """Whether every sensor has a value in all rows, per sensor."""
         return tuple(
             values == self.rows * sensor.components
             for values, sensor in zip(self.values_measured, self.sensors, strict=True)
@@ -370,7 +370,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
     def _sums(
         self, number: int, view: SensorView | None, motion: ToolMotion, unknowns: Unknowns, rows: slice
     ) -> SensorSums:
-        """Compute the sums of one sensor in some rows, weighted by its noise, or equally if `view` is None."""
+        """Compute the sums of a sensor over rows, weighted by its noise, or equally if `view` is None."""
         sensor, everywhere = self.sensors[number], self.measured_in_every_row[number]
         residual = sensor.residual(motion, unknowns, rows)
         if not everywhere:

@@ -1,4 +1,4 @@
-"""Construction of the calibration problem with its initial guess, and its solutions in the user's coordinates."""
+"""Build the calibration problem with an initial guess, and convert its solutions to the user's coordinates."""
 
 import math
 from collections.abc import Mapping
@@ -27,16 +27,16 @@ from pisigma.robot.description import Robot
 from pisigma.robot.se3 import invert, rotation_from_rpy, rpy_from_rotation, transform_from_xyzrpy
 
 MULTIPLIER, FACTOR = 6_364_136_223_846_793_005, 1_442_695_040_888_963_407
-"""Constants of the linear congruential generator for hashing joint values (Knuth, MMIX)."""
+"""Constants of the linear congruential generator that hashes joint values (Knuth, MMIX)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Anchors:
-    """Start values of bases and tools; parameters are changes relative to these, far from the singularity of rpy.
+    """Start values of bases and tools; parameters are relative to them, far from the singularity of roll, pitch, yaw.
 
     Attributes:
-        bases: anchor of every frame: `base = anchor · base_of_problem`. Points that sensors estimate are relative to it
-            too.
+        bases: anchor of every frame: `base = anchor · base_of_problem`. Points that sensors estimate are relative to
+            it, too.
         tools: anchor of every target's rotation: `R_tool = R_of_problem · anchor`.
     """
 
@@ -46,16 +46,16 @@ class Anchors:
 
 @dataclass(frozen=True, eq=False)
 class CalibrationSetup:
-    """A problem ready to be solved.
+    """A calibration problem with start values, ready to be solved.
 
     Attributes:
-        problem: the problem, without free parameters yet.
+        problem: the problem, not yet with free parameters.
         start: start values of all parameters.
-        anchors: frames that bases and tools are relative to.
-        rows: numbers of the rows of the problem in the measurements, in its order.
+        anchors: frames to which bases and tools are relative.
+        rows: indices of the problem's rows in the measurements, in the order of the problem.
         unknown_frames: index of every owner's frame, by group of the sensors' unknowns.
         free_unknowns: indices of the sensors' unknowns to identify, such as positions of sockets.
-        measurements: the rows of the problem, in its order.
+        measurements: the rows of the problem, in the order of the problem.
     """
 
     problem: CalibrationProblem
@@ -69,7 +69,7 @@ class CalibrationSetup:
 
 @dataclass(frozen=True)
 class SetupOptions:
-    """Settings of base, tool and sensors.
+    """Settings for base, tool and sensors of a calibration problem.
 
     Attributes:
         free_base: whether to identify bases.
@@ -77,7 +77,7 @@ class SetupOptions:
         turn_tool: whether to identify the rotations of tools.
         frames: initial guesses of bases by frame: x, y, z [m], roll, pitch, yaw [rad].
         socket_distances: distances between two sockets [m].
-        socket_sigma: their standard deviation [m].
+        socket_sigma: standard deviation of the distances between sockets [m].
         prior_sizes: see `CalibrationProblem`.
     """
 
@@ -100,7 +100,7 @@ def build_setup(
     """Guess bases, tools and the sensors' unknowns, and build the problem relative to them.
 
     Raises:
-        IdentificationError: there are no usable measurements, too few to identify everything, or implausible ones.
+        IdentificationError: measurements are missing, too few to identify all parameters, or implausible.
         PoseError: the joint values do not fit the robot.
     """
     robot.check_joint_count(measurements.q.shape[1])
@@ -176,13 +176,13 @@ def setup_from_guess(
 
 
 def usable_rows(measurements: Measurements) -> tuple[Tensor, Measurements]:
-    """Select the rows with measured values; those of pairs come first, next to each other.
+    """Return the rows with measured values; rows of pairs come first, next to each other.
 
     Returns:
-        Their numbers, and the rows.
+        The indices of these rows, and the rows.
 
     Raises:
-        IdentificationError: no row has a measured value, or all have the same joint values.
+        IdentificationError: no row has a measured value, or all rows have the same joint values.
     """
     usable = torch.stack([measurements.is_measured(kind) for kind in (*KINDS, *READINGS)]).any(0)
     if not bool(usable.any()):
@@ -209,17 +209,17 @@ def usable_rows(measurements: Measurements) -> tuple[Tensor, Measurements]:
 
 
 def number_repeats(q: Tensor, *names: Tensor) -> Tensor | None:
-    """Number the rows by joint values (with payload, to 1e-9) and names, such as frame and target.
+    """Return an index for every row that is equal for equal joint values (with payload, to 1e-9) and names.
 
     Returns:
-        None if all rows differ.
+        The indices; None if all rows differ.
     """
     numbers = renumber(_mixed_keys(q, *names))
     return None if int(numbers.max()) + 1 == len(q) else numbers
 
 
 def _mixed_keys(q: Float64[Tensor, "rows dof"], *names: Tensor) -> Int64[Tensor, " rows"]:
-    """Hash every row's joint values (to 1e-9) and names to one integer."""
+    """Return a hash of every row's joint values (to 1e-9) and names."""
     keys, dof = (q * 1e9).round().long(), q.shape[1]
     factors = [FACTOR * pow(MULTIPLIER, dof - 1 - joint, 2**64) for joint in range(dof)]
     signed = [(factor + 2**63) % 2**64 - 2**63 for factor in factors]
@@ -235,7 +235,7 @@ def _anchored(
     options: SetupOptions,
     unknown_frames: Mapping[str, Int64[Tensor, " owners"]],
 ) -> tuple[Anchors, Float64[Tensor, " parameters"]]:
-    """Choose the anchors, and compute the start relative to them: identity for free bases and free tool rotations."""
+    """Return the anchors, and the start relative to them: the identity for free bases and free tool rotations."""
     bases, tools = guessed.bases.copy(), guessed.tools.copy()
     anchors = Anchors(
         torch.eye(4).double().repeat(len(bases), 1, 1), torch.eye(3).double().repeat(len(tools), 1, 1)
@@ -258,7 +258,7 @@ def _anchored(
 def _moved(
     T: Float64[Tensor, "owners 4 4"], values: Float64[Tensor, "owners columns"], has_point: bool
 ) -> Float64[Tensor, "owners columns"]:
-    """Transform the points among the sensors' unknowns."""
+    """Return the sensors' unknowns with transformed points."""
     if not has_point:
         return values
     points = (T[:, :3, :3] @ values[:, :3, None])[..., 0] + T[:, :3, 3]
@@ -275,7 +275,7 @@ class IdentifiedGeometry:
         tools: tool of every target, in the same form.
         unknowns: unknowns of the sensors by group and owner, in the owner's frame, such as
             `unknowns["socket"]["plate/0"]` [m or rad].
-        setup: setup of the problem that it solves; None if it is not available.
+        setup: setup of the solved problem; None if it is not available.
         point: the solution in the problem's coordinates.
     """
 
@@ -288,13 +288,13 @@ class IdentifiedGeometry:
 
     @cached_property
     def coordinate_jacobian(self) -> Float64[Tensor, "parameters parameters"]:
-        """Derivative of the coordinates with respect to the problem's parameters; requires `setup` and `point`."""
+        """Derivative of the user's coordinates with respect to the problem's; requires `setup` and `point`."""
         assert self.setup is not None
         assert self.point is not None
         return coordinate_change(self.setup, self.point.cpu())
 
     def values_of(self, space: ParameterSpace) -> Float64[Tensor, " parameters"]:
-        """Return all parameters of a space as one vector; NaN for missing unknowns of sensors."""
+        """Return all parameters of a space as a vector; NaN for missing unknowns of sensors."""
         unknowns = []
         for own in space.unknowns:
             missing, values = np.full(len(own.columns), np.nan), self.unknowns.get(own.name, {})
@@ -304,7 +304,7 @@ class IdentifiedGeometry:
 
 
 def identified_geometry(setup: CalibrationSetup, point: Float64[Tensor, " parameters"]) -> IdentifiedGeometry:
-    """Convert a point of the problem to the user's coordinates."""
+    """Return the geometry at a point of the problem, in the user's coordinates."""
     space = setup.problem.space
     dh, bases, tools = in_user_coordinates(setup, point)
     return IdentifiedGeometry(
@@ -336,10 +336,10 @@ def in_user_coordinates(
 def coordinate_change(
     setup: CalibrationSetup, point: Float64[Tensor, " parameters"]
 ) -> Float64[Tensor, "parameters parameters"]:
-    """Return the derivative of all parameters in the user's coordinates with respect to those of the problem.
+    """Return the derivative of all parameters in the user's coordinates with respect to the problem's parameters.
 
     Args:
-        setup: setup with the anchors that bases and tools of the problem are relative to.
+        setup: setup with the anchors to which bases and tools of the problem are relative.
         point: point of the derivative, in the problem's coordinates.
     """
     space, anchors = setup.problem.space, setup.anchors
@@ -351,7 +351,7 @@ def coordinate_change(
         # Shifts of a base are in the axes of its anchor.
         change[first : first + 3, first : first + 3] = anchor[:3, :3]
         # Angular velocities agree in both coordinates up to the anchor; the axes convert them from and to rpy.
-        # At a pitch of 90 deg roll and yaw have the same axis: the pseudo-inverse then returns the smallest changes.
+        # At a pitch of 90 deg, roll and yaw have the same axis; the pseudo-inverse then returns the smallest changes.
         back = torch.linalg.pinv(rpy_axes(user_bases[k, 3:]), rtol=1e-9)
         turns = slice(first + 3, first + 6)
         change[turns, turns] = back @ anchor[:3, :3] @ rpy_axes(bases[k, 3:])
@@ -360,7 +360,7 @@ def coordinate_change(
         back = torch.linalg.pinv(rpy_axes(user_tools[k, 3:]), rtol=1e-9)
         change[first : first + 3, first : first + 3] = back @ rpy_axes(tools[k, 3:])
     for own in space.unknowns:
-        # Shifts of points are in the axes of their frame's anchor too.
+        # Shifts of points are also in the axes of their frame's anchor.
         if own.has_point:
             for k, number in enumerate(setup.unknown_frames[own.name].tolist()):
                 first = space.indices_of(own.name).start + len(own.columns) * k
