@@ -1,10 +1,11 @@
-"""Poses and Jacobians of the tool of URDF and MJCF files in MuJoCo, pinocchio, Drake and the Robotics Toolbox.
+"""Poses and Jacobians of the tool of exported files in MuJoCo, pinocchio, Drake and the Robotics Toolbox.
 
 `python urdf_peers.py PEER < requests.json` reads `[{"file": ..., "base": ..., "tool": ..., "q": [[q_1, ...], ...]}]`
 with joint values [rad or m], and prints for every file the poses of the link, body or site `tool` in `base`, and the
-geometric Jacobians of its origin in the axes of `base` (first of the position, then of the rotation), as JSON. It does
-not import pisigma, so the peers can be installed in a separate environment:
-`pip install mujoco pin roboticstoolbox-python drake==1.51.1` (the last Drake for Python 3.11).
+geometric Jacobians of its origin in the axes of `base` (first of the position, then of the rotation), as JSON. Files
+are URDF, MJCF, or DH tables as .csv or .json, from which `dh_models.py` builds the models. It does not import pisigma,
+so the peers can be installed in a separate environment: `pip install mujoco pin roboticstoolbox-python drake==1.51.1`
+(the last Drake for Python 3.11), and `pip install placo`, which requires another version of pinocchio, in another one.
 """
 
 import json
@@ -12,9 +13,15 @@ import sys
 from collections.abc import Iterator
 
 import numpy as np
+from dh_models import add_to_drake, mujoco_model, pinocchio_model, toolbox_model
 
 Motion = tuple[np.ndarray, np.ndarray]
 """Pose (4, 4) and Jacobian (6, joints)."""
+
+
+def is_table(path: str) -> bool:
+    """Return whether a file is an exported DH table."""
+    return path.endswith((".csv", ".json"))
 
 
 def _in_base(T_base: np.ndarray, T_tool: np.ndarray, J: np.ndarray) -> Motion:
@@ -27,7 +34,7 @@ def mujoco_motions(path: str, q: np.ndarray, *names: str) -> Iterator[Motion]:
     """Yield motions by MuJoCo, which compiles the unmodified file."""
     import mujoco
 
-    spec = mujoco.MjSpec.from_file(path)
+    spec = mujoco_model(path) if is_table(path) else mujoco.MjSpec.from_file(path)
     spec.compiler.fusestatic = False
     model = spec.compile()
     data = mujoco.MjData(model)
@@ -55,7 +62,7 @@ def pinocchio_motions(path: str, q: np.ndarray, *names: str) -> Iterator[Motion]
     """Yield motions by pinocchio, whose continuous joints take cosine and sine."""
     import pinocchio
 
-    model = pinocchio.buildModelFromUrdf(path)
+    model = pinocchio_model(path) if is_table(path) else pinocchio.buildModelFromUrdf(path)
     data = model.createData()
     base, tool = (model.getFrameId(name) for name in names)
     for values in q:
@@ -75,7 +82,10 @@ def drake_motions(path: str, q: np.ndarray, *names: str) -> Iterator[Motion]:
     from pydrake.multibody.tree import JacobianWrtVariable
 
     plant = MultibodyPlant(time_step=0.0)
-    Parser(plant).AddModels(path)
+    if is_table(path):
+        add_to_drake(path, plant)
+    else:
+        Parser(plant).AddModels(path)
     base, tool = (plant.GetFrameByName(name) for name in names)
     world = plant.world_frame()
     if base.body().index() not in [body.index() for body in plant.GetBodiesWeldedTo(plant.world_body())]:
@@ -93,16 +103,27 @@ def toolbox_motions(path: str, q: np.ndarray, *names: str) -> Iterator[Motion]:
     """Yield motions by the Robotics Toolbox for Python."""
     import roboticstoolbox
 
-    robot = roboticstoolbox.Robot.URDF(path)
+    robot = toolbox_model(path) if is_table(path) else roboticstoolbox.Robot.URDF(path)
+    ends = {} if is_table(path) else {"end": names[1], "start": names[0]}
     for values in q:
-        T, J = (
-            robot.fkine(values, end=names[1], start=names[0]).A,
-            robot.jacob0(values, end=names[1], start=names[0]),
-        )
-        yield T, J
+        yield robot.fkine(values, **ends).A, robot.jacob0(values, **ends)
+
+
+def placo_motions(path: str, q: np.ndarray, *names: str) -> Iterator[Motion]:
+    """Yield motions by placo, whose arms have a floating base."""
+    import placo
+
+    robot = placo.RobotWrapper(path, placo.Flags.ignore_collisions)
+    for values in q:
+        robot.state.q[7:] = values
+        robot.update_kinematics()
+        T_base, T_tool = (robot.get_T_world_frame(name) for name in names)
+        J = robot.frame_jacobian(names[1], "local_world_aligned")[:, 6:]
+        yield _in_base(T_base, T_tool, J)
 
 
 PEERS = {
+    "placo": placo_motions,
     "mujoco": mujoco_motions,
     "pinocchio": pinocchio_motions,
     "drake": drake_motions,

@@ -1,4 +1,4 @@
-"""URDF and MJCF files of every robot, loaded by MuJoCo, pinocchio, Drake and the Robotics Toolbox for Python."""
+"""URDF, MJCF and DH tables of every robot in MuJoCo, pinocchio, placo, Drake and the Robotics Toolbox for Python."""
 
 import json
 import os
@@ -16,6 +16,7 @@ from testing.closeness import assert_close
 from testing.outside_arm import ARMS, SIMULATOR
 
 import pisigma
+from pisigma.deployment.export.dh_table import dh_csv, dh_json
 from pisigma.deployment.export.mjcf import update_mjcf, urdf_to_mjcf
 from pisigma.deployment.export.urdf import CALIBRATED_FRAME, CALIBRATED_TOOL, update_urdf
 from pisigma.robot import Robot
@@ -23,14 +24,25 @@ from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.kinematics.jacobian import joint_jacobian
 from pisigma.robot.writing import BASE_LINK, TOOL_LINK, robot_to_urdf
 
-MODULES = {"mujoco": "mujoco", "pinocchio": "pinocchio", "drake": "pydrake", "toolbox": "roboticstoolbox"}
-KINDS = {
-    "mujoco": ("urdf", "urdf of a drawing", "mjcf", "mjcf of a drawing"),
-    "pinocchio": ("urdf", "urdf of a drawing"),
-    "drake": ("urdf", "urdf of a drawing", "mjcf"),
-    "toolbox": ("urdf", "urdf of a drawing"),
+MODULES = {
+    "mujoco": "mujoco",
+    "pinocchio": "pinocchio",
+    "drake": "pydrake",
+    "toolbox": "roboticstoolbox",
+    "placo": "placo",
 }
-"""Kinds of files by what reads them; Drake's parser of MJCF leaves out sites."""
+TABLES = ("dh", "json")
+KINDS = {
+    "mujoco": ("urdf", "urdf of a drawing", "mjcf", "mjcf of a drawing", *TABLES),
+    "pinocchio": ("urdf", "urdf of a drawing", *TABLES),
+    "drake": ("urdf", "urdf of a drawing", "mjcf", *TABLES),
+    "toolbox": ("urdf", "urdf of a drawing", *TABLES, "dh without beta"),
+    "placo": ("urdf", "urdf of a drawing"),
+}
+"""Kinds of files by reader; Drake's parser of MJCF leaves out sites, and a `DHRobot` of the toolbox has no beta."""
+ENDS = {"urdf": (BASE_LINK, TOOL_LINK), **dict.fromkeys((*TABLES, "dh without beta"), ("base", "tool"))}
+"""Names of base and tool by kind, if they are not those of a drawing."""
+SUFFIXES = {"urdf": ".urdf", "mjcf": ".xml", "dh": ".csv", "json": ".json"}
 POSES = 10
 
 
@@ -51,11 +63,12 @@ def calibrated(nominal: Robot, random: np.random.Generator) -> Robot:
 
 @pytest.fixture(scope="module")
 def robots(tmp_path_factory, repository):
-    """Calibrated robots, their files by kind, and joint values."""
+    """Kind of file, calibrated robot, file and joint values."""
     folder, random, made = tmp_path_factory.mktemp("peers"), np.random.default_rng(2), []
     for name, drawing in drawings(folder, repository).items():
         nominal = Robot.load(drawing)
         robot = calibrated(nominal, random)
+        without_beta = robot.with_geometry(robot.dh * np.array([1, 1, 1, 1, 0]))
         in_drawing = update_urdf(robot, nominal, drawing)
         path = folder / f"{name}_drawing.xml"
         path.write_text(urdf_to_mjcf(update_urdf(nominal, nominal, drawing))[0])
@@ -64,13 +77,16 @@ def robots(tmp_path_factory, repository):
             "urdf of a drawing": in_drawing,
             "mjcf": urdf_to_mjcf(in_drawing)[0],
             "mjcf of a drawing": update_mjcf(robot, nominal, path),
+            "dh": dh_csv(robot),
+            "json": dh_json(robot),
+            "dh without beta": dh_csv(without_beta),
         }
-        files = {}
-        for kind, text in texts.items():
-            files[kind] = folder / f"{name} {kind}{'.xml' if kind.startswith('mjcf') else '.urdf'}"
-            files[kind].write_text(text)
         low, high = np.clip(robot.limits, -3.0, 3.0).T
-        made.append((robot, files, random.uniform(low, high, (POSES, robot.dof))))
+        q = random.uniform(low, high, (POSES, robot.dof))
+        for kind, text in texts.items():
+            file = folder / f"{name} {kind}{SUFFIXES[kind.split()[0]]}"
+            file.write_text(text)
+            made.append((kind, without_beta if kind == "dh without beta" else robot, file, q))
     return made
 
 
@@ -81,12 +97,11 @@ def test_peers_compute_the_same_poses_and_jacobians(peer, repository, request):
     if subprocess.run([python, "-c", f"import {MODULES[peer]}"], capture_output=True, check=False).returncode:
         pytest.skip(f"{peer} is not installed for {python}; name a Python that has it in PISIGMA_PEERS")
     requests, expected = [], []
-    for robot, files, q in request.getfixturevalue("robots"):
-        T, J = joint_jacobian(robot, torch.from_numpy(q))
-        for kind in KINDS[peer]:
-            base, tool = (BASE_LINK, TOOL_LINK) if kind == "urdf" else (CALIBRATED_FRAME, CALIBRATED_TOOL)
-            requests.append({"file": str(files[kind]), "base": base, "tool": tool, "q": q.tolist()})
-            expected.append((T, J))
+    for kind, robot, file, q in request.getfixturevalue("robots"):
+        if kind in KINDS[peer]:
+            base, tool = ENDS.get(kind, (CALIBRATED_FRAME, CALIBRATED_TOOL))
+            requests.append({"file": str(file), "base": base, "tool": tool, "q": q.tolist()})
+            expected.append(joint_jacobian(robot, torch.from_numpy(q)))
     script = Path(repository) / "benchmarks" / "urdf_peers.py"
     run = subprocess.run(
         [python, str(script), peer], input=json.dumps(requests), capture_output=True, text=True, check=False
@@ -112,3 +127,22 @@ def test_a_model_in_pinocchio(in_drawing, tmp_path):
     for values, T in zip(q.numpy(), forward_kinematics(model.calibrated, q), strict=True):
         pinocchio.framesForwardKinematics(made, data, values)
         assert_close((data.oMf[base].inverse() * data.oMf[tool]).homogeneous, T, atol=1e-9)
+
+
+def test_an_srdf_of_the_drawing_applies_to_the_calibrated_file(tmp_path):
+    """Named poses of MoveIt keep their joint values."""
+    pinocchio = pytest.importorskip("pinocchio", reason="pinocchio is not installed (pip install pin)")
+    drawing, q = tmp_path / "arm.urdf", np.linspace(-1, 1, 6)
+    drawing.write_text(robot_to_urdf(Robot.load("ur10")))
+    nominal = Robot.load(drawing)
+    states = "".join(
+        f'<joint name="{joint.name}" value="{value!r}"/>'
+        for joint, value in zip(nominal.joints, q.tolist(), strict=True)
+    )
+    srdf = f"""<robot name="{nominal.name}"><group name="arm"><chain base_link="{BASE_LINK}" tip_link="{TOOL_LINK}"/>
+    </group><group_state name="home" group="arm">{states}</group_state></robot>"""
+    model = pinocchio.buildModelFromXML(
+        update_urdf(calibrated(nominal, np.random.default_rng(0)), nominal, drawing)
+    )
+    pinocchio.loadReferenceConfigurationsFromXML(model, srdf)
+    assert_close(model.referenceConfigurations["home"], q, atol=0)

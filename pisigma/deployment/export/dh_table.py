@@ -1,4 +1,4 @@
-"""DH + Hayati tables of a robot as CSV and YAML, in millimetres and degrees at full precision."""
+"""DH + Hayati tables of a robot as CSV, YAML and JSON, in millimetres and degrees at full precision."""
 
 import csv
 import io
@@ -12,7 +12,7 @@ from pisigma.deployment.export.geometry import check_geometry, chosen_geometry
 from pisigma.robot.coupling_section import coupling_document
 from pisigma.robot.description import Robot
 from pisigma.robot.row import DH_COLUMNS, FRAME_COLUMNS, in_file_units
-from pisigma.robot.writing import robot_to_yaml
+from pisigma.robot.writing import robot_document, robot_to_yaml
 
 CONVENTION = (
     "A_i = RotZ(theta_i + direction q_i) Trans(a_i, 0, d_i) RotX(alpha_i) RotY(beta_i), a prismatic joint adds "
@@ -26,6 +26,12 @@ TABLE_SUFFIXES = (".csv", ".yaml", ".yml")
 def dh_yaml(robot: Robot, comments: tuple[str, ...] = ()) -> str:
     """Write a robot file, which `Robot.load` reads, with comments at the top."""
     return header_comment((CONVENTION, *comments)) + robot_to_yaml(robot)
+
+
+def dh_json(robot: Robot, comments: tuple[str, ...] = ()) -> str:
+    """Write the values of a robot file as JSON, with the convention and comments; keys end with the unit."""
+    document = {"convention": CONVENTION, "remarks": list(comments), **robot_document(robot)}
+    return json.dumps(document, indent=2) + "\n"
 
 
 def dh_csv(robot: Robot, comments: tuple[str, ...] = ()) -> str:
@@ -81,12 +87,18 @@ def header_comment(sentences: tuple[str, ...]) -> str:
 def _write(request: ExportRequest) -> Exported:
     model = request.load()
     chosen = chosen_geometry(model, request.geometry)
-    write = dh_csv if request.is_csv else dh_yaml
+    write = {".csv": dh_csv, ".json": dh_json}.get(request.out.suffix.lower(), dh_yaml)
     return Exported(
         write(chosen.robot, chosen.comments), model_facts(model) | {"geometry": chosen.name}, chosen.comments
     )
 
 
 FORMAT = ExportFormat(
-    "dh", "a DH table", TABLE_SUFFIXES, _write, frozenset(("geometry",)), check_geometry, "kinematics"
+    "dh",
+    "a DH table",
+    (*TABLE_SUFFIXES, ".json"),
+    _write,
+    frozenset(("geometry",)),
+    check_geometry,
+    "kinematics",
 )

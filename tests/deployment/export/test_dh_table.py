@@ -1,6 +1,7 @@
 """DH tables: the YAML is a robot file, and the CSV has the same numbers."""
 
 import csv
+import json
 import math
 
 import numpy as np
@@ -9,7 +10,7 @@ import yaml
 from testing.closeness import assert_close
 from testing.coupled import coupled_robot
 
-from pisigma.deployment.export.dh_table import dh_csv, dh_yaml
+from pisigma.deployment.export.dh_table import CONVENTION, dh_csv, dh_json, dh_yaml
 from pisigma.robot import DH_COLUMNS, FRAME_COLUMNS, Robot, catalogue
 
 LENGTHS = ("d", "a", "x", "y", "z")
@@ -42,6 +43,8 @@ def test_the_yaml_is_a_robot_file(name, tmp_path):
     assert [(row.name, row.type, row.direction) for row in again.rows] == [
         (row.name, row.type, row.direction) for row in robot.rows
     ]
+    same = {"convention": CONVENTION, "remarks": ["said"], **yaml.safe_load(dh_yaml(robot))}
+    assert json.loads(dh_json(robot, ("said",))) == same
     lines = (tmp_path / "robot.yaml").read_text().splitlines()
     assert lines[0].startswith("# A_i = RotZ(theta_i")
     assert lines[1:4] == ["# two lines", "# a: b", f"name: {name}"]
