@@ -1,1 +1,1 @@
-"""The calibrated model, its domain and its predicted accuracy."""
+"""Calibrated models: predictions, domain, predicted accuracy, folders and corrected inverse kinematics."""

@@ -1,4 +1,4 @@
-"""Predicted accuracy of a model's positions."""
+"""Predicted accuracy of the positions of a model."""
 
 from dataclasses import replace
 
@@ -16,11 +16,12 @@ def position_accuracy(model: CalibratedModel, q: Float[Tensor, "*batch dof"]) ->
     """Compute the standard deviation of the tool's predicted position [m], `sqrt(σx² + σy² + σz²)`.
 
     Args:
-        model: calibrated model; the position is that of its first target in its first frame.
+        model: calibrated model; the position is the position of its first target in its first frame.
         q: commanded joint values [rad or m].
 
     Returns:
-        NaN where a joint value is NaN, and everywhere if the model has no uncertainty.
+        The standard deviation of every pose; NaN where a joint value is NaN, and everywhere if the model has no
+        uncertainty.
     """
     flat = q.detach().to("cpu", torch.float64).reshape(-1, q.shape[-1])
     result = torch.full((len(flat),), torch.nan, dtype=torch.float64)
@@ -45,10 +46,11 @@ def position_accuracy(model: CalibratedModel, q: Float[Tensor, "*batch dof"]) ->
 def deviation_of_rows(model: CalibratedModel, measurements: Measurements) -> Float64[Tensor, "rows 3"]:
     """Compute the standard deviation of every row's target position along the axes of its frame [m].
 
-    It is that of the posterior, without measurement noise, inside and outside the measured joint values.
+    It is the standard deviation of the posterior, without measurement noise, inside and outside the measured joint
+    values.
 
     Returns:
-        NaN if the model has no uncertainty.
+        The standard deviations; NaN if the model has no uncertainty.
 
     Raises:
         MeasurementError: the model was not calibrated for a frame or target of the rows.
@@ -65,8 +67,8 @@ def parameter_posterior(model: CalibratedModel) -> ParameterPosterior | None:
     """Return the joint posterior of all geometric parameters, in the user's coordinates.
 
     Returns:
-        Geometry, bases, tools and unknown sensor parameters with all their correlations, including those with the
-        weights of the joint correction; None if the model has no uncertainty.
+        Geometry, bases, tools and unknown sensor parameters with all their correlations, including correlations with
+        the weights of the joint correction; None if the model has no uncertainty.
     """
     known = model.uncertainty
     return (

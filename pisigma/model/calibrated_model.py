@@ -1,4 +1,4 @@
-"""A calibrated robot: its geometry, learned joint corrections, their domain, and the poses that it predicts."""
+"""Calibrated robots: geometry, learned joint corrections, their domain, and predicted poses."""
 
 import platform
 from dataclasses import dataclass, field
@@ -32,14 +32,14 @@ if TYPE_CHECKING:
 Frames = dict[str, Float64[np.ndarray, " 6"]]
 """Bases per frame or tools per target: x, y, z [m], roll, pitch, yaw [rad]."""
 CHUNK = 4_096
-"""Poses whose features are held in memory at a time; each has a few hundred feature columns per joint."""
+"""Number of poses whose features are in memory at a time; each has a few hundred feature columns per joint."""
 DIFFERENCE_STEP = 1e-5
-"""[rad or m] Step of central differences; for a correction with 100 cycles per turn the error is 1e-6 of the slope."""
+"""Step of central differences [rad or m]; for a correction with 100 cycles per turn the error is 1e-6 of the slope."""
 
 
 @dataclass(frozen=True)
 class Provenance:
-    """Record of the recipe, data and software that a model was made with.
+    """Record of the recipe, data and software with which a model was made.
 
     Attributes:
         recipe: name of the recipe.
@@ -76,30 +76,30 @@ class CalibratedModel:
     Attributes:
         name: name of the model.
         kind: how the model was made, for example "inverse_calibration".
-        robot: robot whose kinematics yield the nominal joint values; its base and tool are the fitted ones.
+        robot: robot whose kinematics yield the nominal joint values, with the fitted base and tool.
         network: network that corrects nominal joint values, or None.
         domain: region in which the corrections of `network` are valid, or None.
         branches: branches of the closed-form inverse on which the training rows are, most frequent first; empty if the
             robot has no closed-form inverse.
         starts: commanded joint values [rad or m] of training rows. The network is evaluated at joint values wrapped
-            near them; without a closed form they are the initial values of the numeric inverse.
-        calibrated: robot with the identified geometry and the base and tool of `robot`; None if the geometry is the
-            nominal one.
+            near these values; without a closed form they are the initial values of the numeric inverse.
+        calibrated: robot with the identified geometry and the base and tool of `robot`; None if the geometry is
+            nominal.
         bases: for every frame of the measurements ("" if it has no name) x, y, z [m], roll, pitch, yaw [rad] of the
-            base in it; the first is that of `robot`. Empty if the measurements did not distinguish frames.
-        tools: the same for the tool, for every target.
+            base in this frame; the first is the base of `robot`. Empty if the measurements did not distinguish frames.
+        tools: x, y, z [m], roll, pitch, yaw [rad] of the tool, for every target.
         hybrid: arm with a joint correction that was fitted through the kinematics; its geometry differs from that of
             `calibrated`. None without such a correction.
         hybrid_bases: bases that belong to the hybrid's geometry, with the names of `bases`.
-        hybrid_tools: the same for the tools.
+        hybrid_tools: tools that belong to the hybrid's geometry, with the names of `tools`.
         uncertainty: uncertainty of predicted positions, or None.
         made_of: joint values and readings of the training rows, by which repeated rows are recognised; None if they
-            were not kept. See `pisigma.model.training_rows`.
+            were not stored. See `pisigma.model.training_rows`.
         conditions: payload [kg] and temperature [deg C] at which the model is evaluated, by name; empty for the mean
             conditions of the calibration rows. See `pisigma.model.stated_conditions`.
         measured_conditions: lowest and highest calibrated value of every condition in `conditions` that was stated.
-        provenance: recipe, data and versions that the model was made with.
-        metrics: figures for the card, by name.
+        provenance: recipe, data and versions with which the model was made.
+        metrics: figures that the card reports, by name.
     """
 
     name: str
@@ -124,12 +124,12 @@ class CalibratedModel:
 
     @property
     def identified(self) -> Robot:
-        """Robot with the best known geometry: that of the hybrid, else `calibrated`, else the nominal one."""
+        """Robot with the best known geometry: of the hybrid, otherwise `calibrated`, otherwise the nominal robot."""
         return self.calibrated or self.robot if self.hybrid is None else self.hybrid.robot
 
     @property
     def nominal(self) -> Robot | None:
-        """Nominal robot with its own base and tool; None if the model does not come from a hybrid calibration."""
+        """Nominal robot with nominal base and tool; None if the model was not made by a hybrid calibration."""
         if self.hybrid is not None:
             return self.hybrid.correction.robot
         return None if self.uncertainty is None else self.uncertainty.space.robot
@@ -137,7 +137,7 @@ class CalibratedModel:
     def correction(
         self, T: Float64[Tensor, "*batch 4 4"], q_nominal: Float64[Tensor, "*batch dof"]
     ) -> Float64[Tensor, "*batch dof"]:
-        """Compute the correction [rad or m] that `network` adds to nominal joint values of poses T; 0 without one."""
+        """Compute the correction [rad or m] that `network` adds to nominal joint values of poses T, otherwise 0."""
         if self.network is None:
             return torch.zeros_like(q_nominal)
         with torch.no_grad():
@@ -145,7 +145,7 @@ class CalibratedModel:
         return result
 
     def wrapped_near_training(self, q: Float64[Tensor, "*batch dof"]) -> Float64[Tensor, "*batch dof"]:
-        """Wrap joint values [rad or m] near those of the training rows, for which `network` was trained."""
+        """Wrap joint values [rad or m] near the values of the training rows, for which `network` was trained."""
         if not len(self.starts):
             return q
         return nearest_turn(self.robot, q, middle_of_starts(self.starts), within_limits=False)
@@ -153,7 +153,7 @@ class CalibratedModel:
     def forward(self, q: Float64[Tensor, "*batch dof"]) -> Float64[Tensor, "*batch 4 4"]:
         """Predict the pose T_base_tool that the robot takes when commanded to q [rad or m].
 
-        With an identified geometry this is its forward kinematics, including the joint correction of a hybrid.
+        With an identified geometry this is the forward kinematics, including the joint correction of a hybrid.
         Otherwise it is the pose whose corrected joint values are q, see `nominal_joints`.
 
         Returns:
@@ -172,15 +172,15 @@ class CalibratedModel:
     def to_pytorch_kinematics(self) -> "pytorch_kinematics.SerialChain":
         """Return the identified geometry as a chain of pytorch-kinematics in float64.
 
-        The chain does not include the joint correction of a hybrid or of a network on nominal joint values. Without an
-        identified geometry it is the nominal robot with the fitted base and tool.
+        The chain does not include the joint correction of a hybrid or of a network on nominal joint values. Without
+        an identified geometry, it represents the nominal robot with the fitted base and tool.
         """
         return (self.calibrated or self.robot).to_pytorch_kinematics()
 
     def jacobian(self, q: Float64[Tensor, "*batch dof"]) -> Float64[Tensor, "*batch 6 dof"]:
         """Compute the geometric Jacobian of the arm at commanded joint values q [rad or m], see `joint_jacobian`.
 
-        The slope of the joint correction, about 1e-3, is neglected, and so is a network on nominal joint values.
+        The slope of the joint correction, about 1e-3, and a network on nominal joint values are neglected.
         """
         if self.hybrid is None:
             return joint_jacobian(self.calibrated or self.robot, q)[1]
@@ -207,14 +207,14 @@ def poses_of_rows(model: CalibratedModel, measurements: Measurements) -> Float64
     """Predict the pose of every row's target in the frame of the row.
 
     A hybrid that learned the effect of payload or temperature is evaluated at the conditions of the rows, whereas
-    `CalibratedModel.forward` uses the mean ones of the calibration.
+    `CalibratedModel.forward` uses the mean conditions of the calibration.
 
     Returns:
         The poses; NaN where the model has no prediction, see `CalibratedModel.forward`.
 
     Raises:
         MeasurementError: the model was not calibrated for a frame or target of the rows.
-        PoseError: the number of joint values is not that of the robot's joints.
+        PoseError: the number of joint values is not the number of the robot's joints.
     """
     arm = model.hybrid
     if arm is not None:
@@ -227,7 +227,7 @@ def poses_of_rows(model: CalibratedModel, measurements: Measurements) -> Float64
 def nominal_poses_of_rows(model: CalibratedModel, measurements: Measurements) -> Float64[Tensor, "rows 4 4"]:
     """Predict the poses of the rows without any correction, from the nominal arm with fitted bases and tools.
 
-    For errors see `poses_of_rows`.
+    It raises the same errors as `poses_of_rows`.
     """
     T = forward_kinematics(model.robot, measurements.q)
     return _seen(T, model.robot, model.bases, model.tools, measurements)
@@ -238,14 +238,14 @@ def geometric_poses(
 ) -> Float64[Tensor, "*batch rows 4 4"]:
     """Predict the poses of rows at other joint values q [rad or m] by the identified geometry alone.
 
-    For errors see `poses_of_rows`.
+    It raises the same errors as `poses_of_rows`.
     """
     T = forward_kinematics(model.calibrated or model.robot, q)
     return _seen(T, model.robot, model.bases, model.tools, measurements)
 
 
 def bases_of_rows(model: CalibratedModel, measurements: Measurements) -> Float64[Tensor, "#rows 4 4"]:
-    """Return the pose of the robot's base in the frame of every row; for errors see `poses_of_rows`."""
+    """Return the pose of the robot's base in the frame of every row; see `poses_of_rows` for the errors raised."""
     bases = _of_rows(model.bases, measurements.frame, "frame", measurements)
     return transform_from_xyzrpy(torch.from_numpy(model.robot.base[None].copy())) if bases is None else bases
 
@@ -253,9 +253,9 @@ def bases_of_rows(model: CalibratedModel, measurements: Measurements) -> Float64
 def known_names(
     known: Frames, names: tuple[str, ...], what: str, measurements: Measurements
 ) -> tuple[str, ...]:
-    """Return the frame or target of every row under the model's name for it.
+    """Return the frame or target of every row, by the name that the model uses for it.
 
-    A model that was fitted to rows without names accepts rows with any single name, and one that was fitted to a
+    A model that was fitted to rows without names accepts rows with any single name, and a model that was fitted to a
     single name accepts rows without names.
 
     Args:
@@ -301,7 +301,7 @@ def _seen(
     tools: Frames,
     measurements: Measurements,
 ) -> Float64[Tensor, "*batch rows 4 4"]:
-    """Convert poses T_base_tool to poses of the rows' targets in the rows' frames."""
+    """Return poses T_base_tool as poses of the rows' targets in the rows' frames."""
     before = _of_rows(bases, measurements.frame, "frame", measurements)
     behind = _of_rows(tools, measurements.target, "target", measurements)
     if before is not None:
@@ -314,7 +314,7 @@ def _seen(
 def _of_rows(
     known: Frames, names: tuple[str, ...], what: str, measurements: Measurements
 ) -> Float64[Tensor, "rows 4 4"] | None:
-    """Return the base or tool of every row; None if there is only one, which the robot already includes."""
+    """Return the base or tool of every row; None if the model has only one, which the robot already includes."""
     names = known_names(known, names, what, measurements)
     if len(known) < 2:
         return None

@@ -1,4 +1,4 @@
-"""Conversion of calibrated models to the plain arrays of the compiled inverse kinematics."""
+"""Convert calibrated models to the plain arrays of the compiled inverse kinematics."""
 
 import os
 from collections.abc import Sequence
@@ -26,7 +26,7 @@ _NUMERIC = ("numeric",)
 _Input = tuple[int, list[float]]
 _Member = tuple[JointGroup, PiSigma]
 _COARSE = 0.01
-"""Coordinates whose range is below this share of the largest one contribute hardly anything to a distance."""
+"""Share of the largest range of a coordinate below which a coordinate hardly contributes to distances."""
 _FUNCTIONS = {"": arrays.ANGLE, "sin": arrays.SINE, "cos": arrays.COSINE}
 
 
@@ -36,10 +36,11 @@ def save_compiled(model: CalibratedModel, file: str | os.PathLike[str], belongs_
     Args:
         model: model to convert.
         file: file to write.
-        belongs_to: `content_hash` of the model folder, stored in the file; a file with another hash is stale.
+        belongs_to: `content_hash` of the model folder, which is stored in the file; a file with another hash is out
+            of date.
 
     Raises:
-        ModelError: see `describe_as_arrays`.
+        ModelError: the model has no compiled form, see `describe_as_arrays`.
     """
     description, branches = describe_as_arrays(model)
     joints = [joint.name for joint in model.robot.joints]
@@ -49,7 +50,7 @@ def save_compiled(model: CalibratedModel, file: str | os.PathLike[str], belongs_
 
 
 def describe_as_arrays(model: CalibratedModel) -> tuple[arrays.Description, tuple[str, ...]]:
-    """Convert a model to arrays, and return these with the names of its branches.
+    """Return a model as arrays, and the names of its branches.
 
     Raises:
         ModelError: the model has a network and an identified geometry, its learned correction uses features without
@@ -74,7 +75,7 @@ def describe_as_arrays(model: CalibratedModel) -> tuple[arrays.Description, tupl
             f"model '{model.name}' has both an identified geometry and a network that corrects nominal joint values, "
             "which has no compiled form",
             value="network",
-            remedy="omit one of them",
+            remedy="omit either the geometry or the network",
         )
     solver = closed_form_solver(model.robot)
     if solver is None and not len(model.starts):
@@ -104,7 +105,7 @@ def _arms(model: CalibratedModel) -> arrays.Arms:
         nominal,
         model.identified,
         of_correction,
-    )  # in the order NOMINAL, IDENTIFIED, NOMINAL_WITHOUT_BASE
+    )  # the order is NOMINAL, IDENTIFIED, NOMINAL_WITHOUT_BASE
     return arrays.Arms(
         kind=np.array([KINDS[row.type] for row in nominal.rows]),
         rows=np.stack([arm_rows(arm) for arm in arms]),
@@ -118,10 +119,10 @@ def _arms(model: CalibratedModel) -> arrays.Arms:
 
 
 def _correction(model: CalibratedModel) -> tuple[arrays.Correction, tuple[str, ...]]:
-    """Convert the joint correction of a model, and return it with the names of its features in order.
+    """Return the joint correction of a model as arrays, and the names of its features in order.
 
     Raises:
-        ModelError: a feature has no compiled form, or two have the same name.
+        ModelError: a feature has no compiled form, or two features have the same name.
     """
     dof, hybrid = model.robot.dof, model.hybrid
     robot = model.robot if hybrid is None else hybrid.correction.robot
@@ -196,7 +197,7 @@ def _closed_form(model: CalibratedModel, solver: AbstractClosedForm | None) -> a
 
 
 def _network(model: CalibratedModel) -> arrays.Network:
-    """Convert the network of a model and its domain; without a network the result is marked as unused."""
+    """Return the network of a model and its domain as arrays; without a network the result is marked as unused."""
     dof = model.robot.dof
     members = model.network.members() if model.network else []
     inputs = [_input(group, name) for group, _ in members for name in group.inputs.names]
@@ -241,7 +242,7 @@ def _network(model: CalibratedModel) -> arrays.Network:
 
 
 class _Domain(NamedTuple):
-    """Samples of a domain in its distinct coordinates, widest first; see `robot.kernels.arrays.Network`."""
+    """Samples of a domain in distinct coordinates, widest range first; see `robot.kernels.arrays.Network`."""
 
     samples: np.ndarray
     column: np.ndarray
@@ -250,7 +251,7 @@ class _Domain(NamedTuple):
 
     @staticmethod
     def from_model(model: CalibratedModel, inputs: Sequence[_Input], members: Sequence[_Member]) -> "_Domain":
-        """Convert the domain of a model; without a domain the result has no rows."""
+        """Return the samples of a model's domain; without a domain the result has no rows."""
         none = np.zeros(0, dtype=np.int64)
         if model.network is None or model.domain is None:
             return _Domain(np.zeros((0, 0)), none, np.zeros(0), 0)
@@ -274,7 +275,7 @@ class _Domain(NamedTuple):
 
 
 def _input(group: JointGroup, name: str) -> _Input:
-    """Return the kind of an input, and the factor of every joint in it."""
+    """Return the kind of a network input, and the factor of every joint in it."""
     function, factors = group.inputs.combination(name)
     if not factors:
         return POSE_INPUTS.index(name), [0.0] * len(group.inputs.joint_names)

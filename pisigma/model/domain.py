@@ -9,7 +9,7 @@ MARGIN = 1.05
 """Factor between the radius of a domain and the largest distance between neighbouring training rows."""
 
 REPEAT = 1e-3
-"""Training rows that are closer than this, in scaled inputs from -1 to 1, are treated as repeats of one measurement."""
+"""Distance in scaled inputs from -1 to 1 below which training rows are treated as repeats of one measurement."""
 
 _CHUNK = 4096
 
@@ -17,9 +17,9 @@ _CHUNK = 4096
 class Domain(nn.Module):
     """Region of the network's scaled inputs that the training rows cover.
 
-    The measure of a pose is its distance to the nearest training row divided by `radius`, which is the largest distance
-    of a training row to its nearest neighbour plus 5 % (repeats are not treated as neighbours). A pose with a measure
-    of at most 1 is inside.
+    The measure of a pose is its distance from the nearest training row divided by `radius`, which is the largest
+    distance of a training row from its nearest neighbour plus 5 % (repeats are not neighbours). A pose with a
+    measure of at most 1 is inside.
 
     Attributes:
         samples: `(samples, inputs)`: scaled inputs of training rows.
@@ -30,7 +30,7 @@ class Domain(nn.Module):
     radius: Tensor
 
     def __init__(self, samples: Float[Tensor, "samples inputs"], radius: Float[Tensor, ""]) -> None:
-        """Keep samples and radius as buffers.
+        """Store samples and radius as buffers.
 
         Raises:
             ValueError: there is no sample, or the radius is not positive.
@@ -45,7 +45,7 @@ class Domain(nn.Module):
 
     @staticmethod
     def from_rows(scaled: Float[Tensor, "rows inputs"], generator: torch.Generator) -> "Domain":
-        """Make the region around training rows, of which at most `MAX_SAMPLES`, drawn at random, are kept."""
+        """Return the region around training rows; at most `MAX_SAMPLES` rows, drawn at random, are kept."""
         if scaled.shape[0] > MAX_SAMPLES:
             sampled = torch.randperm(scaled.shape[0], generator=generator)[:MAX_SAMPLES]
             scaled = scaled[sampled.to(scaled.device)]
@@ -55,18 +55,18 @@ class Domain(nn.Module):
         return Domain(scaled, spacing * MARGIN)
 
     def measure(self, scaled: Float[Tensor, "*batch inputs"]) -> Float[Tensor, "*batch"]:
-        """Compute the distance to the nearest training row divided by the radius; NaN where an input is NaN."""
+        """Compute the distance from the nearest training row divided by the radius; NaN where an input is NaN."""
         chunks = torch.split(scaled.reshape(-1, scaled.shape[-1]), _CHUNK)
         nearest = torch.cat([_distances(chunk, self.samples).amin(-1) for chunk in chunks])
         return (nearest / self.radius).reshape(scaled.shape[:-1])
 
     def contains(self, scaled: Float[Tensor, "*batch inputs"]) -> Bool[Tensor, "*batch"]:
-        """Return whether poses are inside; False where an input is NaN."""
+        """Return whether poses are inside the domain; False where an input is NaN."""
         return self.measure(scaled) <= 1
 
 
 def _distances(
     a: Float[Tensor, "rows inputs"], b: Float[Tensor, "samples inputs"]
 ) -> Float[Tensor, "rows samples"]:
-    """Compute Euclidean distances from differences; the faster way by matrix products loses half of the digits."""
+    """Compute Euclidean distances from differences; matrix products would be faster but lose half of the digits."""
     return torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist")

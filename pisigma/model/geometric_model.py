@@ -1,4 +1,4 @@
-"""Make a calibrated model from the result of a geometric or hybrid calibration."""
+"""Make calibrated models from the results of geometric and hybrid calibrations."""
 
 from dataclasses import replace
 
@@ -26,16 +26,16 @@ def model_of_calibration(
     measurements: Measurements,
     recipe: tuple[str, str] = ("", ""),
 ) -> CalibratedModel:
-    """Make the model of a geometric calibration.
+    """Return the model of a geometric calibration.
 
-    Its poses are those of the first target in the first frame of the measurements. Nominal joint values are those of
-    the nominal arm with the identified base and tool.
+    The model predicts poses of the first target in the first frame of the measurements. Nominal joint values refer
+    to the nominal arm with the identified base and tool.
 
     Args:
         name: name of the model.
         nominal: nominal robot.
-        result: its calibration.
-        measurements: rows that it was calibrated with.
+        result: calibration of the robot.
+        measurements: rows with which the robot was calibrated.
         recipe: name and SHA-256 of the recipe; empty texts without one.
     """
     made_of = stored_training_rows(nominal, measurements)
@@ -73,15 +73,15 @@ def model_of_hybrid(
     measurements: Measurements,
     recipe: tuple[str, str] = ("", ""),
 ) -> CalibratedModel:
-    """Make the model of a hybrid calibration, or of its geometric part if no joint correction was learned.
+    """Return the model of a hybrid calibration, or of its geometric part if no joint correction was learned.
 
-    For the arguments see `model_of_calibration`.
+    The arguments are those of `model_of_calibration`.
     """
     return with_hybrid(model_of_calibration(name, nominal, result.geometric, measurements, recipe), result)
 
 
 def with_hybrid(model: CalibratedModel, result: HybridResult) -> CalibratedModel:
-    """Add the joint correction and the uncertainty of a hybrid calibration to the model of its geometric part."""
+    """Return the model of a geometric part with joint correction and uncertainty of the hybrid calibration."""
     known, learned = result.geometric, result.learned
     if learned is None:
         geometry = IdentifiedGeometry(known.robot, model.bases, model.tools, known.unknowns)
@@ -99,11 +99,11 @@ def with_hybrid(model: CalibratedModel, result: HybridResult) -> CalibratedModel
 
 
 def _kept(uncertainty: PositionUncertainty, geometry: IdentifiedGeometry) -> PositionUncertainty:
-    """Return the uncertainty at the geometry of a model, with the covariance root in the form that folders store."""
+    """Return the uncertainty for the geometry of a model, with the covariance root as folders store it."""
     return replace(uncertainty, geometry=geometry, covariance_root=CovarianceRoot(uncertainty.root))
 
 
 def branches_of(nominal: Robot, q: Float64[Tensor, "rows dof"]) -> tuple[str, ...]:
-    """Name the nominal arm's branches that occur in joint values, most frequent first; none without closed form."""
+    """Return the names of the nominal arm's branches in joint values, most frequent first; () without closed form."""
     solver = closed_form_solver(nominal)
     return () if solver is None else solver.most_frequent_branches(nearest_branch(solver, q))

@@ -1,4 +1,4 @@
-"""Posterior of a calibrated model: values of all unknowns of its arm, and a root of their covariance."""
+"""Posterior of a calibrated model: values of all unknowns, and a root of their covariance."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -19,11 +19,11 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 
 FLEET_PRIOR = "fleet_prior"
-"""Kind of a model that holds the prior of a fleet: what robots of one type have in common, except base and tool."""
+"""Kind of a model that contains the prior of a fleet: what robots of a type have in common, except base and tool."""
 
 
 def check_fleet_prior(model: CalibratedModel) -> None:
-    """Raise an error unless a model is the prior of a fleet.
+    """Check that a model is the prior of a fleet.
 
     Raises:
         ModelError: the model is of another kind.
@@ -44,11 +44,11 @@ class ModelPosterior:
 
     Attributes:
         space: parameters, as deviations from the nominal robot.
-        geometry: their most probable values.
+        geometry: most probable values of the parameters.
         features: features of the joint correction, including products of inputs.
         weights: weights of the used columns of the features.
-        root: `R` with the covariance `R R^T`; first the rows of the parameters, in the user's coordinates, then those
-            of the weights.
+        root: `R` with the covariance `R R^T`; first the rows of the parameters, in the user's coordinates, then the
+            rows of the weights.
         noise: noise of the sensors of the calibration.
     """
 
@@ -61,10 +61,10 @@ class ModelPosterior:
 
     @staticmethod
     def from_model(model: CalibratedModel) -> "ModelPosterior":
-        """Take the posterior from a model of `pisigma calibrate` or `pisigma recalibrate`.
+        """Return the posterior of a model that `pisigma calibrate` or `pisigma recalibrate` made.
 
         Raises:
-            ModelError: the model has no posterior, or one that lacks unknowns.
+            ModelError: the model has no posterior, or its posterior lacks unknowns.
         """
         known = model.uncertainty
         if known is None:
@@ -97,7 +97,7 @@ class ModelPosterior:
         return mean.sqrt()[number]
 
     def with_model_names(self, rows: Measurements) -> Measurements:
-        """Give the frame and target of rows the model's names where the rows or the model have a single unnamed one.
+        """Return rows with the model's names of frame and target, if rows or model have a single unnamed one.
 
         Raises:
             MeasurementError: the frame of the rows is a target of the model, as when a camera is wrongly taken as
@@ -122,7 +122,7 @@ class ModelPosterior:
         return rows
 
     def positions_in(self, space: ParameterSpace) -> list[int]:
-        """Return the positions of the parameters in a space that has all of their frames, targets and owners."""
+        """Return the indices of the parameters in a space that contains all of their frames, targets and owners."""
         positions = list(range(self.space.arm_size))
         for group, names, among, size in (
             ("base", self.space.frames, space.frames, 6),
@@ -143,7 +143,7 @@ class ModelPosterior:
 def _weights(
     correction: JointCorrection, features: tuple[AbstractFeature, ...]
 ) -> Float64[Tensor, " weights"]:
-    """Return the weights of the used columns of all features, those of products from the product units."""
+    """Return the weights of the used columns of all features; product units give the weights of products."""
     linear = {own.name: weight for own, weight in zip(correction.features, correction.linear, strict=True)}
     blocks = [
         one.weights(correction.weight.detach())

@@ -1,4 +1,4 @@
-"""Hybrid models at a stated payload and temperature, and warnings where these are outside the measured range."""
+"""Hybrid models at a stated payload and temperature, and warnings if these are outside the measured range."""
 
 import math
 from collections.abc import Sequence
@@ -20,7 +20,7 @@ _BEYOND = {
     "payload_kg": "the effect of the payload is extrapolated linearly",
     "temperature_c": "the correction stays that of the nearest measured temperature",
 }
-"""Extrapolation of a model outside the measured values of a condition."""
+"""Clause about the extrapolation of a model outside the measured values of a condition."""
 
 
 def under_stated_conditions(
@@ -99,7 +99,7 @@ def condition_warnings(model: CalibratedModel, rows: Measurements | None = None)
 def _warning(
     name: str, low: float, high: float, values: Float64[Tensor, " rows"], model: str, single: bool
 ) -> Sequence[str]:
-    """Return the warning on one condition; none if all values are in the measured range or not stated."""
+    """Yield a warning about one condition if values are stated outside the measured range."""
     slack = 1e-9 * max(abs(low), abs(high), 1.0)
     beyond = values[(values < low - slack) | (values > high + slack)]
     if not len(beyond):
@@ -117,7 +117,7 @@ def _learned(model: CalibratedModel) -> ConditionFeatures | None:
 
 
 def _shifted(robot: Robot, shift: Float64[Tensor, " dof"]) -> Robot:
-    """Return the robot with shifted joint offsets: at q it is where the given robot is at `q + shift`."""
+    """Return the robot with shifted joint offsets: its pose at q is that of the given robot at `q + shift`."""
     dh = robot.dh.copy()
     for row, is_revolute, direction, value in zip(
         robot.joint_rows, robot.revolute, robot.directions, shift.tolist(), strict=True
@@ -127,7 +127,7 @@ def _shifted(robot: Robot, shift: Float64[Tensor, " dof"]) -> Robot:
 
 
 def learned_range(model: CalibratedModel, condition: str) -> tuple[float, float] | None:
-    """Return the lowest and the highest calibrated value of a condition whose effect a model corrects; None if none.
+    """Return the lowest and highest calibrated value of a condition that a model corrects; None without correction.
 
     Args:
         model: model of any kind; only a hybrid learns the effect of conditions.

@@ -1,4 +1,4 @@
-"""Joint values of training rows that a model stores: initial values of the numeric inverse, and their branches."""
+"""Joint values of training rows that a model stores, as initial values of the numeric inverse."""
 
 import torch
 from jaxtyping import Float64, Int64
@@ -12,18 +12,18 @@ from pisigma.robot.kinematics.task_axes import WHOLE, TaskAxes
 MAX_STARTS = 512
 
 SAME = 1e-6
-"""[rad or m] Joint values that round to the same multiple of this are treated as equal."""
+"""Rounding step [rad or m]: joint values that round to the same multiple are treated as equal."""
 _CHUNK = 4096
-"""Poses whose distances to all starts are computed at once, which bounds the memory."""
+"""Number of poses whose distances from all starts are computed at a time, which limits the memory."""
 
 
 class StoredStarts:
-    """Initial joint values of the numeric inverse, and the robot's poses there.
+    """Initial joint values of the numeric inverse, and the robot's poses at these values.
 
     Attributes:
-        robot: robot that the joint values belong to.
+        robot: robot to which the joint values belong.
         q: joint values [rad or m].
-        T: poses T_base_tool at these.
+        T: poses T_base_tool [m] at these joint values.
         lever: half the robot's reach over sqrt(2) [m], because a small rotation by φ changes R by sqrt(2) φ.
         points: `(starts, 12)`: the poses as points, see `as_points`.
     """
@@ -53,7 +53,7 @@ class StoredStarts:
         return torch.cat(nearest)
 
     def as_points(self, T: Float64[Tensor, "poses 4 4"]) -> Float64[Tensor, "poses 12"]:
-        """Map poses to points whose distance is that of the tools [m] plus half the reach per radian of rotation."""
+        """Return poses as points whose distance combines the tools' distance [m] and half the reach per radian."""
         return torch.cat([T[:, :3, 3], self.lever * T[:, :3, :3].flatten(1)], -1)
 
 
@@ -64,7 +64,7 @@ def middle_of_starts(starts: Float64[Tensor, "starts dof"]) -> Float64[Tensor, "
 
 
 def spread_rows(q: Float64[Tensor, "rows dof"]) -> Float64[Tensor, "starts dof"]:
-    """Return all rows or, of more than `MAX_STARTS`, as many at even spacing."""
+    """Return all rows, or `MAX_STARTS` evenly spaced rows if there are more."""
     return q[torch.linspace(0, len(q) - 1, min(len(q), MAX_STARTS)).round().long()].clone()
 
 
@@ -76,6 +76,6 @@ def nearest_branch(solver: AbstractClosedForm, q: Float64[Tensor, "poses dof"]) 
 
 
 def rows_at_starts(starts: Float64[Tensor, "starts dof"], q: Float64[Tensor, "rows dof"]) -> int:
-    """Count the rows whose joint values [rad or m] are among those that a model stores."""
+    """Return the number of rows whose joint values [rad or m] are among the values that a model stores."""
     kept = {tuple(row) for row in (starts / SAME).round().tolist()}
     return sum(tuple(row) in kept for row in (q / SAME).round().tolist())

@@ -1,4 +1,4 @@
-"""Training rows of a model, which are recognised in later data so that they are used only once."""
+"""Recognise training rows of a model in later data, so that they are used only once."""
 
 from dataclasses import replace
 
@@ -15,11 +15,11 @@ from pisigma.model.stored_starts import rows_at_starts
 from pisigma.robot.description import Robot
 
 MAX_KEPT_ROWS = 10_000
-"""Most rows of which a model stores joint values and readings."""
+"""Largest number of rows whose joint values and readings a model stores."""
 
 
 def stored_training_rows(robot: Robot, rows: Measurements, before: RowValues | None = None) -> RowValues:
-    """Return the values of training rows that a model stores, after those of its earlier training rows `before`."""
+    """Return the values of training rows that a model stores, after its earlier training rows `before`."""
     values = RowValues.from_rows(rows.as_fields(), robot)
     values = values if before is None else before + values
     count = len(values.numbers)
@@ -27,7 +27,7 @@ def stored_training_rows(robot: Robot, rows: Measurements, before: RowValues | N
 
 
 def known_rows(model: CalibratedModel, rows: Measurements) -> Bool[Tensor, " rows"]:
-    """Return which rows are training rows of the model, even if they are rounded, reordered or only a part of them."""
+    """Return the mask of training rows of the model, even if they are rounded, reordered or only a part."""
     if model.made_of is None:
         whole = bool(model.provenance.data_sha256) and model.provenance.data_sha256 == rows.content_hash()
         return torch.full((rows.rows,), whole)
@@ -35,7 +35,7 @@ def known_rows(model: CalibratedModel, rows: Measurements) -> Bool[Tensor, " row
 
 
 def without_known_rows(model: CalibratedModel, rows: Measurements) -> tuple[Measurements, tuple[str, ...]]:
-    """Leave out rows that the model was calibrated with already, with a warning that names them.
+    """Return the rows without training rows of the model, and warnings that name these.
 
     Raises:
         MeasurementError: all rows are training rows of the model.
@@ -67,16 +67,16 @@ def training_row_warnings(
     file: Measurements | None = None,
     consequence: str = "its figures say nothing about other poses",
 ) -> tuple[str, ...]:
-    """Return a warning if rows that a model is evaluated on are among its training rows; else nothing.
+    """Return a warning if rows on which a model is evaluated are among its training rows; empty otherwise.
 
-    A model stores joint values and readings of its rows; one of an earlier version only a hash of all rows and the
-    joint values of some, so poses that were measured again are treated as training rows too.
+    A model stores joint values and readings of its rows. A model of an earlier version stores only a hash of all
+    rows and the joint values of some, so poses that were measured again are also treated as training rows.
 
     Args:
         model: model of any kind.
-        rows: rows that the model is evaluated on.
+        rows: rows on which the model is evaluated.
         file: all rows of their file, if `rows` are a part of it.
-        consequence: what follows from it, as a clause of the warning.
+        consequence: the consequence, as a clause of the warning.
     """
     made_of = model.provenance.data_sha256
     if made_of and made_of in (whole.content_hash() for whole in (rows, file or rows)):

@@ -1,1 +1,1 @@
-"""Validation of calibrations: held-out rows, setup faults, checks of rows and results, ISO 9283."""
+"""Validation of calibrations: held-out rows, setup faults, checks of rows and results, and ISO 9283."""

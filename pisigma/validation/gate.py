@@ -1,4 +1,4 @@
-"""Check of rows before they are used: every command that reads rows calls `check_rows`."""
+"""Check rows before they are used; every command that reads rows calls `check_rows`."""
 
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ from pisigma.validation.held_out.frames.fitted_frames import FrameKind
 from pisigma.validation.setup_faults.setup_fault import SetupFault
 
 MIN_ROWS_TO_CALIBRATE = 12
-"""Rows from which a calibration shows whether the errors of the arm are too large for this robot."""
+"""Smallest number of rows whose calibration shows whether the errors of the arm are too large for this robot."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,8 +29,8 @@ class RowVerdict:
 
     Attributes:
         diagnostics: the findings; those that make the rows implausible come first.
-        judged: the rows with the predictions of the model; None if they were compared with a nominal robot, or if too
-            few of them have positions.
+        judged: the rows with the predictions of the model; None if rows were compared with a nominal robot, or if
+            too few have positions.
         faults_of_lengths: setup faults that explain the errors of rows without positions.
     """
 
@@ -45,7 +45,7 @@ class RowVerdict:
 
     @property
     def implausible(self) -> tuple[Diagnostic, ...]:
-        """Findings because of which the rows must not be used; commands exit with status 3."""
+        """Findings that forbid the use of the rows; commands exit with status 3."""
         return tuple(one for one in self.diagnostics if one.severity == "implausible")
 
     @property
@@ -70,8 +70,8 @@ def check_rows(
     Args:
         rows: the rows.
         against: a calibrated model, or the nominal robot.
-        fitted: what is known to have moved since the model was made.
-        may_move: what else may have moved since, without being a fault of the rows.
+        fitted: frames and tools that are known to have moved since the model was made.
+        may_move: what else may have moved since then, without being a fault of the rows.
         nominal: the nominal robot with base and tool fitted; only used to report its errors after a correction.
 
     Raises:
@@ -92,7 +92,7 @@ def check_rows_by_model(
     may_move: Collection[Move] = (),
     nominal: CalibratedModel | None = None,
 ) -> RowVerdict:
-    """Run the checks of `ROW_CHECKS`, or those of `diagnose_lengths` for rows without positions; see `check_rows`."""
+    """Run the checks of `ROW_CHECKS`, or `diagnose_lengths` for rows without positions; see `check_rows`."""
     judged = RowsUnderModel.from_rows(model, rows, fitted, may_move, nominal)
     if judged is None and rows.position is None:
         diagnostics, faults = diagnose_lengths(model, rows, fitted, may_move)
@@ -103,7 +103,7 @@ def check_rows_by_model(
 
 
 def _until_implausible(checks: Iterable[Iterable[Diagnostic]]) -> tuple[Diagnostic, ...]:
-    """Collect findings up to the first check that finds the rows implausible; later ones are consequences."""
+    """Return the findings up to the first check that finds the rows implausible; later findings are consequences."""
     found: list[Diagnostic] = []
     for diagnostics in checks:
         found += diagnostics
@@ -113,7 +113,7 @@ def _until_implausible(checks: Iterable[Iterable[Diagnostic]]) -> tuple[Diagnost
 
 
 def _against_robot(rows: Measurements, robot: Robot) -> Iterator[Iterable[Diagnostic]]:
-    """Run the checks by the nominal robot, the most reliable first."""
+    """Run the checks by the nominal robot, most reliable first."""
     yield _moved_setup(rows, robot)
     yield setup_diagnostics(robot, rows)
     yield check_position_size(robot, rows)
@@ -124,7 +124,7 @@ def _against_robot(rows: Measurements, robot: Robot) -> Iterator[Iterable[Diagno
 
 
 def _moved_setup(rows: Measurements, robot: Robot) -> tuple[Diagnostic, ...]:
-    """Name the row before which the instrument or the tool was moved so far that no calibration works."""
+    """Return a finding that names the row before which instrument or tool was moved too far for a calibration."""
     if (moved := new_setup_refusal(robot, rows)) is None:
         return ()
     return (
@@ -141,9 +141,9 @@ def _moved_setup(rows: Measurements, robot: Robot) -> tuple[Diagnostic, ...]:
 
 
 def _as_calibrated(rows: Measurements, robot: Robot) -> tuple[Diagnostic, ...]:
-    """Check a calibration of the rows.
+    """Return the findings of the checks of a calibration of the rows.
 
-    It has no joint correction, so residuals above the stated noise are no finding yet.
+    The calibration has no joint correction, so residuals above the stated noise are not reported.
     """
     try:
         found = diagnostics_of_rows(GeometricCalibrator(robot), rows)
@@ -154,6 +154,6 @@ def _as_calibrated(rows: Measurements, robot: Robot) -> tuple[Diagnostic, ...]:
 
 
 def _is_unmodelled(found: Diagnostic) -> bool:
-    """Return whether a finding is that residuals are larger than stated."""
+    """Return whether a finding states that residuals are larger than the stated noise."""
     ratio = found.values.get("residual_over_stated")
     return isinstance(ratio, float) and ratio > 1

@@ -1,1 +1,1 @@
-"""Model folders on disk: written completely or not at all, and checked when read."""
+"""Model folders on disk, which are written completely or not at all, and checked when they are read."""

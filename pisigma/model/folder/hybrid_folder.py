@@ -1,8 +1,8 @@
-"""Hybrid calibrations in a model folder: their sections of `model.yaml`, and their tensors.
+"""Hybrid calibrations in a model folder: sections of `model.yaml`, and tensors.
 
 The geometry is stored in `model.yaml` in mm and deg, for people, and again in the weights file in SI units, so that
-predictions are equal to the last bit after reading. `model.yaml` states which unknowns the rows of the covariance root
-belong to, and in which order.
+predictions are equal to the last bit after reading. `model.yaml` states the unknowns to which the rows of the
+covariance root belong, in order.
 """
 
 import math
@@ -40,7 +40,7 @@ Shape = tuple[int | None, ...]
 """Expected shape of a tensor; None stands for any length."""
 
 ROUNDING = 1e-9
-"""[m or rad] Largest difference between the geometry in `model.yaml` and that in the weights file."""
+"""Largest difference [m or rad] between the geometry in `model.yaml` and in the weights file."""
 
 DTYPES = {"coverage.joint": torch.int64, "rows.measured": torch.uint8}
 """Types of the tensors that are not float64."""
@@ -93,7 +93,7 @@ def hybrid_tensors(model: CalibratedModel) -> dict[str, Tensor]:
 
 
 def check_size(document: ModelDocument, robot: Robot, stored: int) -> None:
-    """Check, before weights are allocated, that the file has as many numbers as the description requires.
+    """Check that the file has enough numbers for the description, before weights are allocated.
 
     Args:
         document: description of the model.
@@ -101,7 +101,7 @@ def check_size(document: ModelDocument, robot: Robot, stored: int) -> None:
         stored: count of numbers in the weights file.
 
     Raises:
-        MisfitError: the description requires more.
+        MisfitError: the description requires more numbers.
     """
     required = sum(sum(group.orders) * len(group.inputs) * len(group.joints) for group in document.network)
     if (learned := document.learned) is not None:
@@ -145,12 +145,12 @@ def hybrid_shapes(document: ModelDocument, robot: Robot) -> dict[str, Shape]:
 def with_hybrid(
     model: CalibratedModel, document: ModelDocument, tensors: Mapping[str, Tensor]
 ) -> CalibratedModel:
-    """Add the parts of a hybrid calibration, and the geometry to the last bit; other models are returned unchanged.
+    """Return the model with the parts of a hybrid calibration and the exact geometry; other models are unchanged.
 
     Args:
         model: model made from the description and all other tensors.
         document: description of the model.
-        tensors: tensors of the shapes of `hybrid_shapes`.
+        tensors: tensors with the shapes of `hybrid_shapes`.
 
     Raises:
         MisfitError: parts do not fit together.
@@ -181,13 +181,13 @@ def with_hybrid(
 
 
 def _free_rows(known: PositionUncertainty) -> list[int]:
-    """Return the indices of the free parameters: those whose row of the root is not 0."""
+    """Return the indices of the free parameters, whose rows of the root are not 0."""
     result: list[int] = known.root[: len(known.space.parameters)].any(1).nonzero()[:, 0].tolist()
     return result
 
 
 def _limited(robot: Robot) -> np.ndarray:
-    """Return which joints have limits; a file states both limits of a joint or none."""
+    """Return the mask of the joints with limits; a file states both limits of a joint or none."""
     result: np.ndarray = np.isfinite(robot.limits).all(1)
     return result
 
@@ -197,7 +197,7 @@ def _geometry(name: str, robot: Robot) -> dict[str, Tensor]:
 
 
 def _exact(name: str, robot: Robot, tensors: Mapping[str, Tensor], same: Sequence[str]) -> Robot:
-    """Return the robot with the geometry of the weights file; the parts `same` must agree with it up to rounding."""
+    """Return the robot with the geometry of the weights file; parts in `same` must agree with the description."""
     values = {part: tensors[f"{name}.{part}"].numpy() for part in _GEOMETRY}
     for part in same:
         if np.abs(values[part] - getattr(robot, part)).max() > ROUNDING:
@@ -210,7 +210,7 @@ def _exact(name: str, robot: Robot, tensors: Mapping[str, Tensor], same: Sequenc
 
 
 def _with_limits(robot: Robot, limits: Tensor) -> Robot:
-    """Return the robot with its joint limits to the last bit."""
+    """Return the robot with the exact joint limits of the weights file."""
     limited = _limited(robot)
     if len(limits) and np.abs(limits.numpy() - robot.limits[limited]).max() > ROUNDING:
         raise MisfitError(
@@ -266,7 +266,7 @@ def _uncertainty(
     root: Tensor,
     place: tuple[Robot, Frames, Frames],
 ) -> PositionUncertainty:
-    """Make the uncertainty, with zero rows of the root for the parameters that were not free."""
+    """Return the uncertainty, with zero rows of the root for parameters that were not free."""
     robot, bases, tools = place
     groups = [_unknowns(section) for section in known.unknowns]
     if len({group.name for group in groups}) < len(groups):
@@ -306,7 +306,7 @@ def _uncertainty(
 
 
 def _unknowns_section(group: UnknownGroup) -> dict[str, object]:
-    """Describe the unknown parameters of the sensors of one kind."""
+    """Return the section of the unknown parameters of one kind of sensor."""
     return {
         "name": group.name,
         "columns": list(group.columns),
@@ -338,7 +338,7 @@ def _weighted(known: UncertaintySection, correction: JointCorrection | None) -> 
     """Return the features whose weights are in the root, including the input products of the product units.
 
     Raises:
-        MisfitError: the features are not those of the learned part.
+        MisfitError: the features differ from those of the learned part.
     """
     learned = () if correction is None else correction.features
     of_name = {chosen.name: chosen for chosen in learned}

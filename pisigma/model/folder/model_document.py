@@ -1,4 +1,4 @@
-"""Schema of `model.yaml`, and its checksum, by which truncated or edited files are recognised."""
+"""Schema of `model.yaml`, and its checksum, which reveals truncated or edited files."""
 
 import hashlib
 import re
@@ -16,14 +16,14 @@ from pisigma.measurement.sensors.sensor import OtherUnit
 from pisigma.robot.robot_file import RobotDocument
 
 FORMAT = 5
-"""Format that this version writes; `pisigma.model.folder.upgrade` converts folders of earlier formats."""
+"""Format number that this version writes; `pisigma.model.folder.upgrade` converts folders of earlier formats."""
 MAX_FACTORS, MAX_UNITS = 100, 1000
-"""Most factors of a product unit, and most product units of a network."""
+"""Largest number of factors of a product unit, and of product units of a network."""
 _CHECKSUM = re.compile(r"(.*^)sha256: ([0-9a-f]{64})\n", re.DOTALL | re.MULTILINE)
 
 _Vector = tuple[float, float, float]
 _Frame = tuple[float, float, float, float, float, float]
-"""x, y, z [m], roll, pitch, yaw [rad]."""
+"""A frame as x, y, z [m], roll, pitch, yaw [rad]."""
 _Feature = Annotated[FeatureSection, PlainValidator(feature_section)]
 
 
@@ -31,9 +31,9 @@ class MisfitError(ValueError):
     """Parts of a model folder do not fit together; `load_model` raises a `ModelError` with the same fields.
 
     Attributes:
-        file: name of the file at fault.
-        column: key of `model.yaml` at fault, or None.
-        value: the value at fault, or the name of a tensor.
+        file: name of the faulty file.
+        column: faulty key of `model.yaml`, or None.
+        value: the faulty value, or the name of a tensor.
     """
 
     def __init__(
@@ -44,7 +44,7 @@ class MisfitError(ValueError):
 
 
 class GroupSection(Section):
-    """One joint group of the network: see `pisigma.network.correction_network.JointGroup`."""
+    """Section of a joint group of the network, see `pisigma.network.correction_network.JointGroup`."""
 
     joints: Annotated[tuple[str, ...], Field(min_length=1)]
     inputs: Annotated[tuple[str, ...], Field(min_length=1)]
@@ -55,7 +55,7 @@ class GroupSection(Section):
 
 
 class LearnedSection(Section):
-    """The joint correction of a hybrid calibration and the geometry that belongs to it.
+    """Section of the joint correction of a hybrid calibration, and of the geometry that belongs to it.
 
     Attributes:
         features: features of the unit of order 1.
@@ -71,7 +71,7 @@ class LearnedSection(Section):
 
 
 class UnknownsSection(Section):
-    """Unknown parameters of the sensors of one kind; see `pisigma.measurement.sensors.sensor.UnknownGroup`."""
+    """Section of the unknown parameters of one kind of sensor; see `measurement.sensors.sensor.UnknownGroup`."""
 
     name: str
     columns: tuple[str, ...] = Field(min_length=1)
@@ -82,19 +82,19 @@ class UnknownsSection(Section):
 
 
 class UncertaintySection(Section):
-    """Unknowns to which the rows of the covariance root in the weights file belong, in order.
+    """Section of the unknowns to which the rows of the covariance root in the weights file belong, in order.
 
     Attributes:
         unknowns: unknown sensor parameters, group by group.
-        values: by group and owner, their values in the owner's frame [m or rad]; empty in folders that were upgraded
-            from a format without them.
+        values: values of the unknown sensor parameters by group and owner, in the owner's frame [m or rad]; empty in
+            folders that were upgraded from a format without them.
         free: indices of the parameters that have a row in the root, before the rows of all weights; the rows of other
             parameters are 0.
-        features: names of the features whose weights follow: those of the learned part, and `products` for the products
-            of inputs in its product units.
+        features: names of the features whose weights follow: the features of the learned part, and `products` for
+            the products of inputs in its product units.
         prior_scale: see `pisigma.calibration.hybrid.uncertainty.PositionUncertainty`.
         noise: see `pisigma.calibration.hybrid.noise.CalibrationNoise`.
-        stated_noise: see there.
+        stated_noise: see `pisigma.calibration.hybrid.noise.CalibrationNoise.stated`.
     """
 
     unknowns: tuple[UnknownsSection, ...] = ()
@@ -107,7 +107,7 @@ class UncertaintySection(Section):
 
 
 class ProvenanceSection(Section):
-    """See `pisigma.model.calibrated_model.Provenance`."""
+    """Section of the provenance, see `pisigma.model.calibrated_model.Provenance`."""
 
     recipe: str
     recipe_sha256: str
@@ -121,7 +121,7 @@ class ProvenanceSection(Section):
 
 
 class ModelDocument(Section):
-    """All of `model.yaml` except for the checksum in its last line."""
+    """Contents of `model.yaml` except for the checksum in its last line."""
 
     model_config = ConfigDict(protected_namespaces=())
 
@@ -149,7 +149,7 @@ def document_text(document: dict[str, Any]) -> str:
 
 
 def write_document(text: str, compiled_sha256: str | None, path: Path) -> None:
-    """Write a document, followed by the hash of `compiled.npz` and by the checksum of all lines before the last.
+    """Write a document, followed by the hash of `compiled.npz` and the checksum of all preceding lines.
 
     Args:
         text: text from `document_text`.
@@ -161,7 +161,7 @@ def write_document(text: str, compiled_sha256: str | None, path: Path) -> None:
 
 
 def read_document(path: Path) -> ModelDocument:
-    """Read the document and check it.
+    """Read and check the document.
 
     Raises:
         ModelError: the file cannot be read, has another format, was truncated or edited, or does not describe a model.
@@ -179,7 +179,7 @@ def read_document(path: Path) -> ModelDocument:
 
 
 def read_signed_text(path: Path) -> str:
-    """Read the lines before the checksum, in this format or an earlier one.
+    """Return the lines before the checksum, in this format or an earlier one.
 
     Raises:
         ModelError: the file cannot be read, has a newer format, was truncated or edited, or does not describe a model.
@@ -211,7 +211,7 @@ def read_signed_text(path: Path) -> str:
 
 
 def stated_format(text: str) -> int | None:
-    """Return the format in the first line of a document; None if there is none."""
+    """Return the format number in the first line of a document; None if it states none."""
     stated = re.match(r"format: ([0-9]{1,9})\n", text)
     return int(stated[1]) if stated else None
 

@@ -1,4 +1,4 @@
-"""Reading and writing of model folders: `model.yaml` and `model.safetensors`."""
+"""Read and write model folders: `model.yaml` and `model.safetensors`."""
 
 import hashlib
 import os
@@ -45,14 +45,14 @@ from pisigma.robot.writing import robot_document
 
 _PREFIX = "network."
 _ROWS = ("rows.numbers", "rows.measured", "rows.steps")
-"""Tensors of the training rows: values, whether each was measured, and the step that it was rounded to."""
+"""Names of the tensors of training rows: values, whether they were measured, and rounding steps."""
 
 
 def save_model(model: CalibratedModel, folder: Path) -> None:
     """Write the files of a model into a folder, for example one from `staged_folder`.
 
-    In addition to `model.yaml` and `model.safetensors` it writes the arrays of the compiled kernels, if they support
-    the model's kind of correction, and the URDF file of the robot, if it was described by one.
+    In addition to `model.yaml` and `model.safetensors`, the arrays of the compiled kernels are written if these
+    support the model's kind of correction, and the URDF file of the robot if the robot was read from one.
 
     Raises:
         ModelError: the model is evaluated at fixed conditions.
@@ -100,22 +100,22 @@ def describe(text: str, model: CalibratedModel, folder: Path) -> None:
 
     Args:
         text: text of the description, from `document_text`.
-        model: model that it describes.
+        model: model to describe.
         folder: folder with the weights file.
     """
     compiled, sha256 = folder / COMPILED, None
-    with suppress(ModelError):  # the kernels do not evaluate every kind of model
+    with suppress(ModelError):  # kernels do not support every kind of model
         save_compiled(model, compiled, content_hash(text.encode(), (folder / WEIGHTS).read_bytes()))
         sha256 = hashlib.sha256(compiled.read_bytes()).hexdigest()
     write_document(text, sha256, folder / DESCRIPTION)
 
 
 def load_model(folder: str | os.PathLike[str]) -> CalibratedModel:
-    """Read a model folder and check all of it.
+    """Read and check a model folder.
 
     Raises:
-        ModelError: a file is missing, truncated, changed, of another model or in a newer format; no part is loaded
-            then.
+        ModelError: a file is missing, truncated, changed, from another model or in a newer format; nothing is loaded
+            in this case.
     """
     path = Path(folder)
     if not path.is_dir():
@@ -164,7 +164,7 @@ def read_weights(path: Path, sha256: str) -> dict[str, Tensor]:
     """Read the tensors of a weights file.
 
     Raises:
-        ModelError: its hash differs, it is not a safetensors file, or it has numbers that are not finite.
+        ModelError: the hash of the file differs, it is not a safetensors file, or it has numbers that are not finite.
     """
     content = _read_whole(path, sha256)
     try:
@@ -188,10 +188,10 @@ def read_weights(path: Path, sha256: str) -> dict[str, Tensor]:
 
 
 def _read_whole(path: Path, sha256: str) -> bytes:
-    """Read a file whose hash the description states.
+    """Return the content of a file whose hash the description states.
 
     Raises:
-        ModelError: its hash differs, or it cannot be read.
+        ModelError: the hash of the file differs, or it cannot be read.
     """
     content = read_model_file(path.parent, path.name)
     if hashlib.sha256(content).hexdigest() != sha256:
@@ -223,7 +223,7 @@ def _build_model(
         expected |= {_PREFIX + key: tuple(value.shape) for key, value in network.state_dict().items()}
         inputs = sum(len(group.inputs.names) for group in network.groups)
         expected |= {"domain.samples": (None, inputs), "domain.radius": ()} if samples else {}
-    if _ROWS[0] in tensors:  # optional in a folder
+    if _ROWS[0] in tensors:  # these tensors are optional in a folder
         columns = len(robot.axes) + ROW_READINGS
         expected |= dict(zip(_ROWS, ((None, columns), (None, columns), (None, ROW_STEPS)), strict=True))
     _check_tensors(tensors, expected)
@@ -293,7 +293,7 @@ def _check_branches(robot: Robot, branches: tuple[str, ...]) -> None:
 
 
 def _empty_network(document: ModelDocument, robot: Robot) -> CorrectionNetwork | None:
-    """Make the network as described, without its weights."""
+    """Return the network as described, without weights."""
     names = [joint.name for joint in robot.joints]
     groups, networks = [], []
     for section in document.network:
@@ -311,7 +311,7 @@ def _empty_network(document: ModelDocument, robot: Robot) -> CorrectionNetwork |
 
 
 def _check_tensors(tensors: dict[str, Tensor], expected: dict[str, Shape]) -> None:
-    """Raise an error unless the tensors are exactly the expected ones; None in a shape stands for any length."""
+    """Check that the tensors are exactly the expected tensors; None in a shape stands for any length."""
     for name in sorted(set(tensors) ^ set(expected)):
         problem = "unknown" if name in tensors else "missing"
         raise MisfitError(f"the tensor '{name}' is {problem}", file=WEIGHTS, value=name)
@@ -343,7 +343,7 @@ ModelSource = CalibratedModel | str | os.PathLike[str]
 
 @runtime_checkable
 class HasModel(Protocol):
-    """Object with a model: a `pisigma.CorrectedIK`, or a result of `pisigma.calibrate` and similar functions."""
+    """Object with a model: a `pisigma.CorrectedIK`, or a result of `pisigma.calibrate` or a similar function."""
 
     @property
     def model(self) -> CalibratedModel:
@@ -351,11 +351,11 @@ class HasModel(Protocol):
 
 
 def loaded_model(source: ModelSource | HasModel) -> tuple[CalibratedModel, str | os.PathLike[str] | None]:
-    """Return a model, and its folder if it is read from one; see `load_model`."""
+    """Return a model, and its folder if it was read from one; see `load_model`."""
     source = model_or_folder(source)
     return (source, None) if isinstance(source, CalibratedModel) else (load_model(source), source)
 
 
 def model_or_folder(source: ModelSource | HasModel) -> ModelSource:
-    """Return the model of an object that has one; a model or a folder is returned as it is."""
+    """Return the model of an object that has one; a model or a folder is returned unchanged."""
     return source.model if isinstance(source, HasModel) else source

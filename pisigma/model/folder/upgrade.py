@@ -1,4 +1,4 @@
-"""Conversion of model folders of earlier versions, whose keys of `model.yaml` have other names or forms."""
+"""Convert model folders of earlier versions, whose keys of `model.yaml` have other names or forms."""
 
 import hashlib
 import os
@@ -40,7 +40,7 @@ _RENAMED = {
     "variance_widening": "prior_scale",
     "widening": "prior_scale",
 }
-"""Old and new names of keys, anywhere among the metrics and in the section of the uncertainty."""
+"""New name of every renamed key among the metrics and in the section of the uncertainty."""
 
 _LABELS = (
     (r"^identified; the data hardly .*$", "held by the prior"),
@@ -50,11 +50,11 @@ _LABELS = (
     (r"^.* is identified, the single values are not", "in a sum"),
     (r"; the data hardly .*$", "; prior"),
 )
-"""Remarks of earlier versions on a parameter, and the short labels that newer versions store in addition."""
+"""Patterns of remarks of earlier versions on a parameter, and the short labels that newer versions also store."""
 
 _FADED = re.compile(rb"beyond the measured joint values the correction fades to nothing over \d+ deg")
 _EXTRAPOLATED = b"beyond the measured joint values the correction is an extrapolation"
-"""Clause of a card on the fade, and the clause that replaces it."""
+"""Pattern of the clause of a card about the fade, and the clause that replaces it."""
 _NO_FADE = (
     "The correction now applies at all joint values, with a predicted standard deviation; up to format 3 it faded to "
     "zero outside the measured ones."
@@ -62,7 +62,7 @@ _NO_FADE = (
 
 ROOT = "uncertainty.root"
 MAX_DEVIATIONS = 3.0
-"""Up to format 3, conditions within so many standard deviations from their mean counted as measured."""
+"""Number of standard deviations from the mean within which conditions were treated as measured up to format 3."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class Upgrade:
         name: name of the model.
         before: format of the folder before the upgrade.
         after: format after the upgrade; equal to `before` if there was nothing to do.
-        changes: sentences on how the model behaves differently than before.
+        changes: sentences about differences in the behaviour of the model.
     """
 
     name: str
@@ -85,8 +85,8 @@ class Upgrade:
 def upgrade_folder(folder: str | os.PathLike[str], check: Callable[[CalibratedModel, Path], None]) -> Upgrade:
     """Convert a model folder of an earlier version to the format of this one, completely or not at all.
 
-    Tensors, figures and all other files are unchanged, except for the type of a covariance root, and so is the
-    card except for statements that are no longer true; the file for the compiled kernels is written again.
+    Tensors, figures and all other files are unchanged, except for the type of a covariance root. The card is
+    unchanged except for statements that are no longer true. The file for the compiled kernels is written again.
 
     Args:
         folder: folder to upgrade.
@@ -94,8 +94,8 @@ def upgrade_folder(folder: str | os.PathLike[str], check: Callable[[CalibratedMo
             `pisigma.model.inverse.written_model.check_written`.
 
     Raises:
-        ModelError: the folder is not a model, it was truncated or edited or has a newer format, or it is a hybrid with
-            product units of an earlier version, or with an uncertainty whose order cannot be determined.
+        ModelError: the folder is not a model, it was truncated, was edited or has a newer format, or it is a hybrid
+            with product units of an earlier version or with an uncertainty whose order cannot be determined.
         OutputError: the folder cannot be written.
     """
     path = Path(folder)
@@ -136,7 +136,7 @@ def _without_fade(document: dict[str, Any]) -> tuple[str, ...]:
     """Remove the fade of the correction outside the measured joint values, which formats up to 3 had.
 
     Returns:
-        A sentence if the folder had one.
+        A sentence about the change if the folder had a fade.
     """
     document.get("uncertainty", {}).pop("unexplained_m", None)
     learned = (document["metrics"].get("hybrid") or {}).get("learned") or {}
@@ -148,7 +148,8 @@ def _without_turns(uncertainty: dict[str, Any], path: Path) -> dict[str, Any]:
     """Replace the list of product-unit factors of formats up to 3 by the statement that there are no input products.
 
     Raises:
-        ModelError: there are such factors; their uncertainty cannot be converted to that of products.
+        ModelError: there are factors of product units; their uncertainty cannot be converted to an uncertainty of
+            products.
     """
     if uncertainty.pop("turns", []):
         raise ModelError(
@@ -161,11 +162,11 @@ def _without_turns(uncertainty: dict[str, Any], path: Path) -> dict[str, Any]:
 
 
 def _in_order(uncertainty: dict[str, Any], document: Mapping[str, Any], path: Path) -> dict[str, Any]:
-    """State the order of the root's rows, which folders up to format 4 do not.
+    """Add the order of the root's rows, which folders up to format 4 do not state.
 
     Their weights are in the order in which the calibration tried the features: products of inputs after all others,
-    except for gear lines, which were fitted last, to the residuals of all others. Unknown sensor parameters are in the
-    order of their values.
+    except for gear lines, which were fitted last, to the residuals of all other features. Unknown sensor parameters
+    are in the order of their values.
 
     Raises:
         ModelError: rows were added to a model whose weights were read in another order.
@@ -239,19 +240,19 @@ def _with_measured_conditions(document: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def _renamed(values: Any) -> Any:
-    """Return the values with the keys of the present format."""
+    """Return the values with the keys of the current format."""
     if isinstance(values, dict):
         return {_RENAMED.get(key, key): _renamed(value) for key, value in values.items()}
     return [_renamed(value) for value in values] if isinstance(values, list) else values
 
 
 def _metrics(kind: str, metrics: dict[str, Any]) -> dict[str, Any]:
-    """Convert metrics to the present form; see `pisigma.validation.held_out`."""
+    """Return metrics in the current form; see `pisigma.validation.held_out`."""
     if kind == "distilled":
         return metrics | {"joints": [_joint(joint) for joint in metrics.get("joints", ())]}
     if kind not in ("geometric_calibration", "hybrid_calibration"):
         return metrics
-    if "parameters" not in metrics:  # a study stored other figures, which nothing reads
+    if "parameters" not in metrics:  # studies stored other figures, which are not read
         return {}
     metrics = metrics | {"parameters": [_labelled(row) for row in metrics["parameters"]]}
     held_out = metrics.get("held_out")
@@ -262,7 +263,7 @@ def _metrics(kind: str, metrics: dict[str, Any]) -> dict[str, Any]:
 
 
 def _labelled(row: Mapping[str, Any]) -> dict[str, Any]:
-    """Add the label to a row of the parameter table."""
+    """Return a row of the parameter table with a label."""
     label = row["remark"]
     for pattern, words in _LABELS:
         label = re.sub(pattern, words, label)
@@ -270,7 +271,7 @@ def _labelled(row: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _joint(joint: Mapping[str, Any]) -> dict[str, Any]:
-    """Convert the figures of a joint of a distilled model to names without units."""
+    """Return the figures of a joint of a distilled model with names without units."""
     if "correction" in joint:
         return dict(joint)
     names: Sequence[str] = ("mean", "rms", "max")

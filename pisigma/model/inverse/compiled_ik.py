@@ -1,4 +1,4 @@
-"""Compiled corrected inverse kinematics for control loops, on NumPy arrays, in a few microseconds per pose."""
+"""Compiled corrected inverse kinematics for control loops, which solves NumPy arrays in microseconds per pose."""
 
 import ctypes
 import os
@@ -20,13 +20,13 @@ from pisigma.robot.kernels.layout import make_memory, pack
 from pisigma.robot.kernels.machine_code import IGNORED, Said, kernel_forms, load_kernels
 from pisigma.robot.kinematics.task_axes import WHOLE, TaskAxes, default_axes
 
-if TYPE_CHECKING:  # a full name, which run-time type checkers resolve without this import
+if TYPE_CHECKING:  # run-time type checkers resolve the full name without this import
     import pisigma.model.calibrated_model
 
 CHUNK = 2_048
-"""Poses that a thread solves at a time."""
+"""Number of poses that a thread solves at a time."""
 MAX_SOLUTIONS = 8
-"""Most distinct solutions of a pose that are returned for arms without a closed-form inverse."""
+"""Largest number of distinct solutions of a pose that are returned for arms without a closed-form inverse."""
 
 
 class CompiledIK:
@@ -37,7 +37,7 @@ class CompiledIK:
         name: name of the model.
         branches: names of the branches.
         joints: names of the joints.
-        belongs_to: SHA-256 of the model folder of the same state; "" without a folder.
+        belongs_to: SHA-256 of the model folder with the same model; "" without a folder.
         task_axes: axes of the tool that are constrained unless a task states others.
     """
 
@@ -49,7 +49,7 @@ class CompiledIK:
         name: str = "model",
         belongs_to: str = "",
     ) -> None:
-        """Take a description from `model.compiled_model.describe_as_arrays`.
+        """Make the inverse kinematics of a description from `model.compiled_model.describe_as_arrays`.
 
         Raises:
             ModelError: the arm is larger than the compiled kernels allow, or there are no kernels for this machine.
@@ -68,10 +68,11 @@ class CompiledIK:
 
     @staticmethod
     def from_model(model: "pisigma.model.calibrated_model.CalibratedModel") -> "CompiledIK":
-        """Compile a model.
+        """Return the compiled inverse kinematics of a model.
 
         Raises:
-            ModelError: its correction has no compiled form (see `describe_as_arrays`); or see `__init__`.
+            ModelError: the model has no compiled form (see `describe_as_arrays`), or the kernels cannot be used (see
+                `__init__`).
         """
         from pisigma.model.compiled_model import describe_as_arrays
 
@@ -80,7 +81,7 @@ class CompiledIK:
 
     @staticmethod
     def load(file: str | os.PathLike[str]) -> "CompiledIK":
-        """Read a file that `model.compiled_model.save_compiled` wrote.
+        """Return the inverse kinematics in a file that `model.compiled_model.save_compiled` wrote.
 
         Raises:
             ModelError: the file is missing, truncated, changed, of another kind or of another format.
@@ -102,11 +103,11 @@ class CompiledIK:
 
         Args:
             T_base_tool: `(4, 4)`: target pose of the tool in the base frame [m].
-            near: `(dof,)` joint values [rad or m], for example the present ones: of the branches that reach the pose,
-                the nearest is chosen, with revolute joints wrapped as near as their limits allow.
+            near: `(dof,)` joint values [rad or m], for example the robot's current joint values. Of the branches
+                that reach the pose, the nearest is chosen, with revolute joints wrapped as near as their limits allow.
             branch: name of the branch to use. Without `near` and `branch`, branches are tried in the order of their
-                number of training rows; the first that reaches the pose inside the joint limits is chosen, else the
-                first that reaches it.
+                number of training rows; the first branch that reaches the pose inside the joint limits is chosen,
+                otherwise the first that reaches it.
             throw: whether an invalid pose, or a `near` that is not finite, raises an error; otherwise the status is
                 INVALID_POSE.
             approach: `(dof,)`: +1 or -1 for the direction in which every joint moves to the pose, 0 if it is not known.
@@ -134,7 +135,7 @@ class CompiledIK:
         return Solution(*joints, position, rotation, measure, owner, task.ignored)
 
     def solve_packed(self, T_base_tool: bytes, near: bytes) -> list[float]:
-        """Find corrected joint values for one pose that is given as bytes, as received from a socket.
+        """Find corrected joint values for one pose given as bytes, for example received from a network socket.
 
         Args:
             T_base_tool: 16 doubles, row by row [m].
@@ -172,13 +173,14 @@ class CompiledIK:
             near: `(*batch, dof)` or `(dof,)`: see `solve`.
             branch: see `solve`.
             threads: number of threads; None for one per processor that this process may use.
-            throw: see `solve`; with False invalid rows get the status INVALID_POSE and the others are solved.
+            throw: see `solve`; with False, invalid rows get the status INVALID_POSE and other rows are solved.
             approach: `(*batch, dof)` or `(dof,)`: see `solve`.
             single: whether the poses were rounded to float32, which widens the tolerances for rounding.
             axes: see `solve`.
 
         Raises:
-            PoseError: a matrix is not a valid pose (the message states its index), or see `solve`.
+            PoseError: a matrix is not a valid pose (the message states its index), or an argument is invalid, see
+                `solve`.
         """
         task = self._checked(axes)
         T = self._poses(T_base_tool, throw)
@@ -201,8 +203,8 @@ class CompiledIK:
     ) -> Solution:
         """Find solutions `(*batch, branches)` of poses `(*batch, 4, 4)` on every branch; see `solve_batch`.
 
-        For an arm without a closed-form inverse these are up to `MAX_SOLUTIONS` distinct ones; missing ones are
-        UNREACHABLE.
+        For an arm without a closed-form inverse these are up to `MAX_SOLUTIONS` distinct solutions; missing
+        solutions are UNREACHABLE.
         """
         task = self._checked(axes)
         T = self._poses(T_base_tool, throw)
@@ -213,11 +215,11 @@ class CompiledIK:
         return self._solution(out.reshape(*T.shape[:-2], count, out.shape[-1]), task)
 
     def forward(self, q: Any, arm: int | None = None, approach: Any = None) -> tuple[Any, Any, Any, Any]:
-        """Evaluate the calibrated arm.
+        """Compute poses, Jacobians and corrections of the calibrated arm.
 
         Args:
             q: `(poses, dof)` commanded joint values [rad or m].
-            arm: another of the arms in `kernels.arrays`; None for the calibrated one.
+            arm: index of another arm in `kernels.arrays`; None for the calibrated arm.
             approach: `(poses, dof)` or `(dof,)`: see `solve`.
 
         Returns:
@@ -236,7 +238,7 @@ class CompiledIK:
         return T, J, out[:, 6 * dof : 7 * dof], out[:, 7 * dof]
 
     def _checked(self, axes: TaskAxes | None) -> TaskAxes:
-        """Return the constrained axes; models that correct by the whole pose accept only the default ones."""
+        """Return the constrained axes; models that correct by the whole pose accept only the default axes."""
         if axes is None or not self.description.network.used or axes == self.task_axes:
             return axes or self.task_axes
         raise PoseError(
@@ -248,7 +250,7 @@ class CompiledIK:
         )
 
     def _solution(self, out: Any, axes: TaskAxes) -> Solution:
-        """Make solutions from the rows that the kernels write, `(*batch, 2 · dof + 5)`."""
+        """Return the solutions in rows that the kernels write, `(*batch, 2 · dof + 5)`."""
         dof = len(self.joints)
         position, rotation, measure, status, branch = np.moveaxis(out[..., 2 * dof :], -1, 0)
         branches, found = (
@@ -325,7 +327,7 @@ class CompiledIK:
         axes: Any,
         single: bool = False,
     ) -> int:
-        """Run the kernels on the rows from `start` to `stop`, and return the fault code with the row of the whole."""
+        """Run the kernels on the rows from `start` to `stop`, and return the fault code with the index of its row."""
         pairs = []
         for values in (near, approach):
             address, rows = address_of(values), len(values)
@@ -371,7 +373,7 @@ class CompiledIK:
         return T
 
     def _rows(self, values: Any, batch: tuple[int, ...], what: str, throw: bool) -> Any:
-        """Convert joint values or approach directions to `(1 or poses, dof)`, None to `(0, dof)`."""
+        """Return joint values or approach directions as `(1 or poses, dof)`, None as `(0, dof)`."""
         return self._none if values is None else joint_rows(values, batch, what, throw, self.joints)
 
 

@@ -1,4 +1,4 @@
-"""Corrected inverse kinematics of coupled joints, in the controller's values, which are solved as DH values."""
+"""Corrected inverse kinematics of coupled joints: solutions in DH values are converted to the controller's values."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -16,24 +16,25 @@ from pisigma.robot.kinematics import tolerances
 from pisigma.robot.kinematics.status import Status
 from pisigma.robot.kinematics.task_axes import MAX_TILT, TaskAxes
 
-if TYPE_CHECKING:  # a full name, which run-time type checkers resolve without this import
+if TYPE_CHECKING:  # run-time type checkers resolve the full name without this import
     import pisigma.robot.coupling
 
 MAX_STARTS = 4
-"""Stored joint values with the nearest poses that are tried one after the other."""
+"""Largest number of stored joint values with the nearest poses that are tried in sequence."""
 IGNORED_WEIGHT = 1e-6
-"""Weight of rotations about the tool's x and y axes for arms with fewer than six axes, which cannot control them: they
-only decide between joint values that reach the other axes. The tool may then be tilted by up to `MAX_TILT`."""
+"""Weight of rotations about the tool's x and y axes for arms with fewer than six axes, which cannot control them;
+they only determine the choice between joint values that reach the other axes. The tool may then be tilted by up to
+`MAX_TILT`."""
 Values = Float64[np.ndarray, "rows axes"]
 Motion = Callable[[Values], tuple[Any, Any]]
 """Pose `(rows, 4, 4)` and Jacobian `(rows, 6, axes)` of an arm as functions of the controller's values."""
 
 
 class ControllerValues:
-    """Solver in DH values, with wider limits than the controller's, that wraps the solutions into these.
+    """Solver that finds DH values within wide limits and wraps the solutions into the controller's limits.
 
     Full turns of coupled joints change several of the controller's values. If a solution cannot be wrapped into the
-    controller's limits, the other branches are tried, in their order or with `near` the nearest first.
+    controller's limits, the other branches are tried, in their order or, with `near`, nearest first.
     """
 
     def __init__(
@@ -60,12 +61,12 @@ class ControllerValues:
         return ControllerValues(self.ik.with_axes(axes), self.coupling)
 
     def solve(self, T: Any, near: Any, owner: Any, branch: str | None = None, **options: Any) -> Solution:
-        """See `CorrectedIK.__call__`.
+        """Find the controller's values for poses; see `CorrectedIK.__call__`.
 
         Args:
             T: target poses.
             near: checked values of the controller, or None.
-            owner: owner of the solutions.
+            owner: solver that the solutions name as their owner.
             branch: name of the only branch that may be used, or None.
             options: further options of `CorrectedIK.__call__`.
         """
@@ -83,7 +84,7 @@ class ControllerValues:
         return self._answer(first, owner)
 
     def all_branches(self, T: Any, owner: Any, **options: Any) -> Solution:
-        """See `CorrectedIK.all_branches`."""
+        """Find the controller's values on every branch; see `CorrectedIK.all_branches`."""
         if self.coupling.passive:
             return self._solve_passive(T[..., None, :, :], None, owner)
         every = self.ik.all_branches(T, **options)
@@ -91,16 +92,16 @@ class ControllerValues:
         return self._answer(replace(every, q=every.q * 0 + _as(q, every.q)), owner)
 
     def forward(self, q: Any, approach: Any) -> Any:
-        """See `CorrectedIK.forward`."""
+        """Compute poses at the controller's values; see `CorrectedIK.forward`."""
         sides = None if approach is None else self.coupling.approach_to_dh(approach)
         return self.ik.forward(self._to_dh(q), approach=sides)
 
     def jacobian(self, q: Any) -> Any:
-        """See `CorrectedIK.jacobian`; the derivatives are with respect to the controller's values."""
+        """Compute the Jacobian with respect to the controller's values; see `CorrectedIK.jacobian`."""
         return self.ik.jacobian(self._to_dh(q)) @ _as(self.coupling.derivative(as_array(q)), q)
 
     def accuracy(self, q: Any) -> Any:
-        """See `CorrectedIK.accuracy`."""
+        """Predict the accuracy at the controller's values; see `CorrectedIK.accuracy`."""
         return self.ik.accuracy(self._to_dh(q))
 
     def _to_dh(self, q: Any) -> Any:
@@ -118,7 +119,7 @@ class ControllerValues:
         found = solve_from(
             self._motion, rows, starts, lambda q: self.coupling.is_within_limits(self.coupling.to_dh(q))
         )
-        # The nominal solution starts at the corrected one, so that both belong to the same branch.
+        # The nominal solution starts at the corrected solution, so that both belong to the same branch.
         nominal = solve(partial(self._motion, nominal=True), rows, found.q)
         q, q_nominal = found.mask_unreached(found.q), nominal.mask_unreached(nominal.q)
         solution = Solution(
@@ -132,7 +133,7 @@ class ControllerValues:
             np.full(batch, np.nan),
             owner,
         )
-        # A solution outside the limits is only left where no start leads to one within them.
+        # A solution outside the limits remains only if no start leads to a solution within them.
         outside = found.reached & ~self.coupling.is_within_limits(self.coupling.to_dh(found.q))
         beyond = int(Status.OUTSIDE_JOINT_LIMITS)
         solution = replace(solution, status=np.where(outside.reshape(batch), beyond, solution.status))
@@ -147,14 +148,14 @@ class ControllerValues:
         return self.ik.forward(dh), self.ik.jacobian(dh) @ slope
 
     def _inside(self, q: Any, near: Any) -> tuple[Any, Any]:
-        """Wrap DH values so that the controller's values are within its limits, and return which of them cannot be."""
+        """Return DH values wrapped so that the controller's values are within its limits, and a mask of failures."""
         rows = q.reshape(-1, q.shape[-1])
         near_rows = None if near is None else np.broadcast_to(near, q.shape).reshape(rows.shape)
         turned, inside = self.coupling.wrapped_within_limits(rows, near_rows)
         return turned.reshape(q.shape), (~inside & np.isfinite(rows).all(-1)).reshape(q.shape[:-1])
 
     def _other_branches(self, T: Any, q: Any, outside: Any, near: Any, options: dict[str, Any]) -> None:
-        """Replace joint values in `q` by those of the best branch within the limits, if there is one."""
+        """Replace joint values in `q` by the values of the best branch within the limits, if any."""
         poses = T[outside] if T.ndim > 2 else T[None]
         every, excluded = self._inside(
             np.asarray(self.ik.all_branches(poses, approach=_of_rows(options.get("approach"), outside)).q),
@@ -162,7 +163,7 @@ class ControllerValues:
         )
         allowed = ~excluded & np.isfinite(every).all(-1)
         if near is None:
-            # Without a previous posture, the order of the branches of the model decides.
+            # Without a previous posture, the order of the model's branches determines the choice.
             cost = np.argsort(self.ik.order)[None].astype(float)
         else:
             cost = np.abs(every - np.broadcast_to(near, q.shape)[outside].reshape(-1, 1, q.shape[-1])).sum(-1)
@@ -175,7 +176,7 @@ class ControllerValues:
         q[...] = rows.reshape(q.shape)
 
     def _answer(self, solution: Solution, owner: Any) -> Solution:
-        """Convert a solution to the controller's values, with the status according to the controller's limits."""
+        """Return a solution in the controller's values, with the status according to the controller's limits."""
         status = np.asarray(as_array(solution.status))
         dh = np.asarray(as_array(solution.q))
         beyond = ~self.coupling.is_within_limits(dh) & np.isfinite(dh).all(-1)
@@ -191,12 +192,12 @@ class ControllerValues:
 
 
 def _as(values: Any, like: Any) -> Any:
-    """Convert values to a tensor if `like` is one."""
+    """Return values as a tensor if `like` is a tensor."""
     return like.new_tensor(values) if is_tensor(like) else values
 
 
 def _of_rows(values: Any, rows: Any) -> Any:
-    """Select rows of values that have one entry per row."""
+    """Return the selected rows of values that have one entry per row."""
     return values[rows] if values is not None and np.ndim(values) > 1 else values
 
 
@@ -217,12 +218,12 @@ class ReachedPoses:
     rotation: Float64[np.ndarray, " rows"]
 
     def mask_unreached(self, values: np.ndarray) -> np.ndarray:
-        """Replace values of poses that are not reached by NaN."""
+        """Return values with NaN for poses that are not reached."""
         return np.where(self.reached if values.ndim == 1 else self.reached[:, None], values, np.nan)
 
 
 def solve(motion: Motion, T: Float64[np.ndarray, "rows 4 4"], start: Values) -> ReachedPoses:
-    """Solve for poses by damped least squares from initial values.
+    """Find the controller's values that reach poses, by damped least squares from initial values.
 
     Args:
         motion: function for pose and Jacobian of the arm.
@@ -231,7 +232,7 @@ def solve(motion: Motion, T: Float64[np.ndarray, "rows 4 4"], start: Values) -> 
     """
     q = start.copy()
     weight = np.ones(6)
-    # Fewer than six axes cannot set the tilt; a small weight only keeps the arm from tilting freely.
+    # Fewer than six axes cannot control the tilt; a small weight prevents the arm from tilting freely.
     weight[3:5] = 1.0 if q.shape[1] >= 6 else IGNORED_WEIGHT
     error, J = _errors(motion, T, q)
     for _ in range(tolerances.MAX_ITERATIONS):
@@ -260,7 +261,7 @@ def solve_from(
     starts: Float64[np.ndarray, "rows tried axes"],
     is_inside: Callable[[Values], Bool[np.ndarray, " rows"]],
 ) -> ReachedPoses:
-    """Solve every pose from the first start that reaches it within the limits, else from one that reaches it."""
+    """Solve every pose from the first start that reaches it within the limits, otherwise from any that reaches it."""
     result = solve(motion, T, starts[:, 0])
     for tried in starts[:, 1:].swapaxes(0, 1):
         left = ~(result.reached & is_inside(result.q))
@@ -282,7 +283,7 @@ def nearest_starts(
 
 
 def _errors(motion: Motion, T: Any, q: Values) -> tuple[Any, Any]:
-    """Compute position error [m] and rotation vector [rad] in the tool's axes, and the Jacobian in these."""
+    """Compute position error [m] and rotation vector [rad] in the tool's axes, and the Jacobian in these axes."""
     here, J = motion(q)
     R = here[:, :3, :3]
     shift = (R.mT @ (T[:, :3, 3] - here[:, :3, 3])[..., None])[..., 0]

@@ -1,4 +1,4 @@
-"""Corrected inverse kinematics: joint values that really reach a pose."""
+"""Corrected inverse kinematics: joint values with which the real robot reaches a pose."""
 
 import os
 from collections.abc import Callable, Sequence
@@ -17,7 +17,7 @@ from pisigma.model.inverse.solution import AbstractInverse, Solution
 from pisigma.robot.kernels.array_kinematics import call_with_tensors, is_tensor
 from pisigma.robot.kinematics.task_axes import TaskAxes, task_axes
 
-if TYPE_CHECKING:  # full names, which run-time type checkers resolve without these imports
+if TYPE_CHECKING:  # run-time type checkers resolve the full names without these imports
     import pytorch_kinematics
 
     import pisigma.model.calibrated_model
@@ -38,12 +38,13 @@ class CorrectedIK(AbstractInverse):
         name: name of the model.
         branches: names of the branches.
         joints: names of the joints.
-        order: indices of the branches, those with most training rows first.
+        order: indices of the branches, in the order of decreasing numbers of training rows.
         limits: `(dof, 2)` joint limits [rad or m].
-        revolute: `(dof,)`: which joints are revolute.
+        revolute: `(dof,)` mask of the revolute joints.
         closed_form: whether the nominal robot has a closed-form inverse, so that all branches are known.
-        warnings: warnings of conditions of `under` that are outside the range of the calibration.
-        controller: for coupled joints, conversion between joint values and the controller's (used in calls); else None.
+        warnings: warnings about conditions given to `under` that are outside the range of the calibration.
+        controller: for coupled joints, conversion between joint values and the controller's values, which calls use;
+            otherwise None.
     """
 
     controller: "pisigma.model.inverse.controller_values.ControllerValues | None"
@@ -82,7 +83,7 @@ class CorrectedIK(AbstractInverse):
         kernels: "pisigma.model.inverse.compiled_ik.CompiledIK",
         read: "Callable[[], pisigma.model.calibrated_model.CalibratedModel]",
     ) -> "CorrectedIK":
-        """Make it from kernels alone; `read` loads the model when it is first needed."""
+        """Return the inverse kinematics from kernels alone; `read` loads the model when it is first needed."""
         ik = cls.__new__(cls)
         arms, form = kernels.description.arms, kernels.description.closed_form
         ik.name, ik.branches, ik.joints = kernels.name, kernels.branches, kernels.joints
@@ -100,14 +101,14 @@ class CorrectedIK(AbstractInverse):
 
     @cached_property
     def numeric(self) -> "pisigma.model.inverse.numeric_ik.NumericIK":
-        """The solver without kernels."""
+        """Solver in torch, without kernels."""
         from pisigma.model.inverse.numeric_ik import NumericIK
 
         return NumericIK(self.model)
 
     @cached_property
     def compiled(self) -> "pisigma.model.inverse.compiled_ik.CompiledIK | None":
-        """The kernels of the model; None if its correction has no compiled form, or this machine no kernels."""
+        """Kernels of the model; None if its correction has no compiled form, or there are none for this machine."""
         from pisigma.model.inverse.compiled_ik import CompiledIK
 
         try:
@@ -117,7 +118,7 @@ class CorrectedIK(AbstractInverse):
 
     @cached_property
     def postures(self) -> Postures:
-        """Plausible joint values for `near`."""
+        """Ranges of plausible joint values, which `near` has to meet."""
         return Postures(self.limits, self.revolute, self.joints)
 
     def __call__(
@@ -137,11 +138,11 @@ class CorrectedIK(AbstractInverse):
 
         Args:
             T_base_tool: `(*batch, 4, 4)` target poses of the tool in the base frame [m].
-            near: joint values `(*batch, dof)` or `(dof,)` [rad or m], for example the robot's present ones. Of the
-                branches that reach a pose, the nearest is chosen, and revolute joints are wrapped as near to `near` as
-                their limits allow. Distances add radians and metres with equal weight.
-            branch: name of the branch to use; `near` then only affects how joint values are wrapped. By default, the
-                first branch in `order` that reaches the pose, preferably inside the joint limits.
+            near: joint values `(*batch, dof)` or `(dof,)` [rad or m], for example the robot's current joint values.
+                Of the branches that reach a pose, the nearest is chosen, and revolute joints are wrapped as near to
+                `near` as their limits allow. Distances add radians and metres with equal weight.
+            branch: name of the branch to use; `near` then only affects how joint values are wrapped. The default is
+                the first branch in `order` that reaches the pose, preferably inside the joint limits.
             throw: False for control loops: an invalid pose, or a `near` that is not finite or implausible for the
                 robot, then does not raise an error; its solution is NaN with the status INVALID_POSE.
             approach: `(*batch, dof)` or `(dof,)`: +1 or -1 for the direction in which every joint moves to the pose,
@@ -179,8 +180,7 @@ class CorrectedIK(AbstractInverse):
     def all_branches(self, T_base_tool: Any, *, approach: Any = None) -> Solution:
         """Find solutions on every branch, as `(*batch, branches)`; see `__call__` and `for_task`.
 
-        For a robot without a closed-form inverse these are up to eight distinct solutions if it has kernels, for
-        example with the elbow to either side, and otherwise one.
+        For a robot without a closed-form inverse, kernels find up to eight distinct solutions.
         """
         approach = checked_approach(approach)
         if self.controller is not None:
@@ -214,7 +214,7 @@ class CorrectedIK(AbstractInverse):
 
         Args:
             q: joint values [rad or m]; arrays are evaluated by kernels, tensors by torch with gradients.
-            approach: see `__call__`; for arrays only.
+            approach: see `__call__`; accepted for arrays only.
 
         Raises:
             PoseError: q does not match the robot's joints, or `approach` is invalid or given where torch is used.
@@ -250,9 +250,9 @@ class CorrectedIK(AbstractInverse):
         return J.reshape(*values.shape[:-1], 6, values.shape[-1])
 
     def under(self, *, payload_kg: float | None = None, temperature_c: float | None = None) -> "CorrectedIK":
-        """Return the corrected inverse kinematics at a payload or temperature other than the mean of the calibration.
+        """Return the corrected inverse kinematics at a given payload or temperature instead of the calibration's mean.
 
-        Outside the measured range the correction stays that of the nearest measured temperature, and the effect of the
+        Outside the measured range the correction is that of the nearest measured temperature, and the effect of the
         payload is extrapolated linearly; `warnings` of the result then states this.
 
         Args:
@@ -267,7 +267,7 @@ class CorrectedIK(AbstractInverse):
         return CorrectedIK(under_stated_conditions(self.model, payload_kg, temperature_c))
 
     def accuracy(self, q: Any) -> Any:
-        """Predict the standard deviation [m] of the tool's position at `(*batch, dof)`; a tensor if q is one."""
+        """Predict the standard deviation [m] of the tool's position at joint values `(*batch, dof)`."""
         from pisigma.model.accuracy import position_accuracy
 
         if self.controller is not None:
@@ -281,7 +281,7 @@ class CorrectedIK(AbstractInverse):
     def _kernels_of(
         self, q: Any, forward: bool = True
     ) -> "pisigma.model.inverse.compiled_ik.CompiledIK | None":
-        """Return the kernels if they can evaluate the arm at these joint values, else None."""
+        """Return the kernels if they can evaluate the arm at these joint values, otherwise None."""
         if is_tensor(q) or self.compiled is None:
             return None
         return None if forward and self.compiled.description.network.used else self.compiled
@@ -300,19 +300,20 @@ class CorrectedIK(AbstractInverse):
         tolerance_deg: float | Sequence[float] | None = None,
         elbow_angle: float | None = None,
     ) -> "CorrectedIK":
-        """Return a copy for a task that leaves axes of the tool free, for paths, all branches and calls.
+        """Return a copy for a task that leaves axes of the tool free, which applies to calls, branches and paths.
 
-        A robot with more joints than constrained axes moves as near to `near` as it can; without `near` it keeps away
-        from joint limits and singularities.
+        A robot with more joints than constrained axes gets joint values as near to `near` as possible; without
+        `near`, joint values away from joint limits and singularities.
 
         Args:
             ignore_axes: axes of the tool's frame that are not constrained, of "x", "y", "z" (translations along them)
                 and "roll", "pitch", "yaw" (rotations about x, y and z): ("yaw",) for a torch that may rotate about its
-                z axis. None: none for robots with six or more joints, "yaw" for five, "roll" and "pitch" up to 10 deg
-                for four, and all rotations for three.
+                z axis. With None no axis is ignored for robots with six or more joints, "yaw" for five, "roll" and
+                "pitch" up to 10 deg for four, and all rotations for three.
             tolerance_mm: accepted deviations along the tool's axes where the pose cannot be reached exactly [mm], one
                 number or three. The deviations, each divided by its tolerance, are then minimised.
-            tolerance_deg: the same about the tool's axes [deg]. Other axes are met exactly unless they are ignored.
+            tolerance_deg: accepted rotations about the tool's axes where the pose cannot be reached exactly [deg],
+                one number or three. Other axes are met exactly unless they are ignored.
             elbow_angle: elbow angle of an arm with seven revolute joints [rad], see `kinematics.task_axes.TaskAxes`.
 
         Raises:
@@ -344,7 +345,7 @@ class CorrectedIK(AbstractInverse):
         return ik
 
     def _like(self, poses: Any, solution: Solution, axes: TaskAxes) -> Solution:
-        """Convert the solutions of tensors to tensors, with gradients if required; those of arrays (None) to arrays."""
+        """Return solutions as tensors, with gradients if required, for poses that are tensors, otherwise as arrays."""
         if poses is None:
             return replace(solution.map(as_array), owner=self)
         from pisigma.model.inverse.pose_gradients import as_tensors
@@ -353,7 +354,7 @@ class CorrectedIK(AbstractInverse):
 
 
 def _flat(values: Any) -> Any:
-    """Flatten the batch axes of approach directions."""
+    """Return approach directions with flattened batch axes."""
     return None if values is None else np.asarray(values).reshape(-1, np.shape(values)[-1])
 
 
@@ -364,7 +365,7 @@ def load(folder: str | os.PathLike[str]) -> CorrectedIK:
         folder: folder that `pisigma calibrate` or `pisigma train` wrote.
 
     Raises:
-        ModelError: the folder is not a complete model; the message names the file at fault.
+        ModelError: the folder is not a complete model; the message names the faulty file.
     """
     path = Path(folder)
     kernels = _stored_kernels(path)
@@ -387,7 +388,7 @@ def load(folder: str | os.PathLike[str]) -> CorrectedIK:
 
 
 def _stored_kernels(path: Path) -> "pisigma.model.inverse.compiled_ik.CompiledIK | None":
-    """Read the compiled arrays of a model folder; None if they are missing, damaged or out of date."""
+    """Return the compiled arrays of a model folder; None if they are missing, damaged or out of date."""
     stated = compiled_model_hash(path)
     if stated is None:
         return None

@@ -1,4 +1,4 @@
-"""Checks and conversion of the poses and joint values that users pass, without importing torch."""
+"""Check and convert the poses and joint values that users pass, without importing torch."""
 
 from collections.abc import Sequence
 from contextlib import suppress
@@ -13,7 +13,7 @@ from pisigma.robot.kernels.array_kinematics import is_tensor
 
 
 class _Fault(NamedTuple):
-    """Requirement on an argument, and how to correct it."""
+    """Requirement on an argument that is not met, and a remedy."""
 
     option: str
     expected: str
@@ -38,25 +38,25 @@ _METRES = "an array of real numbers with lengths in metres"
 
 
 def fault_error(code: int, index: tuple[int, ...] = ()) -> PoseError:
-    """Make the error for a fault that the kernels found, at an index of the batch."""
+    """Return the error for a fault that the kernels found, at an index of the batch."""
     option, expected, remedy = _FAULTS[code]
     at = f" at index {index if len(index) > 1 else index[0]}" if index else ""
     return PoseError(f"expected {expected}{at}", expected=expected, option=option, remedy=remedy)
 
 
 def as_array(values: Any) -> Any:
-    """Convert a tensor to an array without its gradients; other values are returned as they are."""
+    """Return a tensor as an array without gradients; other values are returned unchanged."""
     return values.detach().numpy(force=True) if is_tensor(values) else values
 
 
 def pose_array(values: Any) -> tuple[Any, bool, Any]:
-    """Convert matrices `(*batch, 4, 4)` to a float64 array.
+    """Return matrices `(*batch, 4, 4)` as a float64 array.
 
     Returns:
-        The array, whether the matrices were float32 before, and the tensor that they were, or None.
+        The array, whether the matrices were float32 before, and the original tensor or None.
 
     Raises:
-        PoseError: they are not numbers, or have another type or shape.
+        PoseError: the matrices are not numbers, or have another type or shape.
     """
     tensor = values if is_tensor(values) else None
     if tensor is not None and str(tensor.dtype) not in ("torch.float32", "torch.float64"):
@@ -81,7 +81,7 @@ def pose_array(values: Any) -> tuple[Any, bool, Any]:
 
 
 def numbers(values: Any, what: str, throw: bool) -> Any:
-    """Convert values to a contiguous float64 array, without a copy if possible.
+    """Return values as a contiguous float64 array, without a copy if possible.
 
     Values that are not numbers become NaN with `throw` False.
 
@@ -91,17 +91,17 @@ def numbers(values: Any, what: str, throw: bool) -> Any:
     try:
         return np.ascontiguousarray(values, dtype=np.float64)
     except (TypeError, ValueError):
-        with suppress(ValueError):  # of ragged values
+        with suppress(ValueError):  # NumPy raises this for ragged values
             if not throw:
                 return np.full(np.shape(values), np.nan)
         raise PoseError(expected=_METRES, option=what) from None
 
 
 def joint_rows(values: Any, batch: tuple[int, ...], what: str, throw: bool, joints: Sequence[str]) -> Any:
-    """Convert joint values or approach directions to shape `(1 or poses, dof)`.
+    """Return joint values or approach directions with the shape `(1 or poses, dof)`.
 
     Raises:
-        PoseError: their shape does not match the joints or the poses, or see `numbers`.
+        PoseError: the shape does not match the joints or the poses, or the values are not numbers, see `numbers`.
     """
     rows, dof = numbers(values, what, throw), len(joints)
     if rows.shape[-1:] != (dof,):
@@ -126,13 +126,13 @@ def joint_rows(values: Any, batch: tuple[int, ...], what: str, throw: bool, join
 
 
 def checked_approach(approach: Any) -> Any:
-    """Check the approach directions of joints; values that are not numbers are returned as they are.
+    """Check the approach directions of joints; values that are not numbers are returned unchanged.
 
     Args:
         approach: +1 or -1 for the direction in which a joint moves before it stops, 0 if not stated; or None.
 
     Raises:
-        PoseError: a value is another number, which would scale a learned backlash.
+        PoseError: a value is another number, which would scale the learned backlash.
     """
     if approach is None:
         return None
@@ -153,19 +153,19 @@ def checked_approach(approach: Any) -> Any:
 class Postures:
     """Joint values that are plausible for a robot: at most one turn beyond the joint limits.
 
-    For prismatic joints it is their stroke, but at least 1 m. Solutions, and a real robot, may be somewhat outside the
-    joint limits; values farther outside are assumed to be in degrees or millimetres by mistake.
+    For prismatic joints the margin is the stroke, but at least 1 m. Solutions, and a real robot, may be somewhat
+    outside the joint limits; values farther outside are assumed to be in degrees or millimetres by mistake.
     """
 
     def __init__(self, limits: np.ndarray, revolute: np.ndarray, joints: Sequence[str]) -> None:
-        """Store the joint limits `(dof, 2)` [rad or m], which joints are revolute, and the names of the joints."""
+        """Store the joint limits `(dof, 2)` [rad or m], the mask of revolute joints, and the names of the joints."""
         slack = np.where(revolute, 2 * np.pi, np.maximum(1.0, limits[:, 1] - limits[:, 0]))
         self._limits, self._revolute, self._joints = limits, revolute, tuple(joints)
         self._lowest, self._highest = limits[:, 0] - slack, limits[:, 1] + slack
         self._lows, self._highs = self._lowest.tolist(), self._highest.tolist()
 
     def clip(self, q: np.ndarray) -> np.ndarray:
-        """Clip joint values `(*batch, dof)` [rad or m] to plausible ones."""
+        """Return joint values `(*batch, dof)` [rad or m] clipped to plausible values."""
         clipped: np.ndarray = np.clip(q, self._lowest, self._highest)
         return clipped
 
@@ -174,7 +174,7 @@ class Postures:
         return all(map(le, self._lows, values)) and all(map(le, values, self._highs))
 
     def check_near(self, near: Any, throw: bool = True) -> Any:
-        """Convert `near` to a float64 array with NaN for implausible values.
+        """Return `near` as a float64 array with NaN for implausible values.
 
         Values that are not numbers, or of another shape, are returned unchecked.
 

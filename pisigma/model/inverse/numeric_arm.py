@@ -1,4 +1,4 @@
-"""Newton iterations of a calibrated arm towards poses, in the constrained axes of the tool, in torch."""
+"""Newton iterations of a calibrated arm towards poses, in torch and in the constrained axes of the tool."""
 
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -24,17 +24,17 @@ from pisigma.robot.kinematics.status import Status
 from pisigma.robot.kinematics.task_axes import TaskAxes
 
 EXACT_ITERATIONS = 25
-"""Steps with the slope of the correction, after steps without it came near a pose but did not converge."""
+"""Number of steps with the slope of the correction, after steps without it came near a pose but did not converge."""
 
 
 @dataclass(frozen=True, eq=False)
 class NumericArm:
-    """An arm with its identified geometry and its joint correction.
+    """An arm with identified geometry and joint correction.
 
     Attributes:
         nominal: nominal arm, which has the joint limits.
-        robot: arm with the identified geometry; for a hybrid the one that belongs to its correction.
-        hybrid: arm with its correction, or None.
+        robot: arm with the identified geometry; for a hybrid, the geometry that belongs to the correction.
+        hybrid: arm with joint correction, or None.
         axes: axes of the tool that are constrained.
     """
 
@@ -55,7 +55,7 @@ class NumericArm:
 
     @cached_property
     def motion_functions(self) -> tuple[Motion, ...]:
-        """Functions for pose and Jacobian: first without the slope of the correction, for a hybrid then with it."""
+        """Functions for pose and Jacobian: without the slope of the correction, and for a hybrid also with it."""
         if self.hybrid is None:
             return (partial(joint_jacobian, self.robot),)
         return tuple(partial(hybrid_motion, self.hybrid, exact=exact) for exact in (False, True))
@@ -70,13 +70,13 @@ class NumericArm:
     def reach(
         self, T: Float64[Tensor, "poses 4 4"], start: Float64[Tensor, "poses dof"]
     ) -> tuple[Float64[Tensor, "poses dof"], Bool[Tensor, " poses"]]:
-        """Iterate from the start of each pose, and return joint values [rad or m] and whether they reach the pose.
+        """Iterate from the start of every pose, and return joint values [rad or m] and whether they reach the pose.
 
         The joint values are wrapped near the starts. Poses that cannot be reached exactly are solved within the
         tolerances of the axes.
         """
-        # The first Jacobian neglects the derivative of the correction, which suffices for most poses and is cheaper;
-        # the exact one finishes those that came near.
+        # The first Jacobian neglects the derivative of the correction, which is sufficient for most poses and
+        # cheaper; # the exact Jacobian is used for poses that came near.
         q, reached = start, torch.zeros(len(T), dtype=torch.bool)
         near, rounds = ~reached, tolerances.MAX_ITERATIONS
         for motion in self.motion_functions:
@@ -111,9 +111,9 @@ class NumericArm:
         q: Float64[Tensor, "poses dof"],
         near: Float64[Tensor, "poses dof"] | None,
     ) -> Float64[Tensor, "poses dof"]:
-        """Move redundant joints, at constant poses, as near as possible to `near` or to the middle of their limits.
+        """Move redundant joints at constant poses as near as possible to `near` or to the middle of their limits.
 
-        A joint without limits prefers its present value instead of a middle, with half a turn as its scale.
+        A joint without limits prefers its current value instead, with half a turn as its scale.
         """
         limits, half = self._travel
         q, _ = wrap_into_limits(self.nominal, q)
@@ -129,7 +129,7 @@ class NumericArm:
     def posture_rating(
         self, T: Float64[Tensor, "poses 4 4"], q: Float64[Tensor, "poses dof"]
     ) -> Float64[Tensor, " poses"]:
-        """Rate joint values: singularity measure times the smallest distance to a joint limit over half its range."""
+        """Return a rating of joint values: singularity measure times relative distance from the nearest joint limit."""
         limits, half = self._travel
         margins = torch.minimum(q - limits[:, 0], limits[:, 1] - q) / half
         margin = torch.where(torch.isfinite(half), margins.clamp(max=1.0), 1.0).amin(-1)

@@ -28,11 +28,11 @@ from pisigma.robot.se3 import check_transforms, pose_error, transform_faults
 NUMERIC = "numeric"
 """Name of the only branch of a robot without a closed-form inverse."""
 _OUTSIDE, _LOST = 1e9, 1e15
-"""Added to the rank of solutions outside the joint limits, and of starts that do not converge."""
+"""Penalties in the rank of solutions outside the joint limits, and of starts that do not converge."""
 
 
 class NumericIK:
-    """Corrected inverse kinematics of a model by iteration. Solutions are float64 tensors on the CPU.
+    """Corrected inverse kinematics of a model by iteration; solutions are float64 tensors on the CPU.
 
     Every pose is solved by damped Newton steps, a few milliseconds each, from several starts: the nominal arm's
     branches (or their nearest joint values where they do not reach the pose), `near`, and stored joint values with the
@@ -41,7 +41,7 @@ class NumericIK:
     Attributes:
         model: calibrated model.
         branches: names of the branches.
-        order: indices of the branches: those of training rows, most frequent first, then the others.
+        order: indices of the branches: branches of training rows, most frequent first, then all others.
         task_axes: axes of the tool that are constrained.
     """
 
@@ -50,7 +50,7 @@ class NumericIK:
 
         Args:
             model: calibrated model.
-            axes: axes of the tool that are constrained; None for the default ones.
+            axes: axes of the tool that are constrained; None for the default axes.
 
         Raises:
             ModelError: the model states branches that its robot does not have, or has no initial values for the numeric
@@ -96,14 +96,14 @@ class NumericIK:
         single: bool | None = None,
         axes: TaskAxes | None = None,
     ) -> Solution:
-        """Find corrected joint values for poses; for arguments, errors and solutions see `CorrectedIK`.
+        """Find corrected joint values for poses; see `CorrectedIK` for arguments, errors and solutions.
 
         Args:
-            T_base_tool: `(*batch, 4, 4)`.
-            near: `(*batch, dof)` or `(dof,)`.
+            T_base_tool: target poses `(*batch, 4, 4)` [m].
+            near: joint values or directions, `(*batch, dof)` or `(dof,)`.
             branch: name of the branch to use.
             throw: whether invalid poses and joint values raise an error.
-            approach: `(*batch, dof)` or `(dof,)`.
+            approach: joint values or directions, `(*batch, dof)` or `(dof,)`.
             single: whether the poses were rounded to float32; None to infer it from their type.
             axes: axes of the tool that are constrained; None for `task_axes`.
         """
@@ -131,7 +131,7 @@ class NumericIK:
         single: bool | None = None,
         axes: TaskAxes | None = None,
     ) -> Solution:
-        """Find solutions on every branch, as `(*batch, branches)`; one for a robot without a closed-form inverse."""
+        """Find solutions on every branch, `(*batch, branches)`; a robot without closed form has one branch."""
         poses = _Poses.from_values(T_base_tool, single, True)
 
         def solve(ik: "NumericIK", rows: Tensor) -> Solution:
@@ -148,7 +148,7 @@ class NumericIK:
         axes: TaskAxes | None,
         solve: Callable[["NumericIK", Tensor], Solution],
     ) -> Solution:
-        """Solve rows of poses, grouped by their approach directions."""
+        """Solve rows of poses in groups of equal approach directions."""
         ik = self if axes is None or axes == self.task_axes else NumericIK(self.model, axes)
         hybrid, rows = self.model.hybrid, torch.arange(len(poses.T))
         if approach is None or hybrid is None or not len(rows):
@@ -163,10 +163,10 @@ class NumericIK:
         return parts[0].map(lambda *values: torch.cat(values)[place], *parts[1:])
 
     def _joint_rows(self, values: Any, what: str, poses: "_Poses", throw: bool) -> Tensor:
-        """Convert joint values to `(poses, dof)`, one row for each pose.
+        """Return joint values as `(poses, dof)`, one row for every pose.
 
         Raises:
-            PoseError: their shape is wrong, or they are not finite and `throw` is True.
+            PoseError: the shape is wrong, or values are not finite and `throw` is True.
         """
         joints = [joint.name for joint in self.model.robot.joints]
         rows = torch.tensor(joint_rows(values, poses.batch, what, throw, joints))
@@ -177,7 +177,7 @@ class NumericIK:
     def _candidates(
         self, T: Tensor, single: bool, near: Tensor | None, requested: Sequence[int]
     ) -> tuple[Solution, Tensor]:
-        """Find solutions `(poses, starts)` from all starts, and their ranks, of which the lowest is the best."""
+        """Find solutions `(poses, starts)` from all starts, and their ranks; the lowest rank is best."""
         starts, branch = self._starts(T, single)
         plausible = torch.isfinite(starts).all(-1).any(1) | (self._solver is None)
         if near is not None and len(requested) == len(self.branches):
@@ -188,7 +188,7 @@ class NumericIK:
             starts = torch.cat([starts, few], 1)
         unknown = branch.new_full((len(T), starts.shape[1] - branch.shape[1]), -1)
         every, rank = self._solved(T, starts, torch.cat([branch, unknown], 1), near)
-        # Only poses that no start solves get further starts.
+        # Only poses that no start solves are tried from further starts.
         lost = ((_among(every, rank, requested) >= _OUTSIDE).all(1) & plausible).nonzero()[:, 0]
         if not len(lost):
             return every, rank
@@ -199,9 +199,9 @@ class NumericIK:
         return every.map(lambda *values: torch.cat(values, 1), others), torch.cat([rank, ranks], 1)
 
     def _starts(self, T: Tensor, single: bool) -> tuple[Tensor, Tensor]:
-        """Return nominal joint values `(poses, branches, dof)` and their branch, -1 if they do not reach the pose.
+        """Return nominal joint values `(poses, branches, dof)`, and their branch or -1 if they do not reach the pose.
 
-        In that case they are the nearest ones to it, or NaN.
+        Joint values that do not reach the pose are as near to it as possible, or NaN.
         """
         if self._solver is None:
             return T.new_zeros(len(T), 0, self.model.robot.dof), torch.zeros(len(T), 0, dtype=torch.int64)
@@ -210,8 +210,9 @@ class NumericIK:
             T = self._solver.upright_poses(T)
         q, near_rows = self._solver.solve(T.float() if single else T).q.double(), self._solver.start_values(T)
         reached, robot = torch.isfinite(q).all(-1), self.model.identified
-        # The calibrated arm may reach what the nominal one just misses: start at its nearest joint values, unless they
-        # miss the pose by far more than geometric errors explain. Divided by the reach, lengths add up with angles.
+        # The calibrated arm may reach poses that the nominal arm just misses: start at the nearest joint values,
+        # unless they miss the pose by far more than geometric errors explain. Divided by the reach, lengths add up
+        # with angles.
         each = T[:, None].expand(*near_rows.shape[:-1], 4, 4).reshape(-1, 4, 4)
         off, _ = task_error(self.task_axes, each, forward_kinematics(robot, near_rows.reshape(-1, robot.dof)))
         off = off * off.new_tensor([*[1 / robot.reach] * 3, 1, 1, 1]) * off.new_tensor(self._arm.weights)
@@ -223,7 +224,7 @@ class NumericIK:
     def _solved(
         self, T: Tensor, starts: Tensor, branch: Tensor, near: Tensor | None
     ) -> tuple[Solution, Tensor]:
-        """Solve from the starts that are not NaN, for poses within reach, and return solutions and ranks."""
+        """Solve poses within reach from the starts that are not NaN, and return solutions and ranks."""
         usable = torch.isfinite(starts).all(-1) & self._arm.within_reach(T)[:, None]
         pose, place = usable.nonzero().unbind(1)
         start, known = starts[pose, place], branch[pose, place] >= 0
@@ -245,13 +246,13 @@ class NumericIK:
     def _finished(
         self, T: Tensor, q: Tensor, start: Tensor, branch: Tensor, near: Tensor | None
     ) -> tuple[Solution, Tensor]:
-        """Make solutions and their ranks from joint values that reach poses.
+        """Return solutions and their ranks from joint values that reach poses.
 
         Args:
             T: `(rows, 4, 4)` target poses.
-            q: `(rows, dof)` joint values of the identified arm, or nominal ones that a network corrects.
-            start: joint values that the iteration started from.
-            branch: branch of the starts that reach the pose, else -1.
+            q: `(rows, dof)` joint values of the identified arm, or nominal joint values that a network corrects.
+            start: joint values from which the iteration started.
+            branch: branch of the starts that reach the pose, otherwise -1.
             near: joint values that the solutions should be near, or None.
         """
         robot, known = self.model.robot, branch >= 0
@@ -266,7 +267,7 @@ class NumericIK:
             commanded = nearest_turn(robot, commanded, near, within_limits=True)
         reached = torch.ones_like(inside)
         if self.model.hybrid is not None:
-            if not self.model.hybrid.correction.is_periodic:  # the correction differs between wraps
+            if not self.model.hybrid.correction.is_periodic:  # the correction depends on the turn of a joint
                 commanded, reached = self._arm.reach(T, commanded)
                 inside = (wrap_into_limits(robot, commanded)[0] == commanded).all(-1) & inside
             measure = 1 + self.model.hybrid.coverage.distance_outside(commanded).amax(-1)
@@ -286,7 +287,7 @@ class NumericIK:
         return replace(solution, ignored_axes=self.task_axes.ignored), torch.where(reached, rank, _LOST)
 
     def _nominal(self, T: Tensor, q: Tensor, known: Tensor) -> Tensor:
-        """Return the nominal arm's joint values near q, or q itself where `known`; NaN without a solution."""
+        """Return the nominal arm's joint values near q, or q where these are `known`; NaN without a solution."""
         if self.model.calibrated is None:
             return q
         solved = solve_numeric(self.model.robot, T, q, axes=self.task_axes, weights=self._arm.weights)
@@ -294,7 +295,7 @@ class NumericIK:
         return torch.where(known[:, None], q, found)
 
     def _corrected(self, T: Tensor, q: Tensor) -> tuple[Tensor, Tensor]:
-        """Add the network's correction to joint values, and return them with the domain measure."""
+        """Return joint values with the network's correction added, and the domain measure."""
         measure = torch.full((len(T),), torch.nan, dtype=torch.float64)
         if self._network is None:
             return q, measure
@@ -319,7 +320,7 @@ class NumericIK:
         return torch.where(known, error, torch.nan)
 
     def _rank(self, T: Tensor, q: Tensor, branch: Tensor, near: Tensor | None) -> Tensor:
-        """Rank joint values inside their limits by distance to `near`, by `posture_rating`, or by branch."""
+        """Return the ranks of joint values by distance from `near`, by `posture_rating`, or by branch."""
         if near is not None:
             rank: Tensor = ((q - near).norm(dim=-1) / SAME).round()
         elif self._spare:
@@ -331,12 +332,12 @@ class NumericIK:
 
 @dataclass(frozen=True)
 class _Poses:
-    """Poses as rows.
+    """Checked poses as rows.
 
     Attributes:
-        T: `(poses, 4, 4)`, identity where a pose is invalid.
-        valid: which poses are valid.
-        single: whether they were rounded to float32.
+        T: `(poses, 4, 4)`, the identity for invalid poses.
+        valid: mask of the valid poses.
+        single: whether the poses were rounded to float32.
         batch: batch shape of the argument.
     """
 
@@ -350,7 +351,7 @@ class _Poses:
         """Convert and check poses.
 
         Raises:
-            PoseError: see `pose_array`; or a matrix is not a valid pose and `throw` is True.
+            PoseError: the argument is invalid, see `pose_array`, or a matrix is not a valid pose and `throw` is True.
         """
         array, rounded, _ = pose_array(values)
         T = torch.from_numpy(np.array(array))
@@ -364,17 +365,17 @@ class _Poses:
         return _Poses(rows, valid, single, tuple(T.shape[:-2]))
 
     def shaped(self, values: Tensor) -> Tensor:
-        """Reshape values of the rows to the batch shape of the argument."""
+        """Return values of the rows in the batch shape of the argument."""
         return values.reshape((*self.batch, *values.shape[1:]))
 
 
 def _among(every: Solution, rank: Tensor, branches: Sequence[int]) -> Tensor:
-    """Return ranks of solutions, `_LOST` on branches other than the requested ones."""
+    """Return ranks of solutions, with `_LOST` on branches that are not requested."""
     return torch.where(torch.isin(every.branch, torch.tensor(branches)), rank, _LOST)
 
 
 def _best(every: Solution, rank: Tensor, branches: Sequence[int]) -> Solution:
-    """Select the best solution of every pose on the requested branches."""
+    """Return the best solution of every pose on the requested branches."""
     least, index = _among(every, rank, branches).min(1)
     lost = least >= _LOST
     best = every.map(lambda values: values[torch.arange(len(index)), index])
@@ -383,7 +384,7 @@ def _best(every: Solution, rank: Tensor, branches: Sequence[int]) -> Solution:
 
 
 def _without(result: Solution, lost: Tensor, status: Status) -> Solution:
-    """Replace solutions by NaN and another status where `lost`."""
+    """Return solutions with NaN and another status where `lost`."""
 
     def kept(values: Tensor) -> Tensor:
         where = lost.reshape(-1, *[1] * (values.ndim - 1))

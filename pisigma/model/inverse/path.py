@@ -15,22 +15,22 @@ from pisigma.robot.kinematics.tolerances import LIMIT_TOLERANCE
 Array = Any
 
 JUMP = 1e6
-"""[rad²] Cost of a jump, as much as 100 million joint motions of 0.1 rad."""
+"""Cost of a jump [rad²], equal to 100 million joint motions of 0.1 rad."""
 _LIMITS = 1e8
-"""[rad²] Cost of a pose outside joint limits, as much as 100 jumps."""
+"""Cost of a pose outside joint limits [rad²], equal to 100 jumps."""
 _NONE = 1e12
-"""[rad²] Cost of a pose without a solution, as much as 10,000 poses outside joint limits."""
+"""Cost of a pose without a solution [rad²], equal to 10,000 poses outside joint limits."""
 _SMALL = 0.1
-"""[rad or m] A smaller step on one branch never is treated as a jump."""
+"""Step on a branch below which it is never treated as a jump [rad or m]."""
 CHUNK = 8_192
-"""Steps whose transitions between all pairs of branches are in memory at the same time."""
+"""Number of steps whose transitions between all pairs of branches are in memory at a time."""
 _TURN = 2 * math.pi
 _OTHER_BRANCH = 1e4
-"""[rad²] Cost of a start on a branch other than the requested one; less than that of a jump."""
+"""Cost of a start on a branch other than the requested branch [rad²]; lower than the cost of a jump."""
 _LATER = 1e-3
-"""[rad²] Cost of a start on a later branch if none is requested, per place in the order of branches."""
+"""Cost of a start on a later branch if no branch is requested [rad²], per place in the order of branches."""
 _STILL = 1e-9
-"""[rad or m] A joint that moves by less is not treated as moving."""
+"""Motion of a joint below which it is treated as at rest [rad or m]."""
 
 
 @dataclass(frozen=True)
@@ -38,12 +38,12 @@ class PathSwitch:
     """A place on a path where the branch changes or the joint values are discontinuous.
 
     Attributes:
-        index: index of the first pose after it.
+        index: index of the first pose after the discontinuity.
         kind: "branch": change to another branch, continuously through a singular pose or by a jump; "jump": jump on the
             same branch; "turn": a joint is rewound by full turns to stay within its limits; "gap": poses that are not
             reached.
         jump: largest joint motion [rad or m] of the discontinuity; 0 for a continuous change of the branch.
-        sentence: a sentence that describes it.
+        sentence: a sentence that describes the change or discontinuity.
     """
 
     index: int
@@ -73,16 +73,16 @@ def follow_path(
 ) -> JointPath:
     """Find joint values along a path.
 
-    For arms with a closed-form inverse, dynamic programming chooses the branches of the whole path with the fewest
-    jumps and, among these, the least sum of squared joint motions. For other arms, and for redundant tasks, every pose
-    is solved from the solution of the previous one.
+    For arms with a closed-form inverse, dynamic programming chooses the branches of the whole path that have the
+    fewest jumps and, among these, the smallest sum of squared joint motions. For other arms, and for redundant
+    tasks, every pose is solved from the solution of the previous one.
 
     Args:
         ik: corrected inverse kinematics.
         T_base_tool: `(poses, 4, 4)` target poses [m].
         near: `(dof,)` joint values [rad or m] of the robot before the path.
-        branch: name of the branch to start on, if that causes no jump; without `near` and `branch`, the one with most
-            training rows.
+        branch: name of the branch to start on, if that causes no jump; without `near` and `branch`, the branch with
+            most training rows.
 
     Raises:
         PoseError: there are no poses, a matrix is not a valid pose, or `near` or `branch` is invalid.
@@ -109,14 +109,14 @@ def _solve(
     near: Array | None,
     approach: Array | None = None,
 ) -> Any:
-    """Solve poses near joint values, which may be those of a solution far outside the joint limits."""
+    """Solve poses near joint values, which may be of a solution far outside the joint limits."""
     return ik(T, near=None if near is None else ik.postures.clip(near), approach=approach)
 
 
 def _approaches(q: Array, near: Array | None) -> Array:
-    """Return the direction in which every joint moves to its values `(poses, dof)`: +1 if they increase, else -1.
+    """Return the direction in which every joint moves to its values `(poses, dof)`: +1 if they increase or -1.
 
-    A joint that does not move keeps its last direction; 0 before its first motion.
+    A joint that does not move keeps its last direction; the direction is 0 before the first motion.
     """
     first = q[:1] if near is None else near[None]
     step = np.nan_to_num(np.diff(np.concatenate([first, q]), axis=0))  # poses without a solution are skipped
@@ -133,7 +133,7 @@ def _guide(ik: AbstractInverse, T: Array, near: Array | None, branch: str | None
     reached = np.flatnonzero(np.isfinite(q).all(-1).any(-1))
     if not len(reached):
         return np.tile(np.clip(0.0, ik.limits[:, 0], ik.limits[:, 1]) if near is None else near, (len(T), 1))
-    # Cost of starting on each branch: by the statement of the caller, the joint motion from `near`, or the usual order.
+    # Cost of starting on each branch: by the requested branch, the joint motion from `near`, or the usual order.
     first = np.zeros(len(ik.branches))
     for place, index in enumerate(ik.order):
         first[index] = _LATER * place
@@ -150,7 +150,7 @@ def _guide(ik: AbstractInverse, T: Array, near: Array | None, branch: str | None
 
 
 def _jumps(ik: AbstractInverse, T: Array, q: Array) -> Array:
-    """Return whether staying on a branch is a jump `(poses - 1, branches)`; long steps are checked halfway."""
+    """Return whether a step on the same branch is a jump `(poses - 1, branches)`; long steps are checked halfway."""
     step = np.abs(wrap_motion(np.diff(q, axis=0), ik.revolute)).max(-1)
     result = np.zeros(step.shape, dtype=bool)
     rows = np.flatnonzero((np.nan_to_num(step, nan=0.0) > 0.1).any(-1))
@@ -161,7 +161,7 @@ def _jumps(ik: AbstractInverse, T: Array, q: Array) -> Array:
 
 
 def _one_by_one(ik: AbstractInverse, T: Array, near: Array | None) -> Array:
-    """Solve every pose from the joint values of the previous one."""
+    """Solve every pose from the joint values of the previous pose."""
     result, last = np.empty((len(T), len(ik.joints))), near
     for row, wanted in enumerate(T):
         q = np.asarray(_solve(ik, wanted, last).q)
@@ -204,7 +204,7 @@ def _at(
     left: int,
     taken: int,
 ) -> Sequence[PathSwitch]:
-    """Describe the discontinuity before a pose, if there is one."""
+    """Return the discontinuity before a pose; None if there is none."""
     turned = np.abs(step - wrap_motion(step, ik.revolute)) > 1
     names = f"from branch '{ik.branches[left]}' to '{ik.branches[taken]}'"
     if jump:
@@ -244,12 +244,12 @@ def unwrap_path(
     Args:
         q: `(poses, dof)` joint values [rad or m] with any wrapping, without NaN.
         limits: `(dof, 2)` joint limits [rad or m].
-        revolute: `(dof,)`: which joints are revolute.
-        near: `(dof,)` joint values that the path should start near, or None for 0.
+        revolute: `(dof,)` mask of the revolute joints.
+        near: `(dof,)` joint values near which the path should start, or None for 0.
 
     Returns:
         The joint values, and `(pose, joint)` where a joint must be rewound by full turns before the pose because it
-        reaches a limit. A value that has no wrap within the limits stays outside.
+        reaches a limit. A value that cannot be wrapped into the limits remains outside.
     """
     rolled = q.copy()
     rolled[1:] = q[0] + np.cumsum(wrap_motion(np.diff(q, axis=0), revolute), axis=0)
@@ -262,12 +262,12 @@ def unwrap_path(
 
 
 def _within(values: Array, lower: float, upper: float, meant: float) -> tuple[Array, list[int]]:
-    """Shift one joint's continuous values by full turns into its limits; also return where the shift changes."""
+    """Return a joint's continuous values shifted by full turns into its limits, and where the shift changes."""
     result, breaks, start = values.copy(), [], 0
     lower, upper = lower - LIMIT_TOLERANCE, upper + LIMIT_TOLERANCE
     while start < len(values):
         following = values[start:]
-        # numbers of turns that keep all values up to each one inside the limits
+        # numbers of turns that keep all values up to this one inside the limits
         highest = np.floor((upper - np.maximum.accumulate(following)) / _TURN)
         lowest = np.ceil((lower - np.minimum.accumulate(following)) / _TURN)
         fits = lowest <= highest
@@ -291,7 +291,7 @@ def wrap_motion(step: Array, revolute: Array) -> Array:
 
 
 def is_jump(before: Array, middle: Array, after: Array, revolute: Array) -> Array:
-    """Return whether solutions `(..., dof)` are not connected through the solution of the halfway pose.
+    """Return whether two solutions `(..., dof)` are not connected through the solution of the halfway pose.
 
     A continuous motion passes near the middle of a step, so that both halves are shorter than three quarters of it. If
     the halfway pose has no solution (NaN), the solutions are not connected.
@@ -319,17 +319,17 @@ def choose_branches(q: Array, status: Array, jumps: Array, first: Array, revolut
     """Choose the branch of every pose by dynamic programming over all branches.
 
     The sum of squared joint motions, plus `JUMP` for every jump, is minimised. A pose outside joint limits costs as
-    much as 100 jumps, and one without a solution as much as 10,000 poses outside joint limits.
+    much as 100 jumps, and a pose without a solution as much as 10,000 poses outside joint limits.
 
     Args:
-        q: `(poses, branches, dof)` solutions [rad or m], NaN where there is none.
-        status: `(poses, branches)`: their `Status`.
-        jumps: `(poses - 1, branches)`: whether staying on a branch is a jump.
+        q: `(poses, branches, dof)` solutions [rad or m], NaN where a pose has none.
+        status: `(poses, branches)`: `Status` of the solutions.
+        jumps: `(poses - 1, branches)`: whether a step on the same branch is a jump.
         first: `(branches,)` cost of a start on each branch [rad²].
-        revolute: `(dof,)`: which joints are revolute.
+        revolute: `(dof,)` mask of the revolute joints.
 
     Returns:
-        `(poses,)`: indices of branches.
+        `(poses,)`: index of the chosen branch of every pose.
     """
     poses, branches = status.shape
     nodes = np.where(status == Status.OUTSIDE_JOINT_LIMITS, _LIMITS, 0.0)

@@ -28,13 +28,13 @@ def as_tensors(
     owner: AbstractInverse,
     axes: TaskAxes,
 ) -> Solution:
-    """Convert solutions to tensors with the dtype and device of the poses, and with gradients to them.
+    """Return solutions as tensors with the dtype and device of the poses, and with gradients with respect to them.
 
     Args:
         solution: float64 arrays or tensors on the CPU; solutions of all branches have one batch axis more than the
             poses.
-        poses: poses as they were passed.
-        model: calibrated model; None without gradients.
+        poses: poses as passed by the caller.
+        model: calibrated model; None if no gradients are required.
         owner: see `Solution`.
         axes: axes of the tool that are constrained.
     """
@@ -68,10 +68,11 @@ def with_pose_gradients(
     `dq_nominal = J_nominal⁺ ξ`.
 
     J⁺ is the pseudo-inverse of the dimensionless Jacobian, without singular values below `SINGULAR_TOLERANCE`. It is
-    the inverse if that exists; for a redundant arm it yields the least joint motion, and for fewer than six joints or
-    at a singular pose it follows the part of ξ that the tool can follow. Changes of T that are not motions (shear,
-    scale) do not contribute. The gradient of a solution that is NaN is 0, so that it can be masked. Only first
-    derivatives are available. If some axes of the tool are not constrained, ξ and J are restricted to the others.
+    the inverse if this exists; for a redundant arm it yields the smallest joint motion, and for fewer than six
+    joints or at a singular pose it follows the part of ξ that the tool can follow. Changes of T that are not motions
+    (shear, scale) do not contribute. The gradient of a solution that is NaN is 0, so that it can be masked. Only
+    first derivatives are available. If some axes of the tool are not constrained, ξ and J are restricted to the
+    constrained axes.
 
     Args:
         model: calibrated model.
@@ -107,7 +108,7 @@ def _twist(T: Float64[Tensor, "*batch 4 4"]) -> Float64[Tensor, "*batch 6"]:
 
 
 def _attached(robot: Robot, T: Tensor, axes: TaskAxes, q: Tensor, motion: Motion) -> Tensor:
-    """Attach gradients with respect to the poses to joint values; `motion` evaluates rows of joint values."""
+    """Return joint values with gradients with respect to the poses; `motion` evaluates rows of joint values."""
     twist, flat = _twist(T), q.detach().reshape(-1, q.shape[-1])
     rows = torch.isfinite(flat).all(-1).nonzero()[:, 0]
     inverse = flat.new_zeros(len(flat), q.shape[-1], 6)
@@ -140,7 +141,7 @@ def pseudo_inverse(robot: Robot, J: Float64[Tensor, "poses 6 dof"]) -> Float64[T
 
 
 class _Implicit(torch.autograd.Function):
-    """Identity with a given derivative."""
+    """Identity function with a given derivative."""
 
     @staticmethod
     def forward(ctx: Any, twist: Tensor, q: Tensor, inverse: Tensor) -> Tensor:

@@ -12,12 +12,12 @@ from pisigma.model.inverse.joint_input import Postures
 from pisigma.robot.kinematics.status import Status
 from pisigma.robot.kinematics.task_axes import TaskAxes
 
-if TYPE_CHECKING:  # a full name, which run-time type checkers resolve without this import
+if TYPE_CHECKING:  # run-time type checkers resolve the full name without this import
     import pisigma.model.calibrated_model
 
 
 class AbstractInverse(ABC):
-    """Interface of corrected inverse kinematics; for the attributes see `CorrectedIK`."""
+    """Interface of solvers of corrected inverse kinematics; see `CorrectedIK` for the attributes."""
 
     name: str
     branches: tuple[str, ...]
@@ -35,7 +35,7 @@ class AbstractInverse(ABC):
     @property
     @abstractmethod
     def compiled(self) -> object | None:
-        """The compiled kernels; None without such."""
+        """The compiled kernels; None if there are none."""
 
     @property
     @abstractmethod
@@ -45,7 +45,7 @@ class AbstractInverse(ABC):
     @property
     @abstractmethod
     def postures(self) -> Postures:
-        """Plausible joint values for `near`."""
+        """Ranges of plausible joint values, which `near` has to meet."""
 
     @abstractmethod
     def __call__(
@@ -57,19 +57,19 @@ class AbstractInverse(ABC):
         throw: bool = True,
         approach: Any = None,
     ) -> "Solution":
-        """Find joint values for poses."""
+        """Find corrected joint values [rad or m] for poses T_base_tool [m]."""
 
     @abstractmethod
     def all_branches(self, T_base_tool: Any, *, approach: Any = None) -> "Solution":
-        """Find joint values on every branch."""
+        """Find corrected joint values on every branch for poses T_base_tool [m]."""
 
     @abstractmethod
     def forward(self, q: Any, *, approach: Any = None) -> Any:
-        """Compute poses of the calibrated arm."""
+        """Compute poses T_base_tool [m] of the calibrated arm at joint values q [rad or m]."""
 
     @abstractmethod
     def jacobian(self, q: Any) -> Any:
-        """Compute the Jacobian of the calibrated arm."""
+        """Compute the geometric Jacobian of the calibrated arm at joint values q [rad or m]."""
 
     @abstractmethod
     def accuracy(self, q: Any) -> Any:
@@ -91,20 +91,21 @@ class Solution:
     Attributes:
         q: `(*batch, dof)`: corrected joint values [rad or m]; NaN if and only if the status is UNREACHABLE or
             INVALID_POSE.
-        q_nominal: `(*batch, dof)`: joint values of the nominal robot, wrapped near `q`; NaN also where only the
-            identified geometry, not the nominal one with the same base and tool, reaches the pose.
+        q_nominal: `(*batch, dof)`: joint values of the nominal robot, wrapped near `q`; NaN also where the
+            identified geometry reaches the pose but the nominal geometry does not.
         branch: `(*batch,)`: index into `branches`.
         branches: names of the branches.
-        status: `(*batch,)`: a `Status` as a number. The most serious one is reported, in the order unreachable, outside
-            joint limits, singular, outside domain, reached. Joint limits apply to the corrected values, which are
-            commanded.
+        status: `(*batch,)`: a `Status` as a number. The most serious status is reported, in the order unreachable,
+            outside joint limits, singular, outside domain, reached. Joint limits apply to the corrected values,
+            which are commanded.
         position_residual: `(*batch,)`: distance of the tool from the target position [m] as predicted by the model,
             before joint values are rounded to float32, and without the ignored axes; NaN without a solution.
-        rotation_residual: `(*batch,)`: angle between the tool and the target orientation [rad], in the same way.
-        domain_measure: `(*batch,)`: distance to the training rows divided by their spacing; above 1 the correction is
-            extrapolated, whichever status is reported. For a hybrid it is 1 plus the largest angle [rad] by which a
+        rotation_residual: `(*batch,)`: angle between the tool and the target orientation [rad], computed in the same
+            way.
+        domain_measure: `(*batch,)`: distance to the training rows divided by their spacing; above 1 the correction
+            is extrapolated, regardless of the status. For a hybrid it is 1 plus the largest angle [rad] by which a
             joint is outside its measured values. NaN without a learned correction or without a solution.
-        owner: solver of the solution, which predicts its accuracy.
+        owner: solver that found the solution and predicts its accuracy.
         ignored_axes: axes of the tool that affect neither the status nor the residuals: those that the task ignores or
             that an arm with fewer than six joints cannot control; see `kinematics.task_axes.TaskAxes`.
     """
@@ -122,7 +123,7 @@ class Solution:
 
     @property
     def correction(self) -> Any:
-        """`q - q_nominal` [rad or m]."""
+        """Correction of the joint values, `q - q_nominal` [rad or m]."""
         return self.q - self.q_nominal
 
     @property
@@ -134,13 +135,13 @@ class Solution:
     def accuracy(self) -> Any:
         """Predicted standard deviation of the tool's position [m], `(*batch,)`; NaN if the model has no uncertainty.
 
-        It is computed with torch in float64 when it is first read.
+        It is computed with torch in float64 at the first access.
         """
         return np.full(np.shape(self.status), np.nan) if self.owner is None else self.owner.accuracy(self.q)
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """A sentence for every status that says what it means and what to do, with flattened batch axes."""
+        """Sentence about the meaning of every status and what to do, with flattened batch axes."""
         return tuple(Status(status).sentence for status in np.ravel(self.status).tolist())
 
     def select(self, index: Any) -> "Solution":
@@ -148,10 +149,10 @@ class Solution:
         return self.map(lambda values: values[index])
 
     def map(self, change: Callable[..., Any], *others: "Solution") -> "Solution":
-        """Apply a function, which must keep the joint axis last, to all values.
+        """Return the solutions after applying a function, which must keep the joint axis last, to all values.
 
         Args:
-            change: function of the values, and of those of every other solution.
+            change: function of the values of this solution and of every other solution.
             others: further solutions, with the same branches.
         """
         changed = {

@@ -1,4 +1,4 @@
-"""Check of written models: the folder is read and compared with the model in memory before it gets its name."""
+"""Check written models: the folder is read and compared with the model in memory before it gets its name."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -14,11 +14,11 @@ from pisigma.model.folder.model_folder import load_model, save_model
 from pisigma.model.inverse.corrected_ik import CorrectedIK, load
 
 PROBES = 20
-"""Number of joint values at which the model in memory and the one in the folder are compared."""
+"""Number of joint vectors at which the model in memory and the model in the folder are compared."""
 PROBE_RADIUS = 0.1
-"""[rad or m] Largest distance of these from the joint values of training rows."""
+"""Largest distance [rad or m] of the compared joint values from the joint values of training rows."""
 TOLERANCE, JOINT_TOLERANCE = 1e-12, 1e-9
-"""[m or rad] Largest difference of predictions, and of joint values, which result from an iteration."""
+"""Largest difference of predictions [m or rad], and of joint values, which result from an iteration."""
 
 
 def write_model(model: CalibratedModel, folder: Path) -> None:
@@ -36,7 +36,7 @@ def check_written(model: CalibratedModel, folder: Path) -> None:
     """Compare a model with its folder: poses, corrected IK, predicted deviations and prior sizes of weights.
 
     Raises:
-        AssertionError: they differ.
+        AssertionError: the model and its folder differ.
     """
     try:
         loaded, ik = load_model(folder), load(folder)
@@ -55,7 +55,7 @@ def check_written(model: CalibratedModel, folder: Path) -> None:
 
 
 def _prior_sizes(model: CalibratedModel) -> Tensor:
-    """Return for every weight the index and the usual value of its prior size, which limits its drift."""
+    """Return the index and the usual value of the prior size of every weight, which limits its drift."""
     rows = [torch.zeros(0, 2, dtype=torch.float64)]
     for feature in model.uncertainty.features if model.uncertainty else ():
         number = feature.group[feature.used]
@@ -64,7 +64,7 @@ def _prior_sizes(model: CalibratedModel) -> Tensor:
 
 
 def _probe(model: CalibratedModel) -> Measurements:
-    """Make rows near the training rows, in all frames and of all targets, with approach, payload and temperature."""
+    """Return rows near the training rows, in all frames and for all targets, with approach and conditions."""
     generator = torch.Generator().manual_seed(0)
     starts = model.starts.double().cpu()
     if not len(starts):
@@ -86,7 +86,7 @@ def _probe(model: CalibratedModel) -> Measurements:
 
 
 def _check(what: str, before: Tensor, after: Tensor, tolerance: float) -> None:
-    """Raise an error unless values are equal within a tolerance; NaN equals NaN."""
+    """Check that values are equal within a tolerance; NaN equals NaN."""
     same = torch.isclose(before, after, rtol=0.0, atol=tolerance, equal_nan=True)
     if before.shape != after.shape or not bool(same.all()):
         most = float((before - after).abs().nan_to_num(torch.inf).max())

@@ -1,4 +1,4 @@
-"""Known weaknesses of calibrations by a camera: views, intrinsics, the tool, and what limits the accuracy."""
+"""Check known weaknesses of calibrations by a camera: views, intrinsics, tool, and limits of the accuracy."""
 
 from collections.abc import Iterator
 
@@ -25,21 +25,23 @@ from pisigma.validation.checks.check import CheckedCalibration
 from pisigma.validation.held_out.diagnostic import Diagnostic
 
 FRONTAL = np.deg2rad(12.0)
-"""[rad] If 90 % of the views are less oblique, the error over the workspace is 1.5 to 3 times that of usual views."""
+"""Angle of views [rad]; if 90 % of the views are less oblique, the error over the workspace is 1.5 to 3 times that
+of typical views."""
 ONE_BRANCH = 0.95
 """Share of the images in one branch of the arm above which the other branches are treated as not measured."""
 EXPLAINED = 1.3
-"""Scatter of the images over that explained by their corners, below which no model of the arm can improve the fit."""
+"""Ratio of the images' scatter to the scatter explained by their corners, below which no model of the arm can
+improve the fit."""
 WIDE = 3.0
-"""Standard deviation of the focal length [px] above which intrinsics are regarded as free; usual is 0.5."""
+"""Standard deviation of the focal length [px] above which intrinsics are regarded as free; 0.5 is typical."""
 CONTRADICTED = 4.0
-"""[standard deviations] Estimated intrinsics that deviate by more contradict their calibration."""
+"""Deviation, in standard deviations, above which estimated intrinsics contradict their calibration."""
 POSTURES = 200
-"""Random joint vectors at which the error over the joint space is predicted."""
+"""Number of random joint vectors at which the error over the joint space is predicted."""
 
 
 def check_camera(checked: CheckedCalibration) -> Iterator[Diagnostic]:
-    """Report which known weaknesses of camera calibrations this one has; `benchmarks/camera.py` measures them."""
+    """Report known weaknesses of a camera calibration; `benchmarks/camera.py` measures their effects."""
     by_corners = checked.rows.is_measured("corner")
     if not bool(by_corners.any()):
         return
@@ -47,7 +49,7 @@ def check_camera(checked: CheckedCalibration) -> Iterator[Diagnostic]:
     yield from view_warnings(images.T[:, 2, 2].abs().clamp(max=1.0).acos().cpu(), images.q, checked.robot)
     yield from _intrinsics(images, result)
     yield from _tool(images, checked.rows, result)
-    if bool(by_corners.all()):  # with other sensors, the camera need not be the limit
+    if bool(by_corners.all()):  # with other sensors, the camera need not limit the accuracy
         yield from _limit(images, result)
 
 
@@ -58,7 +60,7 @@ def _warning(cause: str, sentence: str, **values: float | str) -> Diagnostic:
 def view_warnings(
     tilt: Float64[Tensor, " images"], q: Float64[Tensor, "images dof"], robot: Robot
 ) -> Iterator[Diagnostic]:
-    """Warn of views of a board that are too frontal, or all in one branch of the arm.
+    """Return warnings about views of a board that are too frontal, or all in one branch of the arm.
 
     Args:
         tilt: angle between the optical axis and the normal of the board [rad].
@@ -182,7 +184,7 @@ def _predicted_error(result: CalibrationResult) -> tuple[float, dict[str, float]
 
 
 def _conditioned(root: Float64[Tensor, "unknowns directions"], rows: list[int]) -> Tensor:
-    """Compute the root of the covariance given some of the unknowns, by removing the directions that move these."""
+    """Return the covariance root conditional on given unknowns, by removing the directions that move them."""
     axes, strength, _ = torch.linalg.svd(root[rows].t(), full_matrices=False)
     axes = axes[:, strength > 1e-9 * strength.max()]
     conditioned: Tensor = root - (root @ axes) @ axes.t()

@@ -1,4 +1,4 @@
-"""Interface of the checks of calibrations and of rows, and their inputs: a calibration, or rows under a model."""
+"""Interface of the checks of calibrations and of rows, and their inputs: a calibration, or rows with predictions."""
 
 import math
 from collections.abc import Callable, Collection, Iterator, Mapping
@@ -31,13 +31,14 @@ from pisigma.validation.setup_faults.setup_faults import find_setup_faults, judg
 
 @dataclass(frozen=True, eq=False)
 class CheckedCalibration:
-    """A calibration, its rows, and everything else that a check may need.
+    """Input of the checks of a calibration: the calibration, its rows and further results.
 
     Attributes:
-        calibrator: the calibrator of the geometric calibration; checks also fit others to the same rows with it.
+        calibrator: the calibrator of the geometric calibration, with which checks also fit other robots to the same
+            rows.
         rows: the rows of the calibration, as read; `rows.place(row)` names file and line.
-        results: by name, all fitted to these rows: "nominal" (the nominal arm with base and tool fitted, all rows with
-            full weight), "geometric", and "hybrid" if one was requested.
+        results: results by name, all fitted to these rows: "nominal" (the nominal arm with base and tool fitted, all
+            rows with full weight), "geometric", and "hybrid" if one was requested.
         validation: errors of held-out rows; None if no rows were held out.
     """
 
@@ -58,31 +59,31 @@ class CheckedCalibration:
 
     @property
     def geometric(self) -> CalibrationResult:
-        """The geometric calibration, or the one that the hybrid is based on."""
+        """The geometric calibration, on which a hybrid is based."""
         return geometric_result(self.results["geometric"])
 
     @property
     def hybrid(self) -> HybridResult | None:
-        """The hybrid calibration; None if only a geometric one was requested."""
+        """The hybrid calibration; None if only a geometric calibration was requested."""
         result = self.results.get("hybrid")
         return result if isinstance(result, HybridResult) else None
 
     @cached_property
     def errors(self) -> Mapping[str, Mapping[str, Float64[Tensor, "rows components"]]]:
-        """Errors, measured minus predicted, by result and sensor [m or rad].
+        """Errors (measured minus predicted) by result and sensor [m or rad].
 
-        Rows are in the order of `rows`; NaN where the sensor has no value.
+        The order is that of `rows`; NaN in rows without a value of the sensor.
         """
         return MappingProxyType({name: result.errors_of(self.rows) for name, result in self.results.items()})
 
     @property
     def final_errors(self) -> Mapping[str, Float64[Tensor, "rows components"]]:
-        """Errors of the last result by sensor, which is the calibration that is kept [m or rad]."""
+        """Errors [m or rad] by sensor of the last result, which is the calibration that is kept."""
         return list(self.errors.values())[-1]
 
     @cached_property
     def figures(self) -> ValidationFigures | None:
-        """Errors of the rows of the calibration under every result; None if no length was measured."""
+        """Error figures of the rows of the calibration by result; None if no length was measured."""
         errors = {name: pose_errors_of(result, self.rows) for name, result in self.results.items()}
         if not any(bool(torch.isfinite(one.position).any()) for one in errors.values()):
             return None
@@ -90,16 +91,16 @@ class CheckedCalibration:
 
 
 Move = Literal["frame", "tool", "joint_zero"]
-"""Things that may have moved since a model was made; see the kinds of `Cause`."""
+"""What may have moved since a model was made; see the kinds of `Cause`."""
 MOVES: Final[frozenset[Move]] = frozenset({"frame", "tool", "joint_zero"})
 LARGE_SHARE = 2e-3
-"""Errors as a share of the reach above which a mistake or a motion is their cause, and not wear."""
+"""Errors, as a share of the reach, above which their cause is a mistake or a motion, not wear."""
 STEP = 1e-6
-"""[rad or m] Step of the finite differences by joint values."""
+"""Step of finite differences with respect to joint values [rad or m]."""
 FITTED = 9
 """Number of parameters of a base and of the position of a tool."""
 MIN_ROWS_OF_MODEL = 5
-"""Rows with positions that a check needs."""
+"""Smallest number of rows with positions that a check requires."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,8 +110,8 @@ class RowsUnderModel:
     Attributes:
         model: the model.
         rows: the rows.
-        fitted: what is known to have moved and is therefore fitted to the rows.
-        may_move: what else may have moved without being a fault.
+        fitted: frames and tools that are known to have moved and are therefore fitted to the rows.
+        may_move: what else may have moved without being a fault, such as "joint_zero".
         nominal: the nominal robot with base and tool fitted; only used to report its errors after a correction.
     """
 
@@ -128,7 +129,7 @@ class RowsUnderModel:
         may_move: Collection[Move],
         nominal: CalibratedModel | None = None,
     ) -> "RowsUnderModel | None":
-        """Select the rows that have a measured and a predicted position; None if there are too few.
+        """Return the rows with a measured and a predicted position; None if there are too few.
 
         Frames and targets that the model does not have are fitted.
         """
@@ -145,7 +146,7 @@ class RowsUnderModel:
 
     @cached_property
     def renamed_rows(self) -> Measurements:
-        """The rows, with fitted frames and targets named as in the model."""
+        """The rows, in which fitted frames and targets have names of the model."""
         return with_known_names(self.model, self.rows, self.fitted)
 
     @cached_property
@@ -156,7 +157,7 @@ class RowsUnderModel:
     def zero_columns(
         self, zeros: Float64[Tensor, " dof"] | None = None
     ) -> tuple[Float64[Tensor, "rows 4 4"], Float64[Tensor, "dof rows 4 4"]]:
-        """Predict poses with joint zeros moved [rad or m], and differentiate them by the zeros (finite differences)."""
+        """Return poses predicted with moved joint zeros [rad or m], and their derivatives by finite differences."""
         zeros = torch.zeros(self.renamed_rows.dof, dtype=torch.float64) if zeros is None else zeros
         moved = [zeros, *(zeros + STEP * torch.eye(self.renamed_rows.dof).double())]
         here, *there = (
@@ -172,7 +173,7 @@ class RowsUnderModel:
 
     @cached_property
     def predicted(self) -> Float64[Tensor, "rows 4 4"]:
-        """Predicted poses, after fitting."""
+        """Predicted poses, with fitted frames and tools."""
         return (
             fit_frames(self.poses_before_fit, self.measured, self.rows, self.fitted)[0]
             if self.fitted
@@ -198,7 +199,7 @@ class RowsUnderModel:
 
     @cached_property
     def predicted_deviation(self) -> Float64[Tensor, " rows"]:
-        """Standard deviation of every row's error by the model's posterior and noise [m]; NaN if it has none."""
+        """Predicted standard deviation of every row's error [m], including noise; NaN if the model has none."""
         deviation = deviation_of_rows(self.model, self.renamed_rows).square().sum(-1)
         known = self.model.uncertainty
         noise = torch.as_tensor(math.nan if known is None else _position_noise(known.noise))
@@ -232,7 +233,7 @@ class RowsUnderModel:
 Check = Callable[[CheckedCalibration], Iterator[Diagnostic]]
 """Check of a calibration for one kind of fault.
 
-It yields nothing if it finds none, and raises `IdentificationError` if the rows cannot belong to this robot."""
+It yields nothing if it finds no fault, and raises `IdentificationError` if the rows cannot belong to this robot."""
 RowCheck = Callable[[RowsUnderModel], Iterator[Diagnostic]]
 """Check of rows for one kind of fault, by the predictions of a model."""
 
@@ -240,7 +241,7 @@ RowCheck = Callable[[RowsUnderModel], Iterator[Diagnostic]]
 def kinds_to_fit(
     model: CalibratedModel, rows: Measurements, fitted: Collection[FrameKind]
 ) -> tuple[FrameKind, ...]:
-    """Add frames and tools to what is fitted, if rows have some that a model does not have."""
+    """Return what is fitted, including frames or tools if rows have some that the model does not have."""
     new: tuple[FrameKind, ...] = (
         *(("base",) if _unknown(rows.frame, model.bases) else ()),
         *(("tool",) if _unknown(rows.target, model.tools) else ()),
@@ -256,5 +257,5 @@ def _unknown(names: tuple[str, ...], known: Collection[str]) -> bool:
 
 
 def _position_noise(noise: CalibrationNoise) -> float:
-    """Return the noise of a coordinate [m]; 0 if the calibration had no positions, NaN if it is not known."""
+    """Return the noise of a coordinate [m]; 0 if the calibration had no positions, NaN if it is unknown."""
     return noise.standard_deviation("position") if "position" in noise.value else 0.0

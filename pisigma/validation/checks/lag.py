@@ -1,4 +1,4 @@
-"""Check whether joint values were logged before the robot arrived, or after it had left the pose."""
+"""Check whether joint values were logged before the robot arrived at the pose or after it left."""
 
 import math
 from collections.abc import Iterator
@@ -17,7 +17,8 @@ MIN_ROWS = 12
 LIKELY = CLEARLY + math.log(100.0)
 """Log Bayes factor above which a lag is reported."""
 NOTICED, LARGE = 1.1, 1.5
-"""Errors over those without the lag, above which a warning is given and above which the calibration is implausible."""
+"""Ratios of the errors with and without the lag above which a warning is given, and above which the calibration is
+implausible."""
 
 
 @dataclass(frozen=True)
@@ -25,10 +26,11 @@ class Lag:
     """Lag between the logged joint values and the measured pose, as a share of the motion between two rows.
 
     Attributes:
-        before: whether they were logged before the arrival, on the way from the previous row; else after it.
-        share: lag over the motion between two rows [1].
-        factor: errors of the rows over those without the lag [1].
-        log_bayes_factor: logarithm of the odds of a lag against none.
+        before: whether joint values were logged before the arrival, on the way from the previous row; otherwise
+            after leaving.
+        share: lag as a share of the motion between two rows [1].
+        factor: ratio of the errors with and without the lag [1].
+        log_bayes_factor: logarithm of the odds of a lag against no lag.
     """
 
     before: bool
@@ -40,7 +42,7 @@ class Lag:
 def check_lag(checked: CheckedCalibration) -> Iterator[Diagnostic]:
     """Test the residuals for a share λ of the motions between the rows: `r = X x + λ J Δq + e`.
 
-    `J Δq` is the change of a row's values by the motion from the previous row, or to the next one.
+    `J Δq` is the change of a row's values by the motion from the previous row, or to the next row.
     """
     rows = OrderedRows.from_result(checked.geometric)
     lag = None if rows is None else find_lag(rows, checked.rows)
@@ -61,7 +63,7 @@ def check_lag(checked: CheckedCalibration) -> Iterator[Diagnostic]:
 
 
 def find_lag(rows: OrderedRows, measurements: Measurements) -> Lag | None:
-    """Fit a lag to the residuals of a calibration, whether likely or not; None if there are too few rows.
+    """Fit a lag to the residuals of a calibration, likely or not; None if there are too few rows.
 
     Args:
         rows: residuals of a calibration.
@@ -76,13 +78,13 @@ def find_lag(rows: OrderedRows, measurements: Measurements) -> Lag | None:
     found = []
     for before, motion in zip((True, False), _motions(measurements), strict=True):
         z = (rows.joint_derivative @ motion[rows.number][..., None]).reshape(len(r), -1)[:, 0]
-        # What the calibration could not absorb of the lag: only this part can show in the residuals (Frisch-Waugh).
+        # The part of the lag that the calibration could not absorb, which alone affects the residuals (Frisch-Waugh).
         free = z - X @ (covariance @ (X.T @ z))
         information = float(free @ free)
         if information <= 1e-12 * float(z @ z):
             continue
         share = float(free @ left) / information
-        # The share of squares that the lag leaves; its log Bayes factor by Schwarz's criterion with one more parameter.
+        # Share of the squares that remain with the lag, and log Bayes factor by Schwarz's criterion for one parameter.
         ratio = max(1 - share**2 * information / float(left @ left), 1e-12)
         gain = (
             -rows.degrees_of_freedom / 2 * math.log(ratio) - math.log(max(rows.degrees_of_freedom, 2.0)) / 2
@@ -94,7 +96,7 @@ def find_lag(rows: OrderedRows, measurements: Measurements) -> Lag | None:
 def _motions(
     measurements: Measurements,
 ) -> tuple[Float64[np.ndarray, "rows dof"], Float64[np.ndarray, "rows dof"]]:
-    """Compute the motions [rad or m] from the previous row, and from the next row back; 0 at the ends of a file."""
+    """Compute the joint motions [rad or m] from the previous and from the next row; 0 at the ends of a file."""
     q = measurements.q.cpu().numpy()
     order = (
         np.argsort(np.array(measurements.line), kind="stable")

@@ -1,4 +1,4 @@
-"""Check whether only some of the rows agree with a model, and the others belong to another setup."""
+"""Check whether only some rows agree with a model, and the others belong to another setup."""
 
 import itertools
 import math
@@ -28,33 +28,34 @@ from pisigma.validation.setup_faults.setup_fault import combine_alternatives
 from pisigma.validation.setup_faults.setup_faults import find_setup_faults
 
 MIN_WRONG_SHARE = 0.25
-"""Share of the rows above which it is not known which of them are wrong."""
+"""Share of wrong rows above which it is unknown which rows are wrong."""
 MIN_AGREEING_SHARE = 0.35
-"""Share of the rows that must agree with the model."""
+"""Smallest share of the rows that must agree with the model."""
 AGREES = 3.5
-"""Error over the expected one (model and sensor) up to which a row agrees with a model."""
+"""Ratio of an error to the expected error (of model and sensor) up to which a row agrees with a model."""
 APART = 2.0
 """Multiple of the limit `AGREES` above which a row belongs to another setup."""
 FAR_APART = 6.0
-"""Ratio of the median errors of both groups."""
+"""Smallest ratio of the median errors of both groups."""
 BETWEEN = 0.15
-"""Share of the rows that may be neither near nor far."""
+"""Largest share of the rows that may be neither near nor far."""
 DRAWS, SAMPLE = 100, 4
-"""Number and size of the random samples that a base or a tool is fitted to, as are halves and every second row."""
+"""Number and size of the random samples of rows to which a base or a tool is fitted, in addition to halves and every
+second row."""
 SPARE_ROWS = 3
-"""Rows that must agree with a fit in addition to those of its sample."""
+"""Number of rows that must agree with a fit in addition to the rows of its sample."""
 ADVICE = " No result is computed from all of them; measure again, or give each group its own file or frame."
 EXPLAINED = 2.5
-"""Error over the expected one up to which moved joint zeros explain all rows."""
+"""Ratio of an error to the expected error up to which moved joint zeros explain all rows."""
 
 
 def check_mixed_rows(judged: RowsUnderModel) -> Iterator[Diagnostic]:
-    """Look for the largest set of rows that agrees with the model, with its base or tool as they are or fitted.
+    """Look for the largest set of rows that agrees with the model, with given or fitted base or tool.
 
     Bases and tools are fitted to random samples of rows (RANSAC: Fischler and Bolles 1981, Communications of the ACM
-    24(6)). If more than a quarter of the rows are far off while the others agree to the noise, rows of two setups are
-    mixed, or it is not known which are wrong. Moved joint zeros cause errors of all sizes, so they are fitted to all
-    rows first.
+    24(6)). If more than a quarter of the rows are far off while the others agree to the noise, rows of two setups
+    are mixed, or it is unknown which rows are wrong. Moved joint zeros cause errors of all sizes, so they are fitted
+    to all rows first.
     """
     if not bool(torch.isfinite(judged.predicted_deviation).all()):
         return
@@ -64,7 +65,7 @@ def check_mixed_rows(judged: RowsUnderModel) -> Iterator[Diagnostic]:
 
 
 def mixed_rows(judged: RowsUnderModel, wrong: Bool[Tensor, " rows"]) -> Diagnostic:
-    """Report that some rows do not agree with the others, what distinguishes them, and what explains them."""
+    """Report rows that do not agree with the others, what distinguishes them, and what explains them."""
     found = too_many_wrong_rows(judged.rows, wrong)
     sentence = f"{found.sentence.removesuffix(ADVICE)}{_cause(judged, wrong)}{ADVICE}"
     return found.model_copy(update={"sentence": sentence})
@@ -85,7 +86,7 @@ def too_many_wrong_rows(rows: Measurements, wrong: Bool[Tensor, " rows"]) -> Dia
 
 
 def _cause(judged: RowsUnderModel, wrong: Bool[Tensor, " rows"]) -> str:
-    """Describe what explains the wrong rows; empty if nothing does."""
+    """Return a sentence about what explains the wrong rows; empty if nothing does."""
     faults = find_setup_faults(judged.model, None, judged.rows.select(wrong), judged.fitted)
     if not faults:
         return ""
@@ -106,7 +107,7 @@ def _agreements(judged: RowsUnderModel) -> Iterator[Float64[Tensor, "rows 4 4"]]
         best, most = None, SAMPLE + SPARE_ROWS - 1
         for sample in samples:
             chosen = sample
-            for _ in range(3):  # local optimisation: refit to all rows that agree
+            for _ in range(3):  # local optimisation: fit again to all rows that agree
                 T = _fitted(judged, kind, chosen)
                 agreeing = judged.error_lengths(T) <= limit
                 chosen = agreeing.nonzero()[:, 0]
@@ -127,7 +128,7 @@ def _samples(rows: int) -> Iterator[Tensor]:
 
 
 def _fitted(judged: RowsUnderModel, kind: str, chosen: Tensor) -> Float64[Tensor, "rows 4 4"]:
-    """Predict the poses with the base or the tool fitted to some rows."""
+    """Return predicted poses, with the base or the tool fitted to the chosen rows."""
     some, measured = judged.poses_before_fit[chosen], judged.measured.select(chosen)
     if kind == "base":
         return best_base(some, measured) @ judged.poses_before_fit
@@ -135,7 +136,7 @@ def _fitted(judged: RowsUnderModel, kind: str, chosen: Tensor) -> Float64[Tensor
 
 
 def _apart(judged: RowsUnderModel, T: Float64[Tensor, "rows 4 4"]) -> Bool[Tensor, " rows"] | None:
-    """Find the rows that are far from what the others agree on; None if these are few or not clearly separated."""
+    """Return the mask of rows that are far from the agreeing rows; None if they are few or not clearly separated."""
     ratio = judged.error_lengths(T) / (AGREES * judged.predicted_deviation)
     near, far = ratio <= 1, ratio > APART
     count = judged.rows.rows
@@ -156,25 +157,26 @@ def _joints_explain(judged: RowsUnderModel) -> bool:
 
 
 CERTAIN = 30.0
-"""Log Bayes factor above which rows differ. For one arm, unmodelled gear errors and sag give factors of up to 90 with
-frames, and of up to 30 otherwise, but small differences."""
+"""Log Bayes factor above which rows certainly differ. For one arm, unmodelled gear errors and sag give factors of up
+to 90 with frames, and up to 30 otherwise, but small differences."""
 LARGE = {"tool": 1.6, "frame": 2.2, "arm": 2.2}
-"""Errors over those without the difference above which there are two populations. For one arm (simulated with gear
-errors and sag, and measured: UR5, UR10, FANUC R-2000iC) the ratio is 1.3, 1.9 and 1.9 at most."""
+"""Ratio of the errors with and without the difference above which there are two populations. For one arm (simulated
+with gear errors and sag, and measured: UR5, UR10, FANUC R-2000iC) the ratio is 1.3, 1.9 and 1.9 at most."""
 HARDLY_USED = 0.38
-"""Share of the values used up by parameters above which the ratios of one arm grow, because the best of many ways to
-split the rows overfits: 24 sets of 60 positions (share 0.35) have 1.7 at most, of 40 positions (0.5) 2.9, and arms of 7
-joints (0.63) 3.1."""
+"""Share of the values absorbed by parameters above which the ratios of one arm grow, because the best of many ways
+to split the rows overfits: 24 sets of 60 positions (share 0.35) have 1.7 at most, of 40 positions (0.5) 2.9, and
+arms of 7 joints (0.63) 3.1."""
 IMPLAUSIBLE = 5.0
-"""The same ratio for a tool or a frame above which the calibration is wrong; for two arms it always is."""
+"""Ratio of the errors with and without a different tool or frame above which the calibration is wrong; with two arms
+it always is."""
 
 
 def check_two_populations(checked: CheckedCalibration) -> Iterator[Diagnostic]:
-    """Look for rows of another arm, tool or frame; if there are none, for two sizes of errors.
+    """Look for rows of another arm, tool or frame; if there are none, look for two sizes of errors.
 
-    Up to a tenth of wrong rows are outliers, which the robust loss gives no weight; more need not be. A hybrid has
-    smaller residuals, so smaller differences show; but it absorbs a part of large ones, so both calibrations are
-    tested.
+    Up to a tenth of wrong rows are outliers, to which the robust loss gives no weight; more wrong rows need not be
+    outliers. A hybrid has smaller residuals, so smaller differences are visible, but it absorbs a part of large
+    differences, so both calibrations are tested.
     """
     learned = checked.hybrid if checked.hybrid is not None and checked.hybrid.learned is not None else None
     for result in (checked.geometric, learned):
@@ -207,7 +209,7 @@ def _two_sizes(checked: CheckedCalibration) -> Iterator[Diagnostic]:
 
 
 def _differ(found: Populations) -> bool:
-    """Return whether these are two populations rather than unmodelled errors of one arm."""
+    """Return whether the rows are two populations rather than one arm with unmodelled errors."""
     return (
         found.log_bayes_factor > CERTAIN
         and found.factor > LARGE[found.differing] * max((1 - HARDLY_USED) / (1 - found.used), 1.0)
@@ -249,7 +251,7 @@ def _two_populations(rows: Measurements, found: Populations) -> Diagnostic:
 
 
 MAX_PLACES = 8
-"""Rows that are listed one by one."""
+"""Largest number of rows that are listed individually."""
 
 
 class Distinction(NamedTuple):
@@ -265,7 +267,7 @@ class Distinction(NamedTuple):
 
 
 def distinguishing_property(rows: Measurements, some: Bool[Tensor, " rows"]) -> Distinction:
-    """Find a property that some rows have and all others do not."""
+    """Return a property that the given rows have and all others do not."""
     for distinction in (*_by_name(rows, some), *_by_order(rows, some), *_by_value(rows, some)):
         return distinction
     numbers = some.nonzero()[:, 0].tolist()
@@ -275,7 +277,7 @@ def distinguishing_property(rows: Measurements, some: Bool[Tensor, " rows"]) -> 
 
 
 def _by_name(rows: Measurements, some: Bool[Tensor, " rows"]) -> Iterator[Distinction]:
-    """Compare the files, frames, targets and dates of the rows with those of the others."""
+    """Return a distinction by file, frame, target or date; None if these do not distinguish the rows."""
     named: tuple[tuple[str, Sequence[str] | None], ...] = (
         ("file", rows.origin),
         ("frame", rows.frame),
@@ -292,7 +294,7 @@ def _by_name(rows: Measurements, some: Bool[Tensor, " rows"]) -> Iterator[Distin
 
 
 def _by_order(rows: Measurements, some: Bool[Tensor, " rows"]) -> Iterator[Distinction]:
-    """Test whether the rows are a range of the file, or every n-th row."""
+    """Return a distinction by a range of the file or by every n-th row; None if there is none."""
     numbers = some.nonzero()[:, 0].tolist()
     first, last = numbers[0], numbers[-1]
     if last - first + 1 == len(numbers) and len(numbers) > 1:
@@ -310,7 +312,7 @@ def _by_order(rows: Measurements, some: Bool[Tensor, " rows"]) -> Iterator[Disti
 
 
 def _by_value(rows: Measurements, some: Bool[Tensor, " rows"]) -> Iterator[Distinction]:
-    """Look for a temperature, a payload or a joint value that separates these rows from all others."""
+    """Return a distinction by temperature, payload or a joint value; None if no value separates the rows."""
     columns: list[tuple[str, Tensor]] = []
     if rows.temperature is not None:
         columns.append(("a temperature", rows.temperature))

@@ -16,14 +16,15 @@ from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.held_out.trained_calibrations import base_and_tool
 
 SUSPICIOUS = 0.01
-"""Errors of the nominal robot as a share of its reach; arms are built to a third of that and better."""
+"""Errors of the nominal robot, as a share of its reach, above which other robots are tried; arms are built to a
+third of it or better."""
 NEARER = 1 / 3
-"""Errors of another robot over those of this one below which it is reported. A nominal arm explains its own
-measurements to a thousandth of its reach, so two different robots differ by more."""
+"""Ratio of the errors of another robot to those of this robot below which the other is reported. A nominal arm
+explains measurements of such an arm to a thousandth of its reach; different robots differ by more."""
 MIN_ROWS = 6
 """Minimum number of rows; with fewer, base and tool alone fit another robot to the rows."""
 MAX_ROWS = 200
-"""Rows that suffice to distinguish robots."""
+"""Number of rows that are sufficient to distinguish robots."""
 
 
 def check_other_robot(checked: CheckedCalibration) -> Iterator[Diagnostic]:
@@ -48,7 +49,7 @@ def check_other_robot(checked: CheckedCalibration) -> Iterator[Diagnostic]:
 
 
 def check_other_robot_of_rows(judged: RowsUnderModel) -> Iterator[Diagnostic]:
-    """Look for another robot of the catalogue that fits rows with large errors better."""
+    """Look for a robot of the catalogue that fits rows with large errors better than this robot."""
     if judged.has_large_errors and not judged.setup_faults:
         yield from other_robot_diagnostics(judged.model.robot, judged.rows)
 
@@ -67,7 +68,7 @@ def other_robot_diagnostics(robot: Robot, rows: Measurements) -> tuple[Diagnosti
 
 
 def _rms_mm(checked: CheckedCalibration, other: Robot) -> float | None:
-    """Compute the RMS error of another nominal robot [mm]; None if it has other joints or cannot be fitted."""
+    """Return the RMS error of another nominal robot [mm]; None if it has other joints or cannot be fitted."""
     if other.name == checked.robot.name or other.revolute != checked.robot.revolute:
         return None
     count = checked.rows.rows

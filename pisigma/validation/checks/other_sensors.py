@@ -26,12 +26,12 @@ from pisigma.validation.setup_faults.setup_fault import SetupFault, fault_of_cau
 from pisigma.validation.setup_faults.setup_faults import unexplained
 
 FAR, STRETCHED = 3.0, 0.01
-"""A stated distance is wrong if it is off by more than this multiple of the RMS error of the rows plus this share of
-the distance."""
+"""Limits of a stated distance: it is wrong if it is off by more than this multiple of the RMS error of the rows plus
+this share of the distance."""
 
 MAX_ITERATIONS, MIN_GAIN, STEP, MAX_STEP = 8, 0.9, 1e-6, 0.3
-"""Fit of what has moved: iterations, ratio of successive errors at which it ends, finite-difference step and largest
-step [rad or m]."""
+"""Settings of the fit of motions: number of iterations, ratio of successive errors at which it ends,
+finite-difference step and largest step [rad or m]."""
 
 
 def distance_diagnostics(comparison: ModelComparison, figures: ModelFigures) -> Iterator[Diagnostic]:
@@ -39,7 +39,7 @@ def distance_diagnostics(comparison: ModelComparison, figures: ModelFigures) -> 
 
     Args:
         comparison: comparison of models on the rows of the sockets.
-        figures: figures of one of these models.
+        figures: figures of one of the compared models.
     """
     distances = () if comparison.socket_distance is None else comparison.socket_distance.each
     rms = figures.position.statistics["rms"]
@@ -70,9 +70,9 @@ def diagnose_lengths(
 
     Args:
         model: the model.
-        rows: rows without positions. Rows of an anchor that has too few of them are not judged; nor are touches and
-            wires to stated points if the base may have moved, because they depend on the base.
-        fitted: what is known to have moved.
+        rows: rows without positions. Rows of an anchor with too few rows are not checked; touches and wires to
+            stated points are not checked if the base may have moved, because they depend on the base.
+        fitted: frames and tools that are known to have moved.
         may_move: what else may have moved without being a fault.
 
     Returns:
@@ -105,7 +105,7 @@ def diagnose_lengths(
 
 
 def _fault(model: CalibratedModel, rows: Measurements, free: Collection[str]) -> SetupFault | None:
-    """Find the fault that explains the errors best; None if none does."""
+    """Return the fault that explains the errors best; None if no fault explains them."""
     before, dof = _rms(_errors(model, rows)), rows.dof
     maps = signs_and_swaps(dof)
     found = [
@@ -120,7 +120,7 @@ def _fault(model: CalibratedModel, rows: Measurements, free: Collection[str]) ->
 
 
 def _moved_most(model: CalibratedModel, rows: Measurements, free: Collection[str]) -> tuple[float, Cause]:
-    """Find the joint zero, or the tool, whose motion leaves the smallest errors; return these [m] and the cause.
+    """Return the smallest errors [m] after moving one joint zero or the tool, and the cause.
 
     The candidate is chosen with errors linearised at the model, and then fitted by iteration.
     """
@@ -147,7 +147,7 @@ def _moved_most(model: CalibratedModel, rows: Measurements, free: Collection[str
 
 
 def _numbers(dof: int, moves: Collection[str]) -> list[int]:
-    """List the unknowns that are free if some things may have moved: joint zeros, and the 3 coordinates of the tool."""
+    """Return the indices of the unknowns that may have moved: joint zeros, and 3 coordinates of the tool."""
     kinds = (("joint_zero", range(dof)), ("tool", range(dof, dof + 3)))
     return [number for kind, numbers in kinds if kind in moves for number in numbers]
 
@@ -155,7 +155,7 @@ def _numbers(dof: int, moves: Collection[str]) -> list[int]:
 def _fitted(
     model: CalibratedModel, rows: Measurements, free: Sequence[int]
 ) -> tuple[float, Float64[Tensor, " numbers"]]:
-    """Fit some unknowns; return the RMS residual [m], corrected for the degrees of freedom, and the unknowns."""
+    """Fit the free unknowns; return the RMS residual [m], corrected for the degrees of freedom, and the unknowns."""
     x = torch.zeros(rows.dof + 3, dtype=torch.float64)
     least, best = float("inf"), x
     for _ in range(MAX_ITERATIONS if free else 1):
@@ -179,7 +179,7 @@ def _columns(
     free: Sequence[int],
     error: Float64[Tensor, "rows 3"],
 ) -> Float64[Tensor, "values free"]:
-    """Differentiate all errors by some unknowns, by finite differences."""
+    """Return the derivatives of all errors with respect to the free unknowns, by finite differences."""
     eye = STEP * torch.eye(len(x), dtype=torch.float64)
     columns = [((_errors(model, rows, x + eye[number]) - error) / STEP).flatten() for number in free]
     return torch.nan_to_num(torch.stack(columns, -1))

@@ -11,15 +11,17 @@ from pisigma.validation.checks.setup_fault import setup_diagnostics
 from pisigma.validation.held_out.diagnostic import Diagnostic
 
 UNUSUAL = 4.0
-"""Lower bound of the errors over their prior standard deviation above which a warning is given. Healthy robots have up
-to 4.6 times the default prior of 1 mrad."""
+"""Ratio of the lower bound of the errors to their prior standard deviation above which a warning is given. Healthy
+robots have up to 4.6 times the default prior of 1 mrad."""
 IMPLAUSIBLE = 10.0
-"""The same above which the rows do not belong to this robot (the user can state a wider prior): the odds against one
-normal error of 10 standard deviations are 1e23 to 1."""
+"""Ratio of the lower bound of the errors to their prior standard deviation above which the rows do not belong to
+this robot (the user can state a wider prior): the odds against a normal error of 10 standard deviations are 1e23 to
+1."""
 PREDICTED_SHARE = 0.25
-"""Held-out rows are treated as predicted well if their error is below this share of that of the nominal robot,"""
+"""Share of the nominal robot's error below which the error of held-out rows is small, if it also meets
+`PREDICTED_REACH`."""
 PREDICTED_REACH = 0.005
-"""and below this share of the reach."""
+"""Share of the reach below which the error of held-out rows is small, if it also meets `PREDICTED_SHARE`."""
 NAMES = {
     PriorGroup.JOINT_OFFSET: "joint zeros",
     PriorGroup.LENGTH: "lengths",
@@ -31,8 +33,8 @@ NAMES = {
 def check_prior_ratio(checked: CheckedCalibration) -> Iterator[Diagnostic]:
     """Compare the estimated sizes of the geometric errors with the prior and with the limits of the robot's class.
 
-    If the class is not stated, it is the narrowest one, starting from that of the manufacturer, in which joint zeros
-    of these sizes are possible. Joint zeros beyond the manufacturer's class are accepted if held-out rows are predicted
+    If the class is not stated, it is the narrowest class, starting from the manufacturer's, in which joint zeros of
+    these sizes are possible. Joint zeros beyond the manufacturer's class are accepted if held-out rows are predicted
     well.
     """
     unusual = [ratio for ratio in checked.geometric.prior_ratios if ratio.at_least > UNUSUAL]
@@ -54,15 +56,15 @@ def check_prior_ratio(checked: CheckedCalibration) -> Iterator[Diagnostic]:
 
 
 def narrowest_class(checked: CheckedCalibration, large: Sequence[PriorRatio]) -> RobotClass | None:
-    """Find the class of a robot with errors of these sizes: the stated one, or the narrowest that allows them.
+    """Return the class of a robot with errors of these sizes: the stated class, or the narrowest that allows them.
 
-    The search for the narrowest class starts with that of the maker.
+    The search for the narrowest class starts with the maker's class.
 
     A wider class than the manufacturer's is accepted for joint zeros only: lengths and angles of another class belong
     to another robot, unless the user states the class.
 
     Returns:
-        None if no class allows these errors.
+        The class; None if no class allows these errors.
     """
     usual = _usual_class(checked)
     sizes = [(ratio.group, ratio.size) for ratio in large]
@@ -134,16 +136,17 @@ def _consequence(ratio: PriorRatio, usual: RobotClass, possible: RobotClass | No
 
 
 FAR = 8e-3
-"""[rad] Healthy industrial robots and cobots have joint zeros within 3 mrad of the nominal ones."""
+"""Deviation of a joint zero above which a warning is given [rad]; healthy industrial robots and cobots are within 3
+mrad."""
 CERTAIN = 3.0
-"""[standard errors] Margin above `FAR`."""
+"""Margin above `FAR`, in standard errors."""
 
 
 def check_joint_zero(checked: CheckedCalibration) -> Iterator[Diagnostic]:
-    """Warn of single joint zeros that are far off: a calibration cannot distinguish a wrong zero from a wrong log.
+    """Warn of joint zeros that are far off; a calibration cannot distinguish a wrong zero from a wrong log.
 
-    Large ones are found as a setup fault with the nominal robot. If the poses cover little of the workspace, base and
-    tool absorb most of their effect, and only the estimated parameters show them.
+    Large deviations are found as a setup fault with the nominal robot. If the poses cover little of the workspace,
+    base and tool absorb most of their effect, and only the estimated parameters show them.
     """
     if setup_diagnostics(checked.robot, checked.rows):
         return

@@ -1,4 +1,4 @@
-"""Registry of all checks of calibrations and of rows; a new check is a file and a line here."""
+"""Registry of all checks of calibrations and of rows."""
 
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.files.errors import IdentificationError, ImplausibleError

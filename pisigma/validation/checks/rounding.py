@@ -16,28 +16,29 @@ from pisigma.validation.setup_faults.cause import joints_text, length_text
 from pisigma.validation.setup_faults.ordered_rows import OrderedRows
 
 STEPS = tuple(factor * 10.0**power for power in (1, 0, -1, -2, -3) for factor in (5, 2, 1))
-"""Rounding steps [deg or mm] that are tried, the coarsest first."""
+"""Rounding steps [deg or mm] that are tried, coarsest first."""
 ON_LATTICE = 1e-4
 """Largest distance of a rounded value from a multiple of the step, in steps."""
 MIN_ROWS = 12
 MIN_SHARE = 0.25
 """Share of the squared errors above which rounding is reported."""
 MAX_SHARE = 1.7
-"""Largest predicted over observed squared error of rounded rows; the series of joint errors absorbs a part of it."""
+"""Largest ratio of the predicted to the observed squared error of rounded rows; the series of joint errors absorbs a
+part of it."""
 LIKELY = math.log(100.0)
 """Log likelihood ratio above which rounding causes the errors."""
 SIZES = np.geomspace(1e-3, 1e3, 61)
-"""Sizes of all other errors that are tried, over the noise."""
+"""Sizes of all other errors that are tried, relative to the noise."""
 
 
 @dataclass(frozen=True)
 class Rounding:
-    """Rounded joint values.
+    """Rounding of joint values, and its effect on the errors.
 
     Attributes:
-        steps: rounding step of every joint [rad or m]; 0 if it is not rounded.
+        steps: rounding step of every joint [rad or m]; 0 for joints that are not rounded.
         error: RMS position error caused by the rounding [m].
-        share: its share of the squared errors of the rows [1].
+        share: share of the squared errors of the rows that rounding causes [1].
     """
 
     steps: tuple[float, ...]
@@ -46,10 +47,10 @@ class Rounding:
 
 
 def check_rounding(checked: CheckedCalibration) -> Iterator[Diagnostic]:
-    """Compare the errors that rounding causes with those of the rows.
+    """Compare the errors that rounding causes with the errors of the rows.
 
     Joints that were commanded to whole degrees have round values without an error. Therefore the directions of the
-    errors must agree with rounded joint values too: they must be large where a joint moves the tool far.
+    errors must also agree with rounded joint values: errors must be large where a joint moves the tool far.
     """
     rounding = joint_rounding(checked.geometric, checked.rows)
     if rounding is not None:
@@ -84,11 +85,11 @@ def check_rounding(checked: CheckedCalibration) -> Iterator[Diagnostic]:
 
 
 def joint_rounding(result: CalibrationResult, measurements: Measurements) -> Rounding | None:
-    """Find rounded joint values that cause a part of the errors; None if there are none.
+    """Return the rounding of joint values that causes a part of the errors; None if there is none.
 
     With the derivative `J` of a row's values, rounding to steps `s` adds the covariance `J diag(s²/12) J^T` of a
-    uniform distribution to that of the other errors, `σ² I`. The maximum likelihoods over σ with and without rounding
-    are compared.
+    uniform distribution to the covariance of the other errors, `σ² I`. The maximum likelihoods over σ with and
+    without rounding are compared.
 
     Args:
         result: a geometric calibration.
@@ -105,7 +106,7 @@ def joint_rounding(result: CalibrationResult, measurements: Measurements) -> Rou
     if rows is None or len(rows.residual) < MIN_ROWS:
         return None
     made = rows.joint_derivative * steps / math.sqrt(12)
-    # Residuals of a fit are too small, because its parameters absorbed a part of the errors.
+    # Residuals of a fit are too small, because the parameters absorbed a part of the errors.
     left = rows.residual_after_fit * math.sqrt(
         rows.values / max(rows.values - rows.effective_parameters, 1.0)
     )
@@ -120,7 +121,7 @@ def joint_rounding(result: CalibrationResult, measurements: Measurements) -> Rou
 def _gain(
     residual: Float64[np.ndarray, "rows values"], made: Float64[np.ndarray, "rows values dof"]
 ) -> float:
-    """Compute the log likelihood ratio of rounding against none."""
+    """Compute the log likelihood ratio of rounding against no rounding."""
     covariance = made @ made.transpose(0, 2, 1)
     sizes, axes = np.linalg.eigh(covariance)
     along = np.square(np.einsum("nvk,nv->nk", axes, residual))
@@ -133,7 +134,7 @@ def _gain(
 
 
 def _common_step(values: Float64[np.ndarray, "rows columns"]) -> float:
-    """Find the coarsest step that all values are multiples of; 0 if there is none."""
+    """Return the coarsest step of which all values are multiples; 0 if there is none."""
     values = values[np.isfinite(values).all(1)]
     if len(values) < MIN_ROWS or np.ptp(values, 0).min() <= 0:
         return 0.0
@@ -145,7 +146,7 @@ def _common_step(values: Float64[np.ndarray, "rows columns"]) -> float:
 
 
 def _steps_text(robot: Robot, steps: Sequence[float]) -> str:
-    """Write steps with their joints."""
+    """Return a text with rounding steps and the joints that have them."""
     texts = []
     for step in dict.fromkeys(step for step in steps if step):
         joints = tuple(joint for joint, one in enumerate(steps) if one == step)

@@ -22,26 +22,27 @@ from pisigma.validation.setup_faults.row_order import Motion, find_motion
 LIKELY = CLEARLY + math.log(100.0)
 """Log Bayes factor above which a motion is reported, assuming that something moves in 1 of 100 measurements."""
 CERTAIN = CLEARLY + math.log(1e6)
-"""Log Bayes factor above which a motion can make a calibration implausible: at most 1 healthy one in a million is."""
+"""Log Bayes factor above which a motion can make a calibration implausible; at most one in a million valid
+calibrations is affected."""
 LARGE = 1.5
-"""Errors over those without the motion above which noise and robot cannot be their only cause."""
+"""Ratio of the errors with and without the motion above which noise and robot cannot be their only cause."""
 MIN_ROWS = 12
-"""Rows of a setup: 36 values for the 9 parameters of base and tool of positions."""
+"""Smallest number of rows of a setup: 36 values for the 9 parameters of base and tool of positions."""
 FITS_SHARE = 5e-3
-"""Errors of the nominal robot as a share of its reach; geometric errors make less."""
+"""Errors of the nominal robot, as a share of its reach; geometric errors cause smaller ones."""
 FAR = 5.0
-"""Errors over those of the rows of one setup above which a row belongs to another setup."""
+"""Ratio of an error to the errors of the rows of a setup above which a row belongs to another setup."""
 MAX_WRONG_SHARE = 0.1
 """Share of the rows of a setup that may be far off without contradicting it."""
 
 
 def check_row_order(checked: CheckedCalibration) -> Iterator[Diagnostic]:
-    """Test the residuals for a motion of a frame or the tool at some row, or a slow one over all rows.
+    """Test the residuals for a motion of a frame or the tool at any row, or for a slow motion over all rows.
 
     A motion is reported if it is `LIKELY`. It makes the calibration implausible if it is `CERTAIN` and its factor on
-    the residuals is `LARGE`. A hybrid has smaller residuals, so smaller motions show; but it absorbs a part of large
-    ones, so both calibrations are tested. A tool that seems to have moved exactly where the rows of another frame start
-    is an effect of what the frames do not explain, unless the factor is `LARGE`.
+    the residuals is `LARGE`. A hybrid has smaller residuals, so smaller motions are visible, but it absorbs a part
+    of large motions, so both calibrations are tested. A tool that seems to have moved exactly where the rows of
+    another frame start is an effect of errors that the frames do not explain, unless the factor is `LARGE`.
     """
     motions = [find_motion(checked.geometric)]
     if checked.hybrid is not None and checked.hybrid.learned is not None:
@@ -83,7 +84,7 @@ def _values(motion: Motion, rows: Measurements) -> dict[str, float | int | str]:
 
 
 def _texts(motion: Motion, rows: Measurements) -> tuple[str, str]:
-    """Describe what moved, at which row and how far, and what to do."""
+    """Return a text about what moved, at which row and how far, and a text about what to do."""
     what = {"frame": "measuring frame", "target": "target on the tool", "tool": "tool"}[motion.moved]
     what += f" '{motion.name}'" if motion.name and motion.moved != "tool" else ""
     x, y, z = motion.shift * 1e3
@@ -107,7 +108,7 @@ def _texts(motion: Motion, rows: Measurements) -> tuple[str, str]:
 
 
 def explain_refusal(refusal: IdentificationError, robot: Robot, rows: Measurements) -> IdentificationError:
-    """Replace a refusal by one that names the setup fault, if one explains the errors; else return it unchanged."""
+    """Return a refusal that names the setup fault if one explains the errors; otherwise the refusal unchanged."""
     if moved := new_setup_refusal(robot, rows):
         return moved
     causes = setup_diagnostics(robot, rows)
@@ -117,10 +118,10 @@ def explain_refusal(refusal: IdentificationError, robot: Robot, rows: Measuremen
 
 
 def new_setup_refusal(robot: Robot, measurements: Measurements) -> IdentificationError | None:
-    """Find the row before which the instrument was moved, for motions so large that no calibration of all rows works.
+    """Find the row before which the instrument was moved so far that no calibration of all rows is possible.
 
-    Base and tool are fitted to the first and to the last third of the rows. The row is the one up to (or after) which
-    the other rows agree with that fit. The rows on both sides must fit the nominal robot on their own.
+    Base and tool are fitted to the first and to the last third of the rows. The row is found up to (or after) which
+    the other rows agree with that fit. The rows on both sides must fit the nominal robot separately.
 
     Args:
         robot: the nominal robot.
@@ -142,7 +143,7 @@ def new_setup_refusal(robot: Robot, measurements: Measurements) -> Identificatio
         along = order[::-1] if backwards else order
         errors = _errors(robot, measurements, along[:third])[along]
         of_setup = errors < FAR * max(float(np.median(errors[:third])), 1e-4)
-        # The sum of +1 (agrees) and -1 (does not) peaks at the last row of the setup, despite single wrong rows.
+        # The sum of +1 (agrees) and -1 (does not agree) peaks at the last row of the setup, despite single wrong rows.
         agreeing = np.cumsum(np.where(of_setup, 1, -1))
         count = int(agreeing.argmax()) + 1
         first = len(order) - count if backwards else count
@@ -165,7 +166,7 @@ def new_setup_refusal(robot: Robot, measurements: Measurements) -> Identificatio
 
 
 def _errors(robot: Robot, measurements: Measurements, rows: np.ndarray) -> Float64[np.ndarray, " rows"]:
-    """Compute all position errors [m] with base and tool fitted to some rows; infinite if these do not determine it."""
+    """Compute all position errors [m] with base and tool fitted to given rows; infinite if undetermined."""
     try:
         fitted = fit_base_and_tool(robot, measurements.select(torch.from_numpy(rows.copy()))).robot
     except IdentificationError:

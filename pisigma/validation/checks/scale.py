@@ -21,10 +21,10 @@ from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.setup_faults.cause import length_text
 
 SCALE_SIGMAS = (0.003, 0.1)
-"""Prior standard deviations of a common factor on the lengths, with equal probability: of instruments and heat, and of
-wrong units."""
+"""Prior standard deviations of a common factor on the lengths, with equal probability: for instruments and heat, and
+for wrong units."""
 LENGTH_ERRORS = np.geomspace(3e-5, 1.0, 40)
-"""[m] Standard deviations of the errors of single lengths, with equal probability."""
+"""Standard deviations of the errors of individual lengths [m], with equal probability."""
 STRONG = math.log(10.0)
 """Logarithm of the Bayes factor above which a common factor is reported (Jeffreys 1961, Theory of Probability, appendix
 B: "strong").
@@ -39,16 +39,16 @@ less than 0.2 %, and wrong use of a scale bar by 1 %."""
 
 
 MAX_ODDS = 1e6
-"""Limit of the reported odds."""
+"""Largest odds that are reported."""
 
 
 @dataclass(frozen=True)
 class CommonScale:
-    """One factor on all lengths of an arm.
+    """A common factor on all lengths of an arm.
 
     Attributes:
-        factor: fitted over nominal lengths [1].
-        sigma: its standard deviation [1].
+        factor: ratio of fitted to nominal lengths [1].
+        sigma: standard deviation of the factor [1].
         log_bayes_factor: logarithm of the odds of a factor other than 1 against 1, at equal prior odds.
     """
 
@@ -63,7 +63,7 @@ class CommonScale:
 
 
 def check_scale(checked: CheckedCalibration) -> Iterator[Diagnostic]:
-    """Look for a common factor on all lengths, in addition to independent errors of each."""
+    """Look for a common factor on all lengths, in addition to independent errors of every length."""
     scale = common_scale(checked.geometric)
     if scale is None or scale.log_bayes_factor < STRONG:
         return
@@ -90,7 +90,8 @@ def scale_figures(checked: CheckedCalibration) -> ScaleFigures | None:
     factor, so the residuals do not show it; only the nominal lengths do.
 
     Returns:
-        None if no position was measured, a joint is prismatic, or no length that is nominally not 0 was estimated.
+        The figures; None if no position was measured, a joint is prismatic, or no length that is nominally not 0 was
+        estimated.
     """
     position = checked.rows.position
     if position is None or any(joint.type == "prismatic" for joint in checked.robot.joints):
@@ -118,10 +119,11 @@ def common_scale(result: CalibrationResult) -> CommonScale | None:
     The errors e are normal with one standard deviation, over which the evidence is averaged, with s and without. The
     data enter by their normal equations at the solution, from which the prior is subtracted. With the normal matrix N
     of the data, their right-hand side b, and the prior precision P of all parameters, the likelihood of s is normal,
-    with the information `L^T P L - L^T P (N + P)^-1 P L` and the estimate `L^T P (N + P)^-1 b` over it.
+    with the information `L^T P L - L^T P (N + P)^-1 P L` and the estimate `L^T P (N + P)^-1 b` divided by this
+    information.
 
     Returns:
-        None if no length that is nominally not 0 was estimated.
+        The factor; None if no length that is nominally not 0 was estimated.
     """
     problem, here = result.solved.problem, result.solved.refined
     precision = (
@@ -141,7 +143,8 @@ def common_scale(result: CalibrationResult) -> CommonScale | None:
         precision[erring] = error**-2
         normal = data + np.diag(precision)
         diagonal = normal.diagonal()
-        # Unit diagonal: metres and radians otherwise make the matrix too ill-conditioned for a Cholesky factor.
+        # Scaled to a unit diagonal, because metres and radians make the matrix too ill-conditioned for a Cholesky
+        # factor.
         column = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
         scaled_normal = normal * column * column[:, None]
         root = np.linalg.cholesky(scaled_normal + UNDETERMINED * np.eye(len(column)))
@@ -164,15 +167,16 @@ def common_scale(result: CalibrationResult) -> CommonScale | None:
 
 
 MIN_CHANGE = 5e-4
-"""Factors nearer to 1 come from heat: 20 K stretch an aluminium arm by 0.05 %."""
+"""Smallest difference of the factor from 1; smaller ones are caused by heat: 20 K stretch an aluminium arm by 0.05
+%."""
 UNUSUAL = 2.0
-"""Errors over the expected ones below which no explanation is needed."""
+"""Ratio of errors to expected errors below which no explanation is needed."""
 EXPLAINED_BY_SCALE = 0.6
-"""Share of the errors that may remain after correcting the factor."""
+"""Largest share of the errors that may remain after correction of the factor."""
 AS_GOOD_AS_SCALE = 1.3
-"""Errors under any other explanation must be larger by this factor."""
+"""Factor by which errors under any other explanation must be larger."""
 MIN_DEVIATIONS = 5.0
-"""[standard deviations] Difference of the factor from 1 above which it is reported."""
+"""Difference of the factor from 1, in standard deviations, above which it is reported."""
 
 
 def check_scale_of_rows(judged: RowsUnderModel) -> Iterator[Diagnostic]:
@@ -208,7 +212,7 @@ def check_scale_of_rows(judged: RowsUnderModel) -> Iterator[Diagnostic]:
 
 
 def _frames(T: Float64[Tensor, "rows 4 4"]) -> Float64[Tensor, "values numbers"]:
-    """Differentiate positions by small motions of the base and by shifts of the tool."""
+    """Return the derivatives of positions with respect to small motions of the base and shifts of the tool."""
     eye = torch.eye(3).to(T).expand(len(T), 3, 3)
     return torch.cat([eye, -skew(T[:, :3, 3]), T[:, :3, :3]], 2).flatten(0, 1)
 
@@ -216,10 +220,10 @@ def _frames(T: Float64[Tensor, "rows 4 4"]) -> Float64[Tensor, "values numbers"]
 def _fit(
     A: Float64[Tensor, "values numbers"], error: Float64[Tensor, " values"]
 ) -> tuple[float, float, float]:
-    """Solve least squares; return the RMS length of the residuals [m], the last unknown, and its standard deviation."""
+    """Return RMS length of the least-squares residuals [m], the last unknown, and its standard deviation."""
     scale = A.norm(dim=0).clamp(min=1e-300)
     U, size, V = torch.linalg.svd(A / scale, full_matrices=False)
-    # Where rotations are alike, shifts of base and tool have equal effects: leave out what the rows do not determine.
+    # If rotations are similar, shifts of base and tool have equal effects; omit what the rows do not determine.
     certain = size > 1e-6 * size[0]
     U, size, V = U[:, certain], size[certain], V[certain]
     x = V.t() @ (U.t() @ error / size)

@@ -8,7 +8,7 @@ from pisigma.validation.held_out.diagnostic import Diagnostic
 
 
 def check_search(checked: CheckedCalibration) -> Iterator[Diagnostic]:
-    """Reject a search that was stopped at the iteration limit, and warn of one that stalled near the minimum."""
+    """Reject a search that stopped at the iteration limit, and warn of a search that stalled near the minimum."""
     status = checked.geometric.status
     if not status.is_minimum:
         stopped = status is SolutionStatus.ITERATION_LIMIT
@@ -21,7 +21,7 @@ def check_search(checked: CheckedCalibration) -> Iterator[Diagnostic]:
 
 
 def check_few_rows(checked: CheckedCalibration) -> Iterator[Diagnostic]:
-    """Warn if parameters of the arm were to be estimated, but none was."""
+    """Warn if parameters of the arm were requested, but only base and tool were fitted."""
     problem = checked.geometric.solved.problem
     if checked.calibrator.free and not bool((problem.active < problem.space.arm_size).any()):
         yield Diagnostic(

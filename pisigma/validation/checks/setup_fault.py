@@ -30,29 +30,29 @@ UNRELATED = (
     "different rows belong together; check whether one of them was sorted or comes from another program."
 )
 MIN_ROWS_OF_SIZE = 4
-"""Minimum number of rows; with fewer, the positions may be near each other by chance."""
+"""Minimum number of rows for the check of size; with fewer, positions may be near each other by chance."""
 SCALE = 30.0
-"""Spread of the measured over that of the nominal positions above which (or below whose inverse) the unit is wrong."""
+"""Ratio of the spreads of measured and nominal positions above which (or below whose inverse) the unit is wrong."""
 ARM_SHARE = 0.3
-"""Spread of positions caused by a tool that the nominal robot lacks, and smallest spread of usual poses, as a share of
-the reach."""
+"""Spread of positions caused by a tool that the nominal robot lacks, and smallest spread of typical poses, as a
+share of the reach."""
 MIN_ROWS_FOR_JOINTS = 8
-"""Rows that distinguish columns of joints: 24 values, of which base and tool take 9."""
+"""Smallest number of rows that distinguish columns of joints: 24 values, 9 of which determine base and tool."""
 
 
 def check_setup_fault(checked: CheckedCalibration) -> Iterator[Diagnostic]:
     """Look for setup faults that explain the errors of the nominal robot; see `find_nominal_robot_faults`.
 
     A fault makes the calibration implausible, because parameters may absorb it and are then wrong at other poses. A
-    joint zero is a parameter: a calibration estimates it correctly, so it is a warning up to the size that is possible
-    in any class of robots.
+    joint zero is a parameter, which a calibration estimates correctly, so it is only a warning up to the size that
+    is possible in any class of robots.
     """
     yield from setup_diagnostics(checked.robot, checked.rows)
 
 
-@lru_cache(maxsize=1)  # the same rows are checked before and after a calibration
+@lru_cache(maxsize=1)  # cached, because the same rows are checked before and after a calibration
 def setup_diagnostics(robot: Robot, rows: Measurements) -> tuple[Diagnostic, ...]:
-    """Report the setup faults that explain the errors of the nominal robot; see `check_setup_fault`."""
+    """Return findings about setup faults that explain the errors of the nominal robot; see `check_setup_fault`."""
     if faults := find_nominal_robot_faults(robot, rows):
         fault = combine_alternatives(faults)
         severity: Severity = "implausible" if fault.moved > HOBBY.largest.joint_offset else "warning"
@@ -79,7 +79,7 @@ def check_setup_of_rows(judged: RowsUnderModel) -> Iterator[Diagnostic]:
 
 
 def check_position_size(robot: Robot, rows: Measurements) -> Iterator[Diagnostic]:
-    """Compare the spread of the measured positions with that of the nominal robot's."""
+    """Compare the spread of the measured positions with the spread of the nominal robot's positions."""
     group = largest_group(rows)
     if group.position is None or group.rows < MIN_ROWS_OF_SIZE:
         return
@@ -107,7 +107,7 @@ def check_position_size(robot: Robot, rows: Measurements) -> Iterator[Diagnostic
 
 
 def joint_columns(robot: Robot, rows: Measurements) -> Iterator[Diagnostic]:
-    """Try a reversed sign of every joint and a swap of two neighbours, with base and tool fitted each time.
+    """Try a reversed sign of every joint and a swap of two neighbouring joints, with base and tool fitted each time.
 
     With at least `MIN_ROWS_NOMINAL` rows, `find_nominal_robot_faults` tries many more hypotheses instead.
     """

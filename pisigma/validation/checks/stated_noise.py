@@ -1,4 +1,4 @@
-"""Check whether the standard deviations stated in the rows agree with their residuals."""
+"""Check whether standard deviations stated in the rows agree with the residuals."""
 
 import math
 from collections.abc import Iterator
@@ -16,13 +16,14 @@ standard deviation is a manufacturer's bound or an estimate, and rarely correct 
 CHI_MEDIAN = {1: 0.6745, 3: 1.5382}
 """Median length of a standard normal vector by its number of components."""
 HELD_BACK = 0.5
-"""Residuals without over those with the stated noise below which the stated noise impaired the calibration."""
+"""Ratio of the residuals without and with the stated noise below which the stated noise impaired the calibration."""
 
 
 def check_stated_noise(checked: CheckedCalibration) -> Iterator[Diagnostic]:
     """Compare the median residual with the standard deviations stated in the rows.
 
-    The median of n values has a relative standard deviation of about `1 / sqrt(n)`; the tolerance is three of these.
+    The median of n values has a relative standard deviation of about `1 / sqrt(n)`; the tolerance is three times
+    this value.
     """
     solved = checked.geometric.solved
     learned = None if checked.hybrid is None else checked.hybrid.learned
@@ -65,7 +66,7 @@ def _too_large(checked: CheckedCalibration, sensor: str, factor: float) -> Diagn
 
 
 def _share_without(checked: CheckedCalibration) -> float:
-    """Compute the RMS residual of a geometric calibration without the stated noise over that with it."""
+    """Compute the ratio of the RMS residuals of geometric calibrations without and with the stated noise."""
     rows = replace(checked.rows, sigma_position=None, sigma_rotation=None)
     try:
         without = pose_errors_of(checked.calibrator.fit(rows), rows).position

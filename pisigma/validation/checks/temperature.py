@@ -8,7 +8,8 @@ from pisigma.validation.checks.check import CheckedCalibration
 from pisigma.validation.held_out.diagnostic import Diagnostic
 
 HOT = 60.0
-"""[deg C] Robots may work at up to 45 deg C, and their housings warm up by less than 15 K; 20 deg C is 68 deg F."""
+"""Temperature above which a warning is given [deg C]; robots may work at up to 45 deg C, and their housings warm up
+by less than 15 K; 20 deg C is 68 deg F."""
 
 
 def check_temperature(checked: CheckedCalibration) -> Iterator[Diagnostic]:

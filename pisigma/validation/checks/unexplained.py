@@ -1,4 +1,4 @@
-"""Check whether the errors of held-out rows are far larger than those of calibrated robots."""
+"""Check whether the errors of held-out rows are far larger than the errors of calibrated robots."""
 
 import math
 from collections.abc import Iterator
@@ -19,20 +19,22 @@ from pisigma.validation.setup_faults.explanations import PLAUSIBLE_SHARE
 from pisigma.validation.setup_faults.setup_faults import unexplained
 
 FAR, FAR_HOBBY = 2.5e-3, 7.5e-3
-"""Errors as a share of the reach above which a calibrated robot is implausible: industrial arms and cobots, others."""
+"""Errors, as a share of the reach, above which a calibrated robot is implausible: for industrial arms and cobots,
+and for other robots."""
 LARGE = 1e-3
-"""Errors as a share of the reach above which calibration must help; measured arms (UR5, UR10, FANUC, Panda, FR3) have
-2e-4 to 6e-4."""
+"""Errors, as a share of the reach, above which calibration must have reduced them; measured arms (UR5, UR10, FANUC,
+Panda, FR3) have 2e-4 to 6e-4."""
 HARDLY = 1.3
-"""Errors of the nominal robot over those of the calibrated one below which calibration hardly helped."""
+"""Ratio of the errors of the nominal and the calibrated robot below which calibration hardly helped."""
 NOISE = 0.5
 """Share of the errors above which the stated noise of the sensor explains them."""
 
 
 def check_unexplained(checked: CheckedCalibration) -> Iterator[Diagnostic]:
-    """Compare the errors of held-out positions, or else those of the calibration, with those of calibrated robots.
+    """Compare the errors of held-out positions, otherwise of the calibration, with errors of calibrated robots.
 
-    Errors that other checks explain are not reported again: rounded joint values are errors of the rows, not the robot.
+    Errors that other checks explain are not reported again; for example, rounded joint values are errors of the
+    rows, not of the robot.
     """
     if not set(checked.rows.kinds) <= {"position", "rotation"}:
         return
@@ -67,7 +69,7 @@ def _explained(checked: CheckedCalibration, left: float) -> bool:
 
 MAX_ITERATIONS = 8
 MAX_STEP = 0.3
-"""[rad, or share of the reach] Largest step of a joint zero in an iteration."""
+"""Largest step of a joint zero in an iteration [rad, or share of the reach]."""
 
 
 def check_unexplained_rows(judged: RowsUnderModel) -> Iterator[Diagnostic]:
@@ -78,7 +80,7 @@ def check_unexplained_rows(judged: RowsUnderModel) -> Iterator[Diagnostic]:
 
 
 def _left(judged: RowsUnderModel) -> float:
-    """Compute the RMS residual after the fit [m], corrected for its degrees of freedom."""
+    """Compute the RMS residual after the fit [m], corrected for the degrees of freedom."""
     known, robot = judged.renamed_rows, judged.model.robot
     zeros = torch.zeros(known.dof, dtype=torch.float64)
     largest = (
@@ -101,15 +103,15 @@ def _left(judged: RowsUnderModel) -> float:
 
 
 UNRELATED_SHARE = 0.5
-"""Residuals over the spread of the positions above which the joints explain less than three quarters of the variance.
-For a healthy robot the ratio is below 0.01."""
+"""Ratio of the residuals to the spread of the positions above which the joints explain less than three quarters of
+the variance. For a healthy robot the ratio is below 0.01."""
 
 
 def check_residual(checked: CheckedCalibration) -> Iterator[Diagnostic]:
-    """Compare the residuals of every sensor with the reach of the robot, and those of positions with their spread.
+    """Compare the residuals of every sensor with the robot's reach, and residuals of positions with their spread.
 
     Half of the measured lengths must be within 1 % of the reach per axis, and half of the measured angles within
-    0.01 rad, which moves a point at the distance of the reach equally far. No calibration error is this large.
+    0.01 rad, which moves a point at the distance of the reach equally far. No calibration error exceeds these limits.
     """
     robot, by_images = checked.robot, "corner" in checked.rows.kinds
     rows = "images and joint values" if by_images else "rows and positions"

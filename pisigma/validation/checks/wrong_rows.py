@@ -1,4 +1,4 @@
-"""Single rows that no error of the robot explains, while all others agree with a model: they are left out."""
+"""Leave out single rows that no error of the robot explains, while all others agree with a model."""
 
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass, replace
@@ -17,25 +17,28 @@ from pisigma.validation.setup_faults.cause import length_text
 from pisigma.validation.setup_faults.explanations import PLAUSIBLE_SHARE, PLAUSIBLE_TURN
 
 FAR = 10.0
-"""Error over the median error above which a row is wrong, if it is also larger than that of any calibrated robot."""
+"""Ratio of an error to the median error above which a row is wrong, if the error is also larger than that of any
+calibrated robot."""
 MAX_WRONG_SHARE = 0.1
-"""Share of the rows; if more are far off, it is not known which ones are wrong, and all are judged."""
+"""Largest share of wrong rows; if more rows are far off, it is unknown which are wrong, and no row is left out."""
 MIN_ROWS, MIN_ROWS_TO_FIT = 6, 10
-"""Rows needed to call one wrong: in known frames, and with frames or tools fitted to the rows."""
+"""Smallest numbers of rows with which a row can be called wrong: in known frames, and with frames or tools fitted to
+the rows."""
 SUSPICIOUS, REFITS = 3.0, 12
-"""Error over the median error above which a row is not used in the fit of frames and tools; number of such fits."""
+"""Ratio of an error to the median error above which a row is not used in the fit of frames and tools, and number of
+such fits."""
 MAX_NAMED = 5
-"""Rows that a sentence names."""
+"""Largest number of rows that a sentence lists."""
 
 
 @dataclass(frozen=True, eq=False)
 class FilteredRows:
-    """Rows without those that are wrong.
+    """Rows without wrong rows.
 
     Attributes:
-        rows: the remaining rows; all if none is wrong.
-        warnings: which rows are wrong and how far they are off; empty if none is.
-        numbers: row numbers of the wrong rows, from 0.
+        rows: the remaining rows; all rows if none is wrong.
+        warnings: warnings about wrong rows and how far they are off; empty if no row is wrong.
+        numbers: indices of the wrong rows, from 0.
     """
 
     rows: Measurements
@@ -46,10 +49,10 @@ class FilteredRows:
 def without_wrong_rows(
     models: Iterable[CalibratedModel], rows: Measurements, fitted: Collection[FrameKind] = ()
 ) -> FilteredRows:
-    """Leave out single rows that are too far off under every model to be measured correctly.
+    """Leave out single rows that deviate too much from every model to be measured correctly.
 
     Args:
-        models: the models that the rows are compared with.
+        models: models with which the rows are compared.
         rows: the rows.
         fitted: frames and tools that are fitted to the rows.
     """
@@ -77,7 +80,7 @@ def without_wrong_rows(
 def _far_rows(
     model: CalibratedModel, rows: Measurements, fitted: Collection[FrameKind]
 ) -> dict[int, str] | None:
-    """Find the rows that are far off, with a text of how far; None if the model cannot judge the rows."""
+    """Return the rows that are far off, with texts of how far; None if the model cannot predict the rows."""
     if rows.position is None:
         return _far_lengths(model, rows)
     there = torch.isfinite(rows.position).all(-1)
@@ -92,17 +95,17 @@ def _far_rows(
 
 
 def _far_lengths(model: CalibratedModel, rows: Measurements) -> dict[int, str] | None:
-    """Find the far rows among rows without positions, such as balls in sockets; see `_far_rows`."""
+    """Return the rows that are far off among rows without positions, such as balls in sockets; see `_far_rows`."""
     lengths = errors_of_rows(poses_of_rows(model, rows), rows).position.norm(dim=-1)
     there = torch.isfinite(lengths)
-    if int(there.sum()) < MIN_ROWS_TO_FIT:  # sockets and anchors are fitted to them
+    if int(there.sum()) < MIN_ROWS_TO_FIT:  # sockets and anchors are fitted to these rows
         return None
     far = lengths > max(FAR * float(lengths[there].median()), PLAUSIBLE_SHARE * model.robot.reach)
     return {row: length_text(float(lengths[row])) for row in far.nonzero()[:, 0].tolist()}
 
 
 def _fitted_to_usual_rows(judged: RowsUnderModel) -> Float64[Tensor, "rows 4 4"]:
-    """Predict the poses with frames and tools fitted to the rows that are not far off.
+    """Return predicted poses, with frames and tools fitted to the rows that are not far off.
 
     Suspicious rows are replaced by their predictions before the next fit. This converges to the fit of the other rows,
     and which rows are suspicious is decided again in every iteration.
@@ -124,13 +127,13 @@ def _fitted_to_usual_rows(judged: RowsUnderModel) -> Float64[Tensor, "rows 4 4"]
 
 
 def _angles(judged: RowsUnderModel, T: Float64[Tensor, "rows 4 4"]) -> Float64[Tensor, " rows"]:
-    """Compute the angles between measured and predicted orientations [rad]; 0 where none was measured."""
+    """Compute the angles between measured and predicted orientations [rad]; 0 in rows without an orientation."""
     angles = rotation_vector(judged.measured.rotation @ T[:, :3, :3].mT).norm(dim=-1)
     return torch.where(judged.measured.has_rotation, angles, 0.0)
 
 
 def _far(judged: RowsUnderModel, T: Float64[Tensor, "rows 4 4"]) -> tuple[Bool[Tensor, " rows"], list[str]]:
-    """Find the rows that are far off, and write how far every row is."""
+    """Return the mask of the rows that are far off, and a text of the error of every row."""
     lengths = judged.error_lengths(T)
     far = lengths > max(FAR * float(lengths.median()), PLAUSIBLE_SHARE * judged.model.robot.reach)
     texts = [length_text(length) for length in lengths.tolist()]
@@ -138,7 +141,7 @@ def _far(judged: RowsUnderModel, T: Float64[Tensor, "rows 4 4"]) -> tuple[Bool[T
     if int(turned.sum()) >= MIN_ROWS:
         angles = _angles(judged, T)
         typical = float(angles[turned].median())
-        if typical <= PLAUSIBLE_TURN:  # otherwise the model does not know the tool's orientation
+        if typical <= PLAUSIBLE_TURN:  # otherwise the tool's orientation is unknown to the model
             far = far | (turned & (angles > max(FAR * typical, PLAUSIBLE_TURN)))
             degrees = torch.rad2deg(angles).tolist()
             texts = [
