@@ -51,8 +51,7 @@ class CorrectionNetwork(nn.Module):
 
     def members(self) -> list[tuple[JointGroup, PiSigma]]:
         """Return pairs of every joint group and its network."""
-        return [(group, network) for group, network in zip(self.groups, self.networks, strict=True)]  # type:
-        ignore[misc]
+        return [(group, network) for group, network in zip(self.groups, self.networks, strict=True)]  # type: ignore[misc]
 
     def scaled_inputs(
         self, T: Float[Tensor, "*batch 4 4"], q: Float[Tensor, "*batch dof"]

@@ -7,7 +7,6 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.calibration.geometric.prediction import predicted_poses
 from pisigma.calibration.geometric.problem.parameters import ParameterSpace
 from pisigma.calibration.geometric.problem.prior_sizes import PriorGroup, prior_group_of
 from pisigma.calibration.geometric.problem.setup import IdentifiedGeometry
@@ -16,7 +15,7 @@ from pisigma.calibration.hybrid.gravity import USUAL, to_first_row_frame
 from pisigma.calibration.hybrid.result import HybridResult
 from pisigma.calibration.hybrid.uncertainty import PositionUncertainty
 from pisigma.estimation.covariance_root import CovarianceRoot, multiply_updated_root
-from pisigma.files.errors import IdentificationError, ImplausibleError, MeasurementError
+from pisigma.files.errors import IdentificationError, ImplausibleError
 from pisigma.joint_correction.feature import AbstractFeature
 from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.joint_correction.gravity_torques import Direction, GravityTorques
@@ -29,7 +28,7 @@ from pisigma.planning.plan_settings import SensorKind
 from pisigma.robot.description import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.robot_class import RobotClass
-from pisigma.robot.se3 import rotation_vector, skew
+from pisigma.robot.se3 import skew
 
 WIDE_PRIOR = (*(1.0,) * 6, *(0.1,) * 3, *(1.0,) * 3)
 """[m, rad, m, rad] Standard deviations of base and tool before anything is measured: too wide to have an effect."""
@@ -238,39 +237,6 @@ class RobotPosterior:
     def deviation(self, q: Float64[Tensor, "poses dof"]) -> Float64[Tensor, " poses"]:
         """Compute the standard deviation of the predicted position [m], `sqrt(σx² + σy² + σz²)`."""
         return self.tool(q).square().sum((1, 2)).sqrt()
-
-    def normalised_residual(self, rows: Measurements) -> Float64[Tensor, " rows"]:
-        """Compute how improbable measured rows are: the RMS of `(B B^T + 1)^-1/2 r`.
-
-        r is measured minus predicted, over the noise. A row that fits has about 1; under the predictive distribution
-        the square times the number of values is chi-square distributed.
-
-        Args:
-            rows: positions, or poses where the instrument measures poses, of the first target in the first frame.
-
-        Returns:
-            One value per row; NaN where neither was measured.
-
-        Raises:
-            MeasurementError: the rows have no positions, the instrument measures distances, or it is a camera.
-            IdentificationError: a row has a frame or a target that was not calibrated.
-        """
-        instrument, geometry = self.instrument, self.uncertainty.geometry
-        if instrument.kind in ("distance", "camera") or rows.position is None:
-            raise MeasurementError(expected="rows with positions", value="none", option="rows")
-        T = predicted_poses(
-            geometry.robot, geometry.bases, geometry.tools, replace(rows, q=self.corrected_joints(rows.q))
-        )
-        r = (rows.position - T[:, :3, 3]) / instrument.sigma
-        if instrument.kind == "pose" and rows.rotation is not None:
-            turned = rotation_vector(rows.rotation @ T[:, :3, :3].mT) / instrument.sigma_rotation
-            r = torch.cat([r, turned], 1)
-        B = self.sensitivities(rows.q)[:, : r.shape[1]]
-        # Predictive covariance of a row: uncertainty of the model plus noise, in units of the noise.
-        lower = torch.linalg.cholesky(B @ B.mT + torch.eye(r.shape[1]).to(r))
-        white = torch.linalg.solve_triangular(lower, r[..., None], upper=False)[..., 0]
-        surprise: Tensor = white.square().mean(1).sqrt()
-        return surprise
 
 
 def _geometric_sizes(space: ParameterSpace) -> Float64[Tensor, " parameters"]:

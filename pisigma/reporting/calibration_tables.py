@@ -130,13 +130,8 @@ def curve_table(points: Sequence[LearningPoint]) -> Table:
     return Table(tuple(head), tuple(rows))
 
 
-def folds_text(figures: ValidationFigures) -> str:
-    """Describe how rows were held out, such as "6 folds, 8 repeats"."""
-    return _say("folds", figures)[0]
-
-
 def cross_validation_text(figures: ValidationFigures) -> str:
-    """Describe the same as a clause: "6-fold cross-validation, 8 repeats: each of 720 rows was ..."."""
+    """Describe how rows were held out: "6-fold cross-validation, 8 repeats: each of 720 rows was ..."."""
     return _say("cross_validation", figures)[0]
 
 

@@ -69,10 +69,6 @@ class MeasuredPoses:
         """Return the members of the batch that a mask or an index selects."""
         return replace(self, position=self.position[index], rotation=self.rotation[index])
 
-    def scale_positions(self, factor: float) -> "MeasuredPoses":
-        """Return the poses with positions multiplied by a factor."""
-        return replace(self, position=self.position * factor)
-
     @property
     def values(self) -> int:
         """Number of independent measured values: three per position and three per rotation."""

@@ -10,6 +10,8 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float64
 
+from pisigma.robot.kernels.array_kinematics import cosine_sine
+
 Frame = Float64[np.ndarray, "4 4"]
 
 ROUNDING = 2e-14
@@ -18,7 +20,7 @@ ROUNDING = 2e-14
 
 def rotation(axis: int, angle: float) -> Frame:
     """Return the rotation by an angle [rad] about the x (0), y (1) or z (2) axis."""
-    cosine, sine = _cosine_sine(angle)
+    cosine, sine = cosine_sine(angle)
     T = np.eye(4)
     first, second = (axis + 1) % 3, (axis + 2) % 3
     T[first, first] = T[second, second] = cosine
@@ -82,10 +84,3 @@ def snap_right_angle(value: float) -> float:
     if abs(value - quarters * (math.pi / 2)) > ROUNDING:
         return float(value)
     return (2 if quarters == -2 else quarters) * (math.pi / 2)
-
-
-def _cosine_sine(angle: float) -> tuple[float, float]:
-    quarters = angle / (math.pi / 2)
-    if abs(quarters - round(quarters)) < 1e-15 * max(1.0, abs(quarters)):
-        return ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))[round(quarters) % 4]
-    return math.cos(angle), math.sin(angle)

@@ -4,14 +4,11 @@ import numpy as np
 import pytest
 import torch
 from testing.closeness import assert_close
-from testing.refusals import refused
 
-from pisigma.files.errors import MeasurementError
 from pisigma.measurement.dataset import Measurements
 from pisigma.planning.robot_posterior import Instrument, RobotPosterior
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
-from pisigma.robot.se3 import rotation_from_vector
 
 
 def random_joints(robot: Robot, count: int, seed: int) -> torch.Tensor:
@@ -65,32 +62,6 @@ def test_few_rows_are_conditioned_on_without_a_fit(robot: Robot) -> None:
     assert_close(
         posterior.updated_with(rows).deviation(task), posterior.after_measuring(q).deviation(task), rtol=1e-9
     )
-
-
-def test_surprise_is_chi_square_distributed_and_larger_for_wrong_rows(robot: Robot) -> None:
-    posterior = RobotPosterior.from_robot(robot, Instrument("pose", 1e-4, 2e-4)).after_measuring(
-        random_joints(robot, 60, 5)
-    )
-    q = random_joints(robot, 400, 6)
-    T = forward_kinematics(robot, q)
-    generator = torch.Generator().manual_seed(0)
-    spread = posterior.sensitivities(q)
-    numbers = torch.randn(spread.shape[2], generator=generator, dtype=torch.float64)
-    off = spread @ numbers + torch.randn(400, 6, generator=generator, dtype=torch.float64)
-    position = T[:, :3, 3] + off[:, :3] * 1e-4
-    rotation = rotation_from_vector(off[:, 3:] * 2e-4) @ T[:, :3, :3]
-    surprise = posterior.normalised_residual(Measurements(q=q, position=position, rotation=rotation))
-    assert 0.8 < float(surprise.square().mean()) < 1.2
-    position[7, 0] += 5e-3
-    assert (
-        float(posterior.normalised_residual(Measurements(q=q, position=position, rotation=rotation))[7]) > 4
-    )
-
-
-def test_rows_without_positions_are_refused(robot: Robot) -> None:
-    rows = Measurements(q=random_joints(robot, 2, 0), position=torch.zeros(2, 3).double())
-    with refused(MeasurementError, option="rows"):
-        RobotPosterior.from_robot(robot, Instrument("distance")).normalised_residual(rows)
 
 
 def test_distances_do_not_determine_the_pose_of_the_base(robot: Robot) -> None:

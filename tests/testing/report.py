@@ -10,6 +10,7 @@ from testing.hybrid import NOISE, HybridArmUnderTest, hybrid_of, joints_in
 from testing.models import no_type_checker
 
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
+from pisigma.calibration.geometric.identifiability.observability import Observability
 from pisigma.calibration.hybrid.calibrator import HybridCalibrator
 from pisigma.files.model_files import CORRELATION_CSV, HELD_OUT_CSV
 from pisigma.measurement.dataset import Measurements
@@ -19,7 +20,6 @@ from pisigma.model.geometric_model import model_of_calibration, model_of_hybrid
 from pisigma.reporting.calibration_tables import write_correlations
 from pisigma.validation.held_out.calibration_summary import (
     CalibrationSummary,
-    ObservabilityFigures,
     RedundancyFigures,
     summarise,
 )
@@ -90,7 +90,7 @@ def bare_summary(**figures: object) -> CalibrationSummary:
         iterations=1,
         rank=0,
         condition_number=None,
-        observability=ObservabilityFigures(O1=0.0, O2=0.0, O3=0.0, O4=0.0, O5=0.0),
+        observability=Observability(O1=0.0, O2=0.0, O3=0.0, O4=0.0, O5=0.0),
         noise=(),
         parameters=(),
         redundancy=RedundancyFigures(

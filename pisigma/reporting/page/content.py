@@ -217,7 +217,7 @@ class ReportContent:
             "frames": [asdict(one) for one in self.frames.names],
             "targets": [asdict(one) for one in self.targets.names],
             "not_identified": list(self.not_identified),
-            "observability": {} if self.summary is None else self.summary.observability.model_dump(),
+            "observability": {} if self.summary is None else asdict(self.summary.observability),
             "correlated": [list(pair) for pair in self.correlations.pairs],
             "advice": list(self.advice),
             "missing": list(self.missing),

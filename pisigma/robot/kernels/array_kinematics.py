@@ -176,7 +176,7 @@ def arm_rows(robot: "pisigma.robot.description.Robot") -> np.ndarray:
     """Return the rows of an arm, `(rows, 9)`: theta [rad], d, a [m], cosine and sine of alpha, beta and theta."""
     return np.array(
         [
-            (theta, d, a, *_cosine_sine(alpha), *_cosine_sine(beta), *_cosine_sine(theta))
+            (theta, d, a, *cosine_sine(alpha), *cosine_sine(beta), *cosine_sine(theta))
             for theta, d, a, alpha, beta in robot.dh.tolist()
         ]
     )
@@ -196,7 +196,7 @@ def transform_entries(
     x: float, y: float, z: float, roll: float, pitch: float, yaw: float
 ) -> tuple[float, ...]:
     """Return the 16 entries of `transform_of`, row-major."""
-    (c, s), (c_p, s_p), (c_y, s_y) = _cosine_sine(roll), _cosine_sine(pitch), _cosine_sine(yaw)
+    (c, s), (c_p, s_p), (c_y, s_y) = cosine_sine(roll), cosine_sine(pitch), cosine_sine(yaw)
     first = c * c_p, c * s_p * s_y - s * c_y, c * s_p * c_y + s * s_y, x
     second = s * c_p, s * s_p * s_y + c * c_y, s * s_p * c_y - c * s_y, y
     return (*first, *second, -s_p, c_p * s_y, c_p * c_y, z, 0.0, 0.0, 0.0, 1.0)
@@ -216,7 +216,7 @@ def xyzrpy_of(T: Any) -> tuple[float, ...]:
     return x, y, z, math.atan2(-b, d), pitch, 0.0
 
 
-def _cosine_sine(angle: float) -> tuple[float, float]:
+def cosine_sine(angle: float) -> tuple[float, float]:
     """Return cosine and sine, exactly 0 and ±1 within 1e-15 rad of a multiple of 90 deg."""
     quarter = angle / (math.pi / 2)
     if abs(quarter - round(quarter)) < 1e-15 * max(1.0, abs(quarter)):

@@ -7,11 +7,11 @@ finite value are None.
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict
 from typing import Any
 
 from pydantic import JsonValue
 
+from pisigma.calibration.geometric.identifiability.observability import Observability
 from pisigma.calibration.geometric.outliers import Outlier
 from pisigma.calibration.geometric.result import CalibrationResult
 from pisigma.calibration.hybrid.result import HybridResult, LearnedPart
@@ -85,16 +85,6 @@ class RedundancyFigures(Section):
     dependencies: tuple[str, ...]
     pairwise_sets: tuple[tuple[str, ...], ...]
     pairwise_kept: tuple[str, ...]
-
-
-class ObservabilityFigures(Section):
-    """Observability indices of the parameters; see `pisigma.calibration.geometric.identifiability.observability`."""
-
-    O1: float
-    O2: float
-    O3: float
-    O4: float
-    O5: float
 
 
 class OutlierFigures(Section):
@@ -238,7 +228,7 @@ class CalibrationSummary(AbstractSummary):
     iterations: int
     rank: int
     condition_number: float | None
-    observability: ObservabilityFigures
+    observability: Observability
     noise: tuple[NoiseFigures, ...]
     parameters: tuple[ParameterFigures, ...]
     redundancy: RedundancyFigures
@@ -279,7 +269,7 @@ def summarise(result: Result) -> CalibrationSummary:
         iterations=geometric.iterations,
         rank=geometric.rank,
         condition_number=_or_none(geometric.condition_number),
-        observability=ObservabilityFigures(**asdict(geometric.observability)),
+        observability=geometric.observability,
         noise=tuple(
             _noise(one.sensor, one.sigma, one.unit, values=one.values, used_by_parameters=one.used)
             for one in geometric.noise
