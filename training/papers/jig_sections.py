@@ -37,27 +37,29 @@ def jig_sections(published: Published, results: StoredResults, recipe: JigRecipe
         command_block("jigs"),
         published.notes["jigs"],
         picture(JIG_COMPARISON, "RMS error and deviation at the test points, ours and the paper's"),
-        "RMS error and deviation at the test points: ours are averages over the seeds ± one standard deviation; the "
-        "paper's are from Tables 3 to 7 (both jigs: the mean of Tables 6 and 7, as in Table 8).",
+        "The tables show RMS error and deviation at the test points: our figures are averages over the seeds ± one "
+        "standard deviation; those of the paper are from Tables 3 to 7 (for both jigs the mean of Tables 6 and 7, as "
+        "in Table 8).",
         _averages(result),
-        "Definitions:",
+        "The figures are defined as follows:",
         "\n".join(f"- {sentence}." for sentence in result["definitions"]),
         "### Nominal parameters of the welding robot",
         *dh_lines("welding", "welding robot", published.dh_tables["welding"]),
         _frames(published, recipe),
         "### Estimated parameters",
-        "Table 2. The column `true` contains the parameters of our true robot: the paper's result with both jigs.",
+        "The column `true` of the following table contains the parameters of our true robot, which are the paper's "
+        "result with both jigs.",
         _rendered(parameter_table(result)),
         "### Errors at the test points",
-        "Tables 3 to 7, first seed. For Tables 3 to 5 the paper does not state the frame.",
+        "The figures are those of the first seed. For Tables 3 to 5 the paper does not state the frame.",
         _rendered(error_table(result)),
         folded("The same for every coordinate", _rendered(component_table(result))),
         "### One jig compared with both",
-        "Table 8. Its ratio is the error with both jigs over the mean error with single jigs.",
+        "The ratio in Table 8 is the error with both jigs divided by the mean error with single jigs.",
         _rendered(seed_table(result)),
         _said(result),
         "### Straight lines",
-        "Tables 9 and 10, first seed.",
+        "The figures are those of the first seed.",
         _rendered(line_table(result)),
     ]
 
@@ -111,7 +113,10 @@ def _frames(published: Published, recipe: JigRecipe) -> str:
             )
         rows.append((name, *cells))
     head = ["frame", *(column.replace("_mm", " [mm]").replace("_deg", " [deg]") for column in columns)]
-    return "Table 1, frames; paper / ours where they differ:\n\n" + markdown_table(head, rows)
+    return (
+        "The table compares the frames of Table 1 with ours, as paper / ours where they differ:\n\n"
+        + markdown_table(head, rows)
+    )
 
 
 def _said(result: Result) -> str:
@@ -121,10 +126,9 @@ def _said(result: Result) -> str:
     paper = {key: table["both"][key] / table["one_jig"][key] for key in ("mean", "deviation")}
     change = 100 * (ratios["default_over_paper"]["rms"] - 1)
     return (
-        f"Both jigs compared with the mean of the single jigs: {both['rms']:.2f} times the error, "
-        f"{both['deviation']:.2f} times the deviation "
-        f"(paper: {paper['mean']:.2f} and {paper['deviation']:.2f}); both jigs are better for "
-        f"{100 * seeds['share_of_seeds_won_by_both']:.0f} % of the seeds. The default compared with the "
-        f"paper's parameters: {change:+.1f} % error at the test points. Planned touches compared with random ones: "
-        f"{ratios['planned_over_random']['rms']:.2f} times the error."
+        f"Both jigs have {both['rms']:.2f} times the error and {both['deviation']:.2f} times the deviation of the mean "
+        f"of the single jigs (paper: {paper['mean']:.2f} and {paper['deviation']:.2f}), and are better for "
+        f"{100 * seeds['share_of_seeds_won_by_both']:.0f} % of the seeds. The default changes the error at the test "
+        f"points by {change:+.1f} % compared with the paper's parameters. Planned touches lead to "
+        f"{ratios['planned_over_random']['rms']:.2f} times the error of random touches."
     )

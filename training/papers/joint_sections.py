@@ -22,9 +22,11 @@ def joint_sections(published: Published, results: StoredResults) -> list[str]:
         "### KIRO-3, the method of the paper",
         *_recipe("kiro3_paper", published, results, "Table 1"),
         picture(KIRO3_ENERGY, "energy curves of the KIRO-3, the method of the paper and pisigma's default"),
-        "Fig. 5: the training energy over the epochs, in scaled units. The default stops at convergence.",
+        "The figure shows the training energy over the epochs in scaled units, as in Fig. 5 of the paper. The default "
+        "stops at convergence.",
         picture(KIRO3_ERRORS, "joint errors of the KIRO-3 at the 100 training points, before and after"),
-        "Figs 4 and 6: the joint error at every training point, over radius and angle, in degrees.",
+        "The figure shows the joint error [deg] at every training point over radius and angle, as in Figs 4 and 6 of "
+        "the paper.",
         "### KIRO-3, default",
         *_recipe("kiro3", published, results, "Table 1"),
         "### KIRO-3 with wrong link lengths, base and joint offsets",
@@ -32,7 +34,7 @@ def joint_sections(published: Published, results: StoredResults) -> list[str]:
         "### KIRO-4, the method of the paper",
         *_recipe("kiro4_paper", published, results, "Table 2"),
         picture(KIRO4_ENERGY, "energy curves of the KIRO-4, the method of the paper and pisigma's default"),
-        "Fig. 8: the training energy over the epochs, in scaled units.",
+        "The figure shows the training energy over the epochs in scaled units, as in Fig. 8 of the paper.",
         "### KIRO-4, default",
         *_recipe("kiro4", published, results, "Table 2"),
         "### All joints before and after",
@@ -40,7 +42,7 @@ def joint_sections(published: Published, results: StoredResults) -> list[str]:
             JOINT_ERRORS,
             "average joint errors of KIRO-3 and KIRO-4: before, paper, method of the paper, default",
         ),
-        "Averages over the training points, from the tables above.",
+        "The figure shows averages over the training points, from the tables above.",
     ]
 
 
@@ -48,7 +50,8 @@ def _recipe(name: str, published: Published, results: StoredResults, table: str)
     joints = results[name]["joints"]
     return [
         command_block(name),
-        f"{table}, absolute joint errors [deg]: ours and the paper's at the training points, ours at 2000 new poses:",
+        f"The table compares our absolute joint errors [deg] with {table} of the paper at the training points, and "
+        "shows our errors at 2000 new poses:",
         joint_comparison(joints),
         _said(joints) + " " + published.notes[name],
     ]

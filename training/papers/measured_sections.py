@@ -27,17 +27,18 @@ def measured_sections(published: Published, results: StoredResults) -> list[str]
     text = [
         "### KIRO-3 at 4000 poses, mini-batches",
         command_block("kiro3_mini_batches"),
-        "Absolute joint errors at the training poses and at 2000 new poses:",
+        "The table shows absolute joint errors at the training poses and at 2000 new poses:",
         joint_table(joints),
         published.notes["kiro3_mini_batches"],
         "### UR5 with a camera on the flange",
         command_block("ur5_camera"),
-        "Errors of the camera's pose in the frame of the board, at 2000 other postures over the whole joint space:",
+        "The table shows errors of the camera's pose in the frame of the board, at 2000 other postures over the whole "
+        "joint space:",
         pose_table({"geometric": camera}),
         published.notes["ur5_camera"],
         "### Measured UR10, inverse calibration",
         command_block("ur10_inverse"),
-        f"Errors of held-out rows in {figures['folds']}-fold cross-validation; {rows['left_out']} of "
+        f"The table shows errors of held-out rows in {figures['folds']}-fold cross-validation; {rows['left_out']} of "
         f"{rows['used'] + rows['left_out']} rows are not used for training.",
         pose_table({name: ErrorFigures.model_validate(figures[name]) for name in ("nominal", "corrected")}),
         published.notes["ur10_inverse"],
@@ -83,4 +84,4 @@ def _said(result: Result) -> str:
         return seconds
     means = result["held_out"]["mean_rms_mm"]
     of = ", ".join(f"{name} {value:.4f}" for name, value in means.items())
-    return f"Mean over the simulations of the RMS error with all rows: {of} mm. {seconds}"
+    return f"With all rows, the RMS error averaged over the simulations is {of} mm. {seconds}"

@@ -22,11 +22,14 @@ _INTRODUCTION = """\
 
 # Recipes and their results
 
-The tables of three papers compared with ours, each with the command that reproduces it, and the results of the other
-recipes. Our figures come from `results/NAME.json`: what the command prints with `--json`, and figures that only this
-page shows. Figures of the papers come from the `paper` sections of the recipes and from
-[`papers/published.yaml`](papers/published.yaml). To run a recipe and store its result (with `--data CSV` if it
-needs data), and to write this page and its pictures:
+This page compares the tables of three papers with our results, states the command that reproduces each of them, and
+shows the results of the other recipes.
+Our figures come from `results/NAME.json`, which contains the output of the command with `--json` and the figures that
+only this page shows.
+Figures of the papers come from the `paper` sections of the recipes and from
+[`papers/published.yaml`](papers/published.yaml).
+The following commands run a recipe, store its result (with `--data CSV` if it needs data), and write this page and its
+pictures:
 
 ```bash
 python training/papers run kiro3
@@ -34,8 +37,10 @@ python training/papers
 ```
 
 Joint errors are absolute values; "deviation" is the standard deviation of the absolute error; "new poses" are 2000
-held-out random poses of the same region. Tests generate this page from the stored results and compare
-it byte for byte, and run the small recipes and compare their results. Times depend on the load of the machine."""
+held-out random poses of the same region.
+Tests generate this page from the stored results and compare it byte for byte; they also run the small recipes and
+compare their results.
+Times depend on the load of the machine."""
 
 
 def page_text(folder: Path) -> str:

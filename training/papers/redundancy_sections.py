@@ -101,14 +101,16 @@ def dh_lines(robot: str, title: str, table: DhTable) -> list[str]:
     verdict = "all values agree" if different == 0 else f"{different} values differ (paper / ours)"
     head = ["row", *(column.replace("_deg", " [deg]").replace("_mm", " [mm]") for column in _COLUMNS)]
     return [
-        f"Table {table.table}, {title}, compared with `pisigma/robot/catalogue/{robot}.yaml`: {verdict}.",
+        f"The following table compares Table {table.table} ({title}) with `pisigma/robot/catalogue/{robot}.yaml`: "
+        f"{verdict}.",
         markdown_table(head, rows),
     ]
 
 
 def _correlations(robot: str, title: str, published: Published, result: Result) -> list[str]:
     lines = [
-        f"Sets: {_sets(result['redundant_sets'])}; the paper's: {_sets(result['paper']['redundant_sets'])}."
+        f"Our redundant sets are {_sets(result['redundant_sets'])}; those of the paper are "
+        f"{_sets(result['paper']['redundant_sets'])}."
     ]
     stated = published.correlations[robot]
     for kind, table in (("lengths", stated.lengths), ("angles", stated.angles)):
@@ -138,11 +140,11 @@ def _compared(table: CorrelationTriangle, ours: dict[str, Any], kind: str) -> st
     apart = np.abs(theirs[known] - values[known])[other]
     largest = [float(np.abs(part[known][other]).max()) for part in (theirs, values)]
     return (
-        f"Table {table.table}, {kind}: {int(pairs[0].sum())} pairs at ±1 in the paper and {int(pairs[1].sum())} here, "
-        f"{'which are the same, with the same signs' if same_pairs else 'which are not the same'}; the parameters "
-        f"without effect are "
-        f"{'the same' if same_none else 'not the same'}; the other {int(other.sum())} pairs depend on the poses and "
-        f"differ by {np.median(apart):.3f} (median) and {apart.max():.3f} at most; the largest is "
+        f"In Table {table.table} ({kind}), {int(pairs[0].sum())} pairs are at ±1 in the paper and "
+        f"{int(pairs[1].sum())} here, "
+        f"{'which are the same, with the same signs' if same_pairs else 'which are not the same'}, and the parameters "
+        f"without effect are {'the same' if same_none else 'not the same'}. The other {int(other.sum())} pairs depend "
+        f"on the poses and differ by {np.median(apart):.3f} (median) and by at most {apart.max():.3f}; the largest is "
         f"{largest[0]:.3f} in the paper and {largest[1]:.3f} here."
     )
 
@@ -173,9 +175,9 @@ def _convergence(robot: str, published: Published, result: Result) -> list[str]:
     head = ["iteration", *(f"paper: {name}" for name in names), *(f"ours: {name}" for name in names)]
     held_out = max(case["held_out_rms_mm"] for case in cases)
     return [
-        f"Table {table.table}, RMSE [mm] at the 40 poses by the number of accepted steps; our fits stop at "
-        f"convergence. The cases are those of Table {published.redundant_sums[robot].table} below. At 2000 "
-        f"other poses our errors are {scientific(held_out)} mm RMS at most, in all cases.",
+        f"As in Table {table.table}, the following table shows the RMSE [mm] at the 40 poses by the number of accepted "
+        f"steps; our fits stop at convergence. The cases are those of Table {published.redundant_sums[robot].table} "
+        f"below. At 2000 other poses our errors are at most {scientific(held_out)} mm RMS in all cases.",
         markdown_table(head, rows),
     ]
 
@@ -200,7 +202,8 @@ def _sums(robot: str, published: Published, result: Result) -> list[str]:
     head = ["eliminated", *(f"paper: {name}" for name in names), *(f"ours: {name}" for name in names)]
     true = sum(result["true_values"][name] for name in table.members) * factor
     return [
-        f"Table {table.table}, values after calibration [{table.unit}]; the sum does not depend on which parameter is "
-        f"kept. In our true robot it is {true:{digits}}; the paper's true robot has another value.",
+        f"As in Table {table.table}, the following table shows values after calibration [{table.unit}]; the sum does "
+        f"not depend on which parameter is kept. In our true robot it is {true:{digits}}; the paper's true robot has "
+        f"another value.",
         markdown_table(head, rows),
     ]
