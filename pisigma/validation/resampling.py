@@ -17,7 +17,8 @@ class Bootstrap:
 
     Attributes:
         resamples: number of bootstrap resamples for confidence intervals.
-        seed: random seed of the resamples. Equal seeds draw equal groups, so that models are compared on the same ones.
+        seed: random seed of the resamples. Equal seeds draw equal groups, so that models are compared on the same
+            groups.
         confidence: confidence level of an interval.
     """
 
@@ -26,7 +27,7 @@ class Bootstrap:
     confidence: Annotated[float, HIDDEN] = 0.95
 
     def __post_init__(self) -> None:
-        """Refuse settings that define no interval."""
+        """Refuse settings that do not define an interval."""
         for name, valid, expected in (
             ("resamples", 2 <= self.resamples <= MAX_RESAMPLES, f"2 to {MAX_RESAMPLES:,} resamples"),
             ("confidence", 0 < self.confidence < 1, "a confidence level between 0 and 1"),

@@ -43,8 +43,7 @@ class CorrectedIK(AbstractInverse):
         revolute: `(dof,)` mask of the revolute joints.
         closed_form: whether the nominal robot has a closed-form inverse, so that all branches are known.
         warnings: warnings about conditions given to `under` that are outside the range of the calibration.
-        controller: for coupled joints, conversion between joint values and the controller's values, which calls use;
-            otherwise None.
+        controller: conversion to the controller's values for coupled joints; None without coupled joints.
     """
 
     controller: "pisigma.model.inverse.controller_values.ControllerValues | None"
@@ -180,7 +179,7 @@ class CorrectedIK(AbstractInverse):
     def all_branches(self, T_base_tool: Any, *, approach: Any = None) -> Solution:
         """Find solutions on every branch, as `(*batch, branches)`; see `__call__` and `for_task`.
 
-        For a robot without a closed-form inverse, kernels find up to eight distinct solutions.
+        Without a closed-form inverse, kernels find up to eight distinct solutions.
         """
         approach = checked_approach(approach)
         if self.controller is not None:

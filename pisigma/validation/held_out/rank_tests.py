@@ -35,7 +35,7 @@ def groups_differ(
         values: the values.
 
     Returns:
-        The statistic H and its p-value; 0 and 1 if there are not two groups with different values.
+        The statistic H and its p-value; 0 and 1 unless there are two groups and different values.
     """
     from scipy.stats import kruskal
 

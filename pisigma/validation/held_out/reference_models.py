@@ -12,15 +12,15 @@ from pisigma.validation.held_out.trained_calibrations import base_and_tool
 
 
 def nominal_model(model: CalibratedModel, turned: bool) -> CalibratedModel:
-    """Make the model of the nominal robot with base and tool fitted to it.
+    """Return a model of the nominal robot, with base and tool fitted to the predictions of a model.
 
     Base and tool of an identified geometry belong to that geometry and would increase the errors of the nominal arm.
     Therefore they are fitted again, to the target poses that the model predicts at its stored joint values of training
-    rows; the rows under test are not used. A model with nominal geometry already has them.
+    rows; the rows under test are not used. A model with nominal geometry already has such base and tool.
 
     Args:
         model: a model of any kind.
-        turned: whether orientations are compared and therefore fitted too.
+        turned: whether orientations are compared, and therefore also fitted.
 
     Raises:
         ModelError: the model does not store enough joint values to fit base and tool.
@@ -47,7 +47,7 @@ def nominal_model(model: CalibratedModel, turned: bool) -> CalibratedModel:
 
 
 def geometric_model(model: CalibratedModel) -> CalibratedModel:
-    """Return the geometric calibration that a hybrid is based on; for another identified geometry the model itself.
+    """Return the geometric calibration on which a hybrid is based; a model without hybrid is returned unchanged.
 
     Raises:
         ModelError: the model has no identified geometry.
@@ -71,7 +71,7 @@ def geometric_model(model: CalibratedModel) -> CalibratedModel:
 
 
 def _predicted(model: CalibratedModel, turned: bool) -> Measurements:
-    """Predict rows at the stored joint values: every frame with the first target, every target in the first frame."""
+    """Return predicted rows at stored joint values: all frames with the first target, and all other targets."""
     frames, targets = tuple(model.bases) or ("",), tuple(model.tools) or ("",)
     pairs = [(frame, targets[0]) for frame in frames] + [(frames[0], target) for target in targets[1:]]
     count = len(model.starts)

@@ -1,4 +1,4 @@
-"""Base of the figures of all kinds of models, which are the JSON of commands and the metrics of a model on disk."""
+"""Base class of the figures of models, from which the JSON of commands and the metrics of model folders are made."""
 
 from typing import Any, ClassVar, TypeVar
 
@@ -18,7 +18,7 @@ class AbstractSummary(Section):
     Attributes:
         kinds: kinds of models that have these metrics.
         command: command line or call that made the model.
-        diagnostics: findings of the checks; those that make the result implausible come first.
+        diagnostics: findings of the checks; findings that make the result implausible come first.
     """
 
     kinds: ClassVar[tuple[str, ...]]
@@ -26,19 +26,19 @@ class AbstractSummary(Section):
     diagnostics: tuple[Diagnostic, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
-        """Return everything that is set as JSON values, by name."""
+        """Return all figures that are set as JSON values, by name."""
         return self.model_dump(mode="json", exclude_unset=True)
 
     def with_figures(self: Summary, **figures: object) -> Summary:
-        """Return a copy with more figures; those that are None are left out."""
+        """Return a copy with further figures; figures that are None are omitted."""
         return self.model_copy(update={name: value for name, value in figures.items() if value is not None})
 
     @classmethod
     def read(cls: type[Summary], model: CalibratedModel) -> Summary | None:
-        """Read the figures that a model stores.
+        """Return the figures that a model stores.
 
         Returns:
-            None for a model of another kind, and for one that stores no figures.
+            The figures; None for a model of another kind or without figures.
 
         Raises:
             ModelError: the figures do not have the form of this version.

@@ -1,4 +1,4 @@
-"""Calibrations with the same training rows that are compared, and their predictions of other rows."""
+"""Calibrations of the same training rows that are compared by their predictions of other rows."""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -31,17 +31,17 @@ Result = CalibrationResult | HybridResult
 
 
 def geometric_of(calibrator: Calibrator) -> GeometricCalibrator:
-    """Return the geometric calibrator, or the one that a hybrid is based on."""
+    """Return the geometric calibrator, which a hybrid calibrator contains."""
     return calibrator.geometric if isinstance(calibrator, HybridCalibrator) else calibrator
 
 
 def geometric_result(result: Result) -> CalibrationResult:
-    """Return the geometric calibration, or the one that a hybrid is based on."""
+    """Return the geometric calibration, on which a hybrid is based."""
     return result.geometric if isinstance(result, HybridResult) else result
 
 
 def fit(calibrator: Calibrator, rows: Measurements, progress: Progress) -> Result:
-    """Calibrate; see the calibrators' `fit`.
+    """Calibrate with a geometric or hybrid calibrator, and return the result.
 
     Args:
         calibrator: a calibrator of either kind.
@@ -59,7 +59,7 @@ def fit_compared_calibrations(
     progress: Progress = lambda what: None,
     result: Result | None = None,
 ) -> dict[str, Result]:
-    """Fit all calibrations that are compared to the same rows.
+    """Return all calibrations that are compared, fitted to the same rows.
 
     Args:
         calibrator: a calibrator of either kind.
@@ -68,8 +68,8 @@ def fit_compared_calibrations(
         result: result of the calibrator for these rows; None to calibrate.
 
     Returns:
-        By name "nominal" (the nominal arm with base and tool fitted, all rows with full weight), "geometric", and
-        "hybrid" for a hybrid calibrator.
+        Results by name: "nominal" (the nominal arm with base and tool fitted, all rows with full weight),
+        "geometric", and "hybrid" for a hybrid calibrator.
 
     Raises:
         IdentificationError: the rows do not determine the parameters.
@@ -81,7 +81,7 @@ def fit_compared_calibrations(
 
 
 def base_and_tool(calibrator: GeometricCalibrator) -> GeometricCalibrator:
-    """Make the calibrator of the nominal arm: only base and tool are fitted, and all rows have full weight."""
+    """Return the calibrator of the nominal arm: only base and tool are fitted, and all rows have full weight."""
     return replace(calibrator, free=(), loss=SquaredLoss())
 
 
@@ -91,12 +91,12 @@ def drop_missing_frames(
     all_rows: Measurements,
     held_out: Collection[PairOfSockets] = (),
 ) -> Calibrator:
-    """Remove stated frames and socket distances from a calibrator that some of the rows lack.
+    """Return a calibrator without stated frames and socket distances that the rows lack.
 
     Args:
         calibrator: calibrator for all rows.
-        rows: the rows that it will be fitted to.
-        all_rows: rows of all folds; frames and distances that these lack too are kept, so that the calibrator refuses
+        rows: the rows to which the calibrator will be fitted.
+        all_rows: rows of all folds; frames and distances that all rows lack are kept, so that the calibrator refuses
             them.
         held_out: socket distances to remove in addition.
     """
@@ -118,7 +118,7 @@ def drop_missing_frames(
 
 
 def with_frames(calibrator: GeometricCalibrator, result: Result, rows: Measurements) -> Result:
-    """Fit the bases of frames that a calibration lacks to the rows in these frames, and nothing else.
+    """Return a calibration with the bases of missing frames fitted to the rows in these frames.
 
     Args:
         calibrator: the calibrator of the geometric calibration.
@@ -159,7 +159,7 @@ def with_frames(calibrator: GeometricCalibrator, result: Result, rows: Measureme
 def _bases(
     calibrator: GeometricCalibrator, robot: Robot, rows: Measurements
 ) -> dict[str, Float64[np.ndarray, " 6"]]:
-    """Fit the bases of an arm in the frames of some rows, all with full weight."""
+    """Return the bases of an arm in the frames of the rows, which all have full weight."""
     frames = set(rows.frame)
     only_bases = replace(
         calibrator,
@@ -175,18 +175,18 @@ def _bases(
 
 
 def judgeable_rows(measurements: Measurements, test: Tensor, training: Measurements) -> Tensor:
-    """Return which test rows have a target, and an anchor (or its stated position), that training rows have.
+    """Return the mask of test rows whose target and anchor (unless stated) are also in training rows.
 
     Args:
         measurements: all rows.
-        test: numbers of the test rows.
+        test: indices of the test rows.
         training: the training rows.
 
     Returns:
         One bool per test row.
 
     Raises:
-        IdentificationError: no test row does.
+        IdentificationError: no test row can be judged.
     """
     targets, anchors = set(training.target), {*(training.anchor or ()), ""}
     names = measurements.anchor or ("",) * measurements.rows
@@ -224,7 +224,7 @@ class DistanceErrors:
         stated: Mapping[PairOfSockets, float],
         rows: Measurements,
     ) -> "DistanceErrors":
-        """Compute the errors under several calibrations, with sockets at the mean predicted position of their balls.
+        """Return the errors under several calibrations, with sockets at the mean predicted position of their balls.
 
         Args:
             poses: predicted poses of the target in every row by name of a calibration without these distances.
@@ -244,7 +244,7 @@ class DistanceErrors:
 
     @staticmethod
     def concatenate(parts: "Sequence[DistanceErrors]") -> "DistanceErrors":
-        """Join the errors of several folds."""
+        """Return the errors of several folds as one."""
         there = [part for part in parts if part.stated]
         stated = {pair: distance for part in there for pair, distance in part.stated.items()}
         names = there[0].errors if there else ()
@@ -258,9 +258,9 @@ def held_out_distances(
 ) -> tuple[dict[PairOfSockets, float], ...]:
     """Assign every stated distance to one fold, whose calibration does not use it.
 
-    It is the fold without rows of one of the sockets; otherwise distances are assigned to the folds cyclically, as long
-    as one distance remains in the fold, because a calibration without any does not determine the scale. Distances of
-    a socket that no row has are assigned to no fold, so that the calibrations refuse them.
+    This is the fold without rows of one of the sockets; otherwise distances are assigned to the folds cyclically, as
+    long as one distance remains in the fold, because a calibration without distances does not determine the scale.
+    Distances of a socket that no row has are assigned to no fold, so that the calibrations refuse them.
     """
     names = measurements.socket or ()
     known = [{names[row] for row in train.tolist()} if names else set() for train, _ in splits]
@@ -277,7 +277,7 @@ def held_out_distances(
 
 
 def distance_figures(repeats: Sequence[DistanceErrors]) -> SocketDistances | None:
-    """Compute the figures of several repeats in mm; None if no distance was judged."""
+    """Return the figures of several repeats [mm]; None if no distance was judged."""
     repeats = [one for one in repeats if one.stated]
     if not repeats:
         return None

@@ -1,4 +1,4 @@
-"""Results of training networks on joint errors: joint errors before and after, and all figures as one typed value."""
+"""Results of training networks on joint errors: joint errors before and after the correction, and all figures."""
 
 import math
 from collections.abc import Mapping
@@ -25,7 +25,7 @@ Effect = Literal["lowers", "does not change", "raises"]
 """Effect of a correction on an error."""
 Recommendation = Literal["use it", "use it with care", "do not use it"]
 _QUANTITIES = {"position": "mm", "orientation": "deg"}
-"""Units of the compared errors."""
+"""Unit of every compared quantity."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +44,7 @@ class JointErrors:
 
     @staticmethod
     def from_model(model: CalibratedModel, pairs: TrainingPairs) -> "JointErrors":
-        """Compute the joint errors of the used rows, before and after the model's correction."""
+        """Return the joint errors of the rows used for training, before and after the model's correction."""
         T, q, before = pairs.T[pairs.used], pairs.q_nominal[pairs.used], pairs.target[pairs.used]
         return JointErrors(T, before, before - model.correction(T, q))
 
@@ -73,8 +73,8 @@ class TrainingRun:
 class JointErrorFigures(Section):
     """Average, standard deviation and maximum of the absolute error of a joint, in degrees or millimetres.
 
-    They are those of Jeong et al. 1998, Tables 1 and 2; the standard deviation is over all rows (divided by n, as the
-    paper's figures are).
+    The figures are defined as in Jeong et al. 1998, Tables 1 and 2; the standard deviation is over all rows (divided
+    by n, as in the paper).
 
     Attributes:
         average_deg: average of a revolute joint [deg].
@@ -142,7 +142,7 @@ class JointFigures(Section):
 
 
 class RowFigures(Section):
-    """Numbers of rows: used for training, left out of it by a rule, and held out as the set "test"."""
+    """Numbers of rows that were used for training, left out by a rule, and held out as the set "test"."""
 
     used: int
     left_out: int
@@ -156,7 +156,7 @@ class ComparisonFigures(Section):
     Attributes:
         folds: number of folds of a cross-validation.
         rows: number of rows of a test set.
-        rows_not_predicted: number of rows that are left out of both, because the model has no prediction there.
+        rows_not_predicted: number of rows that are not compared, because the model has no prediction for them.
         nominal: errors without the correction, with base and tool as fitted.
         corrected: errors with the correction.
     """
@@ -179,7 +179,7 @@ class ComparisonFigures(Section):
 
     @property
     def models(self) -> dict[str, ErrorFigures]:
-        """The errors of both by name."""
+        """Errors of the nominal and the corrected model, by name."""
         return {"nominal": self.nominal, "corrected": self.corrected}
 
     @property
@@ -194,7 +194,7 @@ class ComparisonFigures(Section):
 
     @property
     def increased_maxima(self) -> tuple[str, ...]:
-        """The quantities whose largest error the correction increases visibly."""
+        """Quantities whose largest error the correction increases by more than rounding."""
         nominal, corrected = self.nominal.figures_by_name, self.corrected.figures_by_name
         return tuple(
             name
@@ -205,7 +205,7 @@ class ComparisonFigures(Section):
 
     @property
     def recommendation(self) -> Recommendation:
-        """Whether to use the correction."""
+        """Recommendation about the use of the correction."""
         effects = self.effects.values()
         if "lowers" not in effects:
             return "do not use it"
@@ -233,7 +233,7 @@ class TrainingSummary(AbstractSummary):
         rows: numbers of rows.
         joints: errors of every corrected joint.
         cross_validation: pose errors of held-out rows, for measured data.
-        verdict: effect of the correction on them, as a sentence.
+        verdict: effect of the correction on held-out rows, as a sentence.
         test: pose errors of the rows that the file marks as test.
     """
 
@@ -252,7 +252,7 @@ def summarise_training(
     validation: ComparisonFigures | None = None,
     test: ComparisonFigures | None = None,
 ) -> TrainingSummary:
-    """Gather the figures of a training.
+    """Return the figures of a training.
 
     Args:
         run: result of the training.
@@ -295,7 +295,7 @@ def _effect(before: float, after: float) -> Effect:
 
 
 def _rise(before: float, after: float, unit: str) -> str:
-    """Write that the largest error increases, if it does to the digits shown; else nothing."""
+    """Return a clause that the largest error increases, or "" if it does not within the digits shown."""
     texts = f"{before:.3f}", f"{after:.3f}"
     rises = after > before and texts[0] != texts[1]
     return f"the largest rises from {texts[0]} to {texts[1]} {unit}" if rises else ""

@@ -20,7 +20,7 @@ class ErrorFigures(Section):
 
     @property
     def figures_by_name(self) -> dict[str, float]:
-        """The figures that are set, by name."""
+        """Figures that are set, by name."""
         return self.model_dump(exclude_unset=True)
 
 
@@ -34,7 +34,7 @@ class DistanceFigures(Section):
 class StatedDistance(Section):
     """A stated distance between two sockets [mm], and its errors under calibrations that do not use it [mm].
 
-    Errors are predicted minus stated; for several repeats of a cross-validation, their mean.
+    Errors are predicted minus stated distances, averaged over several repeats of a cross-validation.
     """
 
     sockets: tuple[str, str]
@@ -46,7 +46,7 @@ class SocketDistances(Section):
     """Errors of `count` stated distances between sockets under calibrations that do not use them.
 
     Attributes:
-        each: the single distances.
+        each: the individual distances.
     """
 
     count: int
@@ -57,7 +57,7 @@ class SocketDistances(Section):
 
     @property
     def models(self) -> dict[str, DistanceFigures]:
-        """The calibrations that have figures, by name."""
+        """Figures of the calibrations that have any, by name."""
         return {name: figures for name in MODELS if (figures := getattr(self, name)) is not None}
 
 
@@ -72,7 +72,7 @@ class AbstractValidationFigures(Section):
         geometric: errors of the geometric calibration.
         hybrid: errors of geometry and joint correction.
         coverage: share of the held-out coordinates within the 95 % intervals that the hybrid predicts.
-        predicted_rms_mm: RMS of the position errors that it predicts [mm].
+        predicted_rms_mm: RMS of the position errors that the hybrid predicts [mm].
         socket_distance: errors of stated distances between sockets that were held out.
         frames_fitted: number of frames that were held out completely; their bases were fitted to the held-out rows.
         sockets_held_out: number of sockets that were held out completely.
@@ -94,17 +94,17 @@ class AbstractValidationFigures(Section):
 
     @property
     def models(self) -> dict[str, ErrorFigures]:
-        """The calibrations that were judged, by name."""
+        """Figures of the calibrations that were judged, by name."""
         return {name: figures for name in MODELS if (figures := getattr(self, name)) is not None}
 
 
 class ValidationFigures(AbstractValidationFigures):
-    """See `AbstractValidationFigures`.
+    """Errors of held-out rows under several calibrations, also of simulations; see `AbstractValidationFigures`.
 
     Attributes:
         rows: number of held-out rows with a length, counted once for all repeats.
         rms_mm_of_simulations: RMS position error in each of several simulations by calibration [mm].
-        mean_rms_mm: mean of these by calibration [mm].
+        mean_rms_mm: mean of `rms_mm_of_simulations` by calibration [mm].
     """
 
     rows: int

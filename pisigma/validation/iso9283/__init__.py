@@ -1,5 +1,5 @@
 """Performance criteria of ISO 9283:1998: poses, distances, drift, paths, and the cube to measure them in.
 
-Tensors are `(*batch, n, 3)`: n repeats of a command, with positions x, y, z [m] or angles a, b, c [rad]. The angles can
-be any three that are small or unique: roll, pitch and yaw, or the components of a rotation vector.
+Tensors are `(*batch, n, 3)`: n repeats of a command, with positions x, y, z [m] or angles a, b, c [rad]. Any three
+angles that are small or unique can be used: roll, pitch and yaw, or the components of a rotation vector.
 """

@@ -16,11 +16,12 @@ PLANES = {
     "C3-C4-C5-C6": (2, 3, 4, 5),
     "C4-C1-C6-C7": (3, 0, 5, 6),
 }
-"""Diagonal planes of the cube by their corners (ISO 9283:1998, 6.8). C1 to C4 go around the upper face, C5 to C8 are
-below them; a plane's third corner is opposite its first, and its fourth opposite its second."""
+"""Corners of the diagonal planes of the cube (ISO 9283:1998, 6.8). C1 to C4 are around the upper face, C5 to C8
+below them; the third corner of a plane is opposite the first, and the fourth opposite the second."""
 
 FROM_THE_ENDS = (0.08, 0.12)
-"""Distance of P2 to P5 from the ends of the diagonals, (10 ± 2) % of their length (ISO 9283:1998, 6.8)."""
+"""Smallest and largest distance of P2 to P5 from the ends of the diagonals, (10 ± 2) % of their length (ISO
+9283:1998, 6.8)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +38,7 @@ class IsoCube:
 
     @property
     def corners(self) -> Float64[Tensor, "8 3"]:
-        """C1 to C8 [m]: the upper face starting at (+x, +y), counterclockwise about z, then the lower one."""
+        """C1 to C8 [m]: the upper face starting at (+x, +y), counterclockwise about z, then the lower face."""
         around = torch.tensor([[1, 1], [-1, 1], [-1, -1], [1, -1]], dtype=torch.float64)
         upper = torch.cat([around, torch.ones(4, 1, dtype=torch.float64)], 1)
         lower = torch.cat([around, -torch.ones(4, 1, dtype=torch.float64)], 1)
@@ -51,7 +52,7 @@ class IsoCube:
 
         Args:
             plane: one of `PLANES`.
-            share: distance from the end of the diagonal over its length, 0.08 to 0.12.
+            share: distance from the end of the diagonal, divided by its length, 0.08 to 0.12.
 
         Raises:
             MeasurementError: the plane is unknown, or the standard does not allow the share.
@@ -80,10 +81,11 @@ def largest_cube(
     nearest to the middle of the region is returned.
 
     Args:
-        reaches: returns which positions in the base frame [m] are reachable with the orientation under test.
+        reaches: function that returns whether positions in the base frame [m] are reachable with the tested
+            orientation.
         low: lowest corner of the region to search [m].
-        high: highest corner of it [m].
-        spacing: spacing of the grid [m]; the edge of the cube is a multiple of it.
+        high: highest corner of the region to search [m].
+        spacing: spacing of the grid [m]; the edge of the cube is a multiple of the spacing.
 
     Raises:
         MeasurementError: not even a cube with an edge of `spacing` is within the workspace.
@@ -114,7 +116,7 @@ def largest_cube(
 
 
 def _full(held: Tensor, cells: int) -> Tensor:
-    """Return where a cube of `cells` cells with only reachable grid points starts; `held` is the cumulative count."""
+    """Return the start of cubes of `cells` cells with only reachable grid points; `held` is the cumulative count."""
     k = cells + 1
     sums = held
     for axis in range(3):

@@ -16,7 +16,7 @@ class DistanceRepeatability:
 
     Attributes:
         length: spread of the distance [m].
-        axes: spread of its components along x, y, z [m].
+        axes: spread of the components of the distance along x, y, z [m].
     """
 
     length: Float[Tensor, "*batch"]
@@ -36,9 +36,9 @@ def distance_accuracy(
 
     Args:
         attained_first: positions of the n repeats at the first pose [m].
-        attained_second: the same at the second pose.
+        attained_second: positions of the n repeats at the second pose [m].
         command_first: commanded position of the first pose [m].
-        command_second: the same for the second pose.
+        command_second: commanded position of the second pose [m].
     """
     commanded = command_first - command_second
     length, axes = _distances(attained_first, attained_second)
@@ -52,7 +52,7 @@ def distance_repeatability(
 ) -> DistanceRepeatability:
     """Compute the positioning distance repeatability RD and RD_x, RD_y, RD_z [m] (ISO 9283:1998, 7.3.3).
 
-    `RD = ± 3 √(Σ (D_j - D̄)² / (n - 1))`, and the same for the components `D_xj` along an axis.
+    `RD = ± 3 √(Σ (D_j - D̄)² / (n - 1))`, likewise for the components `D_xj` along an axis.
 
     Raises:
         MeasurementError: there is only one repeat.

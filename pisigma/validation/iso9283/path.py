@@ -1,4 +1,4 @@
-"""Path accuracy AT and path repeatability RT, and measured paths at the points of the commanded one."""
+"""Path accuracy AT and path repeatability RT, and measured paths at the points of the commanded path."""
 
 from dataclasses import dataclass
 
@@ -16,7 +16,7 @@ from pisigma.validation.iso9283.pose import (
 )
 
 _CROSSINGS = 2**21
-"""Pairs of a command point and a segment of a measured path that are in memory at a time."""
+"""Number of pairs of a command point and a segment of a measured path that are in memory at a time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,8 +24,8 @@ class PathPoints:
     """Measured paths at the planes normal to the commanded path.
 
     Attributes:
-        position: position of every path at every point of the commanded one [m].
-        angles: the same for the angles [rad], or None.
+        position: position of every measured path at every point of the commanded path [m].
+        angles: angles of every measured path at these points [rad], or None.
     """
 
     position: Float[Tensor, "n points 3"]
@@ -69,8 +69,7 @@ def resample_paths(
         measured: samples of n repeats of the path [m]; shorter paths end with NaN.
         command: points of the commanded path [m], in the order in which they are passed.
         angles: angles of the samples [rad].
-        tangents: directions of the command at its points if they are not those of `path_tangents`, for example at
-            corners.
+        tangents: directions of the command at its points, if they differ from `path_tangents`, for example at corners.
 
     Raises:
         MeasurementError: a path does not cross a plane; it must start before the first point and end after the last.
@@ -136,7 +135,7 @@ def _crossings(
     tangents: Float[Tensor, "some 3"],
     first: int,
 ) -> tuple[Tensor, Tensor]:
-    """Find per path and command point the segment that crosses its plane, and the position on it (0 to 1)."""
+    """Return for every path and command point the segment that crosses the plane, and the position on it (0 to 1)."""
     off = measured[:, None] - command[:, None]
     ahead = (off * tangents[:, None]).sum(-1)
     before, behind = ahead[..., :-1], ahead[..., 1:]

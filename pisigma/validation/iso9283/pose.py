@@ -117,7 +117,7 @@ def accuracy_drift(accuracy: Float[Tensor, "times *kinds"]) -> Float[Tensor, "ti
             `(times, n, 3)`.
 
     Returns:
-        The drift up to every time; the first is 0, and the last is that of the standard.
+        The drift up to every time; the first is 0, and the last is the drift of the standard.
     """
     return (accuracy[:1] - accuracy).abs()
 
@@ -129,7 +129,7 @@ def repeatability_drift(repeatability: Float[Tensor, "times *kinds"]) -> Float[T
         repeatability: RP at every time, of positions [m] or of angles [rad].
 
     Returns:
-        The drift up to every time, > 0 if the repeatability has improved; the last is that of the standard.
+        The drift up to every time, > 0 if the repeatability has improved; the last is the drift of the standard.
     """
     return repeatability[:1] - repeatability
 
@@ -139,13 +139,14 @@ def angular_deviations(
 ) -> Float[Tensor, "*batch n 3"]:
     """Compute the angles a, b, c [rad] about the frame's x, y and z between attained and commanded rotations.
 
-    They are the rotation vector of `R_j R_c^T`, which has no singular orientation; the commanded angles are then 0.
+    The angles are the rotation vector of `R_j R_c^T`, which has no singular orientation; the commanded angles are
+    then 0.
     """
     return rotation_vector(attained @ command[..., None, :, :].mT)
 
 
 def barycentre(attained: Float[Tensor, "*batch n 3"]) -> Float[Tensor, "*batch 3"]:
-    """Compute the mean attained position [m], relative to the first one so that no digits are lost."""
+    """Compute the mean attained position [m], relative to the first position so that no digits are lost."""
     first = attained[..., :1, :]
     return first[..., 0, :] + (attained - first).mean(-2)
 

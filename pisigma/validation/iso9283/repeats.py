@@ -1,4 +1,4 @@
-"""Pose accuracy and repeatability of the poses that were measured more than once, as in rows of a session."""
+"""Pose accuracy and repeatability of poses that were measured more than once, for example in a session."""
 
 import math
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ from pisigma.measurement.groups import groups_of_equal_joints, numbers_of_names
 from pisigma.validation.iso9283.pose import barycentre, position_accuracy, position_repeatability
 
 CYCLES = 30
-"""Number of repeats of a pose that ISO 9283:1998 asks for."""
+"""Number of repeats of a pose that ISO 9283:1998 requires."""
 MIN_CYCLES = 10
 """Number of repeats below which RP is not computed, because the spread of few distances is far too small."""
 
@@ -26,7 +26,7 @@ class RepeatedPose:
     Attributes:
         rows: number of measurements of the pose.
         accuracy: pose accuracy AP_P [m]: distance from the commanded position, which the model predicts, to the
-            barycentre of the measured ones; None if the frame of the rows is not one of the model.
+            barycentre of the measured positions; None if the model does not have the frame of the rows.
         repeatability: pose repeatability RP_l [m]; None with fewer than `MIN_CYCLES` measurements.
         squares: sum of the squared distances from the barycentre [m²].
     """
@@ -37,16 +37,16 @@ class RepeatedPose:
     squares: float
 
     def to_json(self) -> dict[str, Any]:
-        """Return plain values, lengths in mm."""
+        """Return the figures as plain values, with lengths in mm."""
         ap, rp = (None if value is None else value * 1e3 for value in (self.accuracy, self.repeatability))
         return {"rows": self.rows, "ap_mm": ap, "rp_mm": rp}
 
 
 def pooled_deviation(poses: Sequence[RepeatedPose]) -> tuple[float, int] | None:
-    """Pool the scatter of a coordinate over poses that were measured more than once.
+    """Return the pooled scatter of a coordinate over poses that were measured more than once.
 
-    `s² = Σ_poses Σ_j |x_j - x̄|² / (3 Σ_poses (n - 1))`, with `3 Σ (n - 1)` degrees of freedom; it contains the noise of
-    the instrument.
+    `s² = Σ_poses Σ_j |x_j - x̄|² / (3 Σ_poses (n - 1))`, with `3 Σ (n - 1)` degrees of freedom; s contains the noise
+    of the instrument.
 
     Returns:
         The standard deviation of a coordinate [m] and its degrees of freedom; None without repeats.
@@ -58,7 +58,7 @@ def pooled_deviation(poses: Sequence[RepeatedPose]) -> tuple[float, int] | None:
 def repeated_poses(
     rows: Measurements, commanded: Float64[Tensor, "rows 3"] | None
 ) -> tuple[RepeatedPose, ...]:
-    """Compute AP_P of every pose with two or more measured positions, and RP_l of those with `MIN_CYCLES` or more.
+    """Compute AP_P of poses with two or more measured positions, and RP_l of poses with `MIN_CYCLES` or more.
 
     Args:
         rows: measured rows; rows of one pose have equal joint values, frames and targets.

@@ -1,1 +1,1 @@
-"""Figures of a calibration report: what the pages of `pisigma.reporting` render."""
+"""Figures of a calibration report, which the pages of `pisigma.reporting` render."""

@@ -1,4 +1,4 @@
-"""Accuracy of a model before and after calibration, on every set of rows with known errors, and what limits it."""
+"""Accuracy before and after calibration, on every set of rows with known errors, and what limits it."""
 
 import math
 from collections.abc import Mapping
@@ -15,15 +15,15 @@ from pisigma.validation.held_out.training_summary import BeforeAfter, TrainingSu
 from pisigma.validation.held_out.validation_figures import ErrorFigures, ValidationFigures
 
 MODELS = ("nominal", "geometric", "hybrid", "corrected", "full", "distilled")
-"""Names of the models in the order of the tables."""
+"""Names of the models, in the order of the tables."""
 DOMINANT_SHARE = 0.8
 """Share of the squared error above which measurement scatter limits the accuracy."""
 _JOINT_ROWS = (("held_out", True), ("training", False))
 
 RowOrigin = Literal["file", "training", "test", "cross_validation", "simulation", "poses"]
-"""Origin of the rows that errors belong to.
+"""Origin of the rows to which errors belong.
 
-"file": rows of a file that the model was not calibrated with. "training": rows that it was calibrated with. "test":
+"file": rows of a file with which the model was not calibrated. "training": rows with which it was calibrated. "test":
 rows that its file marks as test. "cross_validation": rows held out in k-fold cross-validation, or once.
 "simulation": other rows of a simulation. "poses": poses of a region, on which a distilled model was compared with its
 parent.
@@ -35,11 +35,11 @@ class Accuracy:
     """Errors of a set of rows under several models.
 
     Attributes:
-        origin: which rows these are.
+        origin: origin of the rows.
         rows: number of rows.
         models: error figures by the name of the model, "nominal" first; the last is the model of the report.
-        source: file of the rows; of "poses" the name of the parent model, whose poses the errors refer to.
-        validation: figures of the cross-validation, with its folds and repeats; None of other rows.
+        source: file of the rows; for "poses" the name of the parent model, to whose poses the errors refer.
+        validation: figures of the cross-validation, with its folds and repeats; None for other rows.
     """
 
     origin: RowOrigin
@@ -55,7 +55,7 @@ class Accuracy:
 
     @property
     def unit(self) -> str:
-        """Unit of the leading quantity: "mm" of positions, "deg" of orientations where no position was measured."""
+        """Unit of the leading quantity: "mm" for positions, "deg" for orientations if no position was measured."""
         return "deg" if self.model_figures.rms_mm is None else "mm"
 
     @property
@@ -74,7 +74,7 @@ class Accuracy:
 
     @property
     def improvement_factor(self) -> float | None:
-        """RMS error of the nominal robot over that of the model; None without a nominal robot."""
+        """Ratio of the RMS errors of the nominal robot and of the model; None without a nominal robot."""
         if "nominal" not in self.models or len(self.models) < 2 or not self.figure("rms") > 0:
             return None
         return self.figure("rms", "nominal") / self.figure("rms")
@@ -83,9 +83,10 @@ class Accuracy:
 def accuracies(
     model: CalibratedModel, summary: CalibrationSummary | None, rows: JudgedRows | None
 ) -> tuple[Accuracy, ...]:
-    """Collect the error figures of a model, the most meaningful first.
+    """Return the error figures of a model, most meaningful first.
 
-    Rows of another file come first, then the held-out rows of the model, and rows that it was calibrated with last.
+    Rows of another file come first, then the held-out rows of the model, and last the rows with which it was
+    calibrated.
     """
     kept = _of_distilled(model) if model.kind == "distilled" else _of_metrics(model, summary)
     if rows is None or rows.origin == "held_out":
@@ -95,7 +96,7 @@ def accuracies(
 
 
 def figures_of(errors: PoseErrors) -> ErrorFigures:
-    """Compute the statistics of position errors [mm] and orientation errors [deg], where there are any."""
+    """Compute the statistics of position errors [mm] and orientation errors [deg], as far as there are any."""
     figures: dict[str, float] = {}
     for values, unit, factor in ((errors.position, "mm", 1e3), (errors.rotation, "deg", 180 / torch.pi)):
         if values is not None and bool(torch.isfinite(values).any()):
@@ -110,7 +111,7 @@ def _of_rows(rows: JudgedRows) -> Accuracy:
 
 
 def _of_metrics(model: CalibratedModel, summary: CalibrationSummary | None) -> list[Accuracy]:
-    """Read the figures of held-out rows that a model folder keeps."""
+    """Return the figures of held-out rows that a model folder stores."""
     origins: dict[str, RowOrigin] = {
         "test": "test",
         "cross_validation": "cross_validation",
@@ -126,7 +127,7 @@ def _of_metrics(model: CalibratedModel, summary: CalibrationSummary | None) -> l
 
 
 def _of_distilled(model: CalibratedModel) -> list[Accuracy]:
-    """Read the errors of a distilled model against the poses of its parent."""
+    """Return the errors of a distilled model relative to the poses of its parent."""
     models, parent = _models(model.metrics.get("held_out")), str(model.metrics["parent"]["name"])
     rows = int(model.metrics["poses"]["held_out"])
     return [Accuracy("poses", rows, models, parent)] if models else []
@@ -141,7 +142,7 @@ def _models(figures: object) -> dict[str, ErrorFigures]:
 
 @dataclass(frozen=True)
 class JudgedJoint:
-    """Errors of one joint of a network on a set of rows.
+    """Errors of a joint under a network on a set of rows.
 
     Attributes:
         name: name of the joint.
@@ -160,7 +161,7 @@ class JudgedJoint:
 
 
 def judged_joints(model: CalibratedModel) -> tuple[JudgedJoint, ...]:
-    """Read the joint errors of a network, held-out rows first; empty for models without a network."""
+    """Return the joint errors of a network, held-out rows first; empty for models without a network."""
     summary = TrainingSummary.read(model)
     joints = () if summary is None else summary.joints
     rows = ((joint.name, held_out, getattr(joint, key)) for joint in joints for key, held_out in _JOINT_ROWS)
@@ -172,13 +173,13 @@ class AccuracyLimit:
     """Contribution of measurement scatter to the error.
 
     Attributes:
-        noise: RMS length of the scatter of a measured position [mm]; None if it is not known.
-        source: where `noise` comes from: "repeats" of joint values in the rows, or the "hybrid" calibration.
-        error: RMS length of the position error [mm]; 0 where no position was judged.
+        noise: RMS length of the scatter of a measured position [mm]; None if unknown.
+        source: source of `noise`: "repeats" of joint values in the rows, or the "hybrid" calibration.
+        error: RMS length of the position error [mm]; 0 if no position was judged.
         residual_sigma: standard deviation of the residuals of the geometric calibration per coordinate [mm]; None
             without one.
-        of_parent: whether the model approximates another one, whose errors add to its own.
-        limitations: limitations that the model states in that case, one sentence each.
+        of_parent: whether the model approximates another model, whose errors add to its errors.
+        limitations: limitations that such a model states, one sentence each.
     """
 
     noise: float | None = None
@@ -190,7 +191,7 @@ class AccuracyLimit:
 
     @property
     def scatter_share(self) -> float | None:
-        """Share of the scatter in the squared error; None if it is unknown or the scatter exceeds the error."""
+        """Share of the squared error that is scatter; None if it is unknown or the scatter exceeds the error."""
         return None if self.noise is None or self.noise >= self.error else (self.noise / self.error) ** 2
 
     @property
@@ -223,7 +224,7 @@ def limit_of(
 def identified_scatter(summary: CalibrationSummary | None) -> float | None:
     """Return the standard deviation of a coordinate of measured positions that a hybrid identified [mm].
 
-    None of a geometric calibration, whose residuals contain what geometry cannot express as well as noise.
+    None for a geometric calibration, whose residuals contain errors that geometry cannot express in addition to noise.
     """
     if summary is None or summary.hybrid is None or summary.hybrid.learned is None:
         return None

@@ -1,4 +1,4 @@
-"""Curves of the learned joint correction, and correlations of the geometric parameters that a model folder keeps."""
+"""Curves of the learned joint correction, and correlations of the geometric parameters that a model folder stores."""
 
 import csv
 import io
@@ -18,13 +18,13 @@ from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.kinematics.tolerances import MEASURED_ROUNDING
 
 POINTS_PER_CURVE = 1_500
-"""Enough for 13 points to a period of the 110th harmonic over a whole revolution."""
+"""Number of points of a curve: 13 points per period of the 110th harmonic over a revolution."""
 ROWS_PER_CHUNK = 4_096
-"""Rows that the correction is computed for at once, to bound memory."""
+"""Number of rows for which the correction is computed at a time, to limit the memory."""
 STRONG_CORRELATION = 0.9
-"""Absolute correlation above which a pair of parameters is named."""
+"""Absolute correlation above which a pair of parameters is listed."""
 MAX_PAIRS = 12
-"""Pairs that are named."""
+"""Largest number of pairs that are listed."""
 JOINT_UNITS = {
     "revolute": ("deg", math.degrees(1.0), "mdeg", math.degrees(1e3)),
     "prismatic": ("mm", 1e3, "µm", 1e6),
@@ -40,8 +40,8 @@ class ParameterCorrelations:
     """Correlations of the columns of the identification Jacobian.
 
     Attributes:
-        tables: names and matrix of lengths and of angles; empty if the folder does not keep them.
-        pairs: two strongly correlated parameters and their correlation each, the strongest first.
+        tables: names and matrix of lengths and of angles; empty if the folder does not store them.
+        pairs: pairs of strongly correlated parameters with their correlation, strongest first.
     """
 
     tables: tuple[Correlations, ...]
@@ -49,13 +49,13 @@ class ParameterCorrelations:
 
 
 def parameter_correlations(folder: Path) -> ParameterCorrelations:
-    """Read the correlations that a model folder keeps."""
+    """Return the correlations that a model folder stores."""
     tables = read_correlations(folder / CORRELATION_CSV)
     return ParameterCorrelations(tables, _pairs(tables))
 
 
 def read_correlations(path: Path) -> tuple[Correlations, ...]:
-    """Read the correlations of lengths and of angles; empty if there is no such file or it has another form."""
+    """Return the correlations of lengths and of angles; empty if the file is missing or has another form."""
     if not path.is_file():
         return ()
     kinds: dict[str, dict[tuple[str, str], float]] = {"lengths": {}, "angles": {}}
@@ -75,7 +75,7 @@ def read_correlations(path: Path) -> tuple[Correlations, ...]:
 
 
 def _pairs(tables: tuple[Correlations, ...]) -> tuple[tuple[str, str, float], ...]:
-    """List strongly correlated parameters, the strongest first."""
+    """Return pairs of strongly correlated parameters, strongest first."""
     strong = [
         (name, names[k], float(values[i, k]))
         for names, values in tables
@@ -88,16 +88,16 @@ def _pairs(tables: tuple[Correlations, ...]) -> tuple[tuple[str, str, float], ..
 
 @dataclass(frozen=True, eq=False)
 class CorrectionCurve:
-    """Learned correction of one joint over its value, the other joints at their values in a measured row.
+    """Learned correction of a joint over its value, with the other joints at the values of a measured row.
 
     Attributes:
         joint: name of the joint.
-        unit: unit of its values, "deg" or "mm".
-        small_unit: unit of its correction, "mdeg" or "µm".
+        unit: unit of the joint values, "deg" or "mm".
+        small_unit: unit of the correction, "mdeg" or "µm".
         values: joint values [`unit`].
         correction: correction at these values [`small_unit`].
         measured: whether each value was measured for the calibration.
-        dots: corrections at the measured rows that the model keeps [`small_unit`].
+        dots: corrections at the measured rows that the model stores [`small_unit`].
         dot_values: joint values of these rows [`unit`].
     """
 
@@ -122,7 +122,7 @@ class CorrectionCurve:
 
     @property
     def measured_range(self) -> tuple[float, float] | None:
-        """Lowest and highest measured value [`unit`]; None if all of the curve was measured, or nothing."""
+        """Lowest and highest measured value [`unit`]; None if the whole curve or nothing was measured."""
         inside = self.values[self.measured]
         low, high = inside.min(initial=math.inf), inside.max(initial=-math.inf)
         return (float(low), float(high)) if not self.measured.all() and high > low else None
@@ -131,7 +131,7 @@ class CorrectionCurve:
 def correction_curves(model: CalibratedModel) -> tuple[CorrectionCurve, ...]:
     """Compute the curves of all corrected joints; empty for a model without a learned correction.
 
-    The other joints have the values of the kept row that is nearest to the median of all.
+    The other joints have the values of the stored row that is nearest to the median of all rows.
     """
     robot, hybrid, q = model.robot, model.hybrid, model.starts
     if (hybrid is None and model.network is None) or not len(q):

@@ -15,7 +15,7 @@ from pisigma.validation.held_out.judged_rows import JudgedRows
 from pisigma.validation.held_out.rank_tests import SIGNIFICANT, groups_differ, rank_correlation
 
 NOTABLE_RATIO = 1.25
-"""Ratio of the largest to the smallest RMS error of bins below which a dependence is called small."""
+"""Ratio of the largest to the smallest RMS error of bins below which a dependence is small."""
 ORDERED = 0.3
 """Rank correlation of a joint with the order of the rows above which time and position are hard to separate."""
 MAX_BINS = 12
@@ -23,23 +23,23 @@ MAX_BINS = 12
 MIN_ROWS = 8
 """Smallest number of rows of a region or a bin."""
 MIN_ROWS_OF_RMS = 3
-"""Smallest number of rows that the RMS error of a bin is computed from."""
+"""Smallest number of rows from which the RMS error of a bin is computed."""
 _DEGREES = math.degrees(1.0)
 _UNITS = {"kg": "kg", "c": "°C"}
 
 Untested = Literal["joint not moved", "too few rows"]
-"""Why a dependence on a joint was not tested."""
+"""Reason why a dependence on a joint was not tested."""
 
 
 @dataclass(frozen=True)
 class BinTest:
-    """Test of Kruskal and Wallis whether errors differ between bins of a joint's values.
+    """Result of the Kruskal-Wallis test of differences of errors between bins of a joint's values.
 
     Attributes:
         p: probability of such differences by chance.
         low: smallest RMS error of a bin.
         high: largest RMS error of a bin, in the unit of the errors.
-        edges: joint values between which the bin with the largest RMS error extends, in the unit of the joint.
+        edges: joint values that bound the bin with the largest RMS error, in the unit of the joint.
     """
 
     p: float
@@ -49,7 +49,7 @@ class BinTest:
 
     @property
     def significant(self) -> bool:
-        """Whether the differences are more than chance."""
+        """Whether the differences are statistically significant."""
         return self.p < SIGNIFICANT
 
     @property
@@ -63,15 +63,15 @@ class OrderTest:
     """Rank correlation (Spearman) of the error with the order of the rows.
 
     Attributes:
-        component: "x", "y" or "z" of the signed error with the largest correlation; "length" where signs are unknown.
+        component: "x", "y" or "z" of the signed error with the largest correlation; "length" if signs are unknown.
         correlation: rank correlation with the order.
-        p: its two-sided probability by chance.
-        change: mean error of the last tenth of the rows minus that of the first, in the unit of the errors; 0 where
-            the correlation is not significant.
+        p: two-sided probability of such a correlation by chance.
+        change: mean error of the last tenth of the rows minus that of the first, in the unit of the errors; 0 if the
+            correlation is not significant.
         ordered_joint: number of the joint, from 1, whose values follow the order of the rows, so that order and
-            position cannot be separated; None if none does.
+            position cannot be separated; None if there is no such joint.
         joint_correlation: absolute rank correlation of that joint with the order.
-        of_training: whether signed errors are residuals of rows that the model was calibrated with.
+        of_training: whether signed errors are residuals of rows with which the model was calibrated.
     """
 
     component: Literal["x", "y", "z", "length"]
@@ -84,7 +84,7 @@ class OrderTest:
 
     @property
     def significant(self) -> bool:
-        """Whether the correlation is more than chance."""
+        """Whether the correlation is statistically significant."""
         return self.p < SIGNIFICANT
 
 
@@ -96,7 +96,7 @@ class ConditionTest:
         low: smallest stated value.
         high: largest stated value.
         correlation: rank correlation.
-        p: its two-sided probability by chance.
+        p: two-sided probability of such a correlation by chance.
     """
 
     low: float
@@ -106,13 +106,13 @@ class ConditionTest:
 
     @property
     def significant(self) -> bool:
-        """Whether the correlation is more than chance."""
+        """Whether the correlation is statistically significant."""
         return self.p < SIGNIFICANT
 
 
 @dataclass(frozen=True, eq=False)
 class Dependence:
-    """Errors over one quantity.
+    """Errors as a function of a quantity, with a test of dependence.
 
     Attributes:
         key: key of the quantity, for file names.
@@ -121,7 +121,7 @@ class Dependence:
         values: values of the quantity, one per row.
         errors: lengths "before" and "after" per row, or signed components "x", "y" and "z".
         error_unit: "mm" or "deg".
-        test: whether the errors depend on the quantity.
+        test: result of the test of dependence on the quantity.
     """
 
     key: str
@@ -157,7 +157,7 @@ class ErrorsByName:
     """Errors per frame or per target.
 
     Attributes:
-        names: errors of each; empty if there is one only.
+        names: errors of every frame or target; empty if there is only one.
         unit: "mm" or "deg", of the RMS errors.
         p: probability of such differences by chance (Kruskal and Wallis).
     """
@@ -168,12 +168,12 @@ class ErrorsByName:
 
     @property
     def significant(self) -> bool:
-        """Whether the differences are more than chance."""
+        """Whether the differences are statistically significant."""
         return self.p < SIGNIFICANT
 
     @property
     def largest(self) -> NameErrors | None:
-        """The frame or target with the largest RMS error under the model; None if none has rows."""
+        """Frame or target with the largest RMS error under the model; None if there are no rows."""
         return max((one for one in self.names if one.rows), key=lambda one: one.after, default=None)
 
 
@@ -193,7 +193,7 @@ class BinnedErrors:
 
 
 def error_lengths(rows: JudgedRows) -> tuple[Float64[np.ndarray, " rows"], Float64[np.ndarray, " rows"], str]:
-    """Return errors before and after, and their unit: positions in mm; orientations in deg where none was measured."""
+    """Return errors before and after, and their unit: positions in mm, otherwise orientations in deg."""
     if bool(np.isfinite(rows.after.position.numpy()).any()) or rows.after.rotation is None:
         return rows.before.position.numpy() * 1e3, rows.after.position.numpy() * 1e3, "mm"
     before = rows.before.rotation
@@ -202,11 +202,11 @@ def error_lengths(rows: JudgedRows) -> tuple[Float64[np.ndarray, " rows"], Float
 
 
 def dependences(rows: JudgedRows, robot: Robot) -> tuple[Dependence, ...]:
-    """Test errors against every joint's value, the order of the rows, and payload and temperature where they vary.
+    """Test the dependence of errors on joint values, order of the rows, and varying payload and temperature.
 
     Args:
         rows: rows with their errors.
-        robot: robot whose joints these are.
+        robot: robot that was measured.
     """
     before, after, unit = error_lengths(rows)
     judged = np.isfinite(after)
@@ -232,7 +232,7 @@ def dependences(rows: JudgedRows, robot: Robot) -> tuple[Dependence, ...]:
 
 
 def group_errors_by_name(rows: JudgedRows, names: Sequence[str]) -> ErrorsByName:
-    """Compute errors per name, and test whether they differ; empty if there is one name only.
+    """Compute errors per name, and test whether they differ; empty if there is only one name.
 
     Args:
         rows: rows with their errors.
@@ -256,13 +256,13 @@ def group_errors_by_name(rows: JudgedRows, names: Sequence[str]) -> ErrorsByName
 
 
 def _over_joint(values: np.ndarray, errors: np.ndarray, groups: np.ndarray) -> BinTest | Untested:
-    """Test errors against a joint's values; rows of equal joint values count once."""
+    """Test the dependence of errors on a joint's values; rows of equal joint values count once."""
     if len(errors) < 3 or np.ptp(values) == 0:
         return "joint not moved"
     bins = bin_errors(values, errors)
     if np.isnan(bins.rms).all():
         return "too few rows"
-    # repeated rows are not independent: each joint configuration enters the test with its mean error
+    # repeated rows are not independent, so every joint configuration is tested with its mean error
     _, first, group = np.unique(groups, return_index=True, return_inverse=True)
     _, chance = groups_differ(bins.number[first], np.bincount(group, errors) / np.bincount(group))
     worst = int(np.nanargmax(bins.rms))
@@ -271,7 +271,7 @@ def _over_joint(values: np.ndarray, errors: np.ndarray, groups: np.ndarray) -> B
 
 
 def _over_order(rows: JudgedRows, errors: dict[str, np.ndarray], judged: np.ndarray, unit: str) -> Dependence:
-    """Test signed errors against the order of the rows; lengths where signs are unknown."""
+    """Test the dependence of signed errors, otherwise of their lengths, on the order of the rows."""
     number = np.arange(1.0, len(judged) + 1)[judged]
     residual = rows.residual.numpy()[judged] * 1e3
     signed = unit == "mm" and bool(np.isfinite(residual).all()) and len(residual) > 0
@@ -292,7 +292,7 @@ def _over_order(rows: JudgedRows, errors: dict[str, np.ndarray], judged: np.ndar
 
 
 def _ordered_joint(rows: JudgedRows) -> tuple[int | None, float]:
-    """Find the joint whose values follow the order of the rows most closely; None if none does."""
+    """Return the joint whose values follow the order of the rows most closely; None if there is no such joint."""
     q = rows.measurements.q.numpy()
     r = [abs(rank_correlation(np.arange(float(len(q))), values)[0]) for values in q.T]
     return (None, 0.0) if max(r) < ORDERED else (int(np.argmax(r)) + 1, max(r))

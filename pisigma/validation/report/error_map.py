@@ -1,4 +1,4 @@
-"""Where errors are largest: points of the three-dimensional error map, the worst row, and the worst region."""
+"""Points of the three-dimensional error map, the worst row, and the worst region."""
 
 import math
 from dataclasses import dataclass, replace
@@ -17,11 +17,11 @@ from pisigma.validation.held_out.rank_tests import SIGNIFICANT, groups_differ
 from pisigma.validation.report.dependence import MIN_ROWS, error_lengths, root_mean_square
 
 MAX_POINTS = 20_000
-"""Points of a map; of more rows the largest errors and an even selection of the others are shown."""
+"""Largest number of points of a map; of more rows, the largest errors and an even selection of the others are shown."""
 WORST_SHARE = 0.05
 """Share of `MAX_POINTS` that is reserved for the largest errors."""
 SAMPLES = 3_000
-"""Samples of the workspace, where no row was measured."""
+"""Number of samples of the workspace, if no rows were measured."""
 
 Quantity = Literal[
     "before", "after", "predicted", "before_deg", "after_deg", "correction", "distance", "turn"
@@ -36,7 +36,7 @@ tool. "distance" and "turn": distance and angle between the poses of two models.
 
 @dataclass(frozen=True, eq=False)
 class Layer:
-    """One quantity at every point of a map.
+    """A quantity at every point of a map.
 
     Attributes:
         key: the quantity.
@@ -51,12 +51,12 @@ class Layer:
 
 @dataclass(frozen=True, eq=False)
 class ErrorMap:
-    """Points in the robot's base frame with the quantities at each.
+    """Points in the robot's base frame, with quantities at every point.
 
     Attributes:
         place: position of the tool in the robot's base frame [mm].
         layers: quantities that can be shown, at least one.
-        row: number of every point's row: its line in the file, else its number from 1; 0 for samples.
+        row: line of every point's row in the file, otherwise its number from 1; 0 for samples.
         q: joint values [deg or mm].
         frame: frame of every point.
         target: target of every point.
@@ -81,7 +81,7 @@ class ErrorMap:
 
 
 def map_of_rows(model: CalibratedModel, rows: JudgedRows) -> ErrorMap:
-    """Map judged rows; of very many, those with the largest errors and an even selection of the others."""
+    """Return the map of judged rows; of very many, the largest errors and an even selection of the others."""
     before, after = rows.before, rows.after
     layers = _finite(
         _layer("before", before.position),
@@ -99,7 +99,7 @@ def map_of_rows(model: CalibratedModel, rows: JudgedRows) -> ErrorMap:
 
 
 def map_of_workspace(model: CalibratedModel) -> ErrorMap:
-    """Map the workspace without measurements: joint values that the model keeps, and random ones in their ranges."""
+    """Return a map of the workspace without measurements: stored joint values, and random ones in their ranges."""
     q = model.starts
     more = max(SAMPLES - len(q), 0) if len(q) else 0
     if more:
@@ -118,7 +118,7 @@ def map_of_workspace(model: CalibratedModel) -> ErrorMap:
 
 
 def _layer(key: Quantity, values: Float64[Tensor, " points"] | None, unit: str = "mm") -> Layer | None:
-    """Make a layer of values [m or rad]; None without values."""
+    """Return a layer of values given in [m or rad]; None without values."""
     factor = 1e3 if unit == "mm" else math.degrees(1.0)
     return None if values is None else Layer(key, unit, values.numpy() * factor)
 
@@ -129,7 +129,7 @@ def _finite(*layers: Layer | None) -> list[Layer]:
 
 
 def _chosen(layers: list[Layer], rows: int) -> Int64[Tensor, " chosen"]:
-    """Choose the rows that are shown, in their order."""
+    """Return the indices of the rows that are shown, in order."""
     if rows <= MAX_POINTS:
         return torch.arange(rows)
     worst = np.argsort(-np.nan_to_num(layers[min(1, len(layers) - 1)].values), kind="stable")
@@ -159,7 +159,7 @@ def _map(
 
 
 CELLS = 4
-"""Cells of the measured space along every axis."""
+"""Number of cells of the measured space along every axis."""
 
 
 @dataclass(frozen=True)
@@ -169,10 +169,10 @@ class Region:
     Attributes:
         low: lower corner [m].
         high: upper corner [m].
-        rows: number of rows in it.
-        rms: RMS of their errors, in the unit of the errors.
-        ratio: `rms` over the RMS error of all rows.
-        significant: whether errors in it are larger than elsewhere by more than chance.
+        rows: number of rows in the cell.
+        rms: RMS error of these rows, in the unit of the errors.
+        ratio: ratio of `rms` to the RMS error of all rows.
+        significant: whether errors in the cell are significantly larger than elsewhere.
     """
 
     low: tuple[float, ...]
@@ -189,8 +189,8 @@ class LargestErrors:
 
     Attributes:
         row: index of the row with the largest error.
-        error: its error [`unit`].
-        unit: "mm" of positions, "deg" of orientations.
+        error: largest error [`unit`].
+        unit: "mm" for positions, "deg" for orientations.
         position: position of the tool at that row in the robot's base frame [m].
         region: the worst region; None if there are too few rows to compare regions.
     """
@@ -224,7 +224,7 @@ def worst_region(place: Float64[np.ndarray, "rows 3"], errors: Float64[np.ndarra
         errors: lengths of the errors, all finite.
 
     Returns:
-        None if there are too few rows, or all are in one cell.
+        The cell; None if there are too few rows, or all are in one cell.
     """
     low, high = (place.min(0), place.max(0)) if len(place) else (np.zeros(3), np.zeros(3))
     width = np.where(high > low, (high - low) / CELLS, 1.0)
@@ -235,7 +235,7 @@ def worst_region(place: Float64[np.ndarray, "rows 3"], errors: Float64[np.ndarra
     cells = [(k, inside) for k, inside in cells if len(inside) >= least]
     if len(cells) < 2:
         return None
-    # compared one standard error lower, so that a cell of few rows is not the worst by luck
+    # compare one standard error lower, so that a cell of few rows is not the worst by chance
     worst, _ = max(cells, key=lambda one: root_mean_square(one[1]) * (1 - 1 / math.sqrt(len(one[1]))))
     inside = number == worst
     _, chance = groups_differ(inside.astype(int), errors)
@@ -247,5 +247,5 @@ def worst_region(place: Float64[np.ndarray, "rows 3"], errors: Float64[np.ndarra
         rows=int(inside.sum()),
         rms=rms,
         ratio=rms / root_mean_square(errors),
-        significant=chance < SIGNIFICANT / len(cells),  # Bonferroni: the worst of many cells
+        significant=chance < SIGNIFICANT / len(cells),  # Bonferroni's correction for the worst of many cells
     )

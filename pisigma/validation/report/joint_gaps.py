@@ -22,12 +22,12 @@ NOT_MOVED = 1e-3
 
 @dataclass(frozen=True)
 class JointGap:
-    """A joint whose range was measured in part only.
+    """A joint whose range was only partially measured.
 
     Attributes:
         joint: name of the joint.
         unit: "deg" or "mm", of all values.
-        measured: measured stretches of the range; the constant value where the joint was not moved.
+        measured: measured stretches of the range; the constant value if the joint was not moved.
         range: the whole range.
         share: share of the range that was measured.
         whole_turn: whether the range is one revolution.
@@ -48,13 +48,13 @@ class JointGap:
 
 @dataclass(frozen=True)
 class OutsideErrors:
-    """Errors of rows with joint values beyond those that the model was calibrated with.
+    """Errors of rows with joint values beyond the values with which the model was calibrated.
 
     Attributes:
-        outside: number of such rows.
+        outside: number of rows beyond the calibrated joint values.
         rows: number of all rows.
-        rms_outside: their RMS position error [mm]; None if it is not known.
-        rms_inside: RMS position error of the other rows [mm]; None if it is not known.
+        rms_outside: RMS position error of these rows [mm]; None if unknown.
+        rms_inside: RMS position error of the other rows [mm]; None if unknown.
     """
 
     outside: int
@@ -64,12 +64,12 @@ class OutsideErrors:
 
 
 def joint_gaps(model: CalibratedModel, rows: JudgedRows | None) -> tuple[JointGap, ...]:
-    """List the joints whose range was measured in part only.
+    """Return the joints whose range was only partially measured.
 
     Args:
         model: the model.
-        rows: judged rows, whose joint values are used unless they belong to another file; None for those that the model
-            keeps.
+        rows: judged rows, whose joint values are used unless they belong to another file; None for the joint values
+            that the model stores.
     """
     q = model.starts if rows is None or rows.origin == "other" else rows.measurements.q
     if not len(q):
@@ -96,7 +96,7 @@ def joint_gaps(model: CalibratedModel, rows: JudgedRows | None) -> tuple[JointGa
 
 
 def outside_errors(rows: JudgedRows | None) -> OutsideErrors | None:
-    """Compare rows beyond the measured joint values with the others; None if there are no such rows."""
+    """Return errors of rows beyond the measured joint values and of other rows; None if there are no such rows."""
     if rows is None or bool(rows.inside.all()):
         return None
     after = rows.after.position.numpy() * 1e3
@@ -110,11 +110,11 @@ def measured_intervals(
 ) -> list[tuple[list[Stretch], Stretch]]:
     """Return the measured stretches of every joint and its range [rad or m].
 
-    The range of a joint that can turn without end is one revolution, to which its stretches are wrapped.
+    The range of a joint without limits is one revolution, to which its measured stretches are wrapped.
 
     Args:
-        model: a hybrid keeps the stretches that it was calibrated with.
-        q: measured joint values, for models that keep none [rad or m].
+        model: a hybrid stores the stretches with which it was calibrated.
+        q: measured joint values [rad or m], for models that store none.
     """
     coverage = model.hybrid.coverage if model.hybrid else JointCoverage.from_joints(model.robot, q)
     result = []
@@ -127,7 +127,7 @@ def measured_intervals(
 
 
 def _in_range(ends: list[Stretch], limits: Stretch, turn: float | None) -> tuple[list[Stretch], Stretch]:
-    """Wrap stretches to one revolution of an endless joint, or clip them to the limits of another."""
+    """Return stretches wrapped to one revolution of a joint without limits, or clipped to the joint's limits."""
     low, high = limits
     if turn is not None and not high - low < turn - 1e-9:
         if any(b - a >= turn - 1e-9 for a, b in ends):

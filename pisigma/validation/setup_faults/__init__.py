@@ -1,1 +1,1 @@
-"""Faults of the setup or the file that explain large errors: hypotheses, how they are tried and reported."""
+"""Faults of the setup or the file that explain large errors: hypotheses, their trial and their report."""

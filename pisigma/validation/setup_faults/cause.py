@@ -1,4 +1,4 @@
-"""Causes of errors: what may be wrong with a setup or a file, one clause each."""
+"""Causes of errors: what may be wrong with a setup or a file."""
 
 import math
 from collections.abc import Iterable
@@ -7,14 +7,14 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Cause:
-    """One fault of the setup or the file.
+    """A fault of the setup or the file.
 
     Attributes:
         kind: "frame", "tool", "target", "position_unit", "rotation", "handedness", "rows", "joint_unit", "joint_order",
             "joint_sign", "joint_coupling", "joint_zero", "joint_values" or "correction".
         clause: what is wrong, such as "the sign of joint 3 is reversed".
-        advice: what it means or what to check.
-        size: complexity of the assumption, at least 1; among equally good explanations, the simplest is chosen.
+        advice: what the fault means or what to check.
+        size: complexity of the assumption, at least 1; of equally good explanations, the simplest is chosen.
         joints: indices of the joints concerned, from 0.
         moved: largest displacement of a joint zero [rad or m]; infinite for faults of other kinds.
         amount: displacement of a frame or tool [m]; for a wrong unit, the ratio of correct to stated values; the number
@@ -35,7 +35,7 @@ class Cause:
 
 
 def joints_text(joints: tuple[int, ...]) -> str:
-    """Write joint indices (from 0) as joint numbers (from 1)."""
+    """Return a text of joint numbers (from 1) for joint indices (from 0)."""
     if len(joints) == 1:
         return f"joint {joints[0] + 1}"
     if len(joints) > 2 and joints[-1] - joints[0] == len(joints) - 1:
@@ -44,11 +44,11 @@ def joints_text(joints: tuple[int, ...]) -> str:
 
 
 def join_words(words: Iterable[str]) -> str:
-    """Join words to a list in a sentence."""
+    """Return words joined to a list in a sentence."""
     *first, last = words
     return f"{', '.join(first)} and {last}" if first else last
 
 
 def length_text(length: float) -> str:
-    """Write a length [m] in millimetres, with three significant digits or all integer digits."""
+    """Return a length [m] as a text in millimetres, with three significant digits or all integer digits."""
     return f"{length * 1e3:.3g} mm" if abs(length) < 1 else f"{length * 1e3:,.0f} mm"

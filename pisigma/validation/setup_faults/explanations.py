@@ -38,18 +38,18 @@ if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
 SMALL_SHARE = 2e-4
-"""Errors as a share of the reach below which no fault of a joint column is their cause."""
+"""Errors, as a share of the reach, below which a fault of a joint column is not their cause."""
 PLAUSIBLE_SHARE = 0.01
-"""Largest errors of a calibrated robot, and after correcting a fault, as a share of the reach."""
+"""Largest errors of a calibrated robot, and after correction of a fault, as a share of the reach."""
 PLAUSIBLE_TURN = PLAUSIBLE_SHARE / LEVER_SHARE
-"""The same for orientations [rad], whose errors are treated as position errors at a distance of `LEVER_SHARE` of the
-reach."""
+"""Largest orientation errors of a calibrated robot [rad], which are treated as position errors at a distance of
+`LEVER_SHARE` of the reach."""
 AS_GOOD = 1.5
-"""Errors of a simpler explanation over the smallest ones up to which the simpler one is chosen."""
+"""Ratio of the errors of a simpler explanation to the smallest errors up to which the simpler explanation is chosen."""
 MAX_CONVENTIONS = 8
-"""Promising conventions of orientations that are tried with the whole model."""
+"""Number of promising conventions of orientations that are tried with the whole model."""
 MIN_TURN = 0.01
-"""[deg] Smaller rotations of a base or a tool are not reported."""
+"""Smallest rotation of a base or a tool that is reported [deg]."""
 _MOVED = {
     "frame": (
         "base",
@@ -75,7 +75,7 @@ def explanation_limit(here: Hypothesis, reach: float) -> float:
 
 
 def choose_simplest(fault_hypotheses: Sequence[Hypothesis], most: float) -> list[Hypothesis]:
-    """Choose the simplest of the hypotheses that explain the errors about equally well, to at most `most` [m].
+    """Return the simplest of the hypotheses that explain the errors about equally well, up to `most` [m].
 
     The remaining errors must also be small relative to the spread of the poses, which a wrong unit can shrink.
     """
@@ -94,12 +94,12 @@ def choose_simplest(fault_hypotheses: Sequence[Hypothesis], most: float) -> list
 def fault_hypotheses(
     arm: PredictingArm, some: Measurements, here: Hypothesis, most: float
 ) -> Iterator[Hypothesis]:
-    """Yield all hypotheses that may explain the errors to `most` [m]; the first is that nothing is wrong."""
+    """Yield all hypotheses that may explain the errors up to `most` [m]; the first is that nothing is wrong."""
     return frame_hypotheses(arm, some, list(_faults_in_frames(arm, some, here)), most)
 
 
 def _faults_in_frames(arm: PredictingArm, some: Measurements, here: Hypothesis) -> Iterator[Hypothesis]:
-    """Yield the hypotheses of `fault_hypotheses` with frame and tool as they are."""
+    """Yield the hypotheses of `fault_hypotheses` with the given frame and tool."""
     yield here
     for measured, cause in measured_pose_faults(here.measured, here.T[:, :3, 3], "corner" in some.kinds):
         yield replace(here, measured=measured, causes=(cause,))
@@ -138,7 +138,7 @@ def _likely_conventions(arm: PredictingArm, here: Hypothesis) -> Iterator[tuple[
 def _other_corrections(
     model: CalibratedModel, some: Measurements
 ) -> Iterator[tuple[Float64[Tensor, "rows 4 4"], Cause]]:
-    """Predict poses with the correction applied once more than logged, and once less (to first order)."""
+    """Yield poses predicted with the correction applied once more and once less than logged (to first order)."""
     T, T_nominal = poses_of_rows(model, some), nominal_poses_of_rows(model, some)
     clause = "the rows fit the nominal robot at the joint values of the file"
     advice = (
@@ -157,13 +157,13 @@ def _other_corrections(
 def frame_hypotheses(
     arm: PredictingArm, some: Measurements, tried: Sequence[Hypothesis], most: float = math.inf
 ) -> Iterator[Hypothesis]:
-    """Yield hypotheses as they are, and with another frame, another tool, and both; without a model, both are fitted.
+    """Yield hypotheses unchanged, and with another frame, tool, and both; without a model, both are fitted.
 
     Both are fitted only if an affine fit, which is a lower bound of the errors, leaves at most `most` [m].
 
     Args:
         arm: the predicting arm.
-        some: the rows; without a model, they may be others for every hypothesis and are not used.
+        some: the rows; not used without a model, because every hypothesis may have other rows.
         tried: the hypotheses.
         most: largest error that an explanation may leave [m].
     """
@@ -190,7 +190,7 @@ def frame_hypotheses(
 def _with_frames_fitted(
     tried: Sequence[Hypothesis], most: float
 ) -> Iterator[tuple[Hypothesis, Float64[Tensor, "4 4"], Float64[Tensor, "4 4"]]]:
-    """Fit base and tool under all hypotheses at once that they may explain to `most` [m]."""
+    """Fit base and tool under all hypotheses at once, and yield those with errors up to `most` [m]."""
     groups: dict[tuple[bool, ...], list[Hypothesis]] = {}
     for here in tried:
         groups.setdefault(tuple(here.measured.has_rotation.tolist()), []).append(here)
@@ -220,12 +220,12 @@ def _per_group(
 def _moved(
     kind: str, X: Float64[Tensor, "#rows 4 4"], frames: Float64[Tensor, "#rows 4 4"] | None = None
 ) -> Cause:
-    """Make the cause that the frame or the tool has moved, with the largest motion of its origin.
+    """Return the cause that a frame or tool has moved, with the largest motion of its origin.
 
     Args:
         kind: "frame" or "tool".
-        X: its motions.
-        frames: its poses before the motion, in the coordinates of `jacobian`; None for their origin.
+        X: motions of the frame or tool.
+        frames: poses before the motion, in the coordinates of `jacobian`; None for the origin.
     """
     what, advice = _MOVED[kind]
     origin = torch.zeros(3, 1).to(X) if frames is None else frames[:, :3, 3:]
@@ -244,7 +244,7 @@ def measured_pose_faults(
     Args:
         measured: the measured poses.
         predicted: predicted positions, up to a rigid transform [m].
-        by_images: whether the poses are those of boards in images, whose scale is that of the board.
+        by_images: whether the poses are of boards in images, whose scale is the scale of the board.
     """
     advice = "check the order and the directions of the sensor's axes"
     if by_images:
@@ -288,7 +288,7 @@ def other_conventions(
     """Yield the measured orientations under the assumption that they were written in another convention.
 
     Returns:
-        The rotations, what is wrong with those of the file, and the complexity of the assumption, see `Cause.size`.
+        The rotations, what is wrong with the file's rotations, and the complexity of the assumption, see `Cause.size`.
     """
     from scipy.spatial.transform import Rotation  # imported here, because every calibration imports this file
 
@@ -320,7 +320,7 @@ def other_conventions(
 
 
 def _as_rotation_vector(angles: Float64[np.ndarray, "rows 3"]) -> Float64[np.ndarray, "rows 3"]:
-    """Of the two ways to write a rotation in roll, pitch and yaw, choose the one that is shorter as a vector.
+    """Return roll, pitch and yaw in the one of two equivalent forms that is the shorter vector.
 
     A rotation vector that was read as angles may have a second component beyond 90 deg, for which angles read back
     from the matrix are the other solution.

@@ -28,32 +28,32 @@ from pisigma.robot.se3 import rotation_vector
 from pisigma.validation.setup_faults.cause import Cause
 
 COLLAPSED = 0.25
-"""Share of the errors that a setup fault may leave if it explains them."""
+"""Largest share of the errors that may remain if a setup fault explains them."""
 MIN_FREEDOM = 6
-"""Degrees of freedom that a fit must leave."""
+"""Smallest number of degrees of freedom that must remain after a fit."""
 _MAX_POSES = 2**17
 FittedFrames = Literal["none", "base", "base and tool"]
 """Frames that are fitted to the rows under a hypothesis."""
 SHIFTS = (1, -1, 2, -2)
-"""Rows by which joint values may be shifted relative to the measurements."""
+"""Numbers of rows by which joint values may be shifted relative to the measurements."""
 MARGIN = max(SHIFTS)
 ENDS = 3
 """Base and tool are fitted to the first and to the last third of the rows if a row may have been lost in between."""
 _ADVICE = "look for a joint vector or a measurement that was lost or written twice, and match them again"
 MAX_ITERATIONS = 30
 TRIED, HOPELESS = 8, 0.25
-"""Number of iterations after which the search is given up if more than this share of the cost remains."""
+"""Number of iterations after which the search is abandoned if more than a share of the cost remains, and this share."""
 CONVERGENCE_TOLERANCE = 1e-3
 """Relative decrease of the cost per step at convergence."""
 STILL = 1e-3
-"""[rad or m] Range below which a joint value is constant."""
+"""Range below which a joint value is treated as constant [rad or m]."""
 EQUAL = 1e-6
-"""[rad or m] Difference below which two columns are equal."""
+"""Difference below which two columns are treated as equal [rad or m]."""
 
 
 @dataclass(frozen=True, eq=False)
 class PredictingArm:
-    """Predicts the poses of rows under hypotheses.
+    """Arm that predicts the poses of rows under hypotheses.
 
     Attributes:
         robot: the nominal robot.
@@ -91,7 +91,7 @@ class PredictingArm:
             modes: frames that are fitted.
 
         Returns:
-            See `error_with_fitted`.
+            The mean squared error of every hypothesis, see `error_with_fitted`.
         """
         chunks = [
             forward_kinematics(self.robot, some)
@@ -107,9 +107,9 @@ class PredictingArm:
 def error_with_fitted(
     mode: FittedFrames, T: Float64[Tensor, "*#batch rows 4 4"], measured: MeasuredPoses
 ) -> Float64[Tensor, "*#batch"]:
-    """Compute the mean squared error [m²] of predicted poses, as they are or with the base fitted to them.
+    """Compute the mean squared error [m²] of predicted poses, unchanged or with frames fitted.
 
-    With base and tool fitted, it is the lower bound of `affine_error`.
+    With base and tool fitted, the result is the lower bound of `affine_error`.
     """
     if mode == "base and tool":
         return affine_error(T, measured)
@@ -124,10 +124,10 @@ class Hypothesis:
     """Joint values, predicted and measured poses under the assumption of a fault.
 
     Attributes:
-        q: joint values under it [rad or m].
-        T: predicted poses under it.
-        measured: measured poses under it, for example in other units.
-        causes: the faults assumed; empty for none.
+        q: joint values under the hypothesis [rad or m].
+        T: predicted poses under the hypothesis.
+        measured: measured poses under the hypothesis, for example in other units.
+        causes: the assumed faults; empty for no fault.
         fitted: number of parameters that were fitted.
     """
 
@@ -139,13 +139,13 @@ class Hypothesis:
 
     @property
     def complexity(self) -> float:
-        """Complexity of the causes; frame and tool together add less than separately: a new setup changes both."""
+        """Complexity of the causes; frame and tool together count less than separately, as a new setup changes both."""
         kinds = {cause.kind for cause in self.causes}
         return sum(cause.size for cause in self.causes) - (1 if {"frame", "tool"} <= kinds else 0)
 
     @property
     def values_of_tool(self) -> int:
-        """Number of parameters of a tool: 6 with orientations, else 3."""
+        """Number of parameters of a tool: 6 with orientations, otherwise 3."""
         return 6 if bool(self.measured.has_rotation.any()) else 3
 
     @cached_property
@@ -164,24 +164,24 @@ class Hypothesis:
         return position, float(rotation_vector(R).square().sum(-1).mean().sqrt())
 
     def without_causes(self, kinds: Set[str]) -> "Hypothesis":
-        """Remove causes of some kinds, which are not reported."""
+        """Return the hypothesis without causes of some kinds, which are not reported."""
         return replace(self, causes=tuple(cause for cause in self.causes if cause.kind not in kinds))
 
     def with_cause(self, cause: Cause, T: Float64[Tensor, "rows 4 4"], fitted: int) -> "Hypothesis":
-        """Add a cause with the poses predicted under it."""
+        """Return the hypothesis with a further cause and the poses predicted under it."""
         return replace(self, T=T, causes=(*self.causes, cause), fitted=self.fitted + fitted)
 
 
 def shifted_rows(
     robot: Robot, rows: Measurements, chosen: Int64[Tensor, " chosen"], measured: MeasuredPoses
 ) -> Iterator[tuple[Float64[Tensor, "chosen dof"], MeasuredPoses, Cause]]:
-    """Yield hypotheses of joint values or orientations shifted by rows, in all rows or on one side of some row.
+    """Yield hypotheses of joint values or orientations shifted by rows, in all rows or on one side of a row.
 
     Args:
         robot: the nominal robot.
         rows: rows in the order of the file.
-        chosen: numbers of the rows to judge, at least `MARGIN` from both ends.
-        measured: their measured poses.
+        chosen: indices of the rows to judge, at least `MARGIN` from both ends.
+        measured: measured poses of these rows.
     """
     q = rows.q[chosen]
     for shift in SHIFTS:
@@ -208,7 +208,7 @@ def _shifted_from_a_row(
 ) -> Iterator[tuple[Float64[Tensor, "chosen dof"], MeasuredPoses, Cause]]:
     """Find the row after (or before) which a shift explains most, with base and tool fitted to the other side.
 
-    The rows next to it are left out, because the lost values are unknown.
+    The neighbouring rows are left out, because the lost values are unknown.
     """
     inner = torch.arange(MARGIN, rows.rows - MARGIN)
     among = rows.select(inner)
@@ -235,14 +235,14 @@ def _shifted_from_a_row(
 
 
 def _count(shift: int) -> str:
-    """Write the number of rows of a shift."""
+    """Return a text with the number of rows of a shift."""
     return "one row" if abs(shift) == 1 else f"{abs(shift)} rows"
 
 
 def estimate_joint_values(
     robot: Robot, rows: Measurements, measured: MeasuredPoses
 ) -> list[tuple[Float64[Tensor, "rows dof"], Cause]]:
-    """Estimate the values of each revolute joint, with those of the others as logged.
+    """Yield hypotheses with the values of one revolute joint estimated and the other joints as logged.
 
     Every row's value is the one that brings the tool nearest to the measured pose, in closed form, because a target's
     position and axes move on circles about the joint axis. This alternates with fits of base and tool. Two values per
@@ -251,7 +251,7 @@ def estimate_joint_values(
     Args:
         robot: the nominal robot.
         rows: rows with positions, of one frame and target.
-        measured: their measured poses.
+        measured: measured poses of these rows.
     """
     return [
         (_freed(robot, rows, measured, joint), _cause(robot, rows.q, joint))
@@ -332,7 +332,7 @@ def _turned(
 
 
 def _copied(q: Float64[Tensor, "rows dof"], joint: int) -> int | None:
-    """Find another joint whose column is the same."""
+    """Return another joint whose column is equal; None if there is none."""
     same = (q - q[:, joint : joint + 1]).abs().amax(0) < EQUAL
     same[joint] = False
     return int(same.nonzero()[0, 0]) if bool(same.any()) else None

@@ -20,31 +20,31 @@ from pisigma.validation.setup_faults.hypothesis import FittedFrames, PredictingA
 
 QUARTER = math.pi / 2
 GRADIANS = 0.9
-"""Degrees in a gradian."""
+"""Number of degrees in a gradian."""
 ZERO_TOLERANCE = math.radians(0.5)
-"""[rad] A zero closer than this to a multiple of 90 deg is set to that multiple."""
+"""Distance from a multiple of 90 deg below which a zero is set to that multiple [rad]."""
 MAX_ORDERS = 5040
 """Number of orders of seven joints; with more joints, only pairs are swapped."""
 MAX_ZEROS = 4**7
 SCREEN_ROWS = 32
-"""Rows that every map is tried on."""
+"""Number of rows on which every map is tried."""
 NOTICED = 2e-5
-"""[m] Smaller errors need no explanation."""
+"""Errors below which no explanation is needed [m]."""
 PROMISING = 0.5
-"""Share of the errors that a promising map may leave."""
+"""Largest share of the errors that may remain under a promising map."""
 MAX_KEPT = 3
-"""Promising maps of each kind."""
+"""Largest number of promising maps of each kind."""
 NEAR_BEST = 4.0
-"""Errors of a promising map over those of the best map."""
+"""Largest ratio of the errors of a promising map to the errors of the best map."""
 STEPS = 36
-"""Grid values on either side in the search for a zero."""
+"""Number of grid values on either side in the search for a zero."""
 REFINEMENTS = 7
-"""Refinements of this grid."""
+"""Number of refinements of the grid in the search for a zero."""
 
 
 @dataclass(frozen=True, eq=False)
 class JointMaps:
-    """Maps `q -> matrix · q + offset` of logged joint values to the true ones, one per hypothesis.
+    """Maps `q -> matrix · q + offset` from logged to true joint values, one per hypothesis.
 
     Attributes:
         matrix: weights of the logged columns in every joint value.
@@ -62,20 +62,20 @@ class JointMaps:
 
     @staticmethod
     def scaled(factors: Float64[Tensor, "maps dof"]) -> "JointMaps":
-        """Multiply the joints by factors."""
+        """Return maps that multiply joint values by factors."""
         return JointMaps(torch.diag_embed(factors), torch.zeros_like(factors))
 
     def apply(self, q: Float64[Tensor, "rows dof"]) -> Float64[Tensor, "maps rows dof"]:
-        """Map joint values [rad or m]."""
+        """Return the joint values [rad or m] under every map."""
         return q @ self.matrix.mT + self.offset[:, None]
 
     def select(self, index: Int64[Tensor, " chosen"]) -> "JointMaps":
-        """Select some of the maps."""
+        """Return the selected maps."""
         return JointMaps(self.matrix[index], self.offset[index])
 
 
 def signs_and_swaps(dof: int) -> JointMaps:
-    """List a reversed sign of every joint, and every swap of two neighbouring joints."""
+    """Return maps that reverse the sign of one joint, and maps that swap two neighbouring joints."""
     signs = JointMaps.scaled(1 - 2 * torch.eye(dof, dtype=torch.float64))
     order = torch.arange(dof).repeat(dof - 1, 1)
     pairs = torch.stack([torch.arange(dof - 1), torch.arange(1, dof)], 1)
@@ -88,13 +88,13 @@ def signs_and_swaps(dof: int) -> JointMaps:
 
 
 def reversed_signs(dof: int) -> JointMaps:
-    """List all combinations of reversed signs."""
+    """Return maps of all combinations of reversed signs."""
     choices = list(itertools.product((1.0, -1.0), repeat=dof))[1:]
     return JointMaps.scaled(torch.tensor(choices, dtype=torch.float64))
 
 
 def other_orders(dof: int) -> JointMaps:
-    """List all orders of the joints; for more than seven joints, the swaps of two."""
+    """Return maps of all orders of the joints; for more than seven joints, of all swaps of two."""
     orders = torch.arange(dof).repeat(math.comb(dof, 2), 1)
     pairs = torch.combinations(torch.arange(dof))
     orders = orders.scatter(1, pairs, pairs.flip(1))
@@ -106,7 +106,7 @@ def other_orders(dof: int) -> JointMaps:
 
 
 def coupled_joints(dof: int) -> JointMaps:
-    """List all pairs of joints of which one is logged relative to the other, as with a belt or from the horizon."""
+    """Return maps for all pairs of joints of which one is logged relative to the other, for example with a belt."""
     pairs = torch.tensor(list(itertools.permutations(range(dof), 2)), dtype=torch.int64).reshape(-1, 2)
     pairs, sign = pairs.repeat(2, 1), torch.tensor([1.0, -1.0]).double().repeat_interleave(len(pairs))
     maps = JointMaps.unchanged(len(pairs), dof)
@@ -114,7 +114,7 @@ def coupled_joints(dof: int) -> JointMaps:
 
 
 def other_units(robot: Robot) -> JointMaps:
-    """List swapped units: degrees and radians (or gradians) of revolute joints, mm and m of prismatic ones."""
+    """Return maps of swapped units: degrees and radians (or gradians), and mm and m for prismatic joints."""
     turning = [1.0 if turns else 0.0 for turns in robot.revolute]
     rows = [[GRADIANS ** (sign * turns) for turns in turning] for sign in (1, -1) if any(turning)]
     for revolute, per_unit in ((True, math.degrees(1)), (False, 1e3)):
@@ -129,11 +129,11 @@ def other_units(robot: Robot) -> JointMaps:
 
 
 def quarter_turned_zeros(robot: Robot, inner: bool = False) -> JointMaps:
-    """List zeros of revolute joints moved by multiples of 90 deg, of one joint at a time if there are too many.
+    """Return maps with zeros moved by multiples of 90 deg, of one joint at a time if there are too many.
 
     Args:
         robot: the robot.
-        inner: leave out the first and the last joint, whose zeros are absorbed by a fitted base and tool.
+        inner: whether to omit the first and the last joint, whose zeros are absorbed by a fitted base and tool.
     """
     turning = [i for i, revolute in enumerate(robot.revolute) if revolute]
     turning = [i for i in turning if not inner or 0 < i < robot.dof - 1]
@@ -147,13 +147,13 @@ def quarter_turned_zeros(robot: Robot, inner: bool = False) -> JointMaps:
 
 
 def moved_zeros(joints: Int64[Tensor, " maps"], by: Float64[Tensor, " maps"], dof: int) -> JointMaps:
-    """Move the zero of one joint by a given amount [rad or m] in each map."""
+    """Return maps that each move the zero of one joint by a given amount [rad or m]."""
     maps = JointMaps.unchanged(len(joints), dof)
     return replace(maps, offset=maps.offset.index_put((torch.arange(len(joints)), joints), by))
 
 
 def joint_causes(maps: JointMaps, number: int, robot: Robot) -> tuple[Cause, ...]:
-    """Describe what is wrong with the joint columns under a map."""
+    """Return the causes: what is wrong with the joint columns under a map."""
     matrix, offset = maps.matrix[number], maps.offset[number].tolist()
     order = matrix.abs().argmax(1).tolist()
     factor = [row[column] for row, column in zip(matrix.tolist(), order, strict=True)]
@@ -245,7 +245,7 @@ def likely_maps(arm: PredictingArm, measurements: Measurements, measured: Measur
     Args:
         arm: the predicting arm.
         measurements: rows with positions.
-        measured: their poses.
+        measured: measured poses of the rows.
     """
     rows, robot = _screened_rows(measurements), arm.robot
     some, few = measurements.select(rows), measured.select(rows)
@@ -278,7 +278,7 @@ def likely_maps(arm: PredictingArm, measurements: Measurements, measured: Measur
 
 
 def _screened_rows(measurements: Measurements) -> Int64[Tensor, " chosen"]:
-    """Choose rows of the most frequent frame and target, evenly over the file."""
+    """Return rows of the most frequent frame and target, evenly over the file."""
     names = list(zip(measurements.frame, measurements.target, strict=True))
     most = Counter(names).most_common(1)[0][0]
     rows = torch.tensor([name == most for name in names]).nonzero()[:, 0]
@@ -287,7 +287,7 @@ def _screened_rows(measurements: Measurements) -> Int64[Tensor, " chosen"]:
 
 
 def _best_zeros(robot: Robot, errors_of: Callable[[JointMaps], Float64[Tensor, " maps"]]) -> JointMaps:
-    """Find the best zero of every joint on a refined grid, rounded to a multiple of 90 deg if it is near one."""
+    """Return the best zero of every joint on a refined grid, rounded to a multiple of 90 deg if near."""
     dof = robot.dof
     width = torch.tensor(
         [torch.pi if turns else robot.reach for turns in robot.revolute], dtype=torch.float64
@@ -310,7 +310,7 @@ def _best_zeros(robot: Robot, errors_of: Callable[[JointMaps], Float64[Tensor, "
 
 
 def _distinct(likely: list[JointMaps]) -> JointMaps:
-    """Join the maps, without duplicates and without those that change nothing."""
+    """Return all maps without duplicates and without maps that change nothing."""
     joined = JointMaps(
         torch.cat([maps.matrix for maps in likely]), torch.cat([maps.offset for maps in likely])
     )

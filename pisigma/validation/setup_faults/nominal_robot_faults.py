@@ -37,45 +37,46 @@ from pisigma.validation.setup_faults.hypothesis import (
 from pisigma.validation.setup_faults.setup_fault import SetupFault, fault_from_hypothesis
 
 MAX_ROWS = 1_000
-"""Rows that hypotheses are tried on, evenly over all rows."""
+"""Largest number of rows on which hypotheses are tried, evenly over all rows."""
 MAX_ROWS_NOMINAL = 150
-"""The same with the nominal robot, where base and tool are fitted under every hypothesis."""
+"""Largest number of rows on which hypotheses are tried with the nominal robot, for which base and tool are fitted
+each time."""
 MIN_ROWS_NOMINAL = 24
 """Minimum number of rows; with fewer, an affine fit (39 unknowns) leaves too few degrees of freedom."""
 MAX_ZERO = 3 * HOBBY.largest.joint_offset
-"""[rad] Largest plausible error of the zero of a revolute joint."""
+"""Largest plausible error of the zero of a revolute joint [rad]."""
 MAX_SLIDE = 3 * HOBBY.largest.length
-"""[m] The same of prismatic joints."""
+"""Largest plausible error of the zero of a prismatic joint [m]."""
 USUAL = 1e-3
 """Usual prior standard deviation of geometric errors [m and rad]."""
 SURE = 1e-3
 """Probability of the F test below which joint values explain positions."""
 MAX_TARGETS = 4
-"""Targets that are looked for under one name."""
+"""Largest number of targets that are searched for under one name."""
 MAX_EXAMPLES = 3
-"""Rows that a sentence names."""
+"""Largest number of rows that a sentence lists."""
 MAX_TARGET_ITERATIONS = 20
-"""Alternating fits of the base and of the targets."""
+"""Largest number of alternating fits of base and targets."""
 TARGET_TOLERANCE = 1e-2
 """Relative decrease of the mean square per iteration at convergence."""
 MAX_CLUSTERINGS = 8
-"""Iterations of assigning every row to the nearest target and fitting base and targets again."""
+"""Largest number of iterations of assigning rows to the nearest target and fitting base and targets again."""
 
 
 def find_nominal_robot_faults(robot: Robot, measurements: Measurements) -> tuple[SetupFault, ...]:
-    """Find setup faults that reduce the errors of the nominal robot to a quarter or less, the simplest first.
+    """Find setup faults that reduce the errors of the nominal robot to a quarter or less, simplest first.
 
-    Base and tool are fitted to the rows as they are and under every hypothesis: those of `find_setup_faults`, rows
-    shifted before or after some row, several targets under one name, and a joint whose logged values are wrong.
-    Hypotheses are tried if the errors are larger than geometric errors of the usual prior (1 mm, 1 mrad) make them. A
-    correct explanation then leaves these usual errors, which are a tenth or less of those caused by faults.
+    Base and tool are fitted to the unchanged rows and under every hypothesis: the hypotheses of `find_setup_faults`,
+    rows shifted before or after a row, several targets under one name, and a joint whose logged values are wrong.
+    Hypotheses are tried if the errors are larger than geometric errors of the usual prior (1 mm, 1 mrad) make them.
+    A correct explanation then leaves these usual errors, which are a tenth or less of those caused by faults.
 
     Args:
         robot: the nominal robot.
-        measurements: rows; those with positions of the most frequent frame and target are judged.
+        measurements: rows; only rows with positions of the most frequent frame and target are judged.
 
     Returns:
-        Empty if the errors are of usual size, or if nothing explains them.
+        The faults; empty if the errors are of usual size, or if nothing explains them.
     """
     rows = largest_group(measurements)
     if rows.rows < MIN_ROWS_NOMINAL:
@@ -108,9 +109,9 @@ def find_nominal_robot_faults(robot: Robot, measurements: Measurements) -> tuple
 
 
 def _better_than_zeros(faults: Sequence[Hypothesis], error: float, usual: float) -> list[Hypothesis]:
-    """Keep the faults that explain the rows better than moved zeros of all joints, which a calibration estimates.
+    """Return the faults that explain the rows better than moved zeros of all joints, which a calibration estimates.
 
-    Moved zeros of single joints are kept too if they leave errors of usual size.
+    Moved zeros of single joints are also kept if errors of usual size remain.
 
     Args:
         faults: the faults found.
@@ -140,7 +141,7 @@ def _error_with_zeros(robot: Robot, rows: Measurements, measured: MeasuredPoses)
 
 
 def _named_otherwise(robot: Robot, measurements: Measurements, usual: float) -> tuple[SetupFault, ...]:
-    """Find better names for the targets of the most frequent frame if errors are larger than usual [m]."""
+    """Return faults in the names of targets of the most frequent frame, if errors are larger than usual [m]."""
     rows = largest_group(measurements, by_target=False)
     rows = rows.select(evenly_spaced_rows(torch.arange(rows.rows), MAX_ROWS))
     number, lever = numbers_of_names(rows.target), LEVER_SHARE * robot.reach
@@ -161,7 +162,7 @@ def _named_otherwise(robot: Robot, measurements: Measurements, usual: float) -> 
 def _labelled(
     rows: Measurements, T: Float64[Tensor, "rows 4 4"], measured: MeasuredPoses
 ) -> list[Hypothesis]:
-    """Make hypotheses with other names of the targets; see `target_labellings`."""
+    """Return hypotheses with other names of the targets; see `target_labellings`."""
     return [
         Hypothesis(rows.q, one.T, measured, (one.cause,), 3 * one.targets)
         for one in target_labellings(rows, T, measured)
@@ -175,7 +176,7 @@ def _with_joints(
     most: float,
     values: int = 0,
 ) -> list[Hypothesis]:
-    """Make hypotheses from other joint values or poses, with the nominal robot.
+    """Return hypotheses from other joint values or poses, with the nominal robot.
 
     Args:
         arm: the predicting arm.
@@ -215,13 +216,13 @@ def usual_error(robot: Robot, q: Float64[Tensor, "rows dof"]) -> float:
 
 
 def measured_rows(measurements: Measurements) -> Int64[Tensor, " rows"]:
-    """List the rows with a position."""
+    """Return the indices of the rows with a position."""
     assert measurements.position is not None
     return torch.isfinite(measurements.position).all(-1).nonzero()[:, 0]
 
 
 def largest_group(measurements: Measurements, by_target: bool = True) -> Measurements:
-    """Select the rows with positions of the most frequent frame (and target); empty if none was measured."""
+    """Return the rows with positions of the most frequent frame (and target); empty if none was measured."""
     if measurements.position is None:
         return measurements.select(torch.arange(0))
     rows = measured_rows(measurements)
@@ -234,7 +235,7 @@ def largest_group(measurements: Measurements, by_target: bool = True) -> Measure
 
 
 def evenly_spaced_rows(rows: Int64[Tensor, " rows"], most: int) -> Int64[Tensor, " chosen"]:
-    """Choose at most `most` of the rows, evenly over them."""
+    """Return at most `most` of the rows, evenly spaced."""
     count = min(len(rows), most)
     return rows[torch.linspace(0, len(rows) - 1, count).round().long()]
 
@@ -246,7 +247,7 @@ def fits_by_chance(T: Float64[Tensor, "rows 4 4"], position: Float64[Tensor, "ro
         T: predicted poses.
         position: measured positions [m], at least 14.
     """
-    from scipy.special import fdtrc  # scipy.stats takes a second to import
+    from scipy.special import fdtrc  # imported here, because scipy.stats takes a second to import
 
     none = torch.zeros(len(T), dtype=torch.bool)
     free, left = 36, 3 * (len(T) - 13)
@@ -257,7 +258,7 @@ def fits_by_chance(T: Float64[Tensor, "rows 4 4"], position: Float64[Tensor, "ro
 
 @dataclass(frozen=True, eq=False)
 class Labelling:
-    """Assignment of the rows to the targets that they fit.
+    """Assignment of the rows to the targets that they fit best.
 
     Attributes:
         cause: what is wrong with the names in the file.
@@ -275,13 +276,13 @@ def target_labellings(
 ) -> Iterator[Labelling]:
     """Find targets from the measurements alone, as clusters of the measured points of the tool.
 
-    The method is k-means, with base and targets fitted to all rows in every iteration. With several names there are as
-    many targets, and each keeps the most frequent name of its rows; with one name there are 2, then 3, up to
-    `MAX_TARGETS`.
+    The method is k-means, with base and targets fitted to all rows in every iteration. The number of targets is the
+    number of names, and every target gets the most frequent name of its rows; with one name, 2 to `MAX_TARGETS`
+    targets are tried.
 
     Args:
         rows: rows with positions in one frame.
-        T: their predicted poses, with any base and tool.
+        T: predicted poses of the rows, with any base and tool.
         measured: their measured poses.
     """
     names = tuple(dict.fromkeys(rows.target))
@@ -299,7 +300,7 @@ def fit_targets(
     Args:
         T: predicted poses, with any base and tool.
         measured: the measured poses.
-        number: number of every row's target, from 0.
+        number: index of every row's target.
 
     Returns:
         The base, and the poses predicted with it.
@@ -354,14 +355,14 @@ def _other_names(rows: Measurements, number: Int64[Tensor, " rows"], names: tupl
 
 
 def _where(rows: Measurements, row: int) -> str:
-    """Name a row without its file."""
+    """Return a text with the place of a row without its file."""
     return f"line {rows.line[row]}" if rows.line[row] else f"row {row}"
 
 
 def _clustered(
     T: Float64[Tensor, "rows 4 4"], measured: MeasuredPoses, count: int
 ) -> tuple[Int64[Tensor, " rows"], Float64[Tensor, "rows 4 4"]]:
-    """Cluster the measured points of the tool; return their cluster numbers and the predicted poses."""
+    """Cluster the measured points of the tool; return their cluster indices and the predicted poses."""
     number = torch.zeros(len(T), dtype=torch.int64)
     base, tool = best_base_and_tool(T, measured)
     points, fitted = _in_tool_frame(base @ T, measured), base @ T @ tool

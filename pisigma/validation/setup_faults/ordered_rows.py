@@ -21,11 +21,11 @@ from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.joint_correction.gravity_torques import GravityTorques
 
 MAX_ROWS = 4_000
-"""Rows that are used, drawn from all of them."""
+"""Largest number of rows that are used, drawn from all rows."""
 SENSORS = ("position", "rotation")
 """Sensors whose values depend on frame and tool directly, without other unknowns."""
 CAP = 3.0
-"""Residuals are clipped at this multiple of the upper quartile of their lengths while a fault is sought."""
+"""Multiple of the upper quartile of their lengths at which residuals are clipped during the search for a fault."""
 HARMONICS, JOINT_ERROR = 3, 3e-4
 """Harmonics of a series of the joint values, and prior standard deviation of its weights [rad]. The series is fitted
 together with the parameters, because in rows ordered by a joint's values, slow errors of its gear look like a slow
@@ -34,7 +34,7 @@ SAG = 1e-3
 """Prior standard deviation of the weights of gravity torques [rad], which are fitted too: the sag of elastic joints can
 look like a second arm. It is 8.6e-4 for the measured UR10."""
 VALUES_PER_POSE = 6
-"""Independent values of a configuration (the pose of the tool), for any number of targets and repeats."""
+"""Number of independent values of a configuration (the pose of the tool), for any number of targets and repeats."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,11 +44,12 @@ class OrderedRows:
     Attributes:
         result: the geometric calibration.
         problem: the problem of these rows.
-        number: number of every row in the measurements.
+        number: index of every row in the measurements.
         residual: three values per sensor, 0 where nothing was measured.
         derivative: derivative of the values with respect to all parameters.
         values: number of measured values.
-        noise: standard deviation of every column of values [m or rad], or the factor on those stated in the rows.
+        noise: standard deviation of every column of values [m or rad], or the factor on the standard deviations
+            stated in the rows.
     """
 
     result: CalibrationResult
@@ -66,7 +67,7 @@ class OrderedRows:
         The same rows are calibrated with when they are added to a cell, and again for its model.
         """
         setup = (self.problem.frame.cpu().numpy(), self.problem.target.cpu().numpy(), self.configuration)
-        names = (self.problem.space.frames, self.problem.space.targets)  # a result states them
+        names = (self.problem.space.frames, self.problem.space.targets)  # the result already contains them
         counts = (self.jacobian.shape, self.values, self.configuration is None)
         digest = hashlib.sha256(repr((names, counts)).encode())
         for one in (
@@ -82,7 +83,7 @@ class OrderedRows:
         return digest.digest()
 
     def __eq__(self, other: object) -> bool:
-        """Whether a search in both has the same result."""
+        """Return whether a search gives the same result for both."""
         return isinstance(other, OrderedRows) and self.content_hash == other.content_hash
 
     def __hash__(self) -> int:
@@ -102,7 +103,7 @@ class OrderedRows:
             return None
         measured = torch.stack(present).any(0).nonzero()[:, 0].cpu()
         some = measured[randomly_chosen_rows(len(measured), MAX_ROWS)]
-        line = np.zeros(data.rows) if data.origin else np.array(data.line)  # several files follow one another
+        line = np.zeros(data.rows) if data.origin else np.array(data.line)  # several files are concatenated
         some = some[np.lexsort((rows[some].numpy(), line[rows[some]]))]
         problem = replace(solved.problem, pairs=0).select(some)
         whole, every = slice(0, len(some)), torch.arange(len(problem.space.parameters))
@@ -130,7 +131,7 @@ class OrderedRows:
 
     @cached_property
     def clipped(self) -> Float64[np.ndarray, "rows values"]:
-        """Residuals, with those of far rows shortened so that they do not decide where a fault is sought."""
+        """Residuals; large ones are shortened so that they do not determine where a fault is searched for."""
         lengths = np.linalg.norm(self.residual, axis=1)
         longest = CAP * np.quantile(lengths, 0.75)
         shortened: np.ndarray = (
@@ -174,7 +175,7 @@ class OrderedRows:
 
     @cached_property
     def _joint_errors(self) -> tuple[tuple[AbstractFeature, Bool[np.ndarray, "dof columns"], float], ...]:
-        """Unmodelled joint errors of healthy robots, their weights, and the prior standard deviation of these [rad].
+        """Derivatives by the weights of unmodelled joint errors, and prior standard deviations of the weights [rad].
 
         Gravity acts on masses at the origins of the frames.
         """
@@ -220,7 +221,7 @@ class OrderedRows:
 
     @cached_property
     def configuration(self) -> Int64[np.ndarray, " rows"] | None:
-        """Number of every row's configuration (joint values and frame, or target too); None if all rows differ."""
+        """Index of every row's configuration (joint values, frame, and optionally target); None if all rows differ."""
         group = self.problem.pose if self.problem.configuration is None else self.problem.configuration
         return None if group is None else renumber(group).cpu().numpy()
 
@@ -232,7 +233,7 @@ class OrderedRows:
 
 
 def inverse_of(normal: Float64[np.ndarray, "unknowns unknowns"]) -> Float64[np.ndarray, "unknowns unknowns"]:
-    """Invert a normal matrix with column scaling; undetermined directions get variance 0."""
+    """Return the inverse of a normal matrix, with column scaling; undetermined directions get variance 0."""
     scale = 1 / np.sqrt(np.maximum(normal.diagonal(), 1e-300))
     scales = scale * scale[:, None]
     scaled = normal * scales

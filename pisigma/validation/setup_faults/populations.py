@@ -14,24 +14,24 @@ from pisigma.validation.setup_faults.ordered_rows import OrderedRows, inverse_of
 MIN_ROWS = 20
 """Minimum number of rows; with fewer, two arms cannot be distinguished."""
 MAX_ROWS = 300
-"""Rows that the populations are fitted to, evenly over all rows."""
+"""Largest number of rows to which the populations are fitted, evenly over all rows."""
 MIN_SHARE = 0.1
-"""Smaller populations are outliers, which the robust loss gives no weight."""
+"""Smallest share of a population; smaller ones are outliers, to which the robust loss gives no weight."""
 TAILS = 5.0
 """Degrees of freedom of the t distribution of the residuals, so that outliers do not become a population."""
 MAX_USED = 0.9
-"""Share of the values used by parameters, over the share at which the likelihood is unbounded; see `_most_used`."""
+"""Largest share of the values absorbed by parameters, relative to the share at which the likelihood is unbounded."""
 STARTS, FIRST_ITERATIONS, MAX_ITERATIONS = 8, 6, 40
-"""Starts of the expectation maximisation and their iterations, and iterations from the best of them."""
+"""Number of starts of the expectation maximisation, their iterations, and iterations from the best start."""
 CONVERGENCE_TOLERANCE = 1e-2
 """Largest change of the probabilities, and relative change of the variance, at convergence."""
 ALTERNATING = 0.95
 """Share of the rows that must alternate: 1 in 20 may be predicted equally well by both populations."""
 DIFFERENCE = 2.0
-"""Variance of the difference of two arms over that of the difference of one arm and the nominal one."""
+"""Ratio of the variance of the difference of two arms to that of an arm and the nominal arm."""
 APART = 4.0
-"""Distance of a population over the scatter of the other above which it is separate. Residuals of healthy robots are a
-mixture with ratios of up to 2.5, because the unexplained errors depend on the pose."""
+"""Ratio of the distance of a population to the scatter of the other above which they are separate. Residuals of
+healthy robots are a mixture with ratios of up to 2.5, because the unexplained errors depend on the pose."""
 NORMAL_ITERATIONS = 200
 FLOOR = 1e-6
 """Smallest standard deviation, as a share of the largest residual."""
@@ -43,12 +43,12 @@ class Populations:
     """Two populations of rows.
 
     Attributes:
-        differing: what differs between them.
-        second: whether a row of the measurements belongs to the smaller population.
+        differing: what differs between the populations.
+        second: mask of the measured rows that belong to the smaller population.
         tried: number of rows that were judged.
-        difference: difference of their base, tool or arm parameters [m or rad].
-        factor: errors of the rows over those without the difference [1].
-        used: share of the values used up by all fitted parameters [1].
+        difference: difference of the base, tool or arm parameters of the populations [m or rad].
+        factor: ratio of the errors of the rows without and with the difference [1].
+        used: share of the values that all fitted parameters absorb [1].
         log_bayes_factor: logarithm of the odds against one population, by the Bayesian information criterion (Schwarz
             1978, Annals of Statistics 6, 461-464).
     """
@@ -62,10 +62,10 @@ class Populations:
     log_bayes_factor: float
 
 
-# the same rows are checked when they are added to a cell and when they are calibrated with
+# cached, because the same rows are checked when they are added to a cell and in its calibration
 @lru_cache(maxsize=2)
 def find_populations(rows: OrderedRows, count: int) -> Populations | None:
-    """Find the two populations that explain the residuals of a calibration best, whether likely or not.
+    """Find the two populations that explain the residuals of a calibration best, likely or not.
 
     `r_i = X_i x + w_i Z_i m + e_i`: a row of the second population (w_i = 1) has the difference m in addition to the
     unknowns x of all rows. The probabilities of w_i, x, m and the variance of e_i are estimated by expectation
@@ -77,7 +77,7 @@ def find_populations(rows: OrderedRows, count: int) -> Populations | None:
         count: number of rows of the measurements.
 
     Returns:
-        None if there are too few rows.
+        The populations; None if there are too few rows.
     """
     if len(rows.residual) < MIN_ROWS:
         return None
@@ -108,7 +108,7 @@ def find_populations(rows: OrderedRows, count: int) -> Populations | None:
 
 
 def _most_used(components: int) -> float:
-    """Return the share of the values that the unknowns of two populations may use up.
+    """Return the largest share of the values that the unknowns of two populations may absorb.
 
     If a fit passes through a share u of the rows exactly, the variance of the errors can go to 0. For rows with c
     components, the likelihood of the t distribution is then unbounded if c > (1 - u)(TAILS + c), that is
@@ -121,7 +121,7 @@ def _most_used(components: int) -> float:
 
 
 def _alternating(second: Bool[np.ndarray, " rows"]) -> Bool[np.ndarray, " rows"]:
-    """Replace nearly alternating rows by exactly alternating ones: rows that fit both may be assigned to either."""
+    """Return exactly alternating rows for nearly alternating ones, because rows that fit both may be in either."""
     odd: np.ndarray = np.arange(len(second)) % 2 == 1
     for turn in (odd, ~odd):
         if np.mean(second == turn) > ALTERNATING:
@@ -150,8 +150,8 @@ class _Fit:
 
     Attributes:
         probability: probability that a row belongs to the second population.
-        difference: difference of the two.
-        factor: see `Populations`.
+        difference: difference of the two populations.
+        factor: ratio of the errors without and with the difference, see `Populations`.
         log_likelihood: log likelihood with the difference, and without it.
         used: effective number of unknowns.
         unknowns: effective number of unknowns of the difference.
@@ -175,7 +175,7 @@ class _Fit:
 
 @dataclass(frozen=True, eq=False)
 class _Mixture:
-    """Mixture of two populations that differ in some unknowns."""
+    """Mixture of two populations that differ in given unknowns."""
 
     rows: OrderedRows
     Z: Float64[np.ndarray, "rows values numbers"]
@@ -298,9 +298,10 @@ class Mixture:
     """Mixture of two normal populations of residuals.
 
     Attributes:
-        share: share of the population with the larger scatter, or of the smaller one if both scatter equally [1].
-        off: RMS distance of that population from the mean of the other one, per component [m or rad].
-        scatter: RMS distance of the other one from its mean, per component [m or rad].
+        share: share of the population with the larger scatter, or of the smaller population if both scatter equally
+            [1].
+        off: RMS distance of that population from the mean of the other, per component [m or rad].
+        scatter: RMS distance of the other population from its mean, per component [m or rad].
         log_bayes_factor: logarithm of the odds against one population, by the Bayesian information criterion (Schwarz
             1978, Annals of Statistics 6, 461-464).
     """
@@ -312,7 +313,7 @@ class Mixture:
 
     @property
     def are_distinct(self) -> bool:
-        """Whether these are two populations rather than the shape of a single one."""
+        """Whether there are two populations, not one with an unusual shape."""
         return (
             self.log_bayes_factor > math.log(100.0)
             and min(self.share, 1 - self.share) >= MIN_SHARE

@@ -17,16 +17,16 @@ from pisigma.estimation.loss import HampelLoss
 from pisigma.validation.setup_faults.ordered_rows import OrderedRows, inverse_of
 
 MIN_ROWS = 3
-"""Rows that must be measured before and after a motion."""
+"""Smallest number of rows before and after a motion."""
 MAX_USED = 0.8
-"""Share of the values that parameters and motions may use up; with more, the fit follows the noise, which it also
-estimates."""
+"""Largest share of the values that parameters and motions may absorb; with more, the fit follows the noise, which it
+also estimates."""
 DEGREES = (1, 3, 6)
 """Degrees of the polynomials of slow motions, as functions of the share of the rows measured so far."""
 AS_LIKELY = 0.5
-"""Share of the largest log Bayes factor above which a motion at the start of a frame explains the residuals too."""
+"""Share of the largest log Bayes factor above which a motion at the start of a frame also explains the residuals."""
 MAX_ITERATIONS = 6
-"""Iterations of the reweighting."""
+"""Largest number of iterations of the reweighting."""
 CONVERGENCE_TOLERANCE = 1e-2
 """Largest change of the weights, and relative change of the noise, at convergence."""
 _LOSS = HampelLoss()
@@ -40,13 +40,13 @@ class Motion:
     Attributes:
         moved: "frame", "target" (one of several on the tool) or "tool".
         name: name of the frame or the target.
-        rows: numbers of its rows in the measurements, in the order of the file.
+        rows: indices of the rows of the frame or target in the measurements, in the order of the file.
         first: index in `rows` of the first row after the motion; None for a slow motion over all rows.
         shift: mean shift of the measured points [m], in their frame, or for a tool in the flange frame; for a slow
-            motion the largest one since the first row.
-        turn: rotation angle of the frame or tool [rad]; for a slow motion likewise.
-        log_bayes_factor: logarithm of the odds of the motion against none, at equal prior odds.
-        factor: errors of the rows over those without the motion [1].
+            motion the largest shift since the first row.
+        turn: rotation angle of the frame or tool [rad]; for a slow motion the largest angle since the first row.
+        log_bayes_factor: logarithm of the odds of the motion against no motion, at equal prior odds.
+        factor: ratio of the errors of the rows without and with the motion in the model [1].
         begins_frame: whether a target or the tool moved exactly where rows of another frame start.
     """
 
@@ -62,7 +62,7 @@ class Motion:
 
 
 def find_motion(result: CalibrationResult | HybridResult) -> Motion | None:
-    """Find the motion of frame or tool that explains the residuals of a calibration best, whether likely or not.
+    """Find the motion of frame or tool that explains the residuals of a calibration best, likely or not.
 
     A frame or a tool that moves before row k shifts the values of the rows from k by `Z_i m` with six unknowns m. The
     model of the residuals r is linear in m and in x, the parameters of the calibration and the weights of a short
@@ -71,7 +71,7 @@ def find_motion(result: CalibrationResult | HybridResult) -> Motion | None:
     least squares. Slow motions `Σ P_d(t) m_d`, polynomials of the share t of the rows measured so far, are fitted in
     the same way.
 
-    The Bayes factor is that of Zellner's g-prior for m with unit information (Liang et al. 2008, JASA 103, 410-423,
+    The Bayes factor is for Zellner's g-prior of m with unit information (Liang et al. 2008, JASA 103, 410-423,
     eq. 6), divided by the number of rows k that were tried. Residuals of successive rows are correlated, because the
     geometry does not explain everything and rows were measured along a path or repeat a pose. Therefore the number of
     values is divided by the sum of the autocorrelations (Geyer 1992, Statistical Science 7, 473-483) or by the design
@@ -79,7 +79,7 @@ def find_motion(result: CalibrationResult | HybridResult) -> Motion | None:
     components of a row's residuals, `values · tr(C²) / tr(C)²` with their covariance C.
 
     Returns:
-        None if no position or orientation was measured, or if there are too few rows.
+        The motion; None if no position or orientation was measured, or if there are too few rows.
     """
     rows = OrderedRows.from_result(result)
     return None if rows is None else _motion_of(rows)
@@ -109,9 +109,9 @@ class _Candidate:
 
     Attributes:
         moved: see `Motion`.
-        number: number of the frame or the target.
-        index: indices of its rows, in the order of the file.
-        full: derivative of their values with respect to its motion.
+        number: index of the frame or the target.
+        index: indices of the rows of the frame or target, in the order of the file.
+        full: derivative of the values of these rows with respect to the motion.
         course: share of every motion completed at each row: 0 or 1 for a sudden motion.
         first: see `Motion`.
     """
@@ -130,7 +130,7 @@ class _Candidate:
 
     @property
     def candidates_tried(self) -> int:
-        """Number of candidates that it was chosen from."""
+        """Number of candidates from which this one was chosen."""
         return 1 if self.first is None else len(self.index) - 2 * MIN_ROWS
 
     def from_row(self, first: int) -> "_Candidate":
@@ -175,7 +175,7 @@ class _Fit:
 
 @dataclass(frozen=True, eq=False)
 class _Search:
-    """Fits motions to the residuals of a calibration.
+    """Search that fits motions to the residuals of a calibration.
 
     Attributes:
         rows: the residuals.
@@ -223,7 +223,7 @@ class _Search:
         index, Z, X = candidate.index, candidate.full, self.rows.jacobian[candidate.index]
 
         def sum_of_later_rows(terms: np.ndarray) -> np.ndarray:
-            """Sum over each row and all later ones."""
+            """Return the sum over every row and all later rows."""
             sums: np.ndarray = terms[::-1].cumsum(0)[::-1]
             return sums
 
@@ -291,7 +291,7 @@ class _Search:
     def log_bayes_factor(self, fit: _Fit, values_per_independent: float) -> float:
         """Compute the log odds of a candidate against no motion.
 
-        If motions and parameters use up nearly all values, nothing can contradict them: the odds are 0.
+        If motions and parameters absorb nearly all values, nothing can contradict them, so the odds are 0.
 
         Args:
             fit: fit of the candidate.
@@ -338,7 +338,7 @@ class _Search:
         return together * float(max(alike, repeated, 1.0))
 
     def motion(self, fit: _Fit) -> Motion:
-        """Convert a fit to a motion in metres and radians."""
+        """Return the motion of a fit, in metres and radians."""
         candidate = fit.candidate
         weight = fit.weights[candidate.index]
         left = (weight * fit.after[candidate.index] ** 2).sum(0) / np.maximum(weight.sum(0), 1e-300)
@@ -346,9 +346,9 @@ class _Search:
         parts = zip(_sensors(fit.shifts.var(0)[None]), _sensors(left[None]), strict=True)
         factor = max(math.sqrt(1 + added.sum() / max(rest.sum(), 1e-300)) for added, rest in parts)
         course = candidate.course - candidate.course[0]
-        whole = course @ fit.motion.reshape(-1, candidate.full.shape[2])  # motion completed at every row
+        whole = course @ fit.motion.reshape(-1, candidate.full.shape[2])  # motion up to every row
         largest = whole[np.linalg.norm(candidate.full[:, :3] @ whole[..., None], axis=(1, 2)).argmax()]
-        shift, turn = largest[:3], largest[:2:-1]  # about x, y, z, stored as roll, pitch, yaw
+        shift, turn = largest[:3], largest[:2:-1]  # rotations about x, y, z, stored as roll, pitch, yaw
         names = self.rows.problem.space.targets
         if candidate.moved == "frame":
             names = self.rows.problem.space.frames
@@ -369,7 +369,7 @@ class _Search:
         )
 
     def _center(self, rows: Int64[np.ndarray, " chosen"]) -> Float64[np.ndarray, " 3"]:
-        """Compute the mean measured position of some rows [m]; 0 if there is none."""
+        """Return the mean measured position of rows [m]; 0 if no position was measured."""
         position = self.rows.result.solved.measurements.position
         if position is None:
             return np.zeros(3)
@@ -378,7 +378,7 @@ class _Search:
 
 
 def _sensors(values: Float64[np.ndarray, "rows values"]) -> Sequence[Float64[np.ndarray, "rows 3"]]:
-    """Split the values by sensor."""
+    """Return the values of every sensor."""
     return np.split(values, values.shape[1] // 3, 1)
 
 

@@ -1,4 +1,4 @@
-"""A setup fault that explains large errors, as it is reported."""
+"""Setup faults that explain large errors, in the form in which they are reported."""
 
 import math
 from collections.abc import Sequence
@@ -13,17 +13,18 @@ from pisigma.validation.setup_faults.hypothesis import COLLAPSED, Hypothesis
 
 @dataclass(frozen=True)
 class SetupFault:
-    """A setup fault that explains the errors: corrected, they fall to a quarter or less.
+    """A setup fault that explains errors: after its correction they fall to a quarter or less.
 
     Attributes:
-        kinds: kinds of its causes, see `Cause.kind`.
+        kinds: kinds of the causes, see `Cause.kind`.
         clause: what is wrong, such as "the sign of joint 3 is reversed".
         advice: what to check.
         before: root mean square of the position errors [m].
-        after: the same with the fault corrected [m].
-        after_nominal: the same of the nominal robot [m]; NaN if the fault concerns the joint correction.
+        after: root mean square of the position errors after correction of the fault [m].
+        after_nominal: root mean square of the nominal robot's errors after correction of the fault [m]; NaN if the
+            fault concerns the joint correction.
         before_rotation: root mean square of the rotation errors [rad]; NaN if none was measured.
-        after_rotation: the same with the fault corrected [rad].
+        after_rotation: root mean square of the rotation errors after correction of the fault [rad].
         moved: largest motion of a joint zero [rad or m]; infinite for faults of other kinds.
         joints: indices of the joints concerned, from 0.
         amounts: amount of every cause, see `Cause.amount`.
@@ -45,12 +46,12 @@ class SetupFault:
 
     @property
     def explains_orientation(self) -> bool:
-        """Whether the fault explains the rotation errors too."""
+        """Whether the fault also explains the rotation errors."""
         return self.after_rotation <= COLLAPSED * self.before_rotation
 
     @property
     def sentence(self) -> str:
-        """Sentence on what is wrong, on the errors with it corrected, and on what to check."""
+        """Sentence about what is wrong, the errors after its correction, and what to check."""
         clause = self.clause[:1].upper() + self.clause[1:]
         if not np.isfinite(self.after):
             return f"{clause}; {self.advice}."
@@ -63,7 +64,7 @@ class SetupFault:
         return f"{clause}: with this corrected, the errors fall {fall}; {self.advice}."
 
     def diagnostic(self, severity: Severity = "implausible") -> Diagnostic:
-        """Report the fault."""
+        """Return the fault as a finding of the checks."""
         return Diagnostic(
             kind="setup_fault",
             severity=severity,
@@ -75,12 +76,12 @@ class SetupFault:
 
     @property
     def cause(self) -> str:
-        """The kinds of its causes in one word, such as "joint_sign" or "frame+tool"; see `Diagnostic.cause`."""
+        """Kinds of the causes in one word, such as "joint_sign" or "frame+tool"; see `Diagnostic.cause`."""
         return "+".join(self.kinds)
 
     @property
     def values(self) -> dict[str, float | int | str | tuple[int, ...]]:
-        """The numbers of the sentence; joints count from 1; see `Diagnostic.values`."""
+        """Numbers of the sentence by name; joints are counted from 1; see `Diagnostic.values`."""
         figures = {"before_mm": self.before * 1e3, "after_mm": self.after * 1e3}
         finite = {name: value for name, value in figures.items() if np.isfinite(value)}
         if len(self.amounts) == 1 and self.kinds[0].endswith("_unit") and np.isfinite(self.amounts[0]):
@@ -102,7 +103,7 @@ class SetupFault:
 
 
 def combine_alternatives(faults: Sequence[SetupFault]) -> SetupFault:
-    """Combine faults that explain the errors about equally well, the best first, into one with alternatives."""
+    """Return one fault with alternatives for faults that explain the errors about equally well, best first."""
     if len(faults) == 1:
         return faults[0]
     clauses = dict.fromkeys(fault.clause for fault in faults)
@@ -113,7 +114,7 @@ def combine_alternatives(faults: Sequence[SetupFault]) -> SetupFault:
 
 
 def fault_of_cause(cause: Cause, before: float, after: float) -> SetupFault:
-    """Make the fault of a single cause, with the RMS position errors before and after its correction [m]."""
+    """Return the fault of a single cause, with the RMS position errors before and after its correction [m]."""
     nan = math.nan
     return SetupFault(
         *((cause.kind,), cause.clause, cause.advice, before, after, nan, nan, nan),
@@ -123,7 +124,7 @@ def fault_of_cause(cause: Cause, before: float, after: float) -> SetupFault:
 
 
 def fault_from_hypothesis(here: Hypothesis, other: Hypothesis, after_nominal: float) -> SetupFault:
-    """Make the fault of a hypothesis, with the errors before (`here`) and after, and those of the nominal robot [m]."""
+    """Return the fault of a hypothesis, with errors before (`here`), after, and of the nominal robot [m]."""
     (before, before_rotation), (after, after_rotation) = here.rms(), other.rms()
     return SetupFault(
         kinds=tuple(cause.kind for cause in other.causes),

@@ -1,4 +1,4 @@
-"""Search for the usual setup faults that explain large errors of a model, by trying each on the data."""
+"""Search for common setup faults that explain large errors of a model, by trying each of them on the data."""
 
 from collections.abc import Collection
 from dataclasses import replace
@@ -32,7 +32,7 @@ from pisigma.validation.setup_faults.nominal_robot_faults import (
 from pisigma.validation.setup_faults.setup_fault import SetupFault, fault_from_hypothesis
 
 CAUSES = {"base": "frame", "tool": "tool"}
-"""Kind of the cause "moved" by the kind of frame."""
+"""Kind of the cause of a motion by the kind of frame."""
 
 
 @torch.no_grad()
@@ -43,7 +43,7 @@ def find_setup_faults(
     fitted: Collection[FrameKind] = (),
     frames_only: bool = False,
 ) -> tuple[SetupFault, ...]:
-    """Find setup faults that reduce the errors of a model to a quarter or less, the simplest first.
+    """Find setup faults that reduce the errors of a model to a quarter or less, simplest first.
 
     The hypotheses are: another frame and another tool (best-fitting rigid transforms), positions in other units or
     mirrored, orientations in another convention, shifted rows, degrees for radians or millimetres for metres (and vice
@@ -62,7 +62,7 @@ def find_setup_faults(
         frames_only: try only motions of frames and tools.
 
     Returns:
-        Empty if the errors are below 0.02 mm, or if nothing explains them.
+        The faults; empty if the errors are below 0.02 mm, or if nothing explains them.
     """
     judged = judged_values(model, measurements)
     some = judged.select(evenly_spaced_rows(measured_rows(judged), MAX_ROWS))
@@ -111,7 +111,7 @@ def _nominal_error(nominal: CalibratedModel | None, some: Measurements, other: H
 
 
 def judged_values(model: CalibratedModel, measurements: Measurements) -> Measurements:
-    """Leave out orientations if the model does not know that of its tool."""
+    """Return the rows without orientations if the orientation of the tool is unknown to the model."""
     if has_orientation(model):
         return measurements
     return replace(measurements, rotation=None, sigma_rotation=None)
@@ -121,7 +121,7 @@ def is_implausible(figures: ModelFigures, model: CalibratedModel) -> bool:
     """Return whether errors of positions or of orientations are too large for a calibrated robot.
 
     Args:
-        figures: figures of the model, or of another one with its base and tool.
+        figures: figures of the model, or of another model with its base and tool.
         model: the model.
     """
     reach, orientation = model.robot.reach, figures.orientation if has_orientation(model) else None
@@ -130,7 +130,7 @@ def is_implausible(figures: ModelFigures, model: CalibratedModel) -> bool:
 
 
 def unexplained(model: CalibratedModel) -> Diagnostic:
-    """Report that no setup fault explains implausible errors of a model, and what to check."""
+    """Return the finding that no setup fault explains implausible errors of a model, with what to check."""
     limit, turn = PLAUSIBLE_SHARE * model.robot.reach * 1e3, np.rad2deg(PLAUSIBLE_TURN)
     return Diagnostic(
         kind="implausible_errors",

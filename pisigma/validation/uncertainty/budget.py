@@ -10,15 +10,15 @@ COVERAGE = 0.95
 
 @dataclass(frozen=True)
 class Component:
-    """One source of uncertainty.
+    """A source of uncertainty.
 
     Attributes:
-        name: what is uncertain.
+        name: the uncertain quantity.
         evaluation: "A": from repeated observations (JCGM 100:2008, 4.2); "B": from other knowledge (4.3).
         standard_uncertainty: standard uncertainty of one coordinate of the tool's position [m].
-        degrees_of_freedom: its degrees of freedom; infinite where the value is taken as exact; None if they are not
-            known, in which case they are treated as infinite.
-        source: where the figure comes from.
+        degrees_of_freedom: degrees of freedom; infinite if the uncertainty is assumed to be exact; None if they are
+            unknown and therefore treated as infinite.
+        source: source of the figure.
     """
 
     name: str
@@ -28,7 +28,7 @@ class Component:
     source: str
 
     def to_json(self) -> dict[str, Any]:
-        """Return plain values, lengths in mm; infinite degrees of freedom are the text "infinite"."""
+        """Return plain values with lengths in mm; infinite degrees of freedom are the text "infinite"."""
         freedom = self.degrees_of_freedom
         return {
             "name": self.name,
@@ -93,7 +93,7 @@ class UncertaintyBudget:
         return self.combined * math.sqrt(3 * float(stats.f.ppf(COVERAGE, 3, freedom)))
 
     def to_json(self) -> dict[str, Any]:
-        """Return plain values, lengths in mm; without components there are no combined figures."""
+        """Return plain values with lengths in mm; without components there are no combined figures."""
         plain: dict[str, Any] = {
             "components": [one.to_json() for one in self.components],
             "not_stated": list(self.missing),

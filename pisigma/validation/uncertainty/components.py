@@ -1,6 +1,6 @@
-"""Components of the uncertainty of a corrected robot, from a model, its rows, and what is stated about the cell.
+"""Components of the uncertainty of a corrected robot, from a model, its rows, and statements about the cell.
 
-A component is a `Component`, or a sentence that names what is not stated.
+Functions return a `Component`, or a sentence that names what is not stated.
 """
 
 import math
@@ -32,10 +32,10 @@ def uncertainty_budget(
     expansion_per_k: float | None,
     repeatability_mm: float | None = None,
 ) -> UncertaintyBudget:
-    """Compose the budget of one coordinate of the tool's position, with the correction active.
+    """Return the budget of one coordinate of the tool's position, with the correction active.
 
     The scatter of the calibration contains the repeatability of the robot, the random errors of the instrument and
-    what the model cannot express; the certificate of the instrument covers its random errors too. The budget therefore
+    what the model cannot express; the certificate of the instrument also covers its random errors. The budget therefore
     tends to be too large rather than too small.
 
     Args:
@@ -43,8 +43,8 @@ def uncertainty_budget(
         poses: rows with the joint values for which the uncertainty of the model is computed; None if there are none.
         where: name of these rows.
         instrument: the instrument of the cell.
-        temperatures: mean temperature of every session [deg C], by its name; None where the rows do not state it.
-        made_of: names of the sessions that the model was fitted to.
+        temperatures: mean temperature of every session [deg C], by name; None if the rows do not state it.
+        made_of: names of the sessions to which the model was fitted.
         expansion_per_k: coefficient of linear expansion of the arm [1/K]; None if it is not stated.
         repeatability_mm: pose repeatability RP of the maker [mm], which is used if the scatter is not known; None if
             it is not stated.
@@ -158,7 +158,7 @@ def thermal_component(
 
 
 def _noise(model: CalibratedModel) -> NoiseFigures | None:
-    """Return the figures of the coordinates' noise; None if the model does not keep them."""
+    """Return the noise figures of coordinates; None if the model does not store them."""
     summary = CalibrationSummary.read(model)
     if summary is None:
         return None
@@ -168,7 +168,7 @@ def _noise(model: CalibratedModel) -> NoiseFigures | None:
 
 
 def _freedom(model: CalibratedModel) -> float | None:
-    """Return the degrees of freedom of the residuals, `n - p`; None if the model does not keep them."""
+    """Return the degrees of freedom of the residuals, `n - p`; None if the model does not store them."""
     noise = _noise(model)
     if noise is None or noise.values is None or noise.used_by_parameters is None:
         return None

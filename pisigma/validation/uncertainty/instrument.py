@@ -15,8 +15,8 @@ class Instrument(Section):
     Attributes:
         name: maker and type.
         serial: serial number.
-        certificate: number of its calibration certificate.
-        calibrated: day of its calibration (ISO 8601).
+        certificate: number of the calibration certificate.
+        calibrated: day of the calibration (ISO 8601).
         expanded_uncertainty_mm: expanded uncertainty U of a measured coordinate at the distance of the robot [mm].
         coverage_factor: coverage factor k of U, as the certificate states it.
     """
