@@ -99,6 +99,17 @@ class AbstractFeature(ABC):
             state: joint values [rad or m], and further data of the rows.
         """
 
+    def unstated_deviation(
+        self, state: JointState, weight: Float64[Tensor, "dof columns"]
+    ) -> Float[Tensor, "*batch dof"]:
+        """Return the standard deviation of the correction [rad or m] by row data that are not stated.
+
+        Args:
+            state: joint states; see `columns`.
+            weight: weights of the columns.
+        """
+        return torch.zeros_like(state.q)
+
     @classmethod
     def candidates(
         cls: type[Feature], robot: Robot, options: FeatureOptions, state: JointState

@@ -95,6 +95,13 @@ class JointCorrection(nn.Module):
             return total
         return total + sum_of_products(self.factors(state.q), self.orders)
 
+    def unstated_deviation(self, state: JointState) -> Float[Tensor, "*batch dof"]:
+        """Compute the standard deviation of the corrections [rad or m] by row data that are not stated."""
+        variance = torch.zeros_like(state.q)
+        for feature, weight in zip(self.features, self.linear, strict=True):
+            variance = variance + feature.unstated_deviation(state, weight.detach().to(state.q)).square()
+        return variance.sqrt()
+
     def factors(self, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch dof factors"]:
         """Compute the factors of the product units of all joints."""
         phi = unit_inputs(self.robot, q)

@@ -3,8 +3,9 @@
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
+import numpy as np
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Float, Float64, Int64
 from torch import Tensor
 
 from pisigma.measurement.dataset import Measurements
@@ -16,6 +17,9 @@ MIN_SPREAD = 1e-9
 APPROACH = "approach"
 """Key of `JointState.stated`: `(*batch, dof)`, +1 if the joint's value increased before it stopped, -1 if it decreased;
 0 or NaN if not given."""
+
+MIN_MOTION = 1e-3
+"""[rad or m] Smaller motions of a joint need not take up the play of its gear."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,3 +83,39 @@ def repeat_key(measurements: Measurements) -> Float64[Tensor, "rows _key"]:
     if measurements.approach is not None:
         columns.append(measurements.approach.nan_to_num(0.0))
     return torch.cat(columns, 1)
+
+
+def motions_between_rows(
+    measurements: Measurements,
+) -> tuple[Float64[np.ndarray, "rows dof"], Float64[np.ndarray, "rows dof"]]:
+    """Compute the motions [rad or m] from the previous row, and from the next row back; 0 at the ends of a file."""
+    q = measurements.q.cpu().numpy()
+    order = _order_of_files(measurements)
+    origin = np.array(measurements.origin or ("",) * len(q))[order]
+    step = np.diff(q[order], axis=0) * (origin[1:] == origin[:-1])[:, None]
+    none = np.zeros((1, q.shape[1]))
+    before, after = np.empty_like(q), np.empty_like(q)
+    before[order], after[order] = np.concatenate([none, step]), np.concatenate([-step, none])
+    return before, after
+
+
+def approach_by_order(measurements: Measurements) -> Float64[Tensor, "rows dof"]:
+    """Return the direction of approach of every joint if the rows were measured in the order of their file.
+
+    It is that of the joint's last motion by more than `MIN_MOTION`; NaN before its first one in a file.
+    """
+    motion = motions_between_rows(measurements)[0]
+    direction = np.where(np.abs(motion) > MIN_MOTION, np.sign(motion), np.nan)
+    approach, last, file = np.empty_like(direction), direction[0], ""
+    for row in _order_of_files(measurements):
+        origin = measurements.origin[row] if measurements.origin else ""
+        last = np.where(np.isnan(direction[row]), np.nan if origin != file else last, direction[row])
+        approach[row], file = last, origin
+    return torch.from_numpy(approach).to(measurements.q.device)
+
+
+def _order_of_files(measurements: Measurements) -> Int64[np.ndarray, " rows"]:
+    """Return the rows in the order of their lines; those of several files follow one another."""
+    if measurements.origin:
+        return np.arange(measurements.rows)
+    return np.argsort(np.array(measurements.line), kind="stable")

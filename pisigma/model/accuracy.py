@@ -9,7 +9,7 @@ from torch import Tensor
 from pisigma.calibration.geometric.posterior import ParameterPosterior
 from pisigma.measurement.conditions import CONDITIONS
 from pisigma.measurement.dataset import Measurements
-from pisigma.model.calibrated_model import CalibratedModel, corrected_joints, known_names
+from pisigma.model.calibrated_model import CalibratedModel, known_names
 
 
 def position_accuracy(model: CalibratedModel, q: Float[Tensor, "*batch dof"]) -> Float64[Tensor, "*batch"]:
@@ -46,8 +46,8 @@ def position_accuracy(model: CalibratedModel, q: Float[Tensor, "*batch dof"]) ->
 def deviation_of_rows(model: CalibratedModel, measurements: Measurements) -> Float64[Tensor, "rows 3"]:
     """Compute the standard deviation of every row's target position along the axes of its frame [m].
 
-    It is the standard deviation of the posterior, without measurement noise, inside and outside the measured joint
-    values.
+    It is the standard deviation of the posterior and of row data that are not stated, such as directions of approach,
+    without measurement noise, inside and outside the measured joint values.
 
     Returns:
         The standard deviations; NaN if the model has no uncertainty.
@@ -60,7 +60,7 @@ def deviation_of_rows(model: CalibratedModel, measurements: Measurements) -> Flo
     frame = known_names(model.bases, measurements.frame, "frame", measurements)
     target = known_names(model.tools, measurements.target, "target", measurements)
     at, arm = replace(measurements, frame=frame, target=target), model.hybrid
-    return model.uncertainty.deviation(at, at.q if arm is None else corrected_joints(arm, at))
+    return model.uncertainty.deviation(at, None if arm is None else arm.correction)
 
 
 def parameter_posterior(model: CalibratedModel) -> ParameterPosterior | None:

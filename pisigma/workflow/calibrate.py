@@ -16,6 +16,7 @@ from pisigma.files.model_files import HELD_OUT_CSV
 from pisigma.files.progress import Progress
 from pisigma.joint_correction.registry import plugin_features
 from pisigma.measurement.camera.corner_file import MeasurementFiles, read_rows
+from pisigma.measurement.conditions import approach_by_order
 from pisigma.measurement.dataset import Measurements, with_new_frames
 from pisigma.measurement.joint_range import row_warnings, with_limits_of_rows
 from pisigma.measurement.sensors.socket import PairOfSockets, matching_sockets
@@ -24,6 +25,7 @@ from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.geometric_model import model_of_calibration, with_hybrid
 from pisigma.reporting.cards import CardTexts, write_calibration_card
 from pisigma.robot.description import Robot
+from pisigma.validation.checks.backlash import unstated_backlash
 from pisigma.validation.checks.check import CheckedCalibration
 from pisigma.validation.checks.registry import diagnostics_of
 from pisigma.validation.checks.row_order import explain_refusal
@@ -35,6 +37,7 @@ from pisigma.validation.held_out.calibration_validation import (
     joined_repeats,
     judge,
 )
+from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.held_out.few_rows import fit_with_folds
 from pisigma.validation.held_out.held_out_rows import HeldOutRows
 from pisigma.validation.held_out.pose_statistics import predicted_at_other_poses
@@ -130,11 +133,15 @@ def calibrate(
     training, test_rows = measurements.split_sets()
     splitting = Splitting(settings.split, settings.seed, settings.folds, settings.hold_out)
     splits = splitting.split(training, settings.repeats, settings.train_rows)
-    rows = training
-    if settings.train_rows is not None:
-        rows = training.select(draw_rows(training, settings.train_rows, settings.seed))
     distances = matching_sockets(settings.socket_distances, training.socket or ())
     calibrator = calibrator_of(settings, nominal, distances)
+    drawn = None if settings.train_rows is None else draw_rows(training, settings.train_rows, settings.seed)
+    rows, backlash = training if drawn is None else training.select(drawn), None
+    if measurements.approach is None:
+        sided = replace(measurements, approach=approach_by_order(measurements)).split_sets()[0]
+        sided_rows = sided if drawn is None else sided.select(drawn)
+        backlash = unstated_backlash(geometric_of(calibrator), sided_rows)
+        training, rows = (training, rows) if backlash is None else (sided, sided_rows)
     faulty = any(one.severity == "implausible" for one in setup_diagnostics(nominal, rows))
     if faulty:
         calibrator, splits = geometric_of(calibrator), []
@@ -156,7 +163,10 @@ def calibrate(
         _description("geometric" if faulty else settings.model, nominal),
         "Validated on rows of the same measurement only, not on other days, payloads or temperatures.",
     )
-    calibration = compose_calibration(calibrator, result, rows, summary, texts, validation, test, training)
+    found = () if backlash is None else (backlash,)
+    calibration = compose_calibration(
+        calibrator, result, rows, summary, texts, validation, test, training, found=found
+    )
     return replace(calibration, settings=settings, seconds=time.perf_counter() - started)
 
 
@@ -170,6 +180,7 @@ def compose_calibration(
     test: CalibrationValidation | None = None,
     held_out: Measurements | None = None,
     recipe: tuple[str, str] = ("", ""),
+    found: tuple[Diagnostic, ...] = (),
 ) -> Calibration:
     """Check a calibration, and build its model and summary.
 
@@ -183,6 +194,7 @@ def compose_calibration(
         test: errors of the rows of the set "test".
         held_out: rows of the validation whose errors the model folder keeps; None keeps none.
         recipe: name and SHA-256 of the recipe; empty without one.
+        found: what was found before the calibration.
 
     Raises:
         IdentificationError: the measurements cannot come from this robot.
@@ -190,7 +202,7 @@ def compose_calibration(
     checked = CheckedCalibration(
         geometric_of(calibrator), rows, fit_compared_calibrations(calibrator, rows, result=result), validation
     )
-    diagnostics, nominal = diagnostics_of(checked), checked.robot
+    diagnostics, nominal = (*diagnostics_of(checked), *found), checked.robot
     warnings = tuple(one.sentence for one in diagnostics if one.severity == "warning")
     summary = summary.with_figures(
         calibrated=checked.figures,

@@ -102,7 +102,9 @@ class HybridResult:
         Raises:
             IdentificationError: nothing was measured in metres.
         """
-        return self.uncertainty.deviation(measurements, self._moved_joints(measurements))
+        return self.uncertainty.deviation(
+            measurements, None if self.learned is None else self.learned.correction
+        )
 
     def _moved_joints(self, measurements: Measurements) -> Float64[Tensor, "rows dof"]:
         """Compute the joint values of rows with their corrections [rad or m]."""

@@ -22,6 +22,7 @@ from pisigma.estimation.covariance_root import CovarianceRoot
 from pisigma.estimation.held_out import HeldOutErrors, held_out_scale
 from pisigma.estimation.regression import Posterior, prior_size_columns
 from pisigma.joint_correction.feature import AbstractFeature
+from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.measurement.conditions import JointState
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.sensors.sensor import numbers_of
@@ -67,13 +68,15 @@ class PositionUncertainty:
         return self.covariance_root.as_matrix
 
     def deviation(
-        self, measurements: Measurements, q_moved: Float64[Tensor, "rows dof"]
+        self, measurements: Measurements, correction: JointCorrection | None = None
     ) -> Float64[Tensor, "rows 3"]:
         """Compute the standard deviation of every row's position along the axes of its frame [m].
 
+        It includes the effect of row data that are not stated, such as directions of approach.
+
         Args:
             measurements: joint values, frames and targets.
-            q_moved: joint values with their corrections [rad or m].
+            correction: the joint correction; None without one.
         """
         state = JointState.from_measurements(measurements)
         frame = numbers_of(measurements.frame, self.space.frames, measurements.rows)
@@ -83,14 +86,20 @@ class PositionUncertainty:
             for t in range(len(self.space.targets)):
                 rows = ((frame == f) & (target == t)).nonzero()[:, 0]
                 for part in torch.split(rows, CHUNK):
-                    deviation[part] = self._of_rows(state[part], q_moved[part], f, t)
+                    deviation[part] = self._of_rows(state[part], correction, f, t)
         return deviation
 
     def _of_rows(
-        self, state: JointState, q_moved: Float64[Tensor, "rows dof"], frame: int, target: int
+        self, state: JointState, correction: JointCorrection | None, frame: int, target: int
     ) -> Float64[Tensor, "rows 3"]:
+        with torch.no_grad():
+            q_moved = state.q if correction is None else state.q + correction(state)
         columns = self.columns(state, q_moved, frame, target)[:, :3]
-        return self.covariance_root.left_multiply(columns).square().sum(-1).sqrt()
+        variance: Tensor = self.covariance_root.left_multiply(columns).square().sum(-1)
+        if correction is not None:
+            unstated = columns[..., joint_columns(self.space)] * correction.unstated_deviation(state)[:, None]
+            variance = variance + unstated.square().sum(-1)
+        return variance.sqrt()
 
     def columns(
         self, state: JointState, q_moved: Float64[Tensor, "rows dof"], frame: int = 0, target: int = 0

@@ -8,6 +8,7 @@
 | Are rows of two setups mixed? | | `mixed_rows.check_two_populations` | `mixed_rows` |
 | Are single rows wrong? | | robust loss of the calibration | `wrong_rows` |
 | Were joint values logged too early, or rounded? | | `lag`, `rounding` | |
+| Do gears have backlash that the rows do not state? | | `backlash` (before the calibration) | |
 | Are all lengths wrong by one factor? | `setup_fault.check_position_size` | `scale` | `scale` |
 | Do large errors remain that nothing explains? | | `unexplained` | `unexplained` |
 

@@ -4,10 +4,8 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-import numpy as np
-from jaxtyping import Float64
-
 from pisigma.calibration.hybrid.search import CLEARLY
+from pisigma.measurement.conditions import motions_between_rows
 from pisigma.measurement.dataset import Measurements
 from pisigma.validation.checks.check import CheckedCalibration
 from pisigma.validation.held_out.diagnostic import Diagnostic
@@ -71,15 +69,13 @@ def find_lag(rows: OrderedRows, measurements: Measurements) -> Lag | None:
     """
     if len(rows.residual) < MIN_ROWS:
         return None
-    r = rows.clipped.ravel()
-    X = rows.jacobian.reshape(len(r), -1)
-    covariance, spare = rows.covariance, max(rows.values - rows.effective_parameters, 1.0)
-    left = r - X @ (covariance @ (X.T @ r))
+    left = rows.without_parameters(rows.clipped.ravel())
+    spare = max(rows.values - rows.effective_parameters, 1.0)
     found = []
-    for before, motion in zip((True, False), _motions(measurements), strict=True):
-        z = (rows.joint_derivative @ motion[rows.number][..., None]).reshape(len(r), -1)[:, 0]
+    for before, motion in zip((True, False), motions_between_rows(measurements), strict=True):
+        z = (rows.joint_derivative @ motion[rows.number][..., None]).ravel()
         # The part of the lag that the calibration could not absorb, which alone affects the residuals (Frisch-Waugh).
-        free = z - X @ (covariance @ (X.T @ z))
+        free = rows.without_parameters(z)
         information = float(free @ free)
         if information <= 1e-12 * float(z @ z):
             continue
@@ -91,21 +87,3 @@ def find_lag(rows: OrderedRows, measurements: Measurements) -> Lag | None:
         )
         found.append(Lag(before, share, math.sqrt(spare / max(spare - 1, 1.0) / ratio), gain))
     return max(found, key=lambda lag: lag.log_bayes_factor, default=None)
-
-
-def _motions(
-    measurements: Measurements,
-) -> tuple[Float64[np.ndarray, "rows dof"], Float64[np.ndarray, "rows dof"]]:
-    """Compute the joint motions [rad or m] from the previous and from the next row; 0 at the ends of a file."""
-    q = measurements.q.cpu().numpy()
-    order = (
-        np.argsort(np.array(measurements.line), kind="stable")
-        if not measurements.origin
-        else np.arange(len(q))
-    )
-    origin = np.array(measurements.origin or ("",) * len(q))[order]
-    step = np.diff(q[order], axis=0) * (origin[1:] == origin[:-1])[:, None]
-    none = np.zeros((1, q.shape[1]))
-    before, after = np.empty_like(q), np.empty_like(q)
-    before[order], after[order] = np.concatenate([none, step]), np.concatenate([-step, none])
-    return before, after

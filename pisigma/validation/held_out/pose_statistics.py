@@ -299,7 +299,7 @@ def predicted_at_other_poses(
         solved = result.solved
         root = CovarianceRoot(solved.root)
         known = PositionUncertainty(solved.problem.space, solved.geometry, (), root, 1.0)
-        deviation = known.deviation(others, others.q)
+        deviation = known.deviation(others)
     rms = float((deviation.square() + _noise(result, others).square()).sum(1).mean().sqrt())
     return rms if math.isfinite(rms) else None
 

@@ -16,9 +16,11 @@ from pisigma.calibration.geometric.problem.problem import CalibrationProblem
 from pisigma.calibration.geometric.result import CalibrationResult
 from pisigma.calibration.hybrid.gravity import USUAL, to_first_row_frame
 from pisigma.calibration.hybrid.result import HybridResult
+from pisigma.joint_correction.backlash import Backlash
 from pisigma.joint_correction.feature import AbstractFeature
 from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.joint_correction.gravity_torques import GravityTorques
+from pisigma.measurement.conditions import APPROACH
 
 MAX_ROWS = 4_000
 """Largest number of rows that are used, drawn from all rows."""
@@ -177,12 +179,14 @@ class OrderedRows:
     def _joint_errors(self) -> tuple[tuple[AbstractFeature, Bool[np.ndarray, "dof columns"], float], ...]:
         """Derivatives by the weights of unmodelled joint errors, and prior standard deviations of the weights [rad].
 
-        Gravity acts on masses at the origins of the frames.
+        Gravity acts on masses at the origins of the frames. Backlash needs stated directions of approach.
         """
         robot = self.problem.space.robot
+        play = Backlash(robot)
+        backlash = ((play, play.used.numpy(), JOINT_ERROR),) if APPROACH in self.problem.state.stated else ()
         series, sag = FourierSeries(robot, HARMONICS), GravityTorques(robot, to_first_row_frame(robot, USUAL))
         masses = sag.used.numpy() & (np.arange(sag.used.shape[1]) % 4 == 0)
-        return (series, series.used.numpy(), JOINT_ERROR), (sag, masses, SAG)
+        return (series, series.used.numpy(), JOINT_ERROR), (sag, masses, SAG), *backlash
 
     @cached_property
     def precision(self) -> Float64[np.ndarray, " unknowns"]:
@@ -210,9 +214,13 @@ class OrderedRows:
     @cached_property
     def residual_after_fit(self) -> Float64[np.ndarray, "rows values"]:
         """Residuals after fitting the parameters and the series of joint errors."""
-        X, r = self.jacobian.reshape(-1, self.jacobian.shape[2]), self.residual.ravel()
-        left: np.ndarray = r - X @ (self.covariance @ (X.T @ r))
-        return left.reshape(self.residual.shape)
+        return self.without_parameters(self.residual.ravel()).reshape(self.residual.shape)
+
+    def without_parameters(self, values: Float64[np.ndarray, "*values"]) -> Float64[np.ndarray, "*values"]:
+        """Return what remains of values, or of columns of them, after fitting the parameters and weights to them."""
+        X = self.jacobian.reshape(-1, self.jacobian.shape[2])
+        left: np.ndarray = values - X @ (self.covariance @ (X.T @ values))
+        return left
 
     @cached_property
     def effective_parameters(self) -> float:

@@ -1,0 +1,133 @@
+"""Check whether the residuals depend on the direction from which every joint came: unstated backlash."""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pisigma.calibration.geometric.calibrator import GeometricCalibrator
+from pisigma.files.errors import IdentificationError
+from pisigma.measurement.dataset import Measurements
+from pisigma.robot.description import Robot
+from pisigma.robot.kinematics.jacobian import joint_jacobian
+from pisigma.validation.checks.lag import LIKELY, MIN_ROWS, NOTICED, find_lag
+from pisigma.validation.held_out.diagnostic import Diagnostic
+from pisigma.validation.setup_faults.cause import join_words, joints_text, length_text
+from pisigma.validation.setup_faults.ordered_rows import OrderedRows
+
+
+@dataclass(frozen=True)
+class LostMotion:
+    """Backlash of joints, whose last motions are known from the order of the rows.
+
+    Attributes:
+        play: backlash of the joints by their index [rad or m].
+        factor: errors of the rows over those without the backlash [1].
+        log_bayes_factor: logarithm of the odds of backlash in these joints against none.
+    """
+
+    play: dict[int, float]
+    factor: float
+    log_bayes_factor: float
+
+
+def find_backlash(rows: OrderedRows, measurements: Measurements) -> LostMotion | None:
+    """Fit half the backlash of every joint to the residuals of a calibration: `r = X x + Σ_j J_j s_j b_j + e`.
+
+    `s_j` is the sign of the joint's last motion. With friction the joint stays behind (b_j < 0); without it, inertia
+    carries it through the play when the drive stops. Joints are added one by one while the odds grow, at the cost of
+    one more parameter (Schwarz 1978, Annals of Statistics 6(2)) and of the choice.
+
+    Args:
+        rows: residuals of a calibration.
+        measurements: the rows of the calibration, with the directions of the last motions.
+
+    Returns:
+        None if there are too few rows, or no joint can be tested.
+    """
+    if len(rows.residual) < MIN_ROWS:
+        return None
+    assert measurements.approach is not None
+    approach = measurements.approach.nan_to_num(0.0).cpu().numpy()[rows.number]
+    left = rows.without_parameters(rows.clipped.ravel())
+    moved = (rows.joint_derivative * approach[:, None]).reshape(len(left), -1)
+    free = rows.without_parameters(moved)
+    possible = np.flatnonzero((free**2).sum(0) > 1e-12 * (moved**2).sum(0)).tolist()
+    best, freedom = None, rows.degrees_of_freedom
+    spare = max(rows.values - rows.effective_parameters, 1.0)
+    for count in range(1, len(possible) + 1):
+        earlier = () if best is None else tuple(best.play)
+        found = []
+        for joint in possible:
+            if joint in earlier:
+                continue
+            joints = (*earlier, joint)
+            half = np.linalg.lstsq(free[:, joints], left, rcond=None)[0]
+            ratio = max(float(((left - free[:, joints] @ half) ** 2).sum() / (left @ left)), 1e-12)
+            cost = count * math.log(max(freedom, 2.0)) / 2 + math.log(math.comb(len(possible), count))
+            factor = math.sqrt(spare / max(spare - count, 1.0) / ratio)
+            play = dict(zip(joints, (2 * np.abs(half)).tolist(), strict=True))
+            found.append(LostMotion(play, factor, -freedom / 2 * math.log(ratio) - cost))
+        better = max(found, key=lambda one: one.log_bayes_factor, default=None)
+        if better is None or (best is not None and better.log_bayes_factor <= best.log_bayes_factor):
+            break
+        best = better
+    return best
+
+
+def unstated_backlash(calibrator: GeometricCalibrator, rows: Measurements) -> Diagnostic | None:
+    """Test whether the directions of the last motions matter in rows that state no directions of approach.
+
+    A lag between joint values and measurements also depends on the last motion; the one with the larger evidence is
+    assumed.
+
+    Args:
+        calibrator: a geometric calibrator of the robot.
+        rows: the rows, with the directions that follow from their order (`approach_by_order`).
+
+    Returns:
+        A warning that names the joints and their backlash; None if there is none.
+    """
+    if rows.position is None:
+        return None
+    try:
+        ordered = OrderedRows.from_result(calibrator.fit(replace(rows, approach=None)))
+    except IdentificationError:
+        return None  # the calibration itself refuses these rows
+    found = None if ordered is None else find_backlash(ordered, rows)
+    if ordered is None or found is None or found.log_bayes_factor < LIKELY or found.factor < NOTICED:
+        return None
+    lag = find_lag(ordered, rows)
+    if lag is not None and lag.log_bayes_factor > found.log_bayes_factor:
+        return None
+    return _diagnostic(calibrator.robot, rows, found)
+
+
+def _diagnostic(robot: Robot, rows: Measurements, found: LostMotion) -> Diagnostic:
+    """Name the joints with backlash, its size, and what it means for commanded poses."""
+    joints = tuple(sorted(found.play))
+    play = [found.play[joint] for joint in joints]
+    per_unit = [(180 / math.pi, "deg") if robot.revolute[joint] else (1e3, "mm") for joint in joints]
+    sizes = [(size * factor, unit) for size, (factor, unit) in zip(play, per_unit, strict=True)]
+    J = joint_jacobian(robot, rows.q)[1][:, :3, list(joints)]
+    error = float((J * J.new_tensor(play) / 2).square().sum((1, 2)).mean().sqrt())
+    remedy = "State from which side the joints come (docs/how-to/backlash.md), also for the poses to command."
+    return Diagnostic(
+        kind="backlash",
+        severity="warning",
+        sentence=f"{joints_text(joints).capitalize()}: a backlash of about "
+        f"{join_words(f'{size:.2g} {unit}' for size, unit in sizes)}, because the errors depend on the direction of "
+        f"the last motion, which makes them {found.factor:.3g} times as large. The directions were taken from the "
+        "order "
+        "of the rows, and errors of held-out rows are errors with known directions; without them, commanded poses have "
+        f"further errors of {length_text(error)} RMS. {remedy}",
+        cause="unstated",
+        values={
+            "joints": tuple(joint + 1 for joint in joints),
+            "factor": found.factor,
+            "log_odds": found.log_bayes_factor,
+            "error_mm": error * 1e3,
+        }
+        | {f"play{joint + 1}_{unit}": size for joint, (size, unit) in zip(joints, sizes, strict=True)},
+        remedy=remedy,
+    )

@@ -1,0 +1,108 @@
+"""Backlash of joints that the rows do not state is found by the order of the rows, and nothing else is taken for it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from testing.checked import checked
+from testing.closeness import assert_close
+from testing.outside_arm import OutsideArm
+
+from pisigma.calibration.geometric.calibrator import GeometricCalibrator
+from pisigma.calibration.hybrid.calibrator import HybridCalibrator
+from pisigma.measurement.conditions import approach_by_order
+from pisigma.measurement.dataset import Measurements
+from pisigma.model.accuracy import deviation_of_rows
+from pisigma.model.geometric_model import model_of_calibration, with_hybrid
+from pisigma.robot import Robot
+from pisigma.validation.checks.backlash import unstated_backlash
+from pisigma.validation.checks.lag import check_lag
+from pisigma.validation.checks.mixed_rows import check_two_populations
+from pisigma.validation.setup_faults.ordered_rows import OrderedRows
+from pisigma.workflow.calibrate import calibrate
+from pisigma.workflow.settings.calibration import CalibrationSettings
+
+HALF = 1e-3
+"""[rad] Half the backlash of the first two revolute joints."""
+
+
+def sided(rows: Measurements) -> Measurements:
+    """State the directions of the last motions."""
+    return replace(rows, approach=approach_by_order(rows))
+
+
+def with_backlash(name: str, seed: int) -> tuple[Robot, Measurements, list[int]]:
+    """Measure an arm whose joints stay behind by half their play, and return the joints that have play."""
+    arm = OutsideArm(name, seed)
+    joints = np.flatnonzero(arm.robot.revolute)[:2].tolist()
+    side = np.sign(np.diff(arm.q, axis=0, prepend=arm.q[:1] - 1))
+    logged = arm.q.copy()
+    logged[:, joints] += HALF * side[:, joints]
+    return arm.robot, arm.measured(logged=logged), joints
+
+
+@pytest.mark.parametrize("name", ["kr10", "scara", "rail"])
+def test_backlash_is_found_with_its_joints_and_size_and_is_no_lag_and_no_second_frame(name):
+    robot, rows, joints = with_backlash(name, 3)
+    found = unstated_backlash(GeometricCalibrator(robot), sided(rows))
+    assert (found.kind, found.severity) == ("backlash", "warning")
+    assert set(found.values["joints"]) >= {joint + 1 for joint in joints}
+    for joint in joints:
+        assert_close(found.values[f"play{joint + 1}_deg"], float(np.rad2deg(2 * HALF)), rtol=0.35)
+    check = checked(GeometricCalibrator(robot), sided(rows))
+    assert [*check_lag(check), *check_two_populations(check)] == []
+
+
+@pytest.mark.parametrize("name", ["kr10", "scara", "rail"])
+def test_rows_without_backlash_or_in_another_order_than_measured_are_left_alone(name):
+    robot, rows, _ = with_backlash(name, 4)
+    shuffled = rows.select(torch.randperm(rows.rows, generator=torch.Generator().manual_seed(1)))
+    shuffled = replace(shuffled, line=tuple(range(2, 2 + rows.rows)))
+    for other in (shuffled, OutsideArm(name, 5).measured()):
+        assert unstated_backlash(GeometricCalibrator(robot), sided(other)) is None
+
+
+@pytest.mark.parametrize("before", [True, False])
+def test_a_lag_is_not_taken_for_backlash(before):
+    arm = OutsideArm("kr10", 3)
+    other = np.roll(arm.q, 1 if before else -1, axis=0)
+    rows = arm.measured(logged=arm.q - 2e-3 * (arm.q - other))
+    assert unstated_backlash(GeometricCalibrator(arm.robot), sided(rows)) is None
+
+
+@pytest.mark.parametrize(("name", "file"), [("ur5", "ur5/grid.csv"), ("ur10", "ur10/series_b.csv")])
+def test_measured_robots_raise_no_alarm(shared_data, name, file):
+    robot = Robot.load(name)
+    rows = Measurements.read_csv(shared_data / file, robot).select(torch.arange(200))
+    assert unstated_backlash(GeometricCalibrator(robot), sided(rows)) is None
+
+
+def test_a_joint_keeps_its_side_until_it_moves_and_files_are_apart():
+    q = torch.tensor([[0.0, 0.0], [0.5, 0.0], [0.5, -0.1], [0.1, -0.1]], dtype=torch.float64)
+    rows = Measurements(q.repeat(2, 1), torch.zeros(8, 3).double(), origin=("a",) * 4 + ("b",) * 4)
+    one = [[np.nan, np.nan], [1, np.nan], [1, -1], [-1, -1]]
+    np.testing.assert_array_equal(approach_by_order(rows).numpy(), one + one)
+
+
+def test_the_predicted_accuracy_contains_the_play_if_no_side_is_stated():
+    robot, rows, _ = with_backlash("scara", 3)
+    result = HybridCalibrator(robot, features=("backlash",), products=False).fit(sided(rows))
+    model = with_hybrid(model_of_calibration("scara", robot, result.geometric, rows), result)
+    stated = deviation_of_rows(model, sided(rows).select(torch.arange(20, 60)))
+    unstated = deviation_of_rows(model, rows.select(torch.arange(20, 60)))
+    halves = result.learned.correction.linear[0][:, 0].detach()
+    J = OrderedRows.from_result(result.geometric).joint_derivative[20:60] * result.geometric.noise[0].sigma
+    play = torch.from_numpy(J[:, :3]) * halves
+    assert_close(
+        (unstated.square() - stated.square()).sum(1).sqrt(), play.square().sum((1, 2)).sqrt(), rtol=0.02
+    )
+
+
+def test_a_calibration_learns_the_backlash_and_says_so():
+    robot, rows, joints = with_backlash("scara", 3)
+    made = calibrate(robot, rows, CalibrationSettings(features=("backlash",), folds=0))
+    (found,) = (one for one in made.summary.diagnostics if one.kind == "backlash")
+    assert found.sentence in made.warnings
+    assert set(found.values["joints"]) >= {joint + 1 for joint in joints}
+    assert [feature.name for feature in made.model.hybrid.correction.features] == ["backlash"]
