@@ -27,6 +27,7 @@ _NAMES = {
     "measurement.sensors.registry": "Measurements register_sensor",
     "workflow.cell.cell": "Cell",
     "workflow.calibrate": "Calibration calibrate",
+    "workflow.frames.calibrate_frame": "FrameCalibration calibrate_frame",
     "workflow.compare": "ComparedModels compare",
     "workflow.distill": "Distillation distill",
     "workflow.evaluate": "evaluate",

@@ -27,6 +27,8 @@ from pisigma.workflow.evaluate import evaluate as evaluate
 from pisigma.workflow.fleet.prior import estimate_fleet_prior as estimate_fleet_prior
 from pisigma.workflow.fleet.run import FleetRun as FleetRun
 from pisigma.workflow.fleet.run import run_fleet as run_fleet
+from pisigma.workflow.frames.calibrate_frame import FrameCalibration as FrameCalibration
+from pisigma.workflow.frames.calibrate_frame import calibrate_frame as calibrate_frame
 from pisigma.workflow.import_rows import import_rows as import_rows
 from pisigma.workflow.load import load as load
 from pisigma.workflow.monitor import Monitoring as Monitoring

@@ -1,7 +1,7 @@
 """`pisigma calibrate`: geometric or hybrid calibration of measured data."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -25,11 +25,12 @@ from pisigma.cli.progress import progress_of
 from pisigma.cli.screen import print_result
 from pisigma.cli.settings_options import StatedSettings, takes_settings
 from pisigma.files.errors import AcceptanceError
-from pisigma.workflow.settings.calibration import CalibrationSettings
+from pisigma.workflow.settings.calibration import WITH_PRIOR, CalibrationSettings
 from pisigma.workflow.settings.recalibration import RecalibrationSettings
 
 if TYPE_CHECKING:
     from pisigma.workflow.cell.cell import Cell
+    from pisigma.workflow.frames.calibrate_frame import FrameCalibration
 
 RobotName = Annotated[
     str,
@@ -53,6 +54,14 @@ Prior = Annotated[
     ),
 ]
 
+FrameChoice = Literal["tool", "base", "hand-eye"]
+
+Only = Annotated[
+    FrameChoice | None,
+    typer.Option(metavar="FRAME", help="Fit only tool, base or hand-eye; ROBOT may be a model."),
+]
+ARM_AS_GIVEN = "with --only, the arm is used as given and no row is held out"
+
 
 @takes_settings
 def calibrate(
@@ -64,6 +73,7 @@ def calibrate(
     settings: StatedSettings[CalibrationSettings],
     base: Base = None,
     tip: Tip = None,
+    only: Only = None,
     prior: Prior = None,
     accept_implausible: AcceptImplausible = False,
     overwrite: Overwrite = False,
@@ -83,15 +93,21 @@ def calibrate(
 
     if (cell := cell_at(robot)) is not None:
         refuse_with_cell(DATA=data, __out=out, __base=base, __tip=tip, __prior=prior)
+        if only is not None:
+            return _calibrate_frame_of_cell(cell, only, verbose, as_json)
         return _calibrate_cell(cell, settings, accept_implausible, verbose, as_json)
     if not data or out is None:
         raise typer.BadParameter(f"expected {'--out DIR' if data else 'DATA'}, or a cell instead of a robot")
     chosen = settings.build()
     seen_by = chosen.cameras.files if chosen.cameras else ()
     check_folder(out, overwrite, inputs=(robot_file(robot), prior, *data, *seen_by))
+    if only is not None:
+        return _calibrate_frame(
+            context, only, robot, base, tip, data, chosen, out, overwrite, verbose, as_json
+        )
     nominal = Robot.load(robot, base, tip)
     if prior is not None:
-        chosen.check_unused()
+        chosen.check_unused(WITH_PRIOR)
         again = RecalibrationSettings(cameras=chosen.cameras)
         return recalibrate_into(
             context, prior, data, again, out, accept_implausible, overwrite, as_json, verbose, nominal=nominal
@@ -105,6 +121,56 @@ def calibrate(
             print_json({"model": folder and str(folder), **calibration.to_json()})
         else:
             print_result(calibration_text(calibration.summary, folder, calibration.seconds), verbose)
+
+
+def _calibrate_frame(
+    context: typer.Context,
+    only: FrameChoice,
+    robot: str,
+    base: str | None,
+    tip: str | None,
+    data: list[Path],
+    settings: CalibrationSettings,
+    out: Path,
+    overwrite: bool,
+    verbose: bool,
+    as_json: bool,
+) -> None:
+    """Calibrate base, tool or both with the arm of a robot or model, write the model folder, and print it."""
+    from pisigma.files.model_files import is_model
+    from pisigma.robot.description import Robot
+    from pisigma.workflow.frames.calibrate_frame import calibrate_frame
+
+    settings.check_unused(ARM_AS_GIVEN)
+    arm = robot if is_model(Path(robot)) else Robot.load(robot, base, tip)
+    calibration = calibrate_frame(arm, data, only, settings.cameras)
+    with saved_model_folder(calibration, out, False, overwrite, command=command_line(context)) as folder:
+        _print_frame(calibration, folder, verbose, as_json)
+
+
+def _calibrate_frame_of_cell(cell: "Cell", only: FrameChoice, verbose: bool, as_json: bool) -> None:
+    """Calibrate base, tool or both with the newest session of a cell, store the model there, and print it."""
+    from pisigma.workflow.frames.cell_frames import calibrate_frame_of_cell
+
+    calibration, entry = calibrate_frame_of_cell(cell, only)
+    _print_frame(calibration, cell.model_folder(entry.name), verbose, as_json, cell)
+
+
+def _print_frame(
+    calibration: "FrameCalibration",
+    folder: Path | None,
+    verbose: bool,
+    as_json: bool,
+    cell: "Cell | None" = None,
+) -> None:
+    from pisigma.reporting.frame_text import frame_text
+
+    if as_json:
+        then = {} if cell is None else {"next": cell.status().step.to_json()}
+        print_json({"model": folder and str(folder), **calibration.to_json(), **then})
+    else:
+        text = frame_text(calibration.summary, folder, calibration.seconds)
+        print_result(text, verbose, [] if cell is None else next_step_lines(cell.status()))
 
 
 def _calibrate_cell(

@@ -1,4 +1,4 @@
-"""Cards of models that are made from other models (recalibrated, distilled, fleet prior), and their tables."""
+"""Cards of recalibrated, distilled and fleet models and of those with calibrated frames, and their tables."""
 
 from pathlib import Path
 
@@ -6,11 +6,13 @@ from pisigma.lifetime.fleet.prior_summary import FleetPriorSummary
 from pisigma.lifetime.recalibration.summary import RecalibrationSummary
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.model_posterior import FLEET_PRIOR
+from pisigma.reporting.frame_text import coordinate_table, coordinate_title, fit_lines
 from pisigma.reporting.rendering import write_card
 from pisigma.reporting.result_text import Table
 from pisigma.reporting.tables import figure_text
 from pisigma.reporting.verdict import rounded
 from pisigma.validation.held_out.distillation_summary import DistillationSummary
+from pisigma.validation.held_out.frame_summary import FrameSummary
 
 CANDIDATES = {
     "recalibrated": "recalibrated",
@@ -31,6 +33,20 @@ def write_recalibration_card(model: CalibratedModel, summary: RecalibrationSumma
     write_card(
         folder, "recalibration_card.md.j2", model=model, summary=summary, candidates=candidate_table(summary)
     )
+
+
+def write_frame_card(model: CalibratedModel, summary: FrameSummary, folder: Path) -> None:
+    """Write the card into a model folder.
+
+    Args:
+        model: model of the folder.
+        summary: figures of the calibrated frames.
+        folder: model folder.
+    """
+    write_card(
+        folder, "frame_card.md.j2", model=model, summary=summary, title=coordinate_title(summary),
+        coordinates=coordinate_table(summary), lines=fit_lines(summary),
+    )  # fmt: skip
 
 
 def candidate_names(summary: RecalibrationSummary) -> dict[str, str]:

@@ -26,11 +26,7 @@ from pisigma.lifetime.recalibration.recalibrated_model import (
 )
 from pisigma.lifetime.recalibration.recalibration_problem import FrameKey, frame_keys, recalibration_problem
 from pisigma.lifetime.recalibration.relocated_frames import relocated_frames
-from pisigma.lifetime.recalibration.summary import (
-    ContradictingRowFigures,
-    HeldOutFigures,
-    RecalibrationSummary,
-)
+from pisigma.lifetime.recalibration.summary import HeldOutFigures, RecalibrationSummary
 from pisigma.measurement.camera.corner_file import MeasurementFiles, read_rows
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.joint_range import row_warnings
@@ -46,6 +42,7 @@ from pisigma.validation.checks.check import MOVES, Move
 from pisigma.validation.checks.wrong_rows import FilteredRows, without_wrong_rows
 from pisigma.validation.gate import check_rows
 from pisigma.validation.held_out.calibration_validation import pose_errors_of
+from pisigma.validation.held_out.contradicting_row import ContradictingRowFigures
 from pisigma.validation.held_out.distillation_summary import ParentFigures
 from pisigma.validation.held_out.few_rows import fit_if_better
 from pisigma.validation.held_out.frames.fitted_frames import fitted_kinds

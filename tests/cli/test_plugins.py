@@ -72,7 +72,7 @@ def test_a_feature_is_tried_by_calibrate(run, example, arm, tmp_path):
         run("calibrate", "kiro4", tmp_path / "rows.csv", "--out", tmp_path / "a", *options).stdout
     )
     usual = {one["name"] for one in printed["hybrid"]["trials"]}
-    options = (*options, "--features", "belt", "--accept-implausible")
+    options = (*options, "--set", "features=belt", "--accept-implausible")
     printed = json.loads(
         run("calibrate", "kiro4", tmp_path / "rows.csv", "--out", tmp_path / "b", *options).stdout
     )

@@ -3,6 +3,7 @@
 from pisigma.files.yaml_file import Section
 from pisigma.lifetime.recalibration.candidates import Kept
 from pisigma.lifetime.recalibration.movement import SummaryMovement
+from pisigma.validation.held_out.contradicting_row import ContradictingRowFigures
 from pisigma.validation.held_out.distillation_summary import ParentFigures
 from pisigma.validation.held_out.summary import AbstractSummary
 
@@ -11,32 +12,6 @@ class HeldOutFigures(Section):
     """RMS position error of held-out rows under one candidate [mm]; None if the rows are too few for it."""
 
     rms_mm: float | None
-
-
-class ContradictingRowFigures(Section):
-    """A row that was left out because it contradicts the others under any drift.
-
-    Attributes:
-        row: index in the measurements, from 0.
-        place: file and line.
-        residual_mm: length of its error under the model from the other rows [mm].
-        residual_deg: angle of its orientation error [deg].
-    """
-
-    row: int
-    place: str
-    residual_mm: float | None = None
-    residual_deg: float | None = None
-
-    @property
-    def sentence(self) -> str:
-        """Sentence on which row was left out, why, and what to do."""
-        sizes = ((self.residual_mm, "mm"), (self.residual_deg, "deg"))
-        missed = " and ".join(f"{size:.3g} {unit}" for size, unit in sizes if size is not None)
-        return (
-            f"{self.place} was left out: it deviates by {missed} from its prediction by the others; "
-            "measure it again."
-        )
 
 
 class RecalibrationSummary(AbstractSummary):

@@ -271,7 +271,7 @@ def summarise(result: Result) -> CalibrationSummary:
         condition_number=_or_none(geometric.condition_number),
         observability=geometric.observability,
         noise=tuple(
-            _noise(one.sensor, one.sigma, one.unit, values=one.values, used_by_parameters=one.used)
+            noise_figures(one.sensor, one.sigma, one.unit, values=one.values, used_by_parameters=one.used)
             for one in geometric.noise
         ),
         parameters=_parameters(geometric),
@@ -311,7 +311,8 @@ def _outliers(outliers: Sequence[Outlier]) -> tuple[OutlierFigures, ...]:
     return tuple(rows)
 
 
-def _noise(sensor: str, sigma: float, unit: str, **counts: Any) -> NoiseFigures:
+def noise_figures(sensor: str, sigma: float, unit: str, **counts: Any) -> NoiseFigures:
+    """Return the noise of a sensor; `unit` is "m", "rad", or "stated" for a factor on stated standard deviations."""
     if unit not in SHOWN_UNITS:
         return NoiseFigures(sensor=sensor, factor_on_stated_sigma=sigma, **counts)
     name, factor = SHOWN_UNITS[unit]
@@ -345,7 +346,9 @@ def _learned(result: HybridResult, learned: LearnedPart) -> LearnedFigures:
         effective_parameters=learned.effective,
         linearisations=learned.rounds,
         noise=tuple(
-            _noise(sensor, sigma, units[sensor]) for sensor, sigma in learned.noise.items() if sensor in units
+            noise_figures(sensor, sigma, units[sensor])
+            for sensor, sigma in learned.noise.items()
+            if sensor in units
         ),
         prior_scale=result.uncertainty.prior_scale,
     )

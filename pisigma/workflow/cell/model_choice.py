@@ -19,9 +19,10 @@ from pisigma.workflow.calibrate import Calibration, calibrate
 from pisigma.workflow.cell.sessions import Sessions
 from pisigma.workflow.cell.setup_names import ModelRows, newest_day, setup_name
 from pisigma.workflow.evaluate import evaluate
+from pisigma.workflow.frames.calibrate_frame import FrameCalibration
 from pisigma.workflow.monitor import Monitoring
 from pisigma.workflow.recalibrate import Recalibration, recalibrate
-from pisigma.workflow.settings.calibration import CalibrationSettings
+from pisigma.workflow.settings.calibration import WITH_PRIOR, CalibrationSettings
 from pisigma.workflow.settings.evaluation import EvaluationSettings
 from pisigma.workflow.settings.recalibration import RecalibrationSettings
 
@@ -177,15 +178,17 @@ def calibrate_rows(
     if prior is None:
         result = calibrate(robot, rows, replace(settings, cameras=None), progress)
         return replace(result, figures=result.summary.validation_errors is not None)
-    settings.check_unused()
+    settings.check_unused(WITH_PRIOR)
     return recalibrate(prior, rows, RecalibrationSettings(), progress, robot)
 
 
-def errors_of(result: Calibration | Recalibration) -> tuple[float | None, float | None]:
+def errors_of(result: Calibration | Recalibration | FrameCalibration) -> tuple[float | None, float | None]:
     """Return the 95 % quantile and the RMS of the position errors [mm]; None if they are unknown.
 
     Both are of held-out rows; without a validation, the RMS is that of the rows of the calibration.
     """
+    if isinstance(result, FrameCalibration):
+        return None, result.summary.rms_mm
     if isinstance(result, Recalibration):
         p95 = result.gate.p95.get(result.gate.kept)
         return None if p95 is None else p95 * 1e3, result.summary.cross_validation[result.summary.kept].rms_mm
@@ -202,7 +205,7 @@ def model_entry(
     path: Path,
     sessions: Sequence[SessionEntry],
     remark: str,
-    result: Calibration | Recalibration,
+    result: Calibration | Recalibration | FrameCalibration,
     parent: ModelEntry | None = None,
 ) -> ModelEntry:
     """Return the history entry of a new model.

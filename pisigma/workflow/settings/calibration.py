@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated, Literal, get_args
 
 from pisigma.files.errors import IdentificationError, MeasurementError, check_choice
-from pisigma.files.setting import KEY, NAMES, Option, split_names
+from pisigma.files.setting import KEY, Option, split_names
 from pisigma.measurement.camera.camera_files import CameraFiles
 
 if TYPE_CHECKING:
@@ -138,7 +138,7 @@ class CalibrationSettings:
     prior_angle: Annotated[float, Option("--prior-mrad", unit="mrad", is_key=True)] = 1e-3
     robot_class: Annotated["ClassName | None", Option("--class", kind=str, is_key=True)] = None
     robust: Annotated[bool, KEY] = True
-    features: Annotated[tuple[str, ...] | None, NAMES] = None
+    features: Annotated[tuple[str, ...] | None, Option(kind=str, read=split_names, is_key=True)] = None
     gravity: Annotated[
         tuple[float, float, float] | None, Option(kind=str, read=parse_direction, is_key=True)
     ] = None
@@ -192,8 +192,11 @@ class CalibrationSettings:
                 option="prior_length and prior_angle",
             )
 
-    def check_unused(self) -> None:
-        """Refuse settings that a calibration with the prior of a fleet does not use.
+    def check_unused(self, by: str) -> None:
+        """Refuse settings that another kind of calibration does not use.
+
+        Args:
+            by: what that calibration does instead, as a clause.
 
         Raises:
             IdentificationError: a setting other than `cameras`, `jobs` and `folds` of 0 is stated.
@@ -203,9 +206,10 @@ class CalibrationSettings:
         )
         stated = [name for name in self.__dataclass_fields__ if getattr(self, name) != getattr(usual, name)]
         if stated:
-            raise IdentificationError(
-                "a calibration with a fleet prior estimates all parameters of a hybrid, and is cross-validated row "
-                "by row",
-                option=", ".join(stated),
-                remedy="omit this, or the prior",
-            )
+            raise IdentificationError(by, option=", ".join(stated), remedy="omit it")
+
+
+WITH_PRIOR = (
+    "a calibration with a fleet prior estimates all parameters of a hybrid, and is cross-validated row by row"
+)
+"""Why a calibration with a prior uses few settings."""

@@ -99,12 +99,12 @@ def find_weak_directions(problem: CalibrationProblem, here: Linearisation[Tensor
             break
         width = value**-0.5 if value > max(1e-12, rounding) else float("inf")
         sentences.append(
-            f"{_in_words(vector, names)}: the data determine it only to {width:.2g} times its tolerance; {end}"
+            f"{direction_in_words(vector, names)}: the data determine it only to {width:.2g} times its tolerance; {end}"
         )
     return tuple(sentences)
 
 
-def _in_words(vector: Tensor, names: list[str]) -> str:
+def direction_in_words(vector: Tensor, names: list[str]) -> str:
     """Return a text with the large components of a direction, in units of the tolerances."""
     order = vector.abs().argsort(descending=True).tolist()
     sign = 1.0 if float(vector[order[0]]) > 0 else -1.0

@@ -1,0 +1,84 @@
+"""Measured values of a calibration problem in standard deviations, linear in chosen parameters."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float64, Int64
+from torch import Tensor
+
+from pisigma.calibration.geometric.problem.noise import sensor_view_of
+from pisigma.calibration.geometric.result import SolvedCalibration
+from pisigma.calibration.hybrid.sensor_values import SensorValues, sensor_values
+from pisigma.joint_correction.feature import AbstractFeature
+from pisigma.measurement.conditions import JointState
+
+
+@dataclass(frozen=True, eq=False)
+class WhitenedValues:
+    """Values `y = X u + e` with unit noise, linearised at the solution.
+
+    Attributes:
+        X: derivatives of the predicted values with respect to the chosen parameters [1/m or 1/rad].
+        joints: derivatives with respect to the joint values of the row [1/rad or 1/m].
+        y: measured minus predicted [1].
+        row: number of every value's row in the problem.
+        exact: whether the standard deviation of a value is exactly as stated, such as that of a prior.
+        sensors: the values before they were whitened, with the factor from each to standard deviations.
+    """
+
+    X: Float64[Tensor, "values parameters"]
+    joints: Float64[Tensor, "values dof"]
+    y: Float64[Tensor, " values"]
+    row: Int64[Tensor, " values"]
+    exact: Bool[Tensor, " values"]
+    sensors: tuple[tuple[SensorValues, Float64[Tensor, " _rows"]], ...]
+
+    @staticmethod
+    def at_solution(solved: SolvedCalibration, parameters: Sequence[int]) -> "WhitenedValues":
+        """Linearise a calibration at its solution, with the noise that its residuals show.
+
+        Args:
+            solved: the calibration.
+            parameters: indices of the parameters.
+        """
+        problem, here = solved.problem.with_active(list(parameters)), solved.refined
+        deviation = sensor_view_of(here).variances.sqrt()
+        scaled = [
+            (one, one.root / float(sigma))
+            for one, sigma in zip(sensor_values(problem, here.point), deviation, strict=True)
+        ]
+        by_component = [one.components for one, _ in scaled]
+        return WhitenedValues(
+            X=torch.cat([(one.geometry * scale[:, None, None]).flatten(0, 1) for one, scale in scaled]),
+            joints=torch.cat([(one.joints * scale[:, None, None]).flatten(0, 1) for one, scale in scaled]),
+            y=torch.cat([(one.residual * scale[:, None]).flatten() for one, scale in scaled]),
+            row=torch.cat([one.row.repeat_interleave(one.components) for one, _ in scaled]),
+            exact=torch.cat(
+                [
+                    torch.full((len(one.row) * count,), one.certain)
+                    for (one, _), count in zip(scaled, by_component, strict=True)
+                ]
+            ),
+            sensors=tuple(scaled),
+        )
+
+    def weight_columns(
+        self, features: Sequence[AbstractFeature], state: JointState
+    ) -> Float64[Tensor, "values weights"]:
+        """Return the derivatives with respect to the weights of a joint correction.
+
+        Args:
+            features: features of the correction.
+            state: commanded joint values and conditions of all rows of the problem.
+        """
+        blocks = [
+            torch.cat(
+                [
+                    (one.feature_columns(feature, state, slice(None)) * scale[:, None, None]).flatten(0, 1)
+                    for one, scale in self.sensors
+                ]
+            )
+            for feature in features
+        ]
+        return torch.cat(blocks, 1) if blocks else self.X[:, :0]

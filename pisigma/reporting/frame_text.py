@@ -1,0 +1,87 @@
+"""A calibrated base, tool or hand-eye transform as text and tables."""
+
+import math
+from pathlib import Path
+
+from pisigma.reporting.result_text import ResultText, Table, sentences, table_block
+from pisigma.reporting.verdict import Verdict, count_text, rounded
+from pisigma.validation.held_out.frame_summary import CoordinateFigures, FrameSummary
+
+COLUMNS = ("coordinate", "unit", "before", "estimated", "standard error")
+
+
+def coordinate_table(summary: FrameSummary) -> Table:
+    """Make a table of the coordinates in mm and deg, rounded according to their standard errors."""
+    return Table(COLUMNS, tuple(map(_coordinate_row, summary.coordinates)))
+
+
+def _coordinate_row(one: CoordinateFigures) -> tuple[str, ...]:
+    error = one.standard_error
+    digits = 4 if not error else min(max(1 - math.floor(math.log10(error)), 1), 6)
+    before, estimated = (f"{value + 0.0:.{digits}f}" for value in (one.nominal, one.estimated))
+    return (
+        one.name,
+        one.unit,
+        before,
+        estimated,
+        "not determined" if error is None else f"{error:.{digits}f}",
+    )
+
+
+def coordinate_title(summary: FrameSummary) -> str:
+    """Name the frames that the coordinates belong to."""
+    bases = "base of the robot in the measuring frame"
+    tools = "tool in the flange of the robot"
+    return {"tool": tools, "base": bases, "hand-eye": f"{bases}, and {tools}"}[summary.only]
+
+
+def fit_lines(summary: FrameSummary) -> list[str]:
+    """Return sentences on the residuals, and on what the rows hardly determine."""
+    sizes = [
+        f"{rounded(value, summary.rows)} {unit}"
+        for value, unit in ((summary.rms_mm, "mm"), (summary.rms_deg, "deg"))
+        if value is not None
+    ]
+    lines = [f"The residuals of the rows are {' and '.join(sizes)} RMS."] if sizes else []
+    return lines + [f"{one[0].upper()}{one[1:]}." for one in summary.weak_directions]
+
+
+def frame_text(summary: FrameSummary, folder: Path | None, seconds: float) -> ResultText:
+    """Lay out calibrated frames.
+
+    Args:
+        summary: the figures.
+        folder: where the model was written; None if it was not.
+        seconds: time it took [s].
+    """
+    warnings = (*(one.sentence for one in summary.outliers), *summary.warnings)
+    written = () if folder is None else (f"Model written to {folder} in {seconds:.1f} s.",)
+    return ResultText(
+        _verdict(summary, folder, len(warnings)),
+        warnings,
+        (
+            table_block(coordinate_title(summary), *coordinate_table(summary)),
+            sentences("the fit", fit_lines(summary)),
+        ),
+        (),
+        written,
+    )
+
+
+def _verdict(summary: FrameSummary, folder: Path | None, warnings: int) -> Verdict:
+    worst = {
+        unit: max((one.standard_error or 0.0 for one in summary.coordinates if one.unit == unit), default=0.0)
+        for unit in ("mm", "deg")
+    }
+    accuracy = " and ".join(f"{rounded(value, 0)} {unit}" for unit, value in worst.items() if value > 0)
+    lost = [one.name for one in summary.coordinates if one.standard_error is None]
+    arm = "of the model" if summary.parent else "as drawn"
+    trust = "yes" if not warnings and not summary.weak_directions else "with caution"
+    cautions = [count_text(warnings, "warning")] if warnings else []
+    cautions += [f"{', '.join(lost)} not determined"] if lost else []
+    follow = f"verify with other poses: `pisigma verify {folder} ROWS.csv`." if folder else "write the model."
+    return Verdict(
+        f"largest standard error {accuracy or 'unknown'}, with the arm {arm}.",
+        f"{trust}{f' ({chr(44).join(cautions)})' if cautions else ''}.",
+        "measure more orientations, because some coordinates are not determined." if lost else follow,
+    )

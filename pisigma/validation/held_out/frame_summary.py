@@ -1,0 +1,137 @@
+"""Figures of a base, a tool or a hand-eye transform that was calibrated with the arm as given."""
+
+import math
+from typing import Literal
+
+from pisigma.calibration.frames.frame_fit import FrameFit, WrongRow
+from pisigma.files.yaml_file import Section
+from pisigma.measurement.sensors.sensor import SHOWN_UNITS
+from pisigma.validation.held_out.calibration_summary import NoiseFigures, noise_figures
+from pisigma.validation.held_out.contradicting_row import ContradictingRowFigures
+from pisigma.validation.held_out.distillation_summary import ParentFigures
+from pisigma.validation.held_out.summary import AbstractSummary
+
+
+class CoordinateFigures(Section):
+    """A coordinate of a base or a tool.
+
+    Attributes:
+        name: name, such as "tool_x" or, with several targets, "tool_ball_x".
+        unit: unit of the figures: "mm" or "deg".
+        nominal: value before.
+        estimated: estimated value.
+        standard_error: standard error of the estimate; None if the rows do not determine it.
+        by_noise: its share by the noise of the rows, without that of the arm's own uncertainty.
+    """
+
+    name: str
+    unit: str
+    nominal: float
+    estimated: float
+    standard_error: float | None
+    by_noise: float | None
+
+
+class FrameSummary(AbstractSummary):
+    """All figures of a calibrated base, tool or hand-eye transform.
+
+    Attributes:
+        only: what was calibrated.
+        parent: model whose arm was used; None for a robot as drawn.
+        rows: number of rows, including those that were left out.
+        coordinates: what was calibrated, with standard errors.
+        weak_directions: what the rows hardly determine, one sentence each.
+        noise: noise of each sensor, from the residuals.
+        rms_mm: RMS residual of the positions [mm].
+        rms_deg: RMS residual of the orientations [deg].
+        outliers: rows that were left out, as the others contradict them.
+        warnings: warnings, one sentence each.
+    """
+
+    kinds = ("frame_calibration",)
+
+    only: Literal["tool", "base", "hand-eye"]
+    parent: ParentFigures | None = None
+    rows: int
+    coordinates: tuple[CoordinateFigures, ...]
+    weak_directions: tuple[str, ...]
+    noise: tuple[NoiseFigures, ...]
+    rms_mm: float | None = None
+    rms_deg: float | None = None
+    outliers: tuple[ContradictingRowFigures, ...]
+    warnings: tuple[str, ...]
+
+
+def coordinate_figures(fit: FrameFit, arm_variance: tuple[float, ...]) -> tuple[CoordinateFigures, ...]:
+    """Return the coordinates of a fit.
+
+    Args:
+        fit: the fit.
+        arm_variance: variance of every coordinate by the uncertainty of the arm [m² or rad²].
+    """
+    lost, before = fit.undetermined, {one.name: one.nominal for one in fit.solved.result().parameters}
+    figures = []
+    for number, parameter in enumerate(fit.parameters):
+        unit, factor = SHOWN_UNITS[parameter.unit]
+        known = fit.frames[number] not in lost
+        variance = float(fit.covariance[number, number])
+        figures.append(
+            CoordinateFigures(
+                name=parameter.name,
+                unit=unit,
+                nominal=before[parameter.name] * factor,
+                estimated=float(fit.estimates[number]) * factor,
+                standard_error=math.sqrt(variance + arm_variance[number]) * factor if known else None,
+                by_noise=math.sqrt(variance) * factor if known else None,
+            )
+        )
+    return tuple(figures)
+
+
+def weak_direction_sentences(fit: FrameFit) -> tuple[str, ...]:
+    """Return what the rows hardly determine, one sentence each."""
+    return tuple(
+        f"the rows do not determine {one.words} (in mm and mrad); it keeps its value before, measure other orientations"
+        if math.isinf(one.deviation)
+        else f"the rows determine {one.words} (in mm and mrad) only to {one.deviation:.2g}"
+        for one in fit.weak_directions
+    )
+
+
+def wrong_row_figures(wrong: WrongRow) -> ContradictingRowFigures:
+    """Return the figures of a row that was left out."""
+    sizes = {"residual_mm": wrong.distance * 1e3, "residual_deg": math.degrees(wrong.angle)}
+    known = {name: size for name, size in sizes.items() if math.isfinite(size)}
+    return ContradictingRowFigures(row=wrong.row, place=wrong.place, **known)
+
+
+def frame_summary(
+    fit: FrameFit, arm_variance: tuple[float, ...], parent: ParentFigures | None, warnings: tuple[str, ...]
+) -> FrameSummary:
+    """Gather the figures of a fit.
+
+    Args:
+        fit: the fit.
+        arm_variance: see `coordinate_figures`.
+        parent: model whose arm was used.
+        warnings: warnings, one sentence each.
+    """
+    noise = fit.solved.result().noise
+    rms = {one.quantity: one.rms for one in noise if one.sensor != "corner"}
+    summary = FrameSummary(
+        only=fit.only,
+        rows=fit.rows.rows,
+        coordinates=coordinate_figures(fit, arm_variance),
+        weak_directions=weak_direction_sentences(fit),
+        noise=tuple(
+            noise_figures(one.sensor, one.sigma, one.unit, values=one.values, used_by_parameters=one.used)
+            for one in noise
+        ),
+        outliers=tuple(map(wrong_row_figures, fit.wrong)),
+        warnings=warnings,
+    )
+    return summary.with_figures(
+        parent=parent,
+        rms_mm=rms["m"] * 1e3 if "m" in rms else None,
+        rms_deg=math.degrees(rms["rad"]) if "rad" in rms else None,
+    )

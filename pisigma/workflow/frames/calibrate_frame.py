@@ -1,0 +1,111 @@
+"""Calibrate a base, a tool or a hand-eye transform from few rows, with the arm of a robot or model as given."""
+
+import os
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from pisigma.calibration.frames.frame_fit import FrameChoice, FrameFit
+from pisigma.files.errors import IdentificationError, check_choice
+from pisigma.files.model_files import is_model, model_hash
+from pisigma.measurement.camera.camera_files import CameraFiles
+from pisigma.measurement.camera.corner_file import MeasurementFiles, read_rows
+from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.joint_range import row_warnings
+from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.model.folder.model_folder import HasModel, loaded_model
+from pisigma.model.frame_model import frames_of_model, frames_of_robot
+from pisigma.reporting.derived_cards import write_frame_card
+from pisigma.robot.description import Robot
+from pisigma.validation.held_out.distillation_summary import ParentFigures
+from pisigma.validation.held_out.frame_summary import FrameSummary, frame_summary
+from pisigma.workflow.result import AbstractModelResult
+
+CHOICES: tuple[FrameChoice, ...] = ("tool", "base", "hand-eye")
+
+
+@dataclass(frozen=True, eq=False)
+class FrameCalibration(AbstractModelResult):
+    """Result of `calibrate_frame`.
+
+    Attributes:
+        model: the robot or model with the calibrated frames, as `pisigma.load` would read it.
+        fit: the fit, with covariance and weak directions in SI units.
+        summary: all figures.
+        seconds: computing time [s].
+    """
+
+    model: CalibratedModel
+    fit: FrameFit
+    summary: FrameSummary
+    seconds: float
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Warnings, one sentence each."""
+        return self.summary.warnings
+
+    def _describe(self, model: CalibratedModel, summary: FrameSummary, folder: Path) -> None:
+        write_frame_card(model, summary, folder)
+
+
+def calibrate_frame(
+    robot: Robot | CalibratedModel | HasModel | str | os.PathLike[str],
+    data: Measurements | MeasurementFiles,
+    only: FrameChoice,
+    cameras: CameraFiles | None = None,
+) -> FrameCalibration:
+    """Calibrate base, tool or both with the arm as given, from 4 to 12 touches, positions, poses or images.
+
+    The fit is least squares. Standard errors are those of the residuals' noise and, with a model that has a posterior,
+    of its arm. Rows that all others contradict are left out and named.
+
+    Args:
+        robot: robot as drawn (a `Robot`, catalogue name or robot file), or a calibrated model (an object that has one,
+            or its folder).
+        data: measurements, or CSV files of them. For a tool, rows of one socket are touches of one unknown point.
+        only: "tool" (with the base of the robot or model), "base" (with its tool) or "hand-eye" (both).
+        cameras: cameras and boards, for files of detected board corners.
+
+    Returns:
+        The robot or model with the calibrated frames; `save` writes it as a model folder.
+
+    Raises:
+        RobotError: there is no such robot.
+        ModelError: the folder is not that of a model, or a network of the model depends on base and tool.
+        MeasurementError: the data cannot be read, or the model does not know a frame or target of the rows.
+        IdentificationError: there are too few rows.
+        PoseError: the joint values do not fit the robot.
+    """
+    started = time.perf_counter()
+    check_choice(IdentificationError, "only", only, CHOICES)
+    model, parent = _model_of(robot)
+    arm = _drawn(robot) if model is None else model.robot
+    rows = read_rows(data, arm, cameras)
+    found = frames_of_robot(arm, rows, only) if model is None else frames_of_model(model, rows, only)
+    summary = frame_summary(found.fit, found.arm_variance, parent, row_warnings(arm, rows))
+    summary = summary.with_figures(
+        command=f"pisigma.calibrate_frame({arm.name!r}, {rows.file_names!r}, {only!r})"
+    )
+    made = found.model
+    return FrameCalibration(
+        replace(made, metrics=summary.to_json()), found.fit, summary, time.perf_counter() - started
+    )
+
+
+Source = Robot | CalibratedModel | HasModel | str | os.PathLike[str]
+
+
+def _drawn(robot: Source) -> Robot:
+    """Return a robot as drawn."""
+    assert isinstance(robot, Robot | str | os.PathLike)
+    return robot if isinstance(robot, Robot) else Robot.load(os.fspath(robot))
+
+
+def _model_of(robot: Source) -> tuple[CalibratedModel | None, ParentFigures | None]:
+    """Return the model of an argument and its figures as a parent; None for a robot."""
+    if isinstance(robot, Robot) or (isinstance(robot, str | os.PathLike) and not is_model(Path(robot))):
+        return None, None
+    model, folder = loaded_model(robot)
+    sha256 = "" if folder is None else model_hash(folder)
+    return model, ParentFigures(name=model.name, kind=model.kind, sha256=sha256)
