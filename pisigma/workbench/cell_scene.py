@@ -123,6 +123,13 @@ class CellScene:
             self._draw_rows()
         self._server.flush()
 
+    def add_rows(self, q: Float64[np.ndarray, "rows dof"]) -> None:
+        """Show the joint values of new rows [rad or m], which have not been compared with the others yet."""
+        with self._lock, self._server.atomic():
+            if self._scene is not None:
+                self._scene.add_rows(q)
+        self._server.flush()
+
     def mark_lines(self, lines: list[int]) -> None:
         """Mark the rows of some lines in red with their numbers, and look at the first one."""
         with self._lock, self._server.atomic():

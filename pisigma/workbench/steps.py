@@ -22,6 +22,7 @@ from pisigma.files.errors import (
 )
 from pisigma.files.progress import Progress
 from pisigma.lifetime.cell.layout import EXPORTS, REPORTS, newest_plan
+from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.growing_file import GrowingFile
 from pisigma.model.inverse.solution import Solution
 from pisigma.planning.session.growing_images import growing_file
@@ -221,14 +222,20 @@ def check_rows(cell: Cell, form: Form, progress: Progress) -> tuple[Outcome, Ses
     return _session_outcome(session.state, f"Session {name}"), session.state
 
 
-def follow_file(cell: Cell, path: Path, show: Callable[[SessionState], None], progress: Progress) -> Outcome:
+def follow_file(
+    cell: Cell,
+    path: Path,
+    arrived: Callable[[Measurements], None],
+    show: Callable[[SessionState], None],
+    progress: Progress,
+) -> Outcome:
     """Follow a growing file with the newest plan as `measure` does, until it ends or a person stops it."""
     plan = newest_plan(cell.folder)
     session = MeasuringSession.read(plan, cell.file.settings_of_step("measure"))
     growing = growing_file(path, session.plan.arm.robot, session.plan.settings)
     rest, waiting = remaining_poses_file(plan, path, None), f"waiting for rows in {path.name}"
     with contextlib.suppress(StoppedError):
-        for step in follow(session, growing, tick=lambda: progress(waiting)):
+        for step in follow(session, growing, tick=lambda: progress(waiting), arrived=arrived):
             show(step.state)
             if step.replanned:
                 session.write_remaining(rest, [])

@@ -17,7 +17,6 @@ from pisigma.lifetime.cell.layout import CELL_FILE, EXPORTS, MODELS, PLANS, REPO
 from pisigma.lifetime.cell.status import CellStatus
 from pisigma.measurement.csv.columns import POSITION
 from pisigma.planning.plan_file import joint_columns, yaml_of
-from pisigma.planning.session.state import SessionState
 from pisigma.reporting.rendering import code
 from pisigma.reporting.result_text import merge_alike_warnings
 from pisigma.robot.robot_file import catalogue
@@ -85,13 +84,13 @@ class Tabs:
     """Renders the page and its tabs.
 
     Attributes:
-        live: state of the session that is being followed; None if none is.
+        live: state of the session that is being followed, with the number of unchecked rows; None if none is.
         serving: the server of the model in use.
     """
 
     def __init__(self, jobs: Jobs, serving: ModelServer, growing: Path | None = None) -> None:
         self._jobs, self.serving, self._growing = jobs, serving, growing
-        self.live: SessionState | None = None
+        self.live: dict[str, Any] | None = None
         self._environment = template_environment(
             "pisigma.workbench",
             {
@@ -137,7 +136,7 @@ class Tabs:
             "forms": lambda step: form_of(step, cell.file),
             "growing": self._growing,
             "serving": self.serving,
-            "live": self.live and self.live.to_json(),
+            "live": self.live,
             "words": form_of_command(status.step.command) if status.step.command else None,
         }
         return self._environment.get_template(f"{name}.html.j2").render(

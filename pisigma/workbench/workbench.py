@@ -17,6 +17,7 @@ from aiohttp.typedefs import Handler
 from pisigma.files.errors import PisigmaError, PlanningError
 from pisigma.files.progress import Progress
 from pisigma.lifetime.cell.status import CellStatus
+from pisigma.measurement.dataset import Measurements
 from pisigma.planning.session.state import SessionState
 from pisigma.workbench import steps
 from pisigma.workbench.cell_scene import CellScene
@@ -41,7 +42,7 @@ STATIC = {
 """Type, package and folder of the files of the page."""
 NO_CELL = {"state": "no_cell", "reason": "the folder has no cell yet", "command": "pisigma new"}
 """Next step of a folder without a cell."""
-HELD = 10
+HELD = 30
 """How often a request for the state is looked at again."""
 REPORT_POLICY = (
     "sandbox allow-scripts; default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; img-src data:; "
@@ -270,15 +271,22 @@ class Workbench(UploadedRows):
     def follow(self, cell: Cell, form: Form, progress: Progress) -> Outcome:
         """Follow the growing file until a person stops it, and show every row."""
 
+        def arrived(rows: Measurements) -> None:
+            self._scene.add_rows(rows.q.numpy())
+            assert self._tabs.live is not None  # the state at the start is shown before
+            count = self._tabs.live["rows"] + rows.rows
+            self._tabs.live |= {"rows": count, "unchecked": rows.rows}
+            self.jobs.version += 1
+
         def show(state: SessionState) -> None:
             self._scene.show_state(state)
-            self._tabs.live = state
+            self._tabs.live = {**state.to_json(), "unchecked": 0}
             self.jobs.version += 1
 
         if self.growing is None:
             raise PlanningError("no file is followed", remedy="open the page with --rows FILE")
         try:
-            return steps.follow_file(cell, self.growing, show, progress)
+            return steps.follow_file(cell, self.growing, arrived, show, progress)
         finally:
             self._tabs.live = None
 

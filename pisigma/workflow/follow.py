@@ -1,4 +1,4 @@
-"""Follow a growing file of measurements: rows are checked at once, and the accuracy is updated in the background."""
+"""Follow a growing file of measurements: rows are checked at once, and the accuracy is updated in another process."""
 
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -8,6 +8,7 @@ from pathlib import Path
 
 from pisigma.deployment.export.programs.languages import LANGUAGES, check_program
 from pisigma.files.output_file import check_output
+from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.growing_file import FileGrowth, GrowingFile
 from pisigma.planning.plan_file import YAML_SUFFIX, yaml_of
 from pisigma.planning.session.state import AccuracyPoint, Alarm, SessionState
@@ -16,7 +17,7 @@ from pisigma.workflow.measure import MeasuringSession
 
 REST_SUFFIX = ".rest.csv"
 """Suffix of the remaining plan: that of `poses.csv` is written to `poses.rest.csv`."""
-PAUSE = 0.05
+PAUSE = 0.01
 """Time between two reads of the file [s]."""
 
 
@@ -40,7 +41,11 @@ class SessionStep:
 
 
 def follow(
-    session: MeasuringSession, file: GrowingFile, once: bool = False, tick: Callable[[], None] = lambda: None
+    session: MeasuringSession,
+    file: GrowingFile,
+    once: bool = False,
+    tick: Callable[[], None] = lambda: None,
+    arrived: Callable[[Measurements], None] = lambda rows: None,
 ) -> Iterator[SessionStep]:
     """Check the rows of a growing file until the session ends.
 
@@ -49,6 +54,7 @@ def follow(
         file: the growing file.
         once: whether to check only the rows that exist, and end.
         tick: called before every read of the file; an exception that it raises ends the session.
+        arrived: called with new rows before they are checked, which takes longer the more rows there are.
 
     Yields:
         A step at the start and whenever there are new rows, a new accuracy, or a file to wait for.
@@ -65,10 +71,12 @@ def follow(
     waiting, plan, state, ending = "", session.plan, session.state, False
     work: Future[tuple[Alarm, ...]] | None = None
     yield SessionStep(FileGrowth(), (), state)
-    with ThreadPoolExecutor(1) as pool:
+    with ThreadPoolExecutor(1) as pool, session.in_background():
         while True:
             tick()
             growth = file.read()
+            if growth.rows is not None:
+                arrived(growth.rows)
             alarms = session.add(growth.rows, growth.left_out)
             worked = work is not None and work.done()
             if work is not None and worked:

@@ -3,8 +3,9 @@
 import contextlib
 import os
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import count as counting_from
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from jaxtyping import Bool, Int64
 from torch import Tensor
 
 from pisigma.deployment.export.programs.planned import planned_program
+from pisigma.files.engines.background import BackgroundProcess, compute_here
 from pisigma.files.output_file import write_atomically
 from pisigma.files.progress import Progress
 from pisigma.measurement.dataset import Measurements
@@ -55,8 +57,8 @@ class MeasuringSession:
 
     `add` checks new rows at once. `update` looks for faults of the setup that all rows share, calibrates with the rows
     so far and replans the remaining poses, which takes some seconds. `next_step` and `idle_step` return the same work
-    in short steps, the most urgent one first. They may run in another thread than `add`; their results are in the next
-    `state`.
+    in short steps, the most urgent one first. They may run in another thread than `add`, and within `in_background` in
+    another process; their results are in the next `state`.
 
     Attributes:
         plan: the current plan.
@@ -72,7 +74,7 @@ class MeasuringSession:
         """
         plan = replace(plan, arm=allow_measured_poses(plan.settings, plan.arm))
         self.plan, self.replanned = plan, False
-        self._lock = threading.RLock()
+        self._lock, self._compute = threading.RLock(), compute_here
         self._settings = settings
         candidates = find_candidates(plan.settings, plan.arm)
         subject = Subject(plan.arm.nominal) if plan.model is None else Subject.load(plan.model)
@@ -117,6 +119,17 @@ class MeasuringSession:
         with self._lock:
             alarms = self._judged.add(rows, left_out, self._planned, self._names)
         return tuple(sorted(alarms, key=lambda alarm: alarm.line))
+
+    @contextlib.contextmanager
+    def in_background(self) -> Iterator[None]:
+        """Compute in another process, which `add` and `state` do not wait for, and which ends with the block."""
+        process = BackgroundProcess()
+        self._compute = process.compute
+        try:
+            yield
+        finally:
+            process.close()
+            self._compute = compute_here
 
     @property
     def is_update_due(self) -> bool:
@@ -170,7 +183,9 @@ class MeasuringSession:
         counts = [training.rows] if self._reached else [training.rows - self._settings.every, training.rows]
         parts = [training.select(torch.arange(max(count, 0))) for count in counts]
         found = [
-            session_accuracy(self.plan, self._before, some, kept_apart, self._task, progress)
+            self._compute(
+                partial(session_accuracy, self.plan, self._before, some, kept_apart, self._task), progress
+            )
             for some in parts
         ]
         with self._lock:
@@ -186,7 +201,7 @@ class MeasuringSession:
             counts = self._judged.judgement.counts
         if rows is None or self._looked_at == rows.rows:
             return ()
-        found = setup_sentence(rows.select(usable), counts, self._against)
+        found = self._compute(partial(setup_sentence, rows.select(usable), counts, self._against))
         with self._lock:
             self._setup, self._looked_at = found, rows.rows
             new = [alarm_of_all_rows(found)] if found and not before else []
@@ -202,14 +217,23 @@ class MeasuringSession:
         progress("planning the remaining poses")
         again = None
         if self._settings.replan:
-            again = self._further.replan(self.plan, self._poses, so_far, measured.q, remaining)
+            arguments = self.plan, self._poses, so_far, measured.q, remaining
+            again = self._compute(partial(self._further.replan, *arguments))
         with self._lock:
             if again is not None:
                 self._adopt(again)
             remaining = self._open
             poses = self.plan.q[remaining[~self.plan.check[remaining]]]
-        ahead = expected_accuracy(
-            so_far.posterior, so_far.point.poses, poses, self._further.q, self._task, STEP
+        ahead = self._compute(
+            partial(
+                expected_accuracy,
+                so_far.posterior,
+                so_far.point.poses,
+                poses,
+                self._further.q,
+                self._task,
+                STEP,
+            )
         )
         with self._lock:
             self._expected, self._ahead_of = ahead, so_far
@@ -219,7 +243,7 @@ class MeasuringSession:
         """Cross-validate the calibration so far."""
         so_far = self._so_far
         assert so_far is not None
-        point = with_cross_validation(self.plan.arm.robot, so_far, progress)
+        point = self._compute(partial(with_cross_validation, self.plan.arm.robot, so_far), progress)
         with self._lock:
             self._reached[-1], self._validated = point, so_far
         return ()

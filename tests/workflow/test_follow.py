@@ -1,5 +1,6 @@
 """Following a growing file."""
 
+import time
 from types import SimpleNamespace
 
 import pytest
@@ -28,26 +29,45 @@ def test_rows_are_checked_as_they_are_measured_until_the_plan_is_done(tmp_path, 
     def measure_one(seconds: float) -> None:
         with file.open("a") as out:
             out.write(lines.pop(0) if lines else "")
+        time.sleep(seconds)
 
     monkeypatch.setattr("pisigma.workflow.follow.time", SimpleNamespace(sleep=measure_one))
-    seen, waited = [], []
+    seen, waited, arrived = [], [], []
     with no_type_checker():
-        for step in follow(session(), GrowingFile(file, ROBOT)):
+        for step in follow(
+            session(), GrowingFile(file, ROBOT), arrived=lambda rows: arrived.extend(rows.line)
+        ):
             waited.append(step.growth.waiting)
             seen += [] if step.growth.rows is None else step.growth.rows.line
+            assert arrived == seen
     assert waited[1]
     assert not waited[-1]
     assert seen == list(range(2, 11))
     assert step.state.is_finished
 
 
-def test_the_accuracy_is_computed_in_the_background(tmp_path, monkeypatch):
-    monkeypatch.setattr("pisigma.workflow.follow.PAUSE", 0.01)
+def test_the_accuracy_is_computed_in_the_background(tmp_path):
     file = tmp_path / "rows.csv"
     file.write_text(header(ROBOT) + "".join(row_lines(ROBOT, PLAN.rows(9))))
     with no_type_checker():
         *_, last = follow(session(every=3), GrowingFile(file, ROBOT))
     assert last.state.accuracy.poses == 9
+
+
+def test_a_stop_does_not_wait_for_the_calculation(tmp_path):
+    file = tmp_path / "rows.csv"
+    file.write_text(header(ROBOT) + "".join(row_lines(ROBOT, PLAN.rows(9))))
+    following, stopped = session(every=3), []
+
+    def stop() -> None:
+        if following._worked_out:  # a calibration has begun
+            stopped.append(time.monotonic())
+            raise InterruptedError
+
+    with no_type_checker(), pytest.raises(InterruptedError):
+        list(follow(following, GrowingFile(file, ROBOT), tick=stop))
+    assert time.monotonic() - stopped[0] < 1
+    assert following.state.accuracy is None
 
 
 def test_a_missing_file_ends_the_session(tmp_path):

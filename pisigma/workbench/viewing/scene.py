@@ -24,6 +24,7 @@ from pisigma.workbench.viewing.colors import (
     PLANNED,
     SIGHT,
     TRACKER,
+    UNJUDGED,
     Color,
     error_colors,
 )
@@ -147,6 +148,15 @@ class SessionScene:
             self._label(f"/rows/alarm_{row}", f"line {rows.line[row]}", position[row])
         self._arrows(position, rows, colors, magnification)
         return position
+
+    def add_rows(self, q: Float64[np.ndarray, "rows dof"]) -> None:
+        """Draw new rows in grey at the tool of the nominal robot, until all rows are drawn again.
+
+        Args:
+            q: joint values [rad or m].
+        """
+        self._body.draw(self._scene, "/robot", q[-1], LINKS, None)
+        self._dots("/rows/new", self._poses(q)[:, :3, 3], UNJUDGED)
 
     def _arrows(
         self,
