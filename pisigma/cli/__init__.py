@@ -1,1 +1,1 @@
-"""The `pisigma` command: one short file per subcommand; heavy packages are imported inside the commands."""
+"""The `pisigma` command, with a short file per subcommand; heavy packages are imported inside the commands."""

@@ -7,14 +7,14 @@ import typer
 
 
 def complete_robot(incomplete: str) -> list[str]:
-    """Robots of the catalogue."""
+    """Return the robots of the catalogue that begin with a text, for shell completion."""
     from pisigma.robot.robot_file import catalogue
 
     return [name for name in catalogue() if name.startswith(incomplete)]
 
 
 def complete_model(incomplete: str) -> list[str]:
-    """Return the model folders and the folders that lead to them, for shell completion."""
+    """Return model folders, and folders that contain them, for shell completion."""
     written = Path(incomplete)
     parent = written if incomplete.endswith("/") else written.parent
     folders = [path for path in parent.glob("*/") if str(path).startswith(incomplete.removesuffix("/"))]
@@ -33,16 +33,16 @@ def complete_export(incomplete: str) -> list[str]:
 ModelOrCell = Annotated[
     Path, typer.Argument(metavar="MODEL|CELL", help="Model folder, or a cell.", autocompletion=complete_model)
 ]
-"""The argument of commands that read one model, of a cell the one in use."""
+"""Argument of commands that read a model; for a cell, the model in use."""
 
 Verbose = Annotated[bool, typer.Option("--verbose", help="Print all tables and remarks.")]
-"""The option of commands that print many figures."""
+"""Option `--verbose` of commands that print many figures."""
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
-"""The option of all commands that other programs call."""
+"""Option `--json` of all commands that other programs may call."""
 
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace the model in the folder.")]
-"""The option of commands that write a model folder."""
+"""Option `--overwrite` of commands that write a model folder."""
 
 PayloadKg = Annotated[
     float | None,
@@ -62,4 +62,4 @@ AcceptImplausible = Annotated[
         help="Write the model even if the result must not be trusted.",
     ),
 ]
-"""The option of commands that check a model before they write it."""
+"""Option `--accept-implausible` of commands that check a model before they write it."""

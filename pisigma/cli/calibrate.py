@@ -197,7 +197,7 @@ def _calibrate_cell(
         remark = []
         if entry is not None and cell.history.in_use is not None:
             remark = [f"Model '{entry.name}': {entry.remark}."]
-        assert isinstance(calibration, Calibration)  # there is no prior
+        assert isinstance(calibration, Calibration)  # a cell has no prior of a fleet
         text = calibration_text(calibration.summary, folder, calibration.seconds)
         print_result(text, verbose, [*wrap_lines(remark), *next_step_lines(cell.status())])
     if entry is None:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 CellFolder = Annotated[Path, typer.Argument(metavar="CELL", help="Folder of a cell.")]
 Reason = Annotated[str, typer.Option(help="Reason to record in the history.")]
 MAX_LINES = 12
-"""Number of newest sessions that are printed."""
+"""Largest number of sessions that are printed, newest first."""
 
 
 def status(
@@ -99,7 +99,7 @@ def _controller_lines(status: "CellStatus") -> list[str]:
 
 
 def cell_at(path: str | Path) -> "Cell | None":
-    """Open the cell at a path; return None if the path is not a cell."""
+    """Return the cell at a path; None if the path is not a cell."""
     from pisigma.lifetime.cell.layout import is_cell
 
     if not is_cell(path):
@@ -117,7 +117,7 @@ def report_overrides(cell: "Cell", step: str, settings: StatedSettings[Any]) -> 
 
 
 def settings_at(path: str | Path, step: str, settings: StatedSettings[Group]) -> Group:
-    """Return the settings of the command line, for a cell in addition to those of its file."""
+    """Return the settings of the command line; for a cell, in addition to the settings in its file."""
     cell = cell_at(path)
     if cell is None:
         return settings.build()
@@ -139,7 +139,7 @@ def refuse_with_cell(**given: object) -> None:
 
 
 def output_in_cell(cell: "Cell | None", part: str, suffix: str) -> Path:
-    """Return a path for an output in a folder of a cell; without a cell, `--out` is missing."""
+    """Return a path for an output in a folder of a cell; refuse a missing `--out` without a cell."""
     from pisigma.workflow.cell.new_files import output_path
 
     if cell is None:

@@ -27,7 +27,7 @@ from pisigma.files.errors import (
 from pisigma.files.plugins import load_files, load_installed
 
 REFUSED = 2
-"""Exit status if the user's input is at fault."""
+"""Exit status if the user's input is invalid."""
 NOT_ACCEPTED = 3
 """Exit status if a model does not meet its limits, or must not be trusted."""
 DEFECT = 1
@@ -52,9 +52,9 @@ PluginFiles = Annotated[
 
 
 def report_problems(command: Callable[..., None]) -> Callable[..., None]:
-    """Let a command load plug-ins, show its whole help, and end with a message and an exit status if it fails.
+    """Return a command that loads plug-ins, shows its full help, and reports failures by message and exit status.
 
-    It gets the options `--plugin` and `--help-all`. See `exit_with_problem` for the status.
+    The command gets the options `--plugin` and `--help-all`. See `exit_with_problem` for the exit status.
     """
 
     @functools.wraps(command)
@@ -64,7 +64,7 @@ def report_problems(command: Callable[..., None]) -> Callable[..., None]:
             load_files(plugin or ())
             command(**values)
         except (typer.BadParameter, typer.Exit):
-            raise  # the command line itself reports these
+            raise  # the command line itself reports these exceptions
         except (Exception, KeyboardInterrupt) as problem:
             exit_with_problem(problem, as_json=bool(values.get("as_json")))
 
@@ -80,15 +80,15 @@ def report_problems(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def exit_with_problem(problem: BaseException, as_json: bool = False) -> None:
-    """Print what is wrong and end with an exit status.
+    """Print what is wrong, and end the command with an exit status.
 
-    The status is 2 if the user's input is at fault, 3 if a model does not meet its limits, 130 after an interruption,
+    The status is 2 if the user's input is invalid, 3 if a model does not meet its limits, 130 after an interruption,
     141 if the reader of the output has gone, and 1 for everything else.
 
     Args:
         problem: the exception that ended the command.
-        as_json: also print the fields of a refused input on stdout, as a JSON object with the key `error`. The whole
-            result of a model that does not meet its limits is there already.
+        as_json: also print the fields of a refused input on stdout, as a JSON object with the key `error`. If a
+            model does not meet its limits, the whole result is already printed there.
     """
     if isinstance(problem, AcceptanceError):
         exit_with_error(str(problem), NOT_ACCEPTED)
@@ -120,13 +120,13 @@ def exit_with_error(sentence: str, status: int = REFUSED) -> NoReturn:
         line = textwrap.fill(
             line, width, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False
         )
-    with contextlib.suppress(OSError):  # nobody can read it
+    with contextlib.suppress(OSError):  # stderr is closed, so nobody can read the message
         typer.echo(line, err=True)
     raise typer.Exit(status) from None
 
 
 def _defect(problem: BaseException) -> str:
-    """Describe an unexpected problem."""
+    """Return a sentence about an unexpected problem."""
     frame = traceback.extract_tb(problem.__traceback__)[-1]
     return (
         f"a defect of pisigma ended the command ({type(problem).__name__}: {problem}; {Path(frame.filename).name}, "

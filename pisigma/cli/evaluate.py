@@ -70,7 +70,7 @@ def evaluate(
 
 
 def _tell(evaluation: "Evaluation", verbose: bool, as_json: bool) -> None:
-    """Print an evaluation, and end with status 3 if it is not accepted."""
+    """Print an evaluation, and end with status 3 if a model is not accepted."""
     if as_json:
         print_json(evaluation.to_json())
     else:
@@ -108,7 +108,7 @@ def _print(evaluation: "Evaluation", verbose: bool) -> None:
 
 
 def _trust(evaluation: "Evaluation") -> str:
-    """Return whether the models were accepted."""
+    """Return a sentence about whether the models were accepted."""
     from pisigma.reporting.verdict import count_text
 
     stated, warnings = evaluation.settings.limits.stated, evaluation.warnings

@@ -19,16 +19,16 @@ RARELY_USED = {
         "--payload-kg", "--temperature-c",
     ),
 }  # fmt: skip
-"""Options of commands without settings that only `--help-all` shows."""
+"""Options, of commands without settings, that only `--help-all` shows."""
 _SHOWS_ALL = "pisigma.help_all"
 
 
 class ShortHelpCommand(TyperCommand):
-    """A command whose `--help` shows its options briefly, and whose `--help-all` shows the keys of `--set` too."""
+    """A command whose `--help` shows options briefly, and whose `--help-all` also shows the keys of `--set`."""
 
     @property
     def keys(self) -> dict[str, Setting]:
-        """Settings without an option, by their keys."""
+        """Return the settings without an option, by key."""
         known: dict[str, Setting] = getattr(self.callback, SETTINGS, {})
         return {key: one for key, one in known.items() if one.option.is_key}
 
@@ -59,7 +59,7 @@ class ShortHelpCommand(TyperCommand):
                 raise
 
     def _name_key(self, problem: Any) -> None:
-        """Name the key in the error of an unknown option, if there is a setting of this name without an option."""
+        """Add the key to the error of an unknown option, if a setting without an option has this name."""
         key = str(getattr(problem, "option_name", "")).removeprefix("--").replace("-", "_")
         value = "VALUE"
         if key not in self.keys and key.startswith("no_"):
@@ -98,7 +98,7 @@ def _in_a_sentence(parameter: Any) -> Any:
 
 
 def _assignment(setting: Setting) -> str:
-    """Return how a key is assigned, such as "seed=INT"."""
+    """Return the form of an assignment of a key, such as "seed=INT"."""
     kinds = get_args(setting.kind) or (setting.kind,)
     names = [one if isinstance(one, str) else one.__name__.upper() for one in kinds]
     return f"{setting.key}={setting.option.metavar or '|'.join(names)}"
@@ -123,4 +123,4 @@ def _show_all(ctx: Any, value: bool) -> bool:
 HelpAll = Annotated[
     bool, typer.Option("--help-all", is_eager=True, callback=_show_all, help="Show all options and exit.")
 ]
-"""The option of every command that shows its whole help."""
+"""Option `--help-all` of every command, which shows the full help."""

@@ -26,7 +26,7 @@ _ONLY_FOR_PRINTING = ("as_json", "verbose", "help_all")
 
 
 def print_json(result: Any) -> None:
-    """Print one JSON object on stdout; unknown numbers must be None, because JSON has no NaN."""
+    """Print a JSON object on stdout; unknown numbers must be None, because JSON has no NaN."""
     typer.echo(json.dumps(result, allow_nan=False))
 
 
@@ -52,7 +52,7 @@ def wrap_lines(lines: Iterable[str], indent: str = "") -> list[str]:
             width,
             subsequent_indent=indent,
             break_long_words=False,
-            break_on_hyphens=False,  # names of files stay whole
+            break_on_hyphens=False,  # file names are not divided
         )
     ]
 
@@ -64,9 +64,9 @@ def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]
 
 
 def table_lines(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """Lay out a table: numbers are aligned right, and headings and texts are wrapped where the screen is narrow.
+    """Return the lines of a table: numbers are aligned right, and headings and texts wrapped on narrow screens.
 
-    Numbers and words are never cut, so a table with long ones may be wider than the screen.
+    Numbers and words are never cut, so a table may be wider than the screen.
     """
     from rich.box import SIMPLE_HEAD
     from rich.table import Table
@@ -124,7 +124,7 @@ def screen_width() -> int:
 
 
 def command_line(context: typer.Context, files: Collection[str] = ("out",)) -> str:
-    """Return the running command for cards, without the folders of files and options at their defaults.
+    """Return the running command for cards, without folders of files and without options at their defaults.
 
     Args:
         context: context of the command.

@@ -15,12 +15,12 @@ if TYPE_CHECKING:
     from rich.status import Status
 
 QUIET_S = 2.0
-"""Time [s] for which a command without a terminal says nothing, and between two lines that are not numbered steps."""
+"""Time [s] before a command without a terminal prints a line, and between two lines that are not numbered steps."""
 
 
 @contextmanager
 def progress_of(title: str) -> Iterator[Callable[[str], None]]:
-    """Show what a command is doing: a line that changes on a terminal, otherwise a line per step.
+    """Show the progress of a command: a line that changes on a terminal, otherwise a line per step.
 
     Yields:
         A function to call with the current step; numbered steps, such as "repeat 1 of 3, fold 2 of 5: series", also
@@ -53,7 +53,7 @@ class _Shown:
             from rich.text import Text
 
             self.status.update(Text(self._line(what)))
-            self.status.start()  # not before there is something to show: another bar may be drawn until then
+            self.status.start()  # started at the first step, because another progress bar may be drawn before
             return
         self._stop_timer()
         now = time.monotonic()
@@ -63,13 +63,13 @@ class _Shown:
         if step_name(what) != self.step and is_due:
             self._print()
         elif step_name(what) != self.step:
-            self._line(what)  # which starts the clock of the steps
+            self._line(what)  # this starts the clock of the steps
             self.timer = threading.Timer(QUIET_S - (now - self.printed), self._print)
             self.timer.daemon = True
             self.timer.start()
 
     def hide(self) -> None:
-        """Stop showing it."""
+        """Stop showing the progress."""
         self._stop_timer()
         if self.status is not None:
             self.status.stop()
@@ -84,5 +84,5 @@ class _Shown:
         typer.echo(self._line(self.step), err=True)
 
     def _line(self, what: str) -> str:
-        """Write the current step, with the time left if steps are numbered."""
+        """Return the line of the current step, with the time left if steps are numbered."""
         return make_printable(f"{self.title}: {self.left.after(what)}")

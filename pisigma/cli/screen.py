@@ -1,6 +1,6 @@
-"""Terminal output of a command: the verdict, then warnings, then tables as far as they fit on a screen.
+"""Terminal output of a command: the verdict, then warnings, then tables as far as they fit on the screen.
 
-Nothing is lost: `--verbose` prints everything, and so do cards and pages.
+`--verbose`, cards and pages contain everything.
 """
 
 from collections.abc import Sequence
@@ -13,9 +13,9 @@ from pisigma.reporting.result_text import Block, ResultText, merge_alike_warning
 from pisigma.reporting.verdict import Verdict
 
 MAX_LINES = 40
-"""Lines that a command prints at most without `--verbose`, at 80 columns; warnings come in addition."""
+"""Largest number of lines that a command prints without `--verbose` at 80 columns, not counting warnings."""
 SHORT = 12
-"""Lines up to which the verdict is not repeated at the end."""
+"""Number of lines up to which the verdict is not repeated at the end."""
 
 
 def print_screen(
@@ -32,11 +32,11 @@ def print_screen(
     Args:
         verdict: verdict in three sentences.
         warnings: sentences; all are printed.
-        blocks: the most important first; those for which there is no room are only named.
-        details: printed with `verbose` alone.
-        closing: what was written where.
+        blocks: tables and texts, most important first; blocks that do not fit are only named.
+        details: blocks that are printed with `verbose` only.
+        closing: sentences about files that were written.
         verbose: print everything.
-        next_step: last lines, which state the next step of a cell instead of that of the verdict.
+        next_step: last lines, with the next step of a cell instead of the verdict's.
     """
     verdict = replace(verdict, next_step="") if next_step else verdict
     head = [line for label, text in verdict.lines if text for line in wrap_lines([f"{label}: {text}"], "  ")]
@@ -66,7 +66,7 @@ def print_screen(
 
 
 def _lines(block: Block) -> list[str]:
-    """Lay out a block for the width of the screen."""
+    """Return the lines of a block for the width of the screen."""
     if block.columns:
         return table_lines(block.sentences[0], block.columns, block.rows)
     return wrap_lines(block.sentences, block.indent)

@@ -1,4 +1,4 @@
-"""Options of commands, made from the settings that the commands take."""
+"""Make the options of commands from their settings."""
 
 import functools
 import inspect
@@ -14,16 +14,16 @@ from pisigma.files.setting import Setting, build_settings, by_key, flat_settings
 from pisigma.files.setting_values import read_assignments
 
 SETTINGS = "settings_by_key"
-"""Attribute of a command with its settings by their keys."""
+"""Name of the attribute of a command with its settings by key."""
 _CONTEXT, _SET = "context_of_command", "assignments"
-"""Parameters by which a command gets its context and the values of `--set`."""
+"""Names of the parameters by which a command gets its context and the values of `--set`."""
 
 Group = TypeVar("Group")
 
 
 @dataclass(frozen=True)
 class StatedSettings(Generic[Group]):
-    """Settings that a command line states, for commands that may take the others from a cell.
+    """Settings stated on a command line, for commands that may read other settings from a cell.
 
     Attributes:
         group: class of the settings.
@@ -34,7 +34,7 @@ class StatedSettings(Generic[Group]):
     values: Mapping[str, Any]
 
     def build(self) -> Group:
-        """Return the settings without a cell: those that are not stated have their defaults.
+        """Return the settings without a cell; settings that are not stated have their defaults.
 
         Raises:
             PisigmaError: a value is not valid.
@@ -45,11 +45,11 @@ class StatedSettings(Generic[Group]):
 
 
 def takes_settings(command: Callable[..., None]) -> Callable[..., None]:
-    """Replace every parameter of a command whose type is a class of settings by the options of that class.
+    """Return a command with the options of all classes of settings among its parameters.
 
-    The command is called with the settings; a parameter that may be None is None if none of its settings is stated. A
-    parameter of type `StatedSettings[...]` gets what is stated. If a setting has no option of its own, the command also
-    gets the option `--set`, which states any setting by its key.
+    The command is called with the settings; a parameter that may be None is None if none of its settings is stated.
+    A parameter of type `StatedSettings[...]` gets the stated settings. If a setting has no option of its own, the
+    command also gets the option `--set`, which states any setting by its key.
     """
     parameters: list[inspect.Parameter] = []
     groups: dict[str, tuple[type, bool]] = {}
@@ -102,7 +102,7 @@ def _assignments(known: Mapping[str, Setting]) -> inspect.Parameter:
 
 
 def _stated(values: dict[str, Any], known: Mapping[str, Setting], running: Any) -> dict[str, Any]:
-    """Remove the options of settings from the values of a command, and return the stated ones by key."""
+    """Remove the options of settings from the values of a command, and return the stated settings by key."""
     stated = read_assignments(values.pop(_SET, None) or (), known, "--set")
     for key, setting in known.items():
         if setting.option.is_key:

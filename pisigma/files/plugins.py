@@ -97,9 +97,8 @@ def _run(path: Path) -> None:
     spec = spec_from_file_location(name, path, loader=SourceFileLoader(name, str(path)))
     assert spec is not None
     assert spec.loader is not None
-    sys.modules[name] = module_from_spec(
-        spec
-    )  # registered before it runs, because dataclasses look their module up
+    # registered before it runs, because dataclasses look their module up
+    sys.modules[name] = module_from_spec(spec)
     try:
         spec.loader.exec_module(sys.modules[name])
     except BaseException:

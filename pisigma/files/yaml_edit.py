@@ -108,9 +108,8 @@ def _with_replaced(text: str, node: yaml.Node, value: Any) -> str:
     """Return the text with a value replaced by another one, written in one line."""
     start, is_block = node.start_mark.index, isinstance(node, yaml.CollectionNode) and not node.flow_style
     is_apart = text[start - 1 : start].isspace() or text[start - 1 : start] in ("[", "{")
-    gap = (
-        "" if is_apart and not is_block else " "
-    )  # a block may begin in the column of its key, a value in one line may not
+    # a block may begin in the column of its key, a value in one line may not
+    gap = "" if is_apart and not is_block else " "
     return f"{text[:start]}{gap}{yaml_text(value, in_one_line=True)}{text[_end(node) :]}"
 
 

@@ -65,9 +65,8 @@ def add_roll_pitch_yaw(graph: OnnxGraph, cells: str) -> list[str]:
 
 def _add_chain(graph: OnnxGraph, robot: Robot, q: str, base: np.ndarray) -> Iterator[_Step]:
     """Yield the rows of the chain, adding `RotZ(q)` or `Trans(0, 0, q)` and the constant transform of each row."""
-    ones = graph.add_node(
-        "Add", graph.add_node("Mul", graph.column(q, 0), 0.0), 1.0
-    )  # expanded to the batch size of q
+    # expanded to the batch size of q
+    ones = graph.add_node("Add", graph.add_node("Mul", graph.column(q, 0), 0.0), 1.0)
     frame, joint = graph.add_node("Mul", graph.reshape(ones, [1, 1]), base), 0
     for row, still in zip(robot.rows, _still(robot), strict=True):
         before = frame

@@ -298,9 +298,8 @@ def _equal_pairs(values: RowValues) -> tuple[Int64[Tensor, " pairs"], Int64[Tens
     """
     numbers, steps = values.numbers, values.column_steps
     scale = steps.amax(0)
-    weight = (
-        torch.arange(2.0, 2 + numbers.shape[1]).double().sqrt() % 1 + 0.5
-    )  # weights without simple ratios
+    # weights without simple ratios
+    weight = torch.arange(2.0, 2 + numbers.shape[1]).double().sqrt() % 1 + 0.5
     key, order = ((numbers / scale).nan_to_num(nan=0.0) @ weight).sort()
     last = torch.searchsorted(key, key + 1.1 * float(weight.sum()), right=True)
     ahead = last - torch.arange(len(key)) - 1

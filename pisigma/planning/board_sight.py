@@ -14,12 +14,12 @@ from pisigma.robot.se3 import invert, skew
 
 @dataclass(frozen=True, eq=False)
 class BoardSight:
-    """A camera and the board that it sees: one is on the flange (the target), the other is the measuring frame.
+    """A camera and the board that it sees: one of them is on the flange (the target), the other is the measuring frame.
 
     Attributes:
         camera: camera with known intrinsics.
         board: board, of which every image shows all corners.
-        is_fixed: whether the camera is fixed and the board is on the flange; otherwise the other way round.
+        is_fixed: whether the camera is fixed and the board is on the flange; otherwise the camera is on the flange.
         corner_noise: standard deviation of u and v of a corner [px].
         repeatability: repeatability of the robot.
     """
@@ -39,8 +39,8 @@ class BoardSight:
 
         The covariance is that of (translation [m], rotation vector [rad]) of the target in the axes of the measuring
         frame: `(Σ J^T J)^-1 noise²` over all corners plus the repeatability, as in `CornerSensor` for measured corners.
-        For a small motion (δ, ω) of the target at t, a corner X moves in the camera by `F (δ + ω × (X - t))`, where F
-        rotates from the axes of the frame to those of the camera; in the opposite direction where the camera is the
+        For a small motion (δ, ω) of the target at t, a corner X moves in the camera by `F (δ + ω × (X - t))`, where
+        F rotates from the axes of the frame to the axes of the camera; the sign is reversed if the camera is the
         target.
         """
         T = self.board_in_camera(T_frame_target)

@@ -1,4 +1,4 @@
-"""Poses from which a camera sees the whole board: tests for given poses, and random ones."""
+"""Poses from which a camera sees the whole board: tests of given poses, and random poses."""
 
 import math
 from dataclasses import dataclass
@@ -18,11 +18,11 @@ from pisigma.robot.kinematics.numeric import solve_numeric
 from pisigma.robot.se3 import invert, rotation_from_rpy, transform
 
 FULL_POSE_DOF = 6
-"""Joints of an arm that reaches any pose in its workspace, so that a closed form can be used."""
+"""Number of joints of an arm that reaches any pose in its workspace, so that a closed form can be used."""
 CENTRE_SHARE = 0.5
 """Share of the image's width and height in which the centre of a random board lies."""
 MAX_ITERATIONS = 30
-"""Iterations of the numeric inverse kinematics."""
+"""Largest number of iterations of the numeric inverse kinematics."""
 MAX_DEPTH_RATIO = 8.0
 """Largest depth of random boards, as a multiple of the depth at which they fill the image."""
 SIGHT_LINE_SHARES = (0.1, 0.8)
@@ -66,8 +66,8 @@ class BoardViews:
         """Draw joint values [rad or m] of random views, each in a random branch; NaN where a view is not reached.
 
         Depth, obliqueness, its direction, the rotation about the line of sight and the position in the image are
-        uniform. An arm without a closed form, or with fewer than six joints, comes as near to a view as the numeric
-        inverse kinematics does from random joint values.
+        uniform. An arm without a closed form, or with fewer than six joints, gets the poses nearest to a view that
+        numeric inverse kinematics finds from random joint values.
         """
         T_board = self._sampled_boards(count, generator)
         T_frame_target = T_board if self.sight.is_fixed else invert(T_board)
@@ -89,7 +89,7 @@ class BoardViews:
     def faults(
         self, arm: ArmInSurroundings, q: Float64[Tensor, "poses dof"]
     ) -> dict[str, Bool[Tensor, " poses"]]:
-        """Return which poses fail, by reason."""
+        """Return the masks of poses that fail, by reason."""
         chunks = [self._faults(arm, chunk) for chunk in torch.split(q, POSES_PER_CHUNK)]
         return {reason: torch.cat([chunk[reason] for chunk in chunks]) for reason in chunks[0]}
 
@@ -102,7 +102,7 @@ class BoardViews:
     def margin_in_image(
         self, arm: ArmInSurroundings, q: Float64[Tensor, "poses dof"]
     ) -> Float64[Tensor, " poses"]:
-        """Compute how far the board may be from its stated place before it leaves the image [m]."""
+        """Compute the distance that the board may be from its stated position before it leaves the image [m]."""
         points, pixels, _ = self._shown(self._boards(arm, q)[0])
         edge = pixels.new_tensor([self.sight.camera.width, self.sight.camera.height])
         room = torch.minimum(pixels, edge - pixels).amin(-1) * points[..., 2] / self.sight.camera.fx

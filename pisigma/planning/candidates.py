@@ -1,4 +1,4 @@
-"""Candidate poses for a measurement: drawn within the joint limits or read from a file, and possible there."""
+"""Candidate poses for a measurement, drawn within the joint limits or read from a file."""
 
 import math
 import os
@@ -19,13 +19,14 @@ from pisigma.robot.kinematics.joint_limits import nearest_turn
 from pisigma.robot.se3 import wrap_to_pi
 
 MAX_DRAWS = 40
-"""Blocks of random poses, each with the requested number of candidates."""
+"""Largest number of blocks of random poses, each with the requested number of candidates."""
 KERNEL_WIDTH, RARE_SHARE = 0.25, 0.5
-"""Width of the kernel for the density of joint angles [rad], and the share of its mean below which it is low."""
+"""Width of the kernel for the density of joint angles [rad], and the share of the mean density below which an angle
+is rare."""
 MIN_VIEWS = 100
 """Views of a board that are drawn together, because a robot reaches few of them."""
 SAME_JOINTS = 1e-6
-"""[rad or m] Difference of joint values below which rows of a file are the same pose."""
+"""Difference of joint values below which rows of a file are the same pose [rad or m]."""
 OUTSIDE_WORKSPACE = "the reflector is outside the box of the workspace"
 REPEATED = "an earlier row has the same joint values"
 UNREACHED = "the robot does not reach a view of the board"
@@ -40,12 +41,12 @@ class Candidates:
 
     Attributes:
         q: joint values [rad or m].
-        number: number of each in the file, or among the poses that were drawn; from 1.
+        number: number of every candidate in the file, or among the poses that were drawn, from 1.
         looked_at: number of poses that were drawn or read.
         refused: number of refused poses by reason.
-        workspace: joint values where the robot must be accurate, and that may be waypoints [rad or m]: the candidates
-            themselves; with a camera, which sees its board from a small part of the workspace only, poses that the
-            surroundings allow.
+        workspace: joint values at which the robot must be accurate, and which may be waypoints [rad or m]: the
+            candidates themselves; with a camera, which sees its board from a small part of the workspace only, poses
+            that the surroundings allow.
     """
 
     q: Float64[Tensor, "candidates dof"]
@@ -56,14 +57,14 @@ class Candidates:
 
     @property
     def sentence(self) -> str:
-        """Number of allowed poses, and of refused ones by reason."""
+        """Sentence with the number of allowed poses, and of refused poses by reason."""
         reasons = "; ".join(f"{count:,}: {reason}" for reason, count in self.refused.most_common())
         return f"{len(self.q):,} of {self.looked_at:,} poses are allowed" + (
             f" ({reasons})." if reasons else "."
         )
 
     def check_count(self, count: int) -> None:
-        """Refuse to select more poses than there are.
+        """Refuse a number of poses that exceeds the number of candidates.
 
         Raises:
             PlanningError: there are fewer candidates; the message says why poses were refused.
@@ -86,7 +87,7 @@ def draw_candidates(
 ) -> Candidates:
     """Draw candidates until enough are allowed or too many were refused.
 
-    They are uniform in the joint values. Joints with a range of more than one revolution are drawn within half a
+    Candidates are uniform in the joint values. Joints with a range of more than one revolution are drawn within half a
     revolution of the centre of their range, or of 0 without limits, and then unwrapped (`with_workspace`). Where a
     camera has to see a board, views are drawn instead.
 
@@ -113,7 +114,7 @@ def draw_candidates(
         blocks.append((q, _faults(arm, q, workspace, views)))
     q = torch.cat([sampled for sampled, _ in blocks])
     faults = Faults(blocks[0][1].reasons, torch.cat([one.failed for _, one in blocks]))
-    enough = int((faults.allowed.cumsum(0) < count).sum()) + 1  # poses up to the last one that is needed
+    enough = int((faults.allowed.cumsum(0) < count).sum()) + 1  # poses up to the last that is needed
     candidates = _allowed(q[:enough], replace(faults, failed=faults.failed[:enough]))
     return candidates if views is not None else with_workspace(arm, candidates, candidates)
 
@@ -150,7 +151,7 @@ def read_candidates(
     workspace: Workspace | None = None,
     views: BoardViews | None = None,
 ) -> Candidates:
-    """Read candidates from the joint values of a file; repeated joint values count once.
+    """Return candidates from the joint values of a file; repeated joint values count once.
 
     Args:
         arm: the robot in its surroundings.
@@ -168,7 +169,7 @@ def read_candidates(
 
 
 def _repeats(q: Float64[Tensor, "poses dof"]) -> Bool[Tensor, " poses"]:
-    """Return which poses equal an earlier one, so they would be planned twice, or for calibration and check."""
+    """Return the mask of poses that equal an earlier pose and would be planned twice."""
     steps = (q / SAME_JOINTS).round().numpy()
     _, first, group = np.unique(steps, axis=0, return_index=True, return_inverse=True)
     return torch.from_numpy(first[group.reshape(-1)] < np.arange(len(q)))
@@ -177,16 +178,16 @@ def _repeats(q: Float64[Tensor, "poses dof"]) -> Bool[Tensor, " poses"]:
 def select_spread_poses(
     arm: ArmInSurroundings, q: Float64[Tensor, "poses dof"], count: int, others: Float64[Tensor, "others dof"]
 ) -> Int64[Tensor, " chosen"]:
-    """Select poses spread over the workspace: each time the one farthest from all selected or given poses.
+    """Select poses spread over the workspace, always the pose farthest from all selected and given poses.
 
-    Distances are those of the reflector's positions and of the joint values, each over its standard deviation (Kennard
+    Distances combine the reflector's positions and the joint values, each divided by its standard deviation (Kennard
     and Stone 1969, Technometrics 11(1)).
 
     Args:
         arm: the robot.
         q: joint values [rad or m] to select from.
         count: number of poses to select.
-        others: joint values of poses that are measured anyway [rad or m].
+        others: joint values of poses that are already planned [rad or m].
     """
     both = torch.cat([q, others])
     position = forward_kinematics(arm.robot, both)[:, :3, 3]
@@ -210,7 +211,7 @@ def _faults(
     workspace: Workspace | None,
     views: BoardViews | None,
 ) -> Faults:
-    """Return why poses are not allowed by the surroundings, the workspace, or the camera."""
+    """Return the faults of poses with respect to surroundings, workspace and camera."""
     failed = {} if views is None else {UNREACHED: q.isnan().any(1)}
     q = q.nan_to_num()
     faults = arm.faults(q)
@@ -230,7 +231,7 @@ def _allowed(q: Float64[Tensor, "poses dof"], faults: Faults) -> Candidates:
 
 
 def _sampled_range(arm: ArmInSurroundings) -> Float64[Tensor, "axes 2"]:
-    """Return the range of the controller's values that are drawn [rad or m]."""
+    """Return the range from which the controller's values are drawn [rad or m]."""
     limits = arm.limits.clone()
     for index, (joint, (lower, upper)) in enumerate(zip(arm.robot.axes, arm.limits.tolist(), strict=True)):
         if joint.type == "revolute" and upper - lower > 2 * np.pi:

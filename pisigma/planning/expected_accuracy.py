@@ -16,13 +16,13 @@ from pisigma.planning.robot_posterior import RobotPosterior
 from pisigma.planning.surroundings.arm_in_surroundings import ArmInSurroundings
 
 RANDOM_SELECTIONS = 5
-"""Random selections of poses that a plan is compared with."""
+"""Number of random selections of poses with which a plan is compared."""
 DRAWS = 100
-"""Robots that are drawn from the posterior for its quantiles."""
+"""Number of robots that are drawn from the posterior to compute quantiles."""
 MORE_IMAGES = 10
-"""Additional images whose benefit is predicted."""
+"""Number of additional images whose benefit is predicted."""
 EXACT_CORNERS, EXACT_ROBOT = 1e-4, Repeatability(1e-9, 1e-9)
-"""Noise of corners [px] and repeatability of a robot that contribute nothing to the error."""
+"""Noise of corners [px] and repeatability of a robot so small that they do not contribute to the error."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class ExpectedAccuracy:
         poses: number of measured poses.
         rms: root mean square [m].
         p95: 95 % quantile [m].
-        random_rms: root mean square after as many poses drawn from the candidates at random [m].
+        random_rms: root mean square after the same number of random candidates [m].
     """
 
     poses: int
@@ -65,7 +65,7 @@ def accuracy_curve(
     counts: Sequence[int],
     seed: int = 0,
 ) -> tuple[ExpectedAccuracy, ...]:
-    """Predict the accuracy against the number of poses.
+    """Predict the accuracy as a function of the number of poses.
 
     Args:
         B: derivatives of the measured values of the candidates under the prior; see `RobotPosterior.sensitivities`.
@@ -91,7 +91,7 @@ def accuracy_curve(
 
 
 def rms_of(D: Float64[Tensor, "tasks 3 directions"]) -> float:
-    """Compute the RMS position error over the task [m]; for D see `RobotPosterior.tool`."""
+    """Compute the RMS position error over the task [m] from the derivatives D of `RobotPosterior.tool`."""
     return float((D.square().sum() / len(D)).sqrt())
 
 
@@ -105,7 +105,7 @@ def p95_of(D: Float64[Tensor, "tasks 3 directions"], seed: int = 0) -> float:
 def remaining_errors(
     posterior: RobotPosterior, task: Float64[Tensor, "tasks dof"]
 ) -> tuple[RemainingError, ...]:
-    """Compute the contributions of groups of unknowns to the remaining error, the largest first.
+    """Compute the contributions of groups of unknowns to the remaining error, largest first.
 
     With D as in `RobotPosterior.tool` and R_g the rows of the root that belong to a group, knowing the group exactly
     would remove the projection of D on the directions of R_g (conditioning of a normal distribution).
@@ -123,7 +123,7 @@ def remaining_errors(
 
 
 def _groups(posterior: RobotPosterior) -> dict[str, list[int]]:
-    """Return the indices of the unknowns by the name of their group."""
+    """Return the indices of the unknowns of every group, by the name of the group."""
     known = posterior.uncertainty
     names = {"theta": "joint offsets", "d": "link lengths", "a": "link lengths"}
     names |= {"alpha": "angles between axes", "beta": "angles between axes"}
@@ -167,12 +167,12 @@ class CameraProspects:
         views: BoardViews,
         arm: ArmInSurroundings,
     ) -> "CameraProspects":
-        """Predict the errors.
+        """Return the predicted errors of the planned images.
 
         Args:
             posterior: unknowns of the robot before the first image.
             candidates: views of the board.
-            chosen: indices of the planned ones.
+            chosen: indices of the planned views.
             task: joint values where the robot must be accurate [rad or m].
             views: conditions under which the camera sees the board.
             arm: the robot in its surroundings.
@@ -212,7 +212,7 @@ class CameraProspects:
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """Sentences on what limits the accuracy, what is not identifiable, and how exactly to place the board."""
+        """Sentences about what limits the accuracy, what is not identifiable, and how exactly to place the board."""
         better = {
             f"{MORE_IMAGES} more images": self.more_images,
             "corners without noise": self.exact_corners,
@@ -233,7 +233,7 @@ class CameraProspects:
 
 
 def _unidentifiable(arm: ArmInSurroundings, is_fixed: bool) -> tuple[str, ...]:
-    """Describe which parameters the unknown target and frame absorb: those of the last row, and along axis 1."""
+    """Return sentences about the parameters that the unknown target and frame absorb."""
     frame, target = ("camera", "board") if is_fixed else ("board", "camera")
     first, last = arm.robot.joint_rows[0] + 1, arm.robot.joint_rows[-1] + 1
     return (

@@ -1,4 +1,4 @@
-"""Plan files: a CSV with the poses, and a YAML file next to it with everything that replanning needs."""
+"""Plan files: a CSV file with the poses, and a YAML file next to it with all data for replanning."""
 
 import csv
 import io
@@ -27,14 +27,14 @@ from pisigma.robot.row import Bounded
 from pisigma.robot.writing import robot_document
 
 YAML_SUFFIX = ".plan.yaml"
-"""Suffix of the YAML: that of `poses.csv` is `poses.plan.yaml`."""
+"""Suffix of the YAML file of a plan, such as `poses.plan.yaml` for `poses.csv`."""
 
 
 class Waypoint(Section):
     """Joint values through which the robot moves to a pose.
 
     Attributes:
-        before: number of the pose in the order of the plan.
+        before: number of the pose, in the order of the plan.
         joints: joint values [deg, or mm for prismatic joints].
     """
 
@@ -48,7 +48,7 @@ class PlanDocument(Section):
     Attributes:
         poses: name of the CSV file in the same folder.
         robot: nominal robot.
-        model: folder of the model that was planned for, relative to this file; None for a nominal robot.
+        model: folder of the planned model, relative to this file; None for a nominal robot.
         settings: settings of the plan, with paths relative to this file.
         cell: surroundings of the robot.
         way_points: waypoints between poses where the straight joint motion is not free.
@@ -69,12 +69,12 @@ class StoredPlan:
     Attributes:
         arm: the robot in its surroundings.
         settings: settings of the plan, with paths relative to the working directory.
-        model: folder of the model that was planned for; None for a nominal robot.
+        model: folder of the planned model; None for a nominal robot.
         q: joint values [rad or m].
-        check: whether each pose tests the calibration (set "test") or is calibrated with ("train").
+        check: whether each pose tests the calibration (set "test") or is used for it ("train").
         candidate: row of each pose in the file of candidates, or its number among the random poses; from 1.
         waypoints: joint values through which the robot moves to each pose [rad or m]; mostly none.
-        number: number of each pose, kept in parts of the plan; () where they count from 1.
+        number: number of each pose, which parts of the plan keep; () if numbers start at 1.
     """
 
     arm: ArmInSurroundings
@@ -103,7 +103,7 @@ class StoredPlan:
         )
 
     def write(self, path: Path) -> None:
-        """Write the CSV and the YAML next to it; existing files are replaced.
+        """Write the CSV file and the YAML file next to it; existing files are replaced.
 
         Raises:
             OutputError: a file cannot be written.
@@ -119,7 +119,7 @@ class StoredPlan:
         write_atomically(yaml_of(path), yaml_text(self._document(path)))
 
     def _in_file_units(self, q: Float64[Tensor, "poses dof"]) -> list[list[float]]:
-        """Return the controller's values [deg or mm] with the digits that controllers take."""
+        """Return the controller's values [deg or mm], rounded to the digits that controllers accept."""
         robot = self.arm.robot
         return [
             [round(axis.in_file_unit(value), 6) for axis, value in zip(robot.axes, row, strict=True)]
@@ -147,12 +147,12 @@ def joint_columns(robot: Robot) -> list[str]:
 
 
 def yaml_of(path: Path) -> Path:
-    """Return the path of the YAML that belongs to the CSV of a plan."""
+    """Return the path of the YAML file that belongs to the CSV file of a plan."""
     return path.with_suffix(YAML_SUFFIX)
 
 
 def read_plan(path: str | os.PathLike[str]) -> StoredPlan:
-    """Read a plan from its CSV or its YAML.
+    """Return the plan in a CSV file or a YAML file.
 
     Raises:
         PlanningError: the YAML is missing or cannot be used.

@@ -28,7 +28,7 @@ from pisigma.planning.surroundings.arm_in_surroundings import ArmInSurroundings
 from pisigma.robot.description import Robot
 
 WORKSPACE_POSES = 1000
-"""Poses that represent the workspace where a camera measures."""
+"""Number of poses that represent the workspace if a camera measures."""
 
 
 def instrument_of(settings: PlanSettings, anchor: Float64[Tensor, " 3"] | None = None) -> Instrument:
@@ -59,7 +59,7 @@ def find_candidates(settings: PlanSettings, arm: ArmInSurroundings) -> Candidate
     """Draw or read the poses to select from.
 
     Raises:
-        MeasurementError: their file cannot be used.
+        MeasurementError: the file of candidates cannot be used.
         PlanningError: a prismatic joint has no limits.
     """
     views, workspace = views_of(settings, arm), workspace_of(settings)
@@ -73,7 +73,7 @@ def find_candidates(settings: PlanSettings, arm: ArmInSurroundings) -> Candidate
 
 
 def allow_measured_poses(settings: PlanSettings, arm: ArmInSurroundings) -> ArmInSurroundings:
-    """Return the arm such that candidates that were measured are free of self-collision.
+    """Return the arm, modified so that candidates that were measured are free of self-collision.
 
     Raises:
         MeasurementError: the file of candidates cannot be used.
@@ -103,7 +103,7 @@ def views_of(settings: PlanSettings, arm: ArmInSurroundings) -> BoardViews | Non
     """Return the conditions under which the camera sees its board; None without a camera.
 
     Raises:
-        PlanningError: the surroundings do not state them.
+        PlanningError: the surroundings do not state these conditions.
     """
     if settings.camera is None:
         return None

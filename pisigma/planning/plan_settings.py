@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from pisigma.planning.tour import Pace
 
 MIN_SIGMA_PX, MAX_SIGMA_PX = 1e-3, 100.0
-"""Valid range of the noise of a corner [px]; other values are slips of the unit."""
+"""Valid range of the noise of a corner [px]; other values are in a wrong unit."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class CameraSettings:
 
     @property
     def files(self) -> CameraFiles:
-        """Camera files by which measured corners are read."""
+        """Camera files with which measured corners are read."""
         return CameraFiles((self.camera,), (self.board,), self.is_fixed, self.repeatability)
 
 
@@ -65,7 +65,7 @@ Box = tuple[float, float, float, float, float, float]
 MIN_LENGTH_MM, MAX_LENGTH_MM = 1e-3, 1e3
 """Range of instruments' standard deviations and robots' errors [mm]; other values are in the wrong unit."""
 FILES = ("candidates_from", "task", "measured")
-"""Settings that are paths of files."""
+"""Names of the settings that are paths of files."""
 
 
 def parse_box(stated: str) -> tuple[float, ...]:

@@ -1,4 +1,4 @@
-"""Selection of the poses to measure from many candidates: those that leave the least uncertainty."""
+"""Select the poses to measure from many candidates, such that the remaining uncertainty is minimal."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,16 +11,17 @@ from pisigma.files.errors import PlanningError
 from pisigma.planning.plan_settings import Criterion
 
 DROPPED_VARIANCE = 1e-10
-"""Share of the task's variance that dropped directions may have together. Where a base may be anywhere within a metre,
-errors of a tenth of a millimetre, which a plan is made for, are 1e-8 of the variance."""
+"""Largest share of the task's variance in directions that are dropped. If a base may be anywhere within a metre,
+errors of a tenth of a millimetre, for which a plan is made, are 1e-8 of the variance."""
 MAX_EXCHANGED = 400
-"""Candidates that take part in the exchange: the selected ones, and the best of the others."""
+"""Number of candidates that take part in the exchange: the selected ones, and the best of the others."""
 MIN_GAIN = 1e-6
-"""[nats, or share of the variance] Gain of an exchange below which it is not made."""
+"""Gain below which candidates are not exchanged [nats, or share of the variance]."""
 MIN_REMAINING = 1e-3
-"""Remaining share of a value's standard deviation below which a pose cannot be removed without losing all digits."""
+"""Remaining share of a value's standard deviation below which a pose cannot be removed without a total loss of
+accuracy."""
 MAX_PASSES = 3
-"""Passes over the selected poses in the exchange."""
+"""Largest number of passes over the selected poses in the exchange."""
 
 
 def select_poses(
@@ -32,11 +33,11 @@ def select_poses(
     """Select poses to measure, the most useful first.
 
     "D" (D-optimal) maximises the information on all unknowns, `log det(1 + Σ B_i^T B_i)`; "I" (I-optimal) minimises the
-    mean variance of the tool's position over the task, `tr(C W)`. Poses are first added one by one, each the best by D
-    given those before it: a pivoted block Cholesky factorisation of the covariance of all values. Then each is
-    exchanged for the best other one as long as that gains something; for I both from there and from the end of the
-    exchange by D, of which the better result is taken. The selected poses are sorted by the criterion, so that the
-    first n of them are a good selection of n.
+    mean variance of the tool's position over the task, `tr(C W)`. Poses are first added one by one, always the best
+    pose by D given the previous ones: a pivoted block Cholesky factorisation of the covariance of all values. Then
+    every pose is exchanged for the best other candidate as long as the criterion improves; for I this starts both
+    from the greedy selection and from the result for D, and the better result is used. The selected poses are sorted
+    by the criterion, so that the first n poses are a good selection of n poses.
 
     Source: exchange of Fedorov 1972, "Theory of Optimal Experiments", section 3.3; greedy selection of Krause, Singh
     and Guestrin 2008, JMLR 9, 235-284; for robots Borm and Menq 1991 select poses by observability.
@@ -45,7 +46,7 @@ def select_poses(
         B: derivatives of the measured values of the candidates under the prior; see `RobotPosterior.sensitivities`.
         D: derivatives of the tool's position over the task under the prior; see `RobotPosterior.tool`.
         count: number of poses to select.
-        criterion: "D" or "I", see above.
+        criterion: "D" or "I", see the description above.
 
     Returns:
         Indices of candidates, without repetition.
@@ -87,7 +88,7 @@ def select_poses(
 
 
 def condense_derivatives(D: Float64[Tensor, "tasks 3 directions"]) -> Float64[Tensor, "rank directions"]:
-    """Compute few rows W with the same mean variance, `W^T W = mean(D_i^T D_i)`, up to `DROPPED_VARIANCE` of it."""
+    """Compute few rows W with the same mean variance, `W^T W = mean(D_i^T D_i)`, up to `DROPPED_VARIANCE`."""
     values, vectors = torch.linalg.eigh(torch.einsum("tcd,tce->de", D, D) / len(D))
     left_out = values.clamp(min=0).cumsum(0)
     kept = left_out > DROPPED_VARIANCE * left_out[-1]
@@ -115,7 +116,7 @@ class _Change:
 
 
 class PoseSelection:
-    """Selected candidates, and the gain of adding each of the others.
+    """Selected candidates, and the gain of adding any other candidate.
 
     With C the covariance of the standard normal numbers given the selected poses, adding a pose changes it by
     `-C B_i^T (1 + B_i C B_i^T)^-1 B_i C`, and removing it by `+C B_i^T (1 - B_i C B_i^T)^-1 B_i C` (Woodbury).
@@ -131,7 +132,7 @@ class PoseSelection:
         criterion: Criterion,
         chosen: Sequence[int] = (),
     ) -> None:
-        """Start with no pose, or with some.
+        """Start with the given poses, or without any.
 
         Args:
             B: derivatives of the measured values, see `RobotPosterior.sensitivities`.
@@ -153,19 +154,19 @@ class PoseSelection:
         return self._gains(self._S, self._P)
 
     def add_candidate(self, number: int) -> None:
-        """Add a candidate."""
+        """Add a candidate to the selection."""
         change = self._change(number, 1.0)
-        assert change is not None  # adding loses no digits
+        assert change is not None  # adding a candidate does not lose accuracy
         self._take(change)
         self.chosen.append(number)
 
     def add_until(self, count: int) -> None:
-        """Add the best candidate until `count` are selected."""
+        """Add the best candidates until `count` are selected."""
         while len(self.chosen) < count:
             self.add_candidate(int(self.gains().argmax()))
 
     def exchange_candidates(self) -> None:
-        """Exchange every selected candidate for the best other one until no exchange gains anything."""
+        """Exchange every selected candidate for the best other one until no exchange improves the criterion."""
         for _ in range(MAX_PASSES if len(self.chosen) < len(self._B) else 0):
             exchanged = False
             for number in list(self.chosen):
@@ -207,34 +208,34 @@ class PoseSelection:
         rows = self._B[self.chosen].flatten(0, 1)
         information = torch.eye(rows.shape[1]).to(rows) + rows.t() @ rows
         self._C = torch.cholesky_inverse(torch.linalg.cholesky(information))
-        # C is the covariance of the unknowns; S is what every candidate would still learn.
+        # C is the covariance of the unknowns; S is the covariance of every candidate's values.
         along = self._B @ self._C
         self._S = along @ self._B.mT  # covariance of the values of every candidate
         self._X = along @ self._goal.t() if self._criterion == "I" else self._B[..., :0]  # with the task
         self._P = self._X @ self._X.mT
 
     def _change(self, number: int, sign: float) -> _Change | None:
-        """Compute the effect of adding (+1) or removing (-1) a candidate; None if removing it loses all digits."""
+        """Compute the effect of adding (+1) or removing (-1) a candidate; None if removal is numerically impossible."""
         G = self._C @ self._B[number].t()
         # Woodbury: a pose changes C by rank k only, the number of its values.
         here = torch.eye(G.shape[1]).to(G) + sign * self._B[number] @ G
         lower, failed = torch.linalg.cholesky_ex(here)
         if sign < 0 and (int(failed) or float(lower.diagonal().min()) < MIN_REMAINING):
             return None
-        # contiguous by rows, as products with all candidates read it
+        # contiguous by rows, because products with all candidates read it in this order
         half = torch.linalg.solve_triangular(lower, G.t(), upper=False).contiguous()
         U = self._B @ half.t()
         P = self._P
         if (
             self._criterion == "I" and sign < 0
-        ):  # for an added one this would cancel; `_take` computes it from X
+        ):  # for an added candidate this would cancel, so `_take` computes it from X
             task = half @ self._goal.t()
             cross = (self._X @ task.t()) @ U.mT
             P = P + cross + cross.mT + U @ (task @ task.t()) @ U.mT
         return _Change(sign, half, U, self._S - sign * U @ U.mT, P)
 
     def _take(self, change: _Change) -> None:
-        """Apply a change."""
+        """Apply a change of the selection."""
         half, U, self._S, self._P = change.half, change.along, change.S, change.P
         self._C -= change.sign * half.t() @ half
         if self._criterion == "I":

@@ -1,4 +1,4 @@
-"""Normal distribution of all unknowns of a robot, before or after poses are measured."""
+"""Normal distribution of all unknowns of a robot, before or after measuring poses."""
 
 from dataclasses import dataclass, replace
 
@@ -31,10 +31,10 @@ from pisigma.robot.robot_class import RobotClass
 from pisigma.robot.se3 import skew
 
 WIDE_PRIOR = (*(1.0,) * 6, *(0.1,) * 3, *(1.0,) * 3)
-"""[m, rad, m, rad] Standard deviations of base and tool before anything is measured: too wide to have an effect."""
+"""Standard deviations of base and tool before any measurement [m, rad, m, rad]; they are too wide to have an effect."""
 
 POSES_PER_CHUNK = 512
-"""Poses whose derivatives are computed together: some MB."""
+"""Number of poses whose derivatives are computed together (some MB)."""
 
 
 @dataclass(frozen=True)
@@ -45,9 +45,10 @@ class Instrument:
         kind: "position" of a target, its "pose", its "distance" from an anchor, or a "camera" that sees a board.
         sigma: standard deviation of a coordinate or a distance [m]. The default is between the residuals of a laser
             tracker's coordinates after hybrid calibrations of the measured UR5 and UR10, 0.028 and 0.043 mm.
-        sigma_rotation: standard deviation of an angle about an axis [rad]; the default is that of the UR10's target.
+        sigma_rotation: standard deviation of an angle about an axis [rad]; the default is the value of the UR10's
+            target.
         anchor: origin of distances in the measuring frame [m].
-        sight: camera and board, of which one is the measuring frame and the other the target; None for other kinds.
+        sight: camera and board, one of which is the measuring frame and the other the target; None for other kinds.
     """
 
     kind: SensorKind = "position"
@@ -61,7 +62,7 @@ class Instrument:
 class RobotPosterior:
     """Normal distribution of geometry, base, tool and the weights of a joint correction, and the instrument.
 
-    Poses are those of the first target in the first measuring frame.
+    It predicts poses of the first target in the first measuring frame.
 
     Attributes:
         uncertainty: covariance `R R^T` of all unknowns, and the geometry at which derivatives are computed.
@@ -88,7 +89,7 @@ class RobotPosterior:
         Args:
             robot: nominal robot; its tool should be near the target.
             instrument: the measuring instrument.
-            hybrid: whether the joint correction is unknown as well as the geometry.
+            hybrid: whether the joint correction is unknown in addition to the geometry.
             gravity: direction of gravity in the robot's base frame.
         """
         space = ParameterSpace(robot)
@@ -107,10 +108,10 @@ class RobotPosterior:
 
     @staticmethod
     def from_model(model: CalibratedModel, instrument: Instrument = Instrument()) -> "RobotPosterior":
-        """Return the posterior that a calibrated model keeps.
+        """Return the posterior that a calibrated model stores.
 
         Raises:
-            IdentificationError: the model keeps no posterior.
+            IdentificationError: the model stores no posterior.
         """
         if model.uncertainty is None:
             raise IdentificationError(
@@ -130,9 +131,9 @@ class RobotPosterior:
         )
 
     def updated_with(self, rows: Measurements) -> "RobotPosterior":
-        """Return the posterior given measured rows: that of a hybrid calibration with them.
+        """Return the posterior given measured rows, from a hybrid calibration with them.
 
-        Where they are too few for one, the posterior covariance given their joint values alone.
+        If the rows are too few for a calibration, only the covariance is updated, from their joint values.
 
         Raises:
             PoseError: the joint values do not fit the robot.
@@ -144,11 +145,11 @@ class RobotPosterior:
             )
         except ImplausibleError:
             raise
-        except IdentificationError:  # too few rows
+        except IdentificationError:  # there are too few rows for a calibration
             return self.after_measuring(rows.q)
 
     def after_measuring(self, q: Float64[Tensor, "poses dof"]) -> "RobotPosterior":
-        """Return the posterior given measured poses, which does not depend on the values: `C' = R (1 + B^T B)^-1 R^T`.
+        """Return the posterior after measuring poses, independent of the values: `C' = R (1 + B^T B)^-1 R^T`.
 
         Args:
             q: commanded joint values [rad or m].
@@ -171,9 +172,9 @@ class RobotPosterior:
     def tool(self, q: Float64[Tensor, "poses dof"]) -> Float64[Tensor, "poses 3 directions"]:
         """Compute the derivative D of the target's position with respect to standard normal numbers.
 
-        Its covariance is `D D^T`. The position is in the measuring frame; for distances, which do not determine where
-        the robot is, it is in the robot's base frame. For a camera, a rigid motion of all poses together is ignored,
-        because the pose of the board's frame is known through the arm only.
+        The covariance of the position is `D D^T`. The position is in the measuring frame; for distances, which do
+        not determine where the robot is, it is in the robot's base frame. For a camera, a rigid motion of all poses
+        together is ignored, because the pose of the board's frame is known through the arm only.
         """
         columns = self.columns(q)[:, :3]
         if self.instrument.sight is not None:
@@ -188,7 +189,7 @@ class RobotPosterior:
         return self.uncertainty.covariance_root.left_multiply(columns)
 
     def sensitivities(self, q: Float64[Tensor, "poses dof"]) -> Float64[Tensor, "poses values directions"]:
-        """Compute the derivative B of measured values over their noise; the covariance of these is `B B^T + 1`."""
+        """Compute the derivative B of measured values divided by their noise; their covariance is `B B^T + 1`."""
         return torch.cat([self._measured(some) for some in torch.split(q, POSES_PER_CHUNK)])
 
     def _measured(self, q: Float64[Tensor, "poses dof"]) -> Float64[Tensor, "poses values directions"]:
@@ -217,7 +218,7 @@ class RobotPosterior:
 
         Args:
             base: approximate pose of the robot's base in that frame, as x, y, z, roll, pitch, yaw [m, rad].
-            tool: approximate pose of the target in the frame of the last joint, likewise.
+            tool: approximate pose of the target in the frame of the last joint, in the same form.
         """
         before = self.uncertainty
         robot = before.geometry.robot.with_geometry(base=base, tool=tool)

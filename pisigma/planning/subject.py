@@ -24,14 +24,14 @@ from pisigma.robot.robot_file import FrameSection
 from pisigma.robot.se3 import invert, transform_from_xyzrpy, xyzrpy_from_transform
 
 SAME_FRAME = 1e-6
-"""[m or rad] Difference below which the frames of a plan are those that the model was calibrated with."""
+"""Difference [m or rad] below which the frames of a plan equal the frames with which the model was calibrated."""
 MAX_PITCH = 1.52
-"""[rad] Largest pitch of base and tool at which derivatives are computed; roll and yaw are degenerate at 90 deg."""
+"""Largest pitch of base and tool at which derivatives are computed [rad]; roll and yaw are degenerate at 90 deg."""
 
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """The robot or model that a measurement is planned for.
+    """The robot or model for which a measurement is planned.
 
     Attributes:
         robot: nominal robot.
@@ -78,7 +78,7 @@ class Subject:
         return Subject(subject.nominal, subject)
 
     def arm(self, surroundings: Surroundings | None) -> ArmInSurroundings:
-        """Return the robot in its surroundings, which state target and board, or leave them to the model."""
+        """Return the robot in its surroundings; target and board come from the surroundings or from the model."""
         if self.model is None:
             return ArmInSurroundings.from_robot(self.robot, surroundings)
         if (
@@ -128,7 +128,8 @@ class Subject:
     ) -> RobotPosterior:
         """Return the distribution of the unknowns in the frame of the board, or of a fixed camera.
 
-        A model that was calibrated with another board, camera or sensor does not determine the pose of these.
+        A model that was calibrated with another board, camera or sensor does not determine the poses of board and
+        camera.
         """
         instrument, nominal_base = instrument_of(settings), torch.tensor(arm.nominal.base)
         base = xyzrpy_from_transform(invert(views.T_cell_frame) @ transform_from_xyzrpy(nominal_base)).numpy()
@@ -163,6 +164,6 @@ def _is_same(one: Float64[np.ndarray, " 6"], other: Float64[np.ndarray, " 6"]) -
 
 
 def _regular(xyzrpy: Float64[np.ndarray, " 6"]) -> Float64[np.ndarray, " 6"]:
-    """Limit the pitch of a frame so that its three angles are independent."""
+    """Return a frame with limited pitch, so that its three angles are independent."""
     pitch = np.clip(xyzrpy[4], -MAX_PITCH, MAX_PITCH)
     return np.concatenate([xyzrpy[:4], [pitch], xyzrpy[5:]])

@@ -22,11 +22,11 @@ from pisigma.robot.kinematics.status import Status
 from pisigma.robot.kinematics.tolerances import LIMIT_TOLERANCE
 
 REACHED = (Status.REACHED, Status.OUTSIDE_DOMAIN)
-"""Statuses of a pose whose joint values can be used."""
+"""Statuses of poses whose joint values can be used."""
 TASK_POSES = 300
-"""Joint values that represent the task, where more are stated or none."""
+"""Number of joint vectors that represent the task, if more or none are stated."""
 STARTS = 200
-"""Joint values from which the inverse kinematics of a robot without a closed form starts."""
+"""Number of joint vectors from which the inverse kinematics of a robot without a closed form starts."""
 
 
 def task_poses(
@@ -35,13 +35,13 @@ def task_poses(
     q: Float64[Tensor, "poses dof"],
     model: CalibratedModel | None = None,
 ) -> Float64[Tensor, "tasks dof"]:
-    """Return joint values [rad or m] where the robot has to be accurate: of the task file, else of the workspace.
+    """Return joint values [rad or m] of the task: from the task file, otherwise from the workspace.
 
     Args:
         arm: the robot in its surroundings.
         settings: settings that name the task file.
         q: joint values of the workspace [rad or m].
-        model: model of the robot, if there is one.
+        model: model of the robot, if any.
 
     Raises:
         MeasurementError: the file cannot be used; the message names file, line and column.
@@ -54,11 +54,11 @@ def task_poses(
 
 
 def read_task(path: str | os.PathLike[str], model: CalibratedModel) -> Float64[Tensor, "tasks dof"]:
-    """Read joint values [rad or m], or poses that are converted to joint values by inverse kinematics.
+    """Return joint values [rad or m] in a file, or joint values by inverse kinematics of the poses in it.
 
     Args:
         path: CSV file with columns of joint values, or of poses (see `read_poses`).
-        model: model of the robot; poses are those of its tool in its base frame.
+        model: model of the robot; poses are of its tool in its base frame.
 
     Raises:
         MeasurementError: the file cannot be used; the message names file, line and column.

@@ -15,13 +15,13 @@ from pisigma.planning.surroundings.motion import Motions
 from pisigma.robot.description import Robot
 
 FIRST_STAGE = 20
-"""Poses of the first calibration of a robot that was never measured; fewer do not determine its unknowns."""
+"""Number of poses of the first calibration of a robot that was never measured; fewer do not determine its unknowns."""
 MAX_REORDERINGS = 8
-"""Attempts to avoid blocked motions by another order; the remaining ones get waypoints."""
+"""Largest number of attempts to avoid blocked motions by another order; remaining blocked motions get waypoints."""
 MIN_SPEED = 1e-3
-"""[rad/s or m/s] Smallest valid speed."""
+"""Smallest valid speed [rad/s or m/s]."""
 MAX_SETTLING = 3600.0
-"""[s] Longest valid settling time."""
+"""Longest valid settling time [s]."""
 DETOUR_FACTOR = 3.0
 """Factor on the duration of a blocked motion while the order is optimised."""
 
@@ -56,7 +56,7 @@ class Pace:
     def duration(
         self, robot: Robot, start: Float64[Tensor, "*#batch dof"], end: Float64[Tensor, "*#batch dof"]
     ) -> Float64[Tensor, "*_batch"]:
-        """Compute the duration of joint motions [s]: that of the slowest joint, without acceleration."""
+        """Compute the duration of joint motions [s], determined by the slowest joint, without acceleration."""
         speed = torch.where(torch.tensor(robot.revolute), self.speed, self.slide)
         seconds: Tensor = ((end - start).abs() / speed).amax(-1)
         return seconds
@@ -64,12 +64,12 @@ class Pace:
 
 @dataclass(frozen=True, eq=False)
 class Tour:
-    """An order of poses with waypoints.
+    """An order of poses, with waypoints between them.
 
     Attributes:
-        order: indices of the poses in their order, without those that no free motion leads to.
+        order: indices of the poses in their order, without poses to which no free motion leads.
         before: waypoints before each pose in this order [rad or m]; mostly none.
-        left_out: indices of the poses that no free motion was found to.
+        left_out: indices of the poses to which no free motion was found.
         seconds: total duration [s].
     """
 
@@ -89,11 +89,11 @@ def plan_tour(
     """Order poses for a short duration, with collision-free motions.
 
     Nearest neighbour, then 2-opt (Croes 1958, Operations Research 6(6)), on the duration of the straight joint motions.
-    Blocked motions are made expensive and the order is improved again; those that remain get waypoints.
+    Blocked motions are made expensive and the order is improved again; motions that remain blocked get waypoints.
 
     Args:
         motions: motions of the robot in its surroundings, which keep the results of earlier tours.
-        q: joint values of the poses, all of them free [rad or m].
+        q: joint values of the poses, which are all free of collisions [rad or m].
         pace: speeds and settling time.
         start: current joint values of the robot [rad or m]; None for any.
         stages: ascending numbers of poses that are measured before all later ones in `q`: (20, 40) means the first 20
@@ -111,11 +111,11 @@ def plan_tour(
 
 
 def order_of_use(chosen: int, check: int) -> Int64[Tensor, " poses"]:
-    """Distribute the poses that test the calibration evenly among the others, which are sorted by usefulness.
+    """Return an order with test poses evenly distributed among the others, which are sorted by usefulness.
 
     Args:
         chosen: number of poses to calibrate with, numbered from 0.
-        check: number of poses to test with, numbered after these.
+        check: number of test poses, numbered after these.
     """
     between = (torch.arange(check) + 0.5) * chosen / max(check, 1)
     return torch.cat([torch.arange(chosen) + 0.0, between]).argsort(stable=True)
@@ -133,7 +133,7 @@ def _ordered(
     stage: Int64[np.ndarray, " stage"],
     fixed_start: bool,
 ) -> Int64[np.ndarray, " stage"]:
-    """Order the poses of a stage; with `fixed_start` the first one stays first."""
+    """Return the order of the poses of a stage; with `fixed_start` the first pose remains first."""
     times = seconds[np.ix_(stage, stage)]
     order = _nearest_neighbours(times, fixed_start)
     for _ in range(MAX_REORDERINGS):
@@ -149,11 +149,11 @@ def _ordered(
 
 
 _BLOCKED = 1e4
-"""[s] Penalty on the duration of blocked motions: longer than any motion."""
+"""Penalty on the duration of blocked motions [s], longer than any motion."""
 
 
 def _nearest_neighbours(seconds: Float64[np.ndarray, "poses poses"], fixed_start: bool) -> np.ndarray:
-    """Order by nearest neighbours, starting from every pose (or from the first alone), and return the best order."""
+    """Return the best order by nearest neighbours from every pose, or from the first pose only."""
     best: list[int] = []
     shortest = math.inf
     for first in range(1 if fixed_start else len(seconds)):
@@ -170,7 +170,7 @@ def _nearest_neighbours(seconds: Float64[np.ndarray, "poses poses"], fixed_start
 
 
 def _two_opt(seconds: Float64[np.ndarray, "poses poses"], order: np.ndarray, fixed_start: bool) -> np.ndarray:
-    """Reverse parts of the order as long as that saves time; the ends are open."""
+    """Return the order after reversing parts of it as long as this saves time; the ends are open."""
     count, first = len(order), 1 if fixed_start else 0
     while count > 2:
         times = seconds[np.ix_(order, order)]
@@ -191,7 +191,7 @@ def _two_opt(seconds: Float64[np.ndarray, "poses poses"], order: np.ndarray, fix
 def _with_waypoints(
     motions: Motions, poses: Float64[Tensor, "poses dof"], order: np.ndarray, pace: Pace, fixed_start: bool
 ) -> Tour:
-    """Insert waypoints where a motion is blocked, and leave out poses that cannot be reached."""
+    """Return the tour with waypoints in blocked motions, and without poses that cannot be reached."""
     stops, before, left_out = [int(order[0])], [poses[:0]], []
     for stop in order[1:].tolist():
         points = motions.points_between(poses[stops[-1]], poses[stop])

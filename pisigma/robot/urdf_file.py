@@ -181,9 +181,8 @@ def _check_value(element: Any, tag: str, key: str, joint: str, at: Place) -> Non
         numbers = [float(word) for word in text.split()]
     except ValueError:
         numbers = []
-    largest = (
-        MAX_MAGNITUDE**2 if tag == "limit" else MAX_MAGNITUDE / 1e3
-    )  # some files state 1e16 for no limit
+    # some files state 1e16 for no limit
+    largest = MAX_MAGNITUDE**2 if tag == "limit" else MAX_MAGNITUDE / 1e3
     if len(numbers) != count or not all(abs(number) <= largest for number in numbers):
         expected = "three finite numbers separated by spaces" if count == 3 else "a finite number"
         expected += f" up to {largest:.0e}"

@@ -95,9 +95,8 @@ def _lines_of_joint(
         )
         gain = torch.where(candidates, (sine * P.imag + cosine * P.real) / 2, 0.0)
         order = int(gain.argmax())
-        chance = max(
-            float(gain[candidates].median()) / math.log(2), 1.0
-        )  # mean of an exponential distribution, from its median
+        # mean of an exponential distribution, from its median
+        chance = max(float(gain[candidates].median()) / math.log(2), 1.0)
         if float(gain[order]) < least * chance:
             break
         orders.append(order)

@@ -120,7 +120,7 @@ def show_fleet(
 
 
 def _print_prior(result: "FleetPriorResult", out: Path, verbose: bool) -> None:
-    """Print what robots have in common."""
+    """Print the prior of a fleet: what its robots have in common."""
     from pisigma.reporting.derived_cards import UNDETERMINED, common_table, spectrum_table
     from pisigma.reporting.verdict import Verdict, count_text
 
@@ -147,7 +147,7 @@ def _print_prior(result: "FleetPriorResult", out: Path, verbose: bool) -> None:
 
 
 def _print_run(result: "FleetRun") -> None:
-    """Print how many cells are done, and why others need attention."""
+    """Print the number of cells that are done, and the reasons why others need attention."""
     from pisigma.reporting.verdict import Verdict, count_text
 
     refused, folder = len(result.refused), result.results.parent
@@ -166,7 +166,7 @@ def _print_run(result: "FleetRun") -> None:
 
 
 def _print_status(seen: "FleetStatus", page: Path | None, verbose: bool) -> None:
-    """Print how many cells are in each state, the largest error, and what to do."""
+    """Print the number of cells in every state, the largest error, and what to do."""
     from pisigma.lifetime.cell.step import ATTENTION
     from pisigma.reporting.fleet_tables import ERRORS_NOTE, cell_table, fleet_verdict, state_table
 

@@ -1,4 +1,4 @@
-"""Joint values of a file of poses: solved and written some rows at a time."""
+"""Compute the joint values of a file of poses, and write them some rows at a time."""
 
 import csv
 import math
@@ -27,10 +27,10 @@ BAD_ROW = "bad_row"
 """Status of a row that is not a pose."""
 
 FAR = 50.0
-"""A position farther away than this many times the reach is refused; metres taken for millimetres are off by 1000."""
+"""Multiple of the reach beyond which a position is refused; metres that are read as millimetres are off by 1000."""
 
 LISTED = 10
-"""Largest number of failed rows that are named."""
+"""Largest number of failed rows that are listed."""
 
 _MEASURES = ("position_residual_mm", "rotation_residual_deg", "domain_measure")
 _ACCURACY = "accuracy_mm"
@@ -60,7 +60,7 @@ class PoseFileResult:
         statuses: number of rows by status.
         first_failed: the first `LISTED` rows that failed, in the order of the file.
         failed: number of rows that failed.
-        switches: lines where a path changes its branch or stops, with what happens there.
+        switches: lines at which a path changes its branch or is interrupted, with a description.
     """
 
     rows: int = 0
@@ -81,7 +81,7 @@ class PoseFileResult:
         return values | ({"switches": switches} if path else {})
 
     def problem(self, source: Path) -> str | None:
-        """Describe which rows failed and why; None if none did."""
+        """Return a sentence about rows that failed and the reasons; None if no row failed."""
         if not self.failed:
             return None
         first, *others = self.first_failed
@@ -104,7 +104,7 @@ def write_joint_file(
     accuracy: bool = False,
     path: bool = False,
 ) -> PoseFileResult:
-    """Write one row per pose of a file, completely or not at all, however long the file is.
+    """Write one row per pose of a file of any length, completely or not at all.
 
     A row contains the line of the pose, status, branch, corrected and nominal joint values, the residuals of the
     calibrated model, the domain measure and, with `accuracy`, the predicted standard deviation of the tool's position.
@@ -114,8 +114,8 @@ def write_joint_file(
         solver: the corrected inverse kinematics.
         poses: the file of poses.
         out: the file of joint values.
-        branch: branch instead of the trained one.
-        tell: called with progress, such as "40,000 rows, 4%, 9,000 rows/s".
+        branch: name of the branch to use instead of the default.
+        tell: callback for progress, such as "40,000 rows, 4%, 9,000 rows/s".
         accuracy: whether to predict the standard deviations, which takes most of the time with a hybrid.
         path: whether the poses are a path, which is solved as a whole and in memory; see `CorrectedIK.path`.
 
@@ -193,7 +193,7 @@ def _solve(
 
 
 def _too_far(chunk: PoseChunk, robot: Robot) -> list[str]:
-    """Return why each pose cannot be a pose of the robot; "" if it can."""
+    """Return the reason why a pose is too far away for the robot, for every pose; "" if it is not."""
     distance = (chunk.T[:, :3, 3] - torch.from_numpy(robot.base[:3].copy())).norm(dim=-1)
     reasons = [""] * len(chunk.line)
     for row in (distance > FAR * robot.reach).nonzero()[:, 0].tolist() if robot.reach > 0 else []:

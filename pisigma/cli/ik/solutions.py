@@ -40,11 +40,11 @@ def solution_records(solution: Solution, solver: CorrectedIK) -> list[dict[str, 
 
 
 def failure(solution: Solution, places: Sequence[str], any_will_do: bool) -> str | None:
-    """Describe which poses the robot cannot reach as requested; None if it can reach all.
+    """Return a sentence about poses that the robot cannot reach as requested; None if it reaches all.
 
     Args:
         solution: the solutions.
-        places: name of each of them.
+        places: name of the pose of every solution.
         any_will_do: whether one solution that reaches the pose is enough (all branches of one pose).
     """
     statuses = statuses_of(solution)

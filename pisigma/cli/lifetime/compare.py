@@ -87,7 +87,7 @@ def compare(
 
 
 def _print(compared: "ComparedModels", page: Path | None, verbose: bool) -> None:
-    """Print what differs, distances of the tool, and the parameters of both models."""
+    """Print differences, distances of the tool, and the parameters of both models."""
     from pisigma.reporting.comparison_tables import comparison_blocks
     from pisigma.reporting.lifetime_tables import difference_table
     from pisigma.reporting.tables import pose_rows
@@ -112,7 +112,7 @@ def _print(compared: "ComparedModels", page: Path | None, verbose: bool) -> None
 
 
 def _verdict(compared: "ComparedModels") -> Verdict:
-    """Describe how far two models differ, and which is better."""
+    """Return the verdict: how much two models differ, and which is better."""
     first, second = compared.models
     errors = compared.workspace.errors.figures.figures_by_name
     count, better = len(compared.parameters.differing), compared.better

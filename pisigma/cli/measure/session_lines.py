@@ -16,11 +16,11 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
 SHOWN_ROWS, SHOWN_ALARMS, SHOWN_POINTS = 8, 4, 8
-"""Largest numbers of rows, alarms and points on the page, the last ones."""
+"""Largest numbers of rows, alarms and points on the page; the last ones are shown."""
 
 
 def step_lines(step: SessionStep) -> Iterator[str]:
-    """Describe what is new, one line each; many rows or alarms of one kind share a line."""
+    """Return lines about new rows, alarms and poses; many rows or alarms of one kind share a line."""
     yield from step.growth.notices
     if step.growth.waiting and not step.state.rows.line:
         yield f"Waiting: {step.growth.waiting}"
@@ -38,7 +38,7 @@ def step_lines(step: SessionStep) -> Iterator[str]:
 
 
 def _row_lines(state: SessionState, lines: Sequence[int]) -> Iterator[str]:
-    """Describe how far new rows are from the prediction of the others: each row, or all if there are many."""
+    """Return lines about the distance of new rows from the predictions of the others; one line if they are many."""
     rows = [state.rows.line.index(line) for line in lines]
     if len(lines) <= MAX_ALIKE:
         yield from (f"line {line}: {row_text(state, row)}" for line, row in zip(lines, rows, strict=True))
@@ -56,7 +56,7 @@ def _row_lines(state: SessionState, lines: Sequence[int]) -> Iterator[str]:
 
 
 def row_text(state: SessionState, row: int) -> str:
-    """Describe how far a row is from the prediction of the others."""
+    """Return a text with the distance of a row from the prediction of the others."""
     error = float((state.rows.error[row] ** 2).sum() ** 0.5)
     kind = " (check)" if state.rows.check[row] else ""
     if error != error:
@@ -65,7 +65,7 @@ def row_text(state: SessionState, row: int) -> str:
 
 
 def next_text(state: SessionState) -> str:
-    """Describe which pose is next."""
+    """Return a text about the next pose."""
     following = state.next_pose
     if following is None:
         return "No pose is left."
@@ -77,7 +77,7 @@ def next_text(state: SessionState) -> str:
 
 
 def page(step: SessionStep | None, state: SessionState, title: str) -> "RenderableType":
-    """Lay out the session for a terminal."""
+    """Return the session laid out for a terminal."""
     from rich.console import Group
     from rich.table import Table
     from rich.text import Text

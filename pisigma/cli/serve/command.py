@@ -56,7 +56,7 @@ def serve(
 
 
 def _load(model: Path | None, models: Path | None, pin: bool) -> "ServedModels":
-    """Load the model, that in use of a cell, or those of a folder."""
+    """Load a model, the model in use of a cell, or all models of a folder."""
     from pisigma.deployment.serve.models import ServedModels, model_folders
     from pisigma.lifetime.cell.controller import checked_model_folder
     from pisigma.lifetime.cell.layout import is_cell

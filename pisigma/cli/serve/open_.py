@@ -20,7 +20,7 @@ from pisigma.files.setting import Option
 
 @dataclass(frozen=True)
 class PageAddress:
-    """Where the page of a cell is served.
+    """Address at which the page of a cell is served.
 
     Attributes:
         host: address to serve the page at; an address of this machine or 0.0.0.0 opens it to other machines.
@@ -67,7 +67,7 @@ def open_(
 
 
 def _open_browser(url: str, folder: Path) -> None:
-    """Open a link by way of a file of this user, because every user of a machine sees the command lines of others."""
+    """Open a link through a file that only this user can read; command lines are visible to all users."""
     page = folder / "open.html"
     page.touch(mode=0o600)
     page.write_text(f'<!doctype html><title>pisigma</title><meta http-equiv="refresh" content="0;url={url}">')

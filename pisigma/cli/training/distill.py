@@ -85,7 +85,7 @@ def distill(
 
 
 def _size(orders: str | None, harmonics: int | None) -> "NetworkSize | None":
-    """Return the size of the network that the options state, None for the best of several."""
+    """Return the size of the network that the options state; None to choose the best of several."""
     from pisigma.workflow.distilled_network import NetworkSize
 
     if orders is None:
@@ -103,7 +103,7 @@ def _size(orders: str | None, harmonics: int | None) -> "NetworkSize | None":
 
 
 def _region(model: Path, box: Box | None, joints: Path | None) -> "Region | None":
-    """Return where poses are drawn, None for where the model was measured."""
+    """Return the region in which poses are drawn; None for the region in which the model was measured."""
     from pisigma.measurement.csv.reading import read_joints
     from pisigma.model.folder.model_folder import load_model
     from pisigma.workflow.solved_poses import Region

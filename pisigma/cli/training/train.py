@@ -119,7 +119,7 @@ def _print_training(summary: "TrainingSummary", folder: Path, seconds: float, ve
 
 
 def _worst_joint(summary: "TrainingSummary") -> str:
-    """Describe the mean error of the worst joint, before and after the correction."""
+    """Return a text with the mean error of the worst joint, before and after the correction."""
     errors = {one.name: (one.held_out or one.training, one.held_out is None) for one in summary.joints}
     known = {name: one for name, one in errors.items() if one[0] is not None}
     if not known:
@@ -132,7 +132,7 @@ def _worst_joint(summary: "TrainingSummary") -> str:
 
 
 def _redundancy(summary: "CalibrationSummary") -> Iterator[Block]:
-    """Lay out redundant parameters and convergence next to those of the paper."""
+    """Return tables of redundant parameters and convergence, compared with the paper."""
     if summary.redundant_sets is None:
         return
     paper = summary.paper or {}

@@ -232,9 +232,8 @@ def initial_camera(views: Sequence[BoardView], name: str, size: tuple[int, int])
     slopes, constants = list[float](), list[float]()
     for view in views:
         H = homography(view.points[:, :2], (view.pixels - middle) / width)
-        h1, h2 = H[:, :2].T / np.linalg.norm(
-            H[:2, :2]
-        )  # rows are scaled so that all images have similar weights
+        # rows are scaled so that all images have similar weights
+        h1, h2 = H[:, :2].T / np.linalg.norm(H[:2, :2])
         slopes += [h1[:2] @ h2[:2], h1[:2] @ h1[:2] - h2[:2] @ h2[:2]]
         constants += [h1[2] * h2[2], h1[2] ** 2 - h2[2] ** 2]
     squared = -(np.dot(slopes, constants) / np.dot(slopes, slopes))

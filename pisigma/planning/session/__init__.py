@@ -1,1 +1,1 @@
-"""Measuring session: rows judged as they arrive, the accuracy reached so far, and when to stop."""
+"""Measuring sessions: judgement of rows as they arrive, accuracy so far, and when to stop."""

@@ -1,4 +1,4 @@
-"""Corners in a growing file, read image by image as measurements."""
+"""Read corners in a growing file image by image as measurements."""
 
 import os
 from dataclasses import replace
@@ -24,9 +24,9 @@ def growing_file(path: str | os.PathLike[str], robot: Robot, settings: PlanSetti
 
 
 class ImageReader:
-    """Reads every image of a file of corners separately, so that a faulty image does not affect others.
+    """Reader that reads every image of a file of corners separately, so that a faulty image does not affect others.
 
-    An image is complete once rows of another one follow, or at the end of the session.
+    An image is complete when rows of another image follow, or at the end of the session.
     """
 
     def __init__(self, files: CameraFiles, robot: Robot) -> None:
@@ -61,7 +61,7 @@ class ImageReader:
 
 
 def _images(table: Table) -> list[Table]:
-    """Split a table by image; a row without an image forms its own."""
+    """Yield the parts of a table by image; a row without an image is a separate part."""
     column = table.header.index("image") if "image" in table.header else len(table.header)
     groups: dict[str, list[int]] = {}
     for row, fields in enumerate(table.records):
@@ -79,7 +79,7 @@ def _images(table: Table) -> list[Table]:
 
 
 def _left_out(problem: MeasurementError, image: Table) -> UnusableRow:
-    """Return the row at fault, the first of the image where the exception states none, and what is wrong with it."""
+    """Return the faulty row (the first of the image if the exception names none) with the reason."""
     line = problem.line or image.lines[0]
     if not problem.expected:
         return UnusableRow(line, str(problem).removesuffix("."))

@@ -1,4 +1,4 @@
-"""Alarms on single rows: what was expected, what was measured, and what to do."""
+"""Alarms about single rows: what was expected, what was measured, and what to do."""
 
 from collections.abc import Iterator, Sequence
 
@@ -14,24 +14,25 @@ from pisigma.planning.session.state import Alarm
 from pisigma.robot.description import Robot
 
 SAME_READING = 2e-6
-"""[m] Difference below which readings are the same; noise makes independent readings differ by more."""
+"""Difference below which readings are the same [m]; noise makes independent readings differ by more."""
 SAME_VALUE = 1e-9
-"""[SI] Difference below which numbers are the same, up to rounding in the file."""
+"""Difference below which numbers are the same up to rounding in the file [SI units]."""
 SAME_POSE, NEAR_POSE = 0.1, 3.0
-"""[deg or mm] Differences of joint values below which a row is at a pose, and is meant to be at it."""
+"""Differences of joint values [deg or mm] below which a row is at a pose, and below which it is intended to be at
+the pose."""
 SWAPPED_SHARE = 0.2
-"""A point belongs to another pose where its distance to it is below this share of its error."""
+"""Share of its error below which the distance of a point from another pose shows that it belongs to that pose."""
 AMBIGUOUS_ROWS = 6
 """Number of rows up to which another row may be the wrong one."""
 
 
 def unreadable_alarm(row: UnusableRow) -> Alarm:
-    """Return the alarm on a row that cannot be read."""
+    """Return the alarm about a row that cannot be read."""
     return Alarm(row.line, "unreadable", f"line {row.line}: {row.reason}.", repeat=True)
 
 
 def alarm_of_all_rows(sentence: str) -> Alarm:
-    """Return the alarm on a fault of all rows, for example in the header of the file."""
+    """Return the alarm about a fault of all rows, for example in the header of the file."""
     return Alarm(1, "setup", f"line 1: {sentence} Correct this before you continue to measure.", repeat=False)
 
 
@@ -42,7 +43,7 @@ def cleared_message(line: int) -> Alarm:
 
 
 def stale_readings(rows: Measurements, start: int) -> Iterator[Alarm]:
-    """Find rows from `start` on with the readings of an earlier row: written twice, or from a frozen sensor."""
+    """Yield alarms about rows from `start` that repeat readings of an earlier row: duplicates, or a frozen sensor."""
     fields = rows.as_fields().numbers.values()
     numbers = torch.cat([values.reshape(rows.rows, -1) for values in fields], 1)
     position = torch.full((rows.rows, 3), torch.nan) if rows.position is None else rows.position
@@ -72,7 +73,7 @@ def other_joint_values(
     poses: Float64[Tensor, "poses dof"],
     names: Sequence[str],
 ) -> Iterator[Alarm]:
-    """Find rows from `start` on whose joint values differ from all planned poses; they are used nevertheless."""
+    """Yield alarms about rows from `start` whose joint values are not planned; they are used nevertheless."""
     for row in range(start, rows.rows):
         off = joint_differences(robot, rows.q[row : row + 1], poses)[0].abs()
         pose = int(off.amax(1).argmin())
@@ -96,7 +97,7 @@ def other_joint_values(
 def _in_other_unit(
     robot: Robot, q: Float64[Tensor, "1 dof"], poses: Float64[Tensor, "poses dof"], names: Sequence[str]
 ) -> str:
-    """Find the planned pose that a row is at if its angles are not in the stated unit; "" if there is none."""
+    """Return a text with the planned pose of a row whose angles are in another unit; "" if there is none."""
     stated = {
         180 / torch.pi: "radians labelled as degrees",
         torch.pi / 180: "degrees labelled as radians",
@@ -116,14 +117,14 @@ def contradiction_alarm(
     poses: Float64[Tensor, "poses dof"],
     names: Sequence[str],
 ) -> Alarm:
-    """Return the alarm on a row that the others contradict, with the pose that its point may belong to.
+    """Return the alarm about a row that others contradict, with the pose to which its point may belong.
 
     Args:
         rows: all rows.
         judgement: judgement of the rows.
         row: index of the row.
         poses: joint values of the planned poses [rad or m].
-        names: names of these poses.
+        names: names of the planned poses.
     """
     assert judgement.model is not None
     assert judgement.errors is not None
@@ -154,7 +155,7 @@ def _other_pose(
     poses: Float64[Tensor, "poses dof"],
     names: Sequence[str],
 ) -> str:
-    """Find the planned pose or the row whose point was measured; "" where there is none."""
+    """Return a text with the planned pose or the row whose point was measured; "" if there is none."""
     assert judgement.model is not None
     assert judgement.errors is not None
     if rows.position is None or not bool(rows.position[row].isfinite().all()):
@@ -180,7 +181,7 @@ def joint_differences(
 
 
 def is_wrong(judgement: RowJudgement) -> Tensor:
-    """Return which rows the others contradict."""
+    """Return the mask of rows that the others contradict."""
     if judgement.errors is None:
         return torch.zeros_like(judgement.counts)
     return ~judgement.counts & (judgement.errors.chance < FALSE_ALARMS)

@@ -1,4 +1,4 @@
-"""Judgement of rows: each is predicted from all others, and again as more rows arrive."""
+"""Judge rows: every row is predicted from all others, again whenever rows arrive."""
 
 import contextlib
 import math
@@ -41,31 +41,31 @@ from pisigma.robot.se3 import (
 FALSE_ALARMS = 1e-3
 """Expected share of correct rows that are called wrong."""
 FEW_ROWS = 12
-"""Number of rows up to which all are judged again with every new row, and each is tried as the wrong one."""
+"""Number of rows up to which all rows are judged again with every new row, and every row is tried as the wrong one."""
 CONTRADICTORY_FACTOR = 2.0
-"""Factor over the errors of the robot's class above which few rows contradict each other."""
+"""Factor on the errors of the robot's class above which few rows contradict each other."""
 MIN_MISFIT_GAIN = 8.0
 """Decrease of the misfit above which an older row is called wrong instead of a newer one."""
 REPEATABILITY = {"m": 8e-5, "rad": 1e-4}
-"""[m, rad] Repeatability of robots of any class, in addition to the noise of the sensor."""
+"""Repeatability of robots of any class [m, rad], in addition to the noise of the sensor."""
 USUAL_NOISE = {"m": 5e-5, "rad": 2e-4}
-"""[m, rad] Noise of a sensor whose noise is not stated."""
+"""Noise of a sensor whose noise is not stated [m, rad]."""
 CLASS_VALUES = 20
 """Weight of the robot's class in the estimate of the size of its errors, as a number of measured values."""
 LINEARISATIONS = 2
-"""Linearisations of base and tool."""
+"""Number of linearisations of base and tool."""
 
 
 @dataclass(frozen=True, eq=False)
 class LeaveOneOutErrors:
-    """Rows that are each predicted from the others.
+    """Errors of rows that are each predicted from the others.
 
     Attributes:
-        chance: probability of an error this improbable or more in a correct row; NaN where it cannot be judged.
-        length: size of the error of the measured length [m]; NaN where it cannot be judged.
-        angle: size of the error of the measured orientation [rad]; NaN likewise.
-        position: measured - predicted position in the frame of the row [m]; NaN likewise.
-        scale: factor of this robot's errors over those of its class, at least 1.
+        chance: probability that a correct row has an error at least as improbable; NaN for rows that cannot be judged.
+        length: size of the error of the measured length [m]; NaN for rows that cannot be judged.
+        angle: size of the error of the measured orientation [rad]; NaN for rows that cannot be judged.
+        position: measured minus predicted position in the frame of the row [m]; NaN for rows that cannot be judged.
+        scale: ratio of this robot's errors to the errors of its class, at least 1.
     """
 
     chance: Float64[Tensor, " rows"]
@@ -79,10 +79,10 @@ class LeaveOneOutErrors:
 class RowModel:
     """Linear model of rows, with the prior of the robot's class on geometry, gravity and a Fourier series per joint.
 
-    With X the columns of the unknowns with a prior S, and G those of base, tool and sensors, which have none, the
-    covariance of the values is `V = X S X^T + noise²`, and `P = V^-1 - V^-1 G (G^T V^-1 G)^-1 G^T V^-1`. A row i that
-    is left out has the error `P_ii^-1 (P r)_i` with the covariance `P_ii^-1` (Rasmussen and Williams 2006, sections 2.7
-    and 5.4.2), and its contribution to `r^T P r` is chi-square distributed.
+    With X the columns of the unknowns with a prior S, and G the columns of base, tool and sensors, which have no
+    prior, the covariance of the values is `V = X S X^T + noise²`, and `P = V^-1 - V^-1 G (G^T V^-1 G)^-1 G^T V^-1`.
+    A row i that is left out has the error `P_ii^-1 (P r)_i` with the covariance `P_ii^-1` (Rasmussen and Williams
+    2006, sections 2.7 and 5.4.2), and its contribution to `r^T P r` is chi-square distributed.
 
     Attributes:
         setup: rows, and initial guesses of base and tool.
@@ -91,7 +91,7 @@ class RowModel:
         weights: columns of the weights of gravity and series, linearised nearby.
         point: all parameters.
         sigma: standard deviation of every value [m or rad].
-        kept: rows that base and tool are fitted to, and that others are predicted from.
+        kept: rows to which base and tool are fitted, and from which others are predicted.
     """
 
     setup: CalibrationSetup
@@ -106,13 +106,13 @@ class RowModel:
     def from_rows(
         robot: Robot, rows: Measurements, sigma: float | None, kept: Bool[Tensor, " rows"]
     ) -> "RowModel":
-        """Linearise at the base and tool that are fitted to some of the rows.
+        """Return the model linearised at the base and tool that fit the kept rows.
 
         Args:
             robot: nominal robot.
             rows: all rows.
-            sigma: standard deviation of measured lengths where the rows state none [m]; None for `USUAL_NOISE`.
-            kept: rows that base and tool are fitted to.
+            sigma: standard deviation of measured lengths if the rows state none [m]; None for `USUAL_NOISE`.
+            kept: rows to which base and tool are fitted.
 
         Raises:
             IdentificationError: the rows are too few for base and tool.
@@ -159,7 +159,7 @@ class RowModel:
         A robot may have larger errors than its class: the scale is estimated from the kept rows, so squared errors
         are compared with Fisher's F distribution.
         """
-        from scipy.special import fdtrc  # scipy.stats takes a second to import
+        from scipy.special import fdtrc  # imported here, because scipy.stats takes a second to import
 
         rows = len(self.kept)
         square, count = torch.zeros(2, rows, dtype=torch.float64)
@@ -167,7 +167,7 @@ class RowModel:
         kept = self.kept[self._row].nonzero()[:, 0]
         P, _, determined = self._projection(kept)
         self._leave_one_out(self.kept.nonzero()[:, 0], kept, P, square, count, errors)
-        # The row itself must not enter the scale that it is compared with.
+        # The row itself must not affect the scale with which it is compared.
         left = CLASS_VALUES + len(kept) - determined - torch.where(self.kept, count, 0.0)
         misfit = self.misfit
         # At least 1, the scale of the class: rows that happen to agree must not make the limits stricter.
@@ -190,7 +190,7 @@ class RowModel:
         pull = P @ self._residual[values]
         for row in rows.tolist():
             chosen = (self._row[values] == row).nonzero()[:, 0]
-            sigma = self.sigma[values[chosen]]  # makes lengths and angles comparable
+            sigma = self.sigma[values[chosen]]  # this makes lengths and angles comparable
             # P_ii is singular in directions that only this row determines; these cannot be judged.
             strength, axes = torch.linalg.eigh(P[chosen][:, chosen] * sigma * sigma[:, None])
             certain = strength > DETERMINED
@@ -219,11 +219,11 @@ class RowModel:
         return length, angle, position
 
     def _solution(self) -> Float64[Tensor, " unknowns"]:
-        """Return the mean of the unknowns given the kept rows, parameters counted from the start."""
+        """Return the mean of the unknowns given the kept rows; parameters are relative to the start."""
         return self._projection(self.kept[self._row].nonzero()[:, 0])[1]
 
     def _projection(self, kept: Int64[Tensor, " chosen"]) -> tuple[Tensor, Tensor, int]:
-        """Return P for some values, the mean of the unknowns, and the number of G's unknowns that are determined."""
+        """Return P for the kept values, the mean of the unknowns, and the number of determined unknowns of G."""
         X, r, free = self._columns[kept], self._residual[kept], self._size.isinf()
         Z, G = X[:, ~free] * self._size[~free], X[:, free]
         V = Z @ Z.t()
@@ -244,7 +244,7 @@ class RowModel:
 
     @cached_property
     def _residual(self) -> Float64[Tensor, " values"]:
-        """Measured - predicted at the start parameters, by the linearisation."""
+        """Measured minus predicted values at the start parameters, by linearisation."""
         moved = (self.point - self.setup.start)[self.setup.problem.active]
         return torch.cat([(one.residual + one.geometry @ moved).flatten() for one in self.values])
 
@@ -260,7 +260,7 @@ class RowModel:
 
 
 def _start_at(setup: CalibrationSetup, geometry: IdentifiedGeometry) -> Float64[Tensor, " parameters"]:
-    """Return the start parameters with the bases and tools of another fit, where it has them."""
+    """Return the start parameters with the bases and tools of another fit, as far as it has them."""
     bases, tools = (block.clone() for block in setup.problem.space.split(setup.start)[1:])
     for number, frame in enumerate(setup.problem.space.frames):
         if frame in geometry.bases:
@@ -287,7 +287,7 @@ def _noise(
         usual = USUAL_NOISE[sensor.unit] if sigma is None or sensor.unit == "rad" else sigma
         noise = 1 / one.root if one.stated else torch.full_like(one.root, usual)
         noise = (noise.square() + REPEATABILITY[sensor.unit] ** 2).sqrt()
-        if isinstance(sensor, CornerSensor):  # its weights include the repeatability
+        if isinstance(sensor, CornerSensor):  # the weights of corners include the repeatability
             noise = torch.as_tensor(setup.measurements.readings[NOISE_COLUMN])[one.row]
         blocks.append(noise.repeat_interleave(one.components))
     return torch.cat(blocks)
@@ -298,9 +298,9 @@ class RowJudgement:
     """Judgement of rows.
 
     Attributes:
-        counts: rows that others do not contradict.
-        model: model of the used rows; None while they are too few to fit base and tool.
-        errors: errors of all rows under this model; None likewise.
+        counts: mask of the rows that others do not contradict.
+        model: model of the used rows; None if they are too few to fit base and tool.
+        errors: errors of all rows under this model; None without a model.
     """
 
     counts: Bool[Tensor, " rows"]
@@ -311,13 +311,13 @@ class RowJudgement:
 def judge_rows(
     robot: Robot, rows: Measurements, sigma: float | None, trusted: Bool[Tensor, " rows"]
 ) -> RowJudgement:
-    """Judge new rows by those that counted so far, and these by each other.
+    """Judge new rows by the rows accepted so far, and these by each other.
 
     Args:
         robot: nominal robot.
         rows: all rows, the last ones new.
         sigma: see `RowModel.from_rows`.
-        trusted: rows that counted so far; of `FEW_ROWS` or fewer, none is trusted.
+        trusted: rows accepted so far; if there are `FEW_ROWS` or fewer, none is trusted.
     """
     few = rows.rows <= FEW_ROWS
     counts = torch.ones_like(trusted) if few else trusted.clone()
@@ -332,7 +332,7 @@ def judge_rows(
             again = model.leave_one_out()
             errors = replace(again, chance=errors.chance)
         return RowJudgement(model.kept, model, errors)
-    except IdentificationError:  # too few for base and tool
+    except IdentificationError:  # too few rows for base and tool
         return RowJudgement(torch.ones_like(trusted))
 
 
@@ -344,9 +344,9 @@ def _contradicted(
     errors: LeaveOneOutErrors,
     few: bool,
 ) -> tuple[RowModel, LeaveOneOutErrors] | None:
-    """Leave out the row that the others contradict; None if there is none.
+    """Return the judgement without the row that the others contradict; None if there is no such row.
 
-    A wrong row among few moves base and tool so far that it can be distinguished only by leaving out each in turn.
+    A wrong row among few moves base and tool so far that it can be found only by leaving out every row once.
     """
     counts = model.kept
     chance = torch.where(counts, errors.chance, torch.nan)

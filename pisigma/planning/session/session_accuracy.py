@@ -23,7 +23,7 @@ from pisigma.validation.held_out.calibration_validation import pose_errors_of, v
 from pisigma.validation.held_out.few_rows import fit_if_better
 
 FOLDS = 5
-"""Folds of the cross-validation."""
+"""Number of folds of the cross-validation."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,9 +54,9 @@ def session_accuracy(
     Args:
         plan: plan for a nominal robot, which is calibrated with the rows, or for a model, whose posterior is updated by
             their joint values alone.
-        before: prior of the session, with the instrument.
+        before: prior of the session, including the instrument.
         rows: rows to calibrate with.
-        check: rows that test the calibration; None if there are none yet. Unused with a model.
+        check: rows that test the calibration; None if there are none yet. They are not used with a model.
         task: joint values where the robot has to be accurate [rad or m].
         progress: called with the name of each step.
     """
@@ -82,12 +82,12 @@ def _calibrated(
 
     Raises:
         IdentificationError: the rows are too few, or contradict each other.
-        MeasurementError: too few of them can be held out.
+        MeasurementError: too few rows can be held out.
     """
     result = fit_if_better(HybridCalibrator(robot), rows, progress)
     assert isinstance(result, HybridResult)
     if result.learned is None and np.array_equal(result.geometric.robot.dh, robot.dh):
-        # with too few rows the arm stays nominal, so the posterior of the fit does not contain its errors
+        # with too few rows the arm remains nominal, so the posterior of the fit does not contain its errors
         posterior = before.after_measuring(rows.q)
     else:
         posterior = RobotPosterior.from_result(result, before.instrument)
@@ -99,7 +99,7 @@ def _calibrated(
 def with_cross_validation(
     robot: Robot, so_far: SessionAccuracy, progress: Progress = lambda what: None
 ) -> AccuracyPoint:
-    """Return the accuracy with cross-validated errors, where the rows allow a cross-validation.
+    """Return the accuracy with cross-validated errors, if the rows allow a cross-validation.
 
     Args:
         robot: nominal robot.
@@ -131,10 +131,10 @@ def expected_accuracy(
     Args:
         posterior: posterior given the rows so far.
         measured: number of poses so far.
-        poses: joint values of the remaining poses, the next one first [rad or m].
+        poses: joint values of the remaining poses, beginning with the next [rad or m].
         candidates: joint values of poses that could be measured instead [rad or m].
-        task: see `session_accuracy`.
-        step: poses between two points of the curve.
+        task: joint values where the robot has to be accurate [rad or m].
+        step: number of poses between two points of the curve.
     """
     counts = [*range(step, len(poses), step), len(poses)] if len(poses) else []
     both = torch.cat([poses, candidates])

@@ -1,4 +1,4 @@
-"""Rows of a measuring session: which of them count, alarms on the others, and replanning of the remaining poses."""
+"""Rows of a measuring session: which rows are used, alarms about the others, and replanning of remaining poses."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -38,9 +38,9 @@ from pisigma.validation.checks.mixed_rows import MIN_WRONG_SHARE
 from pisigma.validation.gate import check_rows
 
 MAX_CANDIDATES = 1_000
-"""Candidates of the plan that are considered."""
+"""Largest number of candidates of the plan that are considered."""
 MAX_REPLACEMENTS = 3
-"""Attempts to replace poses that no free motion leads to."""
+"""Largest number of attempts to replace poses to which no free motion leads."""
 
 
 class SessionRows:
@@ -58,7 +58,7 @@ class SessionRows:
 
         Args:
             robot: nominal robot.
-            sigma: standard deviation of measured lengths where rows state none [m].
+            sigma: standard deviation of measured lengths if rows state none [m].
         """
         self._robot, self._sigma = robot, sigma
         self.rows: Measurements | None = None
@@ -69,7 +69,7 @@ class SessionRows:
 
     @property
     def alarms(self) -> tuple[Alarm, ...]:
-        """Alarms on single rows."""
+        """Alarms about single rows."""
         return (*self._fixed, *self._contradicted.values())
 
     @property
@@ -95,7 +95,7 @@ class SessionRows:
             names: names of these poses.
 
         Returns:
-            New alarms on these rows or on earlier ones.
+            New alarms about these rows or earlier ones.
         """
         alarms = [unreadable_alarm(row) for row in left_out]
         changed: list[Alarm] = []
@@ -152,10 +152,10 @@ class SessionRows:
 
 
 def _steps(known: int, count: int) -> Iterator[int]:
-    """Yield the numbers of rows after which rows are judged, where `known` were judged before.
+    """Yield the numbers of rows after which rows are judged, if `known` rows were judged before.
 
-    Rows are judged by those that counted before, so no more than these are added at once. Of several rows that were
-    added at once, each is then judged by the others as well.
+    Rows are judged by the rows accepted before, so no more than their number are added at once. Rows that are added
+    together are then also judged by each other.
     """
     upto = known
     while upto < count:
@@ -168,14 +168,14 @@ def _steps(known: int, count: int) -> Iterator[int]:
 def setup_sentence(
     rows: Measurements, counts: Bool[Tensor, " rows"], against: Robot | CalibratedModel
 ) -> str:
-    """Describe a fault that all rows have in common; "" if there is none.
+    """Return a sentence about a fault that all rows have in common; "" if there is none.
 
-    Where a quarter of the rows or more contradict the others, all rows are judged, including these.
+    If a quarter of the rows or more contradict the others, all rows are judged, including these.
 
     Args:
         rows: all usable rows.
         counts: rows that are not contradicted by others.
-        against: the nominal robot, or the model that was planned for.
+        against: the nominal robot, or the planned model.
     """
     some = rows.select(counts) if counts.double().mean() > 1 - MIN_WRONG_SHARE else rows
     found = check_rows(some, against, may_move=MOVES).implausible
@@ -202,7 +202,7 @@ class FurtherPoses:
     def from_plan(
         plan: StoredPlan, candidates: Candidates, task: Float64[Tensor, "tasks dof"]
     ) -> "FurtherPoses":
-        """Select evenly from the candidates of a plan."""
+        """Return evenly selected candidates of a plan."""
         count = len(candidates.q)
         some = torch.linspace(0, count - 1, min(count, MAX_CANDIDATES)).round().long()
         motions = Motions(plan.arm, candidates.workspace[:MAX_CANDIDATES])
@@ -216,14 +216,14 @@ class FurtherPoses:
         measured: Float64[Tensor, "rows dof"],
         remaining: Int64[Tensor, " remaining"],
     ) -> StoredPlan | None:
-        """Select the remaining poses again, given the rows so far; the next pose and those for testing are kept.
+        """Select the remaining poses again, given the rows so far; the next pose and the test poses are kept.
 
         Args:
-            plan: the present plan.
+            plan: the current plan.
             poses: total number of poses to calibrate with.
             so_far: posterior and accuracy given the rows so far.
-            measured: joint values of the rows that count [rad or m].
-            remaining: indices of the remaining poses, the next one first.
+            measured: joint values of the rows in use [rad or m].
+            remaining: indices of the remaining poses, beginning with the next.
 
         Returns:
             The new plan; None if nothing can be selected.
@@ -248,7 +248,7 @@ class FurtherPoses:
             q = torch.cat([self.q[chosen], plan.q[check]])[use]
             way = plan_tour(self.motions, q, plan.settings.pace, plan.q[first[0]], stages=(AHEAD,))
             left_out = use[way.left_out]
-            # Poses that no collision-free way reaches are replaced by the next best ones.
+            # Poses without a collision-free motion to them are replaced by the next best ones.
             shut_in = left_out[left_out < count]
             new = new[~torch.isin(new, chosen[shut_in])]
             if not len(shut_in):
@@ -280,13 +280,13 @@ def stopping_advice(
     expected: Sequence[AccuracyPoint],
     left: int,
 ) -> Advice:
-    """Decide whether to continue measuring or to stop, and why.
+    """Return the advice whether to continue measuring or to stop, with the reason.
 
     Args:
         limit_mm: limit of the 95 % quantile of the errors [mm]; None for no limit.
         least_gain_mm: decrease of that quantile by the next `AHEAD` poses below which to stop [mm].
         reached: accuracy so far. The limit is reached when the last two points are below it: estimates from few rows
-            scatter, so a first point below the limit is often there by chance.
+            scatter, so a first point is often below the limit by chance.
         expected: expected accuracy after the remaining poses.
         left: number of remaining poses.
     """

@@ -1,4 +1,4 @@
-"""State of a measuring session, as terminals and pages show it."""
+"""State of a measuring session, which terminals and pages show."""
 
 import math
 from collections.abc import Iterable
@@ -23,14 +23,14 @@ other rows contradict the value. "pose": the joint values are not those of a pla
 
 @dataclass(frozen=True)
 class Alarm:
-    """Alarm or remark on a row.
+    """Alarm or remark about a row.
 
     Attributes:
         line: line of the row in the file.
         kind: kind of the alarm.
         sentence: what was expected, what was measured, and what to do.
         repeat: whether to measure the pose again.
-        counts: whether the row counts nevertheless.
+        counts: whether the row is used nevertheless.
     """
 
     line: int
@@ -45,12 +45,12 @@ class RowsSoFar:
     """All rows that were read, in the order of the file.
 
     Attributes:
-        line: lines in the file.
+        line: line of every row in the file.
         q: commanded joint values [rad or m].
         position: predicted position of the target in the robot's base frame [m]; NaN while base and tool are unknown.
-        error: measured - predicted position in the robot's base frame [m]; NaN where it cannot be judged.
-        check: rows of the set "test", which test the calibration and are not calibrated with.
-        alarmed: rows that are not used.
+        error: measured minus predicted position in the robot's base frame [m]; NaN for rows that cannot be judged.
+        check: mask of the rows of the set "test", which test the calibration and are not used for it.
+        alarmed: mask of the rows that are not used.
     """
 
     line: tuple[int, ...]
@@ -72,11 +72,11 @@ class NextPose:
     """The pose to be measured next.
 
     Attributes:
-        number: number of the pose, which stays the same when the remaining poses are replanned.
+        number: number of the pose, which does not change when the remaining poses are replanned.
         count: largest number of a pose so far.
         q: joint values [rad or m].
         check: whether it tests the calibration.
-        commanded: values of the controller, where they differ from the joint values [rad or m].
+        commanded: controller values, if they differ from the joint values [rad or m].
     """
 
     number: int
@@ -99,7 +99,7 @@ class JointSpan:
         name: name of the joint.
         lower: smallest measured value [rad or m].
         upper: largest measured value [rad or m].
-        planned: width of the measured range over that of the plan, at most 1.
+        planned: ratio of the measured range to the planned range, at most 1.
     """
 
     name: str
@@ -113,7 +113,7 @@ class AccuracyPoint:
     """Position error over the task after a number of poses [m]; NaN where a figure is unknown.
 
     Attributes:
-        poses: number of poses calibrated with.
+        poses: number of poses used for the calibration.
         predicted_rms: root mean square predicted by the posterior.
         predicted_p95: 95 % quantile predicted by the posterior.
         cross_validated_rms: root mean square of the errors of held-out rows, which include the noise of the sensor.
@@ -140,7 +140,7 @@ class AccuracyPoint:
 
 @dataclass(frozen=True)
 class Advice:
-    """Advice on what to do next.
+    """Advice about what to do next.
 
     Attributes:
         action: "measure" the next pose, "repeat" a pose, "correct" a fault of all rows, or "stop".
@@ -159,9 +159,9 @@ class SessionState:
         rows: all rows that were read.
         alarms: alarms on rows, in the order of the file.
         next_pose: pose to be measured next; None if the plan is finished.
-        remaining: joint values of all remaining poses, the next one first [rad or m].
+        remaining: joint values of all remaining poses, beginning with the next [rad or m].
         coverage: measured range of every joint.
-        reached: accuracy so far, one point for each time it was computed; the last one is valid.
+        reached: accuracy so far, one point per computation; the last point is valid.
         expected: expected accuracy after the remaining poses.
         advice: what to do next.
         revolute: whether each axis of the controller is revolute (values in rad) or prismatic (in m).
@@ -185,7 +185,7 @@ class SessionState:
         return self.reached[-1] if self.reached else None
 
     def to_json(self) -> dict[str, object]:
-        """Return the figures as plain values: the result of `pisigma measure --json`; None for what is unknown."""
+        """Return the figures as plain values, the result of `pisigma measure --json`; None for unknown values."""
         counting = ~self.rows.alarmed
         sizes = np.linalg.norm(self.rows.error, axis=1) * 1e3
         following = self.next_pose
@@ -228,7 +228,7 @@ class SessionState:
 
     @property
     def is_finished(self) -> bool:
-        """Whether more poses would not help, or none remain."""
+        """Whether no poses remain, or more poses would not help."""
         return self.advice.action == "stop"
 
 
@@ -240,7 +240,7 @@ def _number(value: float) -> float | None:
 def coverage(
     robot: Robot, measured: Float64[Tensor, "rows dof"], planned: Float64[Tensor, "poses dof"]
 ) -> tuple[JointSpan, ...]:
-    """Compare the measured range of every joint with that of the plan; empty without rows.
+    """Return the measured range of every joint relative to the plan; empty without rows.
 
     Args:
         robot: nominal robot.

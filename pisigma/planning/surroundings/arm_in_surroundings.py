@@ -18,18 +18,18 @@ from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.kinematics.tolerances import LIMIT_TOLERANCE
 
 POSES_PER_CHUNK = 2048
-"""Poses that are checked together: some MB."""
+"""Number of poses that are checked together (some MB)."""
 ROUNDING = 1e-9
-"""[m] Distance by which a measured pose is treated as free of self-collision."""
+"""Distance by which capsules of a measured pose may overlap without a self-collision [m]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Faults:
-    """Why poses are not allowed.
+    """Reasons why poses are not allowed.
 
     Attributes:
         reasons: possible reasons, each a sentence without full stop.
-        failed: whether each pose fails for each reason.
+        failed: mask of the poses that fail, for every reason.
     """
 
     reasons: tuple[str, ...]
@@ -37,11 +37,11 @@ class Faults:
 
     @property
     def allowed(self) -> Bool[Tensor, " poses"]:
-        """Poses without faults."""
+        """Mask of the poses without faults."""
         return ~self.failed.any(1)
 
     def counts(self) -> Counter[str]:
-        """Count the failing poses by their first reason."""
+        """Return the number of failing poses by their first reason."""
         first = self.failed[self.failed.any(1)].int().argmax(1)
         return Counter(self.reasons[reason] for reason in first.tolist())
 
@@ -56,14 +56,14 @@ class ArmInSurroundings:
     """A robot in its surroundings.
 
     Attributes:
-        nominal: nominal robot; its base is that of the surroundings.
-        robot: the same with the reflector as its tool.
+        nominal: nominal robot, with its base in the surroundings.
+        robot: nominal robot with the reflector as its tool.
         surroundings: surroundings of the robot.
         capsules: capsules along the links.
         pairs: pairs of capsules that may touch each other.
-        room: distance that the capsules of each pair have to keep [m].
-        beam_blockers: capsules that may block the tracker's beam: none of the link with the reflector, and none so near
-            to the reflector that it touches every beam.
+        room: distance to keep between the capsules of each pair [m].
+        beam_blockers: capsules that may block the tracker's beam: not those of the link with the reflector, and not
+            those so near to the reflector that they touch every beam.
         limits: limits of the controller's values including margins [rad or m].
     """
 
@@ -78,7 +78,7 @@ class ArmInSurroundings:
 
     @staticmethod
     def from_robot(robot: Robot, surroundings: Surroundings | None = None) -> "ArmInSurroundings":
-        """Put a robot into its surroundings; with None, only limits and self-collision are checked."""
+        """Return a robot in its surroundings; with None, only limits and self-collision are checked."""
         surroundings = surroundings or Surroundings()
         capsules = surroundings.capsules(robot)
         pairs = capsules.pairs_to_check(surroundings.clearance / 2)
@@ -94,7 +94,7 @@ class ArmInSurroundings:
         )
 
     def allow_measured_poses(self, q: Float64[Tensor, "poses dof"]) -> "ArmInSurroundings":
-        """Return the arm such that measured poses are free of self-collision, for any radii of the links.
+        """Return the arm, modified so that measured poses are free of self-collision for any radii of the links.
 
         Args:
             q: joint values of measured poses [rad or m].
@@ -107,10 +107,10 @@ class ArmInSurroundings:
 
     @property
     def unseparated_links(self) -> tuple[str, ...]:
-        """Sentence on links that are not checked against each other because their stated radii are too large.
+        """Return a sentence about links that are not checked against each other because stated radii are too large.
 
-        Links that touch in more than half of random poses are not checked, see `Capsules.pairs_to_check`. Usually
-        empty.
+        Links that touch in more than half of random poses are not checked, see `Capsules.pairs_to_check`. The
+        sentence is usually empty.
         """
         tool = (
             None
@@ -147,9 +147,9 @@ class ArmInSurroundings:
         return Faults(tuple(chunks[0]), torch.cat([torch.stack([*chunk.values()], 1) for chunk in chunks]))
 
     def smallest_clearance(self, q: Float64[Tensor, "poses dof"]) -> Float64[Tensor, " poses"]:
-        """Compute the smallest distance of the links from everything they must not touch, minus the clearance [m].
+        """Compute the smallest distance between the links and obstacles, minus the clearance [m].
 
-        Negative where the clearance is not kept, infinite where there is nothing to touch.
+        The result is negative if the clearance is not kept, and infinite without obstacles.
         """
         gaps = [
             torch.stack([*self._gaps(self.capsules.segments(chunk)).values()])
@@ -186,7 +186,7 @@ class ArmInSurroundings:
         return faults
 
     def _gaps(self, segments: Float64[Tensor, "poses pieces 2 3"]) -> dict[str, Float64[Tensor, " poses"]]:
-        """Compute distances between the links and everything that they must not touch, minus the clearance [m]."""
+        """Yield distances between the links and every obstacle, minus the clearance [m]."""
         clearance, radius = self.surroundings.clearance, self.capsules.radius
         infinite = segments.new_full((len(segments), 1), torch.inf)
         gaps = {"links of the robot touch each other": _least(self._apart(segments) - self.room, infinite)}
@@ -208,7 +208,7 @@ class ArmInSurroundings:
     def blocked_lines_of_sight(
         self, q: Float64[Tensor, "poses dof"], lines: Float64[Tensor, "poses lines 2 3"], what: str
     ) -> dict[str, Bool[Tensor, " poses"]]:
-        """Find the poses in which a line of sight is blocked, by what blocks it.
+        """Return the masks of the poses in which a line of sight is blocked, by what blocks it.
 
         Args:
             q: joint values [rad or m].
@@ -223,7 +223,7 @@ class ArmInSurroundings:
         lines: Float64[Tensor, "poses lines 2 3"],
         what: str,
     ) -> dict[str, Bool[Tensor, " poses"]]:
-        """Find the poses in which a line of sight is nearer to something than the clearance."""
+        """Yield masks of the poses in which a line of sight is nearer to an obstacle than the clearance."""
         clearance = self.surroundings.clearance
         infinite = lines.new_full((len(lines), 1), torch.inf)
         distance = (
@@ -239,7 +239,7 @@ class ArmInSurroundings:
     def _turned_away(
         self, T: Float64[Tensor, "poses 4 4"], beam: Float64[Tensor, "poses 2 3"]
     ) -> dict[str, Bool[Tensor, " poses"]]:
-        """Find the poses in which the tracker is outside the acceptance cone of the reflector."""
+        """Return the mask of the poses in which the tracker is outside the acceptance cone of the reflector."""
         reflector = self.surroundings.reflector
         if reflector is None:
             return {}

@@ -17,31 +17,31 @@ from pisigma.robot.kinematics.forward import Geometry, iterate_rows
 from pisigma.robot.urdf_frames import inverse, row_frame
 
 RADIUS_SHARES = (0.05, 0.05, 0.05, 0.035)
-"""Default radii of links from the first joint on, as shares of the length of the nominal arm; the last one holds for
-all further links."""
+"""Default radii of links from the first joint on, as shares of the length of the nominal arm; the last share applies
+to all further links."""
 TOOL_RADIUS = 0.025
-"""[m] Default radius of the tool: a bracket with a reflector of 1.5 inches."""
+"""Default radius of the tool [m]: a bracket with a reflector of 1.5 inches."""
 MIN_LENGTH = 1e-6
-"""[m] Length below which a piece of a link needs no capsule, because its neighbours cover it."""
+"""Length below which a piece of a link needs no capsule [m], because its neighbours cover it."""
 SAMPLES = 500
-"""Random poses by which capsules that touch by construction are found."""
+"""Number of random poses by which capsules that touch by construction are found."""
 
 
 @dataclass(frozen=True, eq=False)
 class Capsules:
     """Pieces of the links as line segments with a radius, each end fixed to a frame of the robot.
 
-    A DH row leads from its joint along the joint's axis by d, and then by a to the next row: these are the pieces of
-    its link. A URDF file states the joint positions, so its links are straight from joint to joint. The last piece is
-    the tool.
+    A DH row leads from its joint along the joint's axis by d, and then by a to the next row; these are the two
+    pieces of its link. A URDF file states the joint positions, so its links are straight from joint to joint. The
+    last piece is the tool.
 
     Attributes:
         robot: nominal robot with the tool.
-        frame: frame that each end of a piece is fixed to: 0 is the base, i the frame after row i.
+        frame: frame to which each end of a piece is fixed: 0 is the base, i the frame after row i.
         point: position of each end in that frame [m].
         link: number of the joint that moves each piece; 0 for fixed pieces.
         radius: radius of each piece [m].
-        carrier: whether each piece carries the robot: it is before the first joint, or on its axis.
+        carrier: whether each piece carries the robot, because it is before the first joint or on its axis.
     """
 
     robot: Robot
@@ -59,14 +59,14 @@ class Capsules:
         radii: Mapping[str, float] | None = None,
         tool_radius: float = TOOL_RADIUS,
     ) -> "Capsules":
-        """Make capsules along the links of a robot.
+        """Return capsules along the links of a robot.
 
         Args:
             robot: nominal robot with the reflector as its tool.
             tip: position of the nominal tool in the frame after the last row, from which the bracket leads to the
                 reflector [m]; None for the origin of that frame.
             radius: radius of all links [m]; None for `RADIUS_SHARES` of the arm's length.
-            radii: radii of single links by the names of their rows [m].
+            radii: radii of individual links by the names of their rows [m].
             tool_radius: radius of the tool [m].
         """
         tip = np.zeros(3) if tip is None else tip
@@ -92,7 +92,7 @@ class Capsules:
         return capsules._of((segments[:, :, 1] - segments[:, :, 0]).norm(dim=-1).amax(0) > MIN_LENGTH)
 
     def _of(self, kept: Bool[Tensor, " pieces"]) -> "Capsules":
-        """Return a part of the pieces."""
+        """Return the capsules of the kept pieces only."""
         values = (self.frame, self.point, self.link, self.radius, self.carrier)
         return Capsules(self.robot, *(value[kept] for value in values))
 
@@ -106,13 +106,13 @@ class Capsules:
         return [as_transform(frame, q[..., 0]) for frame in (rows[0].before, *(row.after for row in rows))]
 
     def pairs_to_check(self, clearance: float) -> Int64[Tensor, "pairs 2"]:
-        """Return the pairs of pieces that must not touch each other: those of links that are not neighbours.
+        """Return the pairs of pieces, of links that are not neighbours, that must not touch each other.
 
-        Pairs that touch in more than half of random poses do so by construction, as in a wrist; the joint limits have
-        to keep these apart. Pairs whose distance never changes are not checked.
+        Pairs that touch in more than half of random poses do so by construction, as in a wrist; the joint limits
+        have to keep them apart. Pairs whose distance never changes are not checked.
 
         Args:
-            clearance: distance to keep between them [m].
+            clearance: distance to keep between pieces [m].
         """
         first, second = torch.combinations(torch.arange(len(self.link))).unbind(-1)
         segments = self.segments(self.random_joints())
@@ -137,10 +137,10 @@ class _Piece(NamedTuple):
     """One piece of a link.
 
     Attributes:
-        row: row whose link it belongs to.
+        row: row to whose link the piece belongs.
         carrier: see `Capsules`.
-        frame: frames that its ends are fixed to.
-        point: positions of its ends in these frames [m].
+        frame: frames to which the ends are fixed.
+        point: positions of the ends in these frames [m].
     """
 
     row: int
@@ -150,7 +150,7 @@ class _Piece(NamedTuple):
 
 
 def _pieces_of_rows(robot: Robot, tip: Float64[np.ndarray, " 3"]) -> Iterator[_Piece]:
-    """Yield the pieces from joint to joint and to the tip: straight if joint positions are known, else by d, a."""
+    """Yield the pieces from joint to joint and to the tip: straight if positions are known, otherwise by d and a."""
     has_seats = any(any(row.urdf_origin) for row in robot.rows)
     seats = [np.array(row.urdf_origin) for row in robot.rows] + [tip if has_seats else np.zeros(3)]
     first = robot.joint_rows[0]
@@ -158,7 +158,7 @@ def _pieces_of_rows(robot: Robot, tip: Float64[np.ndarray, " 3"]) -> Iterator[_P
         yield _Piece(0, True, (0, 0), (np.zeros(3), seats[0]))
     for i, row in enumerate(robot.rows):
         corners = [(i, seats[i]), (i + 1, seats[i + 1])]
-        if row.type == "prismatic":  # the stroke of the joint, and then the moving link
+        if row.type == "prismatic":  # the piece along the stroke of the joint, then the moving link
             corners.insert(1, (i + 1, _behind(robot, i, seats[i])))
         elif not has_seats:
             corners.insert(1, (i + 1, _behind(robot, i, np.array([0.0, 0.0, robot.dh[i, 1]]))))
@@ -170,6 +170,6 @@ def _pieces_of_rows(robot: Robot, tip: Float64[np.ndarray, " 3"]) -> Iterator[_P
 
 
 def _behind(robot: Robot, row: int, point: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, " 3"]:
-    """Transform a point from the frame before a row to the frame after it, at the joint value 0 [m]."""
+    """Return a point [m], given in the frame before a row, in the frame after it, at the joint value 0."""
     result: np.ndarray = (inverse(row_frame(*robot.dh[row].tolist())) @ np.append(point, 1.0))[:3]
     return result

@@ -5,7 +5,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 MIN_SQUARED_LENGTH = 1e-18
-"""[m²] Squared length below which a segment is a point."""
+"""Squared length below which a segment is a point [m²]."""
 
 Segments = Float64[Tensor, "*#batch 2 3"]
 """Both ends of line segments [m]."""
@@ -14,8 +14,8 @@ Segments = Float64[Tensor, "*#batch 2 3"]
 def segment_distance(first: Segments, second: Segments) -> Float64[Tensor, "*_batch"]:
     """Compute the distance of line segments [m].
 
-    The nearest points of two segments are those of their lines, clamped to the segments one after the other
-    (Ericson 2005, Real-Time Collision Detection, section 5.1.9). The batches broadcast.
+    The nearest points of two segments are the nearest points of their lines, clamped to the segments one after the
+    other (Ericson 2005, Real-Time Collision Detection, section 5.1.9). The batches broadcast.
     """
     p, u = first[..., 0, :], first[..., 1, :] - first[..., 0, :]
     r, v = second[..., 0, :], second[..., 1, :] - second[..., 0, :]
@@ -23,7 +23,7 @@ def segment_distance(first: Segments, second: Segments) -> Float64[Tensor, "*_ba
     a, b, e = (u * u).sum(-1), (u * v).sum(-1), (v * v).sum(-1)
     c, f = (u * w).sum(-1), (v * w).sum(-1)
     determinant = a * e - b * b
-    # Parallel lines are equally near everywhere: any s will do, as clamped t and then s follow from it.
+    # Parallel lines have the same distance everywhere, so s is arbitrary; clamped t and then s follow from it.
     parallel = determinant <= 1e-12 * a * e
     s = torch.where(parallel, 0.0, (b * f - c * e) / torch.where(parallel, 1.0, determinant)).clamp(0, 1)
     t = ((b * s + f) / e.clamp(min=MIN_SQUARED_LENGTH)).clamp(0, 1)
@@ -58,7 +58,7 @@ def box_distance(segments: Segments, half_size: Float64[Tensor, "*#batch 3"]) ->
     low, high = torch.where(falling, t, 0.0).amax(-1), torch.where(falling, 1.0, t).amin(-1)
     before = torch.where(falling, slope, -torch.inf).amax(-1)
     behind = torch.where(falling, torch.inf, slope).amin(-1)
-    # Where it never rises the end is nearest, where it never falls the start.
+    # If the distance never rises, the end is nearest; if it never falls, the start is nearest.
     share = torch.where(behind.isinf(), 1.0, before / (before - torch.where(behind.isinf(), 0.0, behind)))
     share = torch.where(before.isinf(), 0.0, share)
     nearest = start + (low + share * (high - low))[..., None] * along

@@ -1,4 +1,4 @@
-"""Straight joint motions between poses: whether they are collision-free, and waypoints where they are not."""
+"""Straight joint motions between poses: whether they are collision-free, and waypoints for blocked motions."""
 
 import torch
 from jaxtyping import Bool, Float64
@@ -7,17 +7,18 @@ from torch import Tensor
 from pisigma.planning.surroundings.arm_in_surroundings import ArmInSurroundings
 
 MIN_STEP = 1e-3
-"""[m] Motion of any point of the robot below which a piece is not divided further, nor below half the clearance."""
+"""Motion of any point of the robot below which a piece is not divided further [m]; half the clearance if that is
+larger."""
 MAX_WAYPOINTS_TRIED = 60
-"""Poses that are tried as waypoints of a motion; ten times as many pairs of them are tried."""
+"""Number of poses that are tried as waypoints of a motion; ten times as many pairs of poses are tried."""
 BATCH = 20
-"""Waypoints that are checked together."""
+"""Number of waypoints that are checked together."""
 SAMPLE = 50
-"""Poses to which motions are checked, to find which of two poses is harder to leave."""
+"""Number of poses to which motions are checked, to find which of two poses is harder to leave."""
 
 
 class Motions:
-    """Straight joint motions between poses, each of which is checked only once.
+    """Straight joint motions between poses; every motion is checked only once.
 
     Attributes:
         arm: the robot in its surroundings.
@@ -33,7 +34,7 @@ class Motions:
     def are_free(
         self, start: Float64[Tensor, "motions dof"], end: Float64[Tensor, "motions dof"]
     ) -> Bool[Tensor, " motions"]:
-        """Return which motions are collision-free, in either direction."""
+        """Return the mask of motions that are collision-free, in either direction."""
         names = [*map(sorted, zip(_names(start), _names(end), strict=True))]
         pairs = [(one, other) for one, other in names]
         new = torch.tensor([pair not in self._free for pair in pairs], dtype=torch.bool).nonzero()[:, 0]
@@ -44,7 +45,7 @@ class Motions:
     def points_between(
         self, start: Float64[Tensor, " dof"], end: Float64[Tensor, " dof"]
     ) -> Float64[Tensor, "points dof"] | None:
-        """Return the waypoints of a motion, empty if it needs none; None if none were found."""
+        """Return the waypoints of a motion; empty if none are required, None if none were found."""
         if bool(self.are_free(start[None], end[None])):
             return self.pool[:0]
         (pair,) = zip(_names(start[None]), _names(end[None]), strict=True)
@@ -53,7 +54,7 @@ class Motions:
         return self._points[pair]
 
     def is_harder_to_leave(self, pose: Float64[Tensor, " dof"], other: Float64[Tensor, " dof"]) -> bool:
-        """Return whether fewer free motions lead away from a pose than from another one."""
+        """Return whether fewer free motions lead away from a pose than from another pose."""
         sample = self.pool[:: max(1, len(self.pool) // SAMPLE)]
         one, two = (int(self.are_free(q.expand_as(sample), sample).sum()) for q in (pose, other))
         return one < two
@@ -62,10 +63,11 @@ class Motions:
 def is_free(
     arm: ArmInSurroundings, start: Float64[Tensor, "motions dof"], end: Float64[Tensor, "motions dof"]
 ) -> Bool[Tensor, " motions"]:
-    """Return which straight joint motions are collision-free.
+    """Return the mask of straight joint motions that are collision-free.
 
-    A piece of a motion is free where the gap at its midpoint is larger than any point of the robot can move from there
-    to its ends; other pieces are halved (Schwarzer, Saha and Latombe 2005, IEEE Trans. Robotics 21(3), section IV).
+    A piece of a motion is free if the gap at its midpoint is larger than the motion of any point of the robot from
+    there to its ends; other pieces are halved (Schwarzer, Saha and Latombe 2005, IEEE Trans. Robotics 21(3), section
+    IV).
 
     Args:
         arm: the robot in its surroundings.
@@ -93,7 +95,7 @@ def waypoints(
     end: Float64[Tensor, " dof"],
     pool: Float64[Tensor, "poses dof"],
 ) -> Float64[Tensor, "points dof"] | None:
-    """Find one or two waypoints that make a motion collision-free, the shortest way among those that are tried.
+    """Find one or two waypoints that make a motion collision-free, by the shortest of the tried ways.
 
     Args:
         arm: the robot in its surroundings.
@@ -134,5 +136,5 @@ def _travel(arm: ArmInSurroundings, start: Tensor, end: Tensor) -> Float64[Tenso
 
 
 def _names(poses: Float64[Tensor, "poses dof"]) -> list[bytes]:
-    """Return keys of poses: the bytes of their joint values."""
+    """Return the bytes of the joint values of poses, as dictionary keys."""
     return [pose.tobytes() for pose in poses.contiguous().numpy()]

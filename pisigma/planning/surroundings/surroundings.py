@@ -42,7 +42,7 @@ class JointSection(Section):
         """Return the allowed range of the controller's values [rad or m]; infinite if there is no limit.
 
         Raises:
-            RecipeError: a name is not a joint of the robot, or is one of the other kind.
+            RecipeError: a name is not a joint of the robot, or is a joint of the other kind.
             PlanningError: a joint's range is empty.
         """
         fields = ("limits_deg", "limits_mm")
@@ -69,7 +69,7 @@ class JointSection(Section):
 
 
 class Box(Section):
-    """A box that the robot must not touch and that blocks lines of sight.
+    """A box that the robot must not touch, and which blocks lines of sight.
 
     Attributes:
         name: name for messages.
@@ -99,7 +99,7 @@ class Box(Section):
         return rotation_from_rpy(torch.tensor([np.deg2rad(self.yaw_deg), 0.0, 0.0], dtype=torch.float64))
 
     def to_box_frame(self, points: Float64[Tensor, "*batch 3"]) -> Float64[Tensor, "*batch 3"]:
-        """Transform points from the robot's base frame to the frame of the box [m]."""
+        """Return points in the robot's base frame [m] transformed to the frame of the box."""
         return (points - self.center) @ self.rotation
 
 
@@ -108,7 +108,7 @@ class LinkSection(Section):
 
     Attributes:
         radius_mm: radius of all links [mm]; None for a share of the arm's length, see `capsules.RADIUS_SHARES`.
-        radii_mm: radii of single links by the names of their rows [mm].
+        radii_mm: radii of individual links by the names of their rows [mm].
     """
 
     radius_mm: Positive | None = None
@@ -119,7 +119,7 @@ class ToolSection(FrameSection):
     """Pose of the reflector in the frame of the nominal tool (a URDF file's tip), in mm and deg.
 
     Attributes:
-        radius_mm: radius of its bracket [mm].
+        radius_mm: radius of the reflector's bracket [mm].
     """
 
     radius_mm: Positive = TOOL_RADIUS * 1e3
@@ -149,8 +149,8 @@ class ReflectorSection(Section):
 
     Attributes:
         name: name such as "cat's eye".
-        axis: its optical axis in the frame of the tool.
-        acceptance_deg: half the angle of its acceptance cone [deg].
+        axis: optical axis of the reflector in the frame of the tool.
+        acceptance_deg: half the angle of the acceptance cone [deg].
     """
 
     name: str = "SMR of 1.5 inches"
@@ -203,8 +203,8 @@ class ViewSection(Section):
         frame: pose of the board, or of a fixed camera, in the robot's base frame; None if a model states it. The
             board's x axis runs along its rows, y from row to row, and z away from the viewer.
         near_mm: smallest depth of the board in front of the camera [mm]; None to compute it from the lens.
-        far_mm: largest depth [mm]; None likewise.
-        lens: lens data, where the depths are not stated.
+        far_mm: largest depth of the board [mm]; None to compute it from the lens.
+        lens: lens data, if the depths are not stated.
         oblique_deg: largest angle between the board's normal and the line of sight [deg].
         margin_px: distance that the board keeps from the edges of the image [px].
     """
@@ -288,7 +288,7 @@ class Surroundings(Section):
         return self.clearance_mm / 1e3
 
     def robot_with_tool(self, robot: Robot) -> Robot:
-        """Return the robot with the reflector as its tool, where the surroundings state it."""
+        """Return the robot with the reflector as its tool, if the surroundings state it."""
         if self.tool is None:
             return robot
         nominal_tool, reflector = (
@@ -297,7 +297,7 @@ class Surroundings(Section):
         return robot.with_geometry(tool=xyzrpy_from_transform(nominal_tool @ reflector).numpy())
 
     def capsules(self, robot: Robot) -> Capsules:
-        """Make capsules along the links of a robot and the bracket of its reflector."""
+        """Return capsules along the links of a robot and the bracket of its reflector."""
         radius = self.links.radius_mm
         radii = {name: size / 1e3 for name, size in self.links.radii_mm.items()}
         tool_radius = TOOL_RADIUS if self.tool is None else self.tool.radius_mm / 1e3
