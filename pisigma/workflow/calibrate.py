@@ -25,6 +25,7 @@ from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.geometric_model import model_of_calibration, with_hybrid
 from pisigma.reporting.cards import CardTexts, write_calibration_card
 from pisigma.robot.description import Robot
+from pisigma.robot.robot_class import CLASSES, HOBBY, RobotClass
 from pisigma.validation.checks.backlash import unstated_backlash
 from pisigma.validation.checks.check import CheckedCalibration
 from pisigma.validation.checks.registry import diagnostics_of
@@ -265,10 +266,12 @@ def calibrator_of(
         IdentificationError: a setting does not fit the robot.
     """
     length, angle = settings.prior_length, settings.prior_angle
+    usual = CLASSES[settings.robot_class] if settings.robot_class else RobotClass.from_robot(robot)
+    zeros = max(angle, usual.usual.joint_offset) if usual is HOBBY else angle
     geometric = GeometricCalibrator(
         robot,
         free=settings.free,
-        prior=Prior(theta=angle, d=length, a=length, alpha=angle, beta=angle) if length else None,
+        prior=Prior(theta=zeros, d=length, a=length, alpha=angle, beta=angle) if length else None,
         loss=HampelLoss() if settings.robust else SquaredLoss(),
         robot_class=settings.robot_class,
         socket_distances=dict(distances),

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 
 from pisigma.calibration.geometric.prior_ratio import PriorRatio
 from pisigma.calibration.geometric.problem.prior_sizes import PriorGroup
-from pisigma.robot.robot_class import CLASSES, RobotClass
+from pisigma.robot.robot_class import CLASSES, HOBBY, RobotClass
 from pisigma.validation.checks.check import CheckedCalibration
 from pisigma.validation.checks.setup_fault import setup_diagnostics
 from pisigma.validation.held_out.diagnostic import Diagnostic
@@ -40,7 +40,7 @@ def check_prior_ratio(checked: CheckedCalibration) -> Iterator[Diagnostic]:
     unusual = [ratio for ratio in checked.geometric.prior_ratios if ratio.at_least > UNUSUAL]
     large = [ratio for ratio in unusual if ratio.at_least > IMPLAUSIBLE]
     possible = narrowest_class(checked, large)
-    usual = _usual_class(checked)
+    usual = checked.robot_class
     for ratio in unusual:
         believed = ratio not in large or (
             possible is not None and (possible is usual or predicts_held_out_rows(checked))
@@ -66,7 +66,7 @@ def narrowest_class(checked: CheckedCalibration, large: Sequence[PriorRatio]) ->
     Returns:
         The class; None if no class allows these errors.
     """
-    usual = _usual_class(checked)
+    usual = checked.robot_class
     sizes = [(ratio.group, ratio.size) for ratio in large]
     at_least = [(ratio.group, ratio.size_at_least) for ratio in large]
     if usual.allows(at_least) or checked.calibrator.robot_class is not None:
@@ -100,11 +100,6 @@ def predicts_held_out_rows(checked: CheckedCalibration) -> bool:
     return errors < PREDICTED_SHARE * figures.nominal.rms_mm and (
         errors < PREDICTED_REACH * checked.robot.reach * 1e3
     )
-
-
-def _usual_class(checked: CheckedCalibration) -> RobotClass:
-    stated = checked.calibrator.robot_class
-    return RobotClass.from_robot(checked.robot) if stated is None else CLASSES[stated]
 
 
 def _size(ratio: PriorRatio) -> str:
@@ -150,9 +145,11 @@ def check_joint_zero(checked: CheckedCalibration) -> Iterator[Diagnostic]:
     """
     if setup_diagnostics(checked.robot, checked.rows):
         return
+    usual = checked.robot_class
+    far = usual.largest.joint_offset if usual is HOBBY else FAR
     for one in checked.geometric.parameters:
         joint = one.name.removeprefix("theta_")
-        if joint == one.name or not one.free or abs(one.change) - CERTAIN * one.standard_error < FAR:
+        if joint == one.name or not one.free or abs(one.change) - CERTAIN * one.standard_error < far:
             continue
         yield Diagnostic(
             kind="joint_zero",

@@ -10,7 +10,6 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import Robot
 from pisigma.robot.frame_fits import MeasuredPoses, best_base_and_tool
 from pisigma.robot.kinematics.forward import forward_kinematics
-from pisigma.robot.robot_class import HOBBY
 from pisigma.validation.checks.check import FITTED, CheckedCalibration, RowsUnderModel
 from pisigma.validation.held_out.diagnostic import Diagnostic, Severity
 from pisigma.validation.setup_faults.explanations import position_spread
@@ -21,6 +20,7 @@ from pisigma.validation.setup_faults.nominal_robot_faults import (
     are_unrelated,
     find_nominal_robot_faults,
     largest_group,
+    largest_zero,
     usual_error,
 )
 from pisigma.validation.setup_faults.setup_fault import combine_alternatives, fault_of_cause
@@ -45,7 +45,7 @@ def check_setup_fault(checked: CheckedCalibration) -> Iterator[Diagnostic]:
 
     A fault makes the calibration implausible, because parameters may absorb it and are then wrong at other poses. A
     joint zero is a parameter, which a calibration estimates correctly, so it is only a warning up to the size that
-    is possible in any class of robots.
+    is possible in the class of the robot.
     """
     yield from setup_diagnostics(checked.robot, checked.rows)
 
@@ -55,7 +55,7 @@ def setup_diagnostics(robot: Robot, rows: Measurements) -> tuple[Diagnostic, ...
     """Return findings about setup faults that explain the errors of the nominal robot; see `check_setup_fault`."""
     if faults := find_nominal_robot_faults(robot, rows):
         fault = combine_alternatives(faults)
-        severity: Severity = "implausible" if fault.moved > HOBBY.largest.joint_offset else "warning"
+        severity: Severity = "implausible" if fault.moved > largest_zero(robot) else "warning"
         return (fault.diagnostic(severity),)
     if are_unrelated(robot, rows):
         return (

@@ -11,16 +11,13 @@ from pisigma.calibration.geometric.identifiability.plausibility import IMPLAUSIB
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.sensors.registry import SENSORS
 from pisigma.robot.frame_fits import best_base_and_tool
-from pisigma.robot.robot_class import HOBBY, RobotClass
+from pisigma.robot.robot_class import HOBBY
 from pisigma.validation.checks.check import FITTED, CheckedCalibration, RowsUnderModel
 from pisigma.validation.checks.rounding import joint_rounding
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.setup_faults.explanations import PLAUSIBLE_SHARE
 from pisigma.validation.setup_faults.setup_faults import unexplained
 
-FAR, FAR_HOBBY = 2.5e-3, 7.5e-3
-"""Errors, as a share of the reach, above which a calibrated robot is implausible: for industrial arms and cobots,
-and for other robots."""
 LARGE = 1e-3
 """Errors, as a share of the reach, above which calibration must have reduced them; measured arms (UR5, UR10, FANUC,
 Panda, FR3) have 2e-4 to 6e-4."""
@@ -44,15 +41,16 @@ def check_unexplained(checked: CheckedCalibration) -> Iterator[Diagnostic]:
     if left is None or nominal is None or _explained(checked, left):
         return
     reach = checked.robot.reach * 1e3
-    stated = checked.calibrator.robot_class or RobotClass.from_robot(checked.robot).name
-    far = left > (FAR_HOBBY if stated == HOBBY.name else FAR) * reach
+    usual = checked.robot_class
+    far = left > usual.remaining * reach
     if far or (left > LARGE * reach and nominal < HARDLY * left):
         what = "rows of the calibration" if checked.validation is None else "held-out rows"
+        healthy = LARGE if usual is not HOBBY else usual.remaining
         yield Diagnostic(
             kind="unexplained",
             severity="implausible",
             sentence=f"The errors of the {what} are {left:.3g} mm RMS ({nominal:.3g} mm for the nominal robot), but "
-            f"robots of this size have less than {LARGE * reach:.2g} mm after a calibration"
+            f"robots of this size have less than {healthy * reach:.2g} mm after a calibration"
             f"{'' if far else ', and calibration hardly helped'}. Mixed populations, a moved frame or tool, joint "
             "values that were logged too early or rounded, and a scale do not explain them; check the sensor, and "
             "what else differs between the rows.",

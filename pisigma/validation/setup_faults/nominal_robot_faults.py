@@ -18,7 +18,7 @@ from pisigma.robot.description import Robot
 from pisigma.robot.frame_fits import LEVER_SHARE, MeasuredPoses, affine_error, best_base_and_tool
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.kinematics.parameter_jacobian import identification_jacobian
-from pisigma.robot.robot_class import HOBBY
+from pisigma.robot.robot_class import HOBBY, RobotClass
 from pisigma.validation.setup_faults.cause import Cause, join_words
 from pisigma.validation.setup_faults.explanations import (
     AS_GOOD,
@@ -43,8 +43,10 @@ MAX_ROWS_NOMINAL = 150
 each time."""
 MIN_ROWS_NOMINAL = 24
 """Minimum number of rows; with fewer, an affine fit (39 unknowns) leaves too few degrees of freedom."""
-MAX_ZERO = 3 * HOBBY.largest.joint_offset
-"""Largest plausible error of the zero of a revolute joint [rad]."""
+LARGEST_ZERO = 0.1
+"""Largest standard deviation of the zeros of revolute joints of industrial arms and cobots after a repair [rad]."""
+MAX_ZEROS = 3.0
+"""Largest plausible error of a single zero over `largest_zero`."""
 MAX_SLIDE = 3 * HOBBY.largest.length
 """Largest plausible error of the zero of a prismatic joint [m]."""
 USUAL = 1e-3
@@ -61,6 +63,11 @@ TARGET_TOLERANCE = 1e-2
 """Relative decrease of the mean square per iteration at convergence."""
 MAX_CLUSTERINGS = 8
 """Largest number of iterations of assigning rows to the nearest target and fitting base and targets again."""
+
+
+def largest_zero(robot: Robot) -> float:
+    """Return the largest standard deviation [rad] of the zeros of revolute joints of this maker's class of robots."""
+    return max(LARGEST_ZERO, RobotClass.from_robot(robot).largest.joint_offset)
 
 
 def find_nominal_robot_faults(robot: Robot, measurements: Measurements) -> tuple[SetupFault, ...]:
@@ -133,7 +140,7 @@ def _error_with_zeros(robot: Robot, rows: Measurements, measured: MeasuredPoses)
     except IdentificationError:
         return math.inf
     moved = (fitted.dh - robot.dh)[:, :2]
-    if np.abs(moved[:, 0]).max() > MAX_ZERO or np.abs(moved[:, 1]).max() > MAX_SLIDE:
+    if np.abs(moved[:, 0]).max() > MAX_ZEROS * largest_zero(robot) or np.abs(moved[:, 1]).max() > MAX_SLIDE:
         return math.inf
     arm = PredictingArm(robot.with_geometry(dh=fitted.dh))
     here = next(frame_hypotheses(arm, rows, [Hypothesis(rows.q, arm.poses(rows), measured)]))
