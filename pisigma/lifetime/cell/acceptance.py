@@ -20,7 +20,7 @@ NO_PATHS = "AT and RT: the sessions of a cell contain no measured paths."
 
 @dataclass(frozen=True)
 class MeasuredAccuracy:
-    """Errors of the model in use on a session that it was not fitted to.
+    """Errors of the model in use on a session to which it was not fitted.
 
     Attributes:
         session: name of the session.
@@ -40,7 +40,7 @@ class MeasuredAccuracy:
 
     @property
     def coordinate_p95_mm(self) -> float:
-        """Largest 95 % quantile of the absolute errors along one axis [mm]."""
+        """Largest 95 % quantile of the absolute errors along any axis [mm]."""
         return max(axis["p95"] for axis in self.errors.axes.values())
 
     def to_json(self) -> dict[str, Any]:
@@ -65,9 +65,9 @@ class Acceptance:
         limit_mm: limit of the 95 % quantile of the position errors [mm]; None if the cell has none.
         instrument: the instrument, as far as it is stated.
         repeatability_mm: pose repeatability RP that the maker of the robot states [mm]; None if it is not stated.
-        temperatures: mean temperature of every valid session [deg C], by its name; None where it is not known.
+        temperatures: mean temperature of every valid session [deg C], by its name; None if unknown.
         budget: uncertainty budget.
-        measured: errors on the newest session that the model was not fitted to; None if there is none.
+        measured: errors on the newest session to which the model was not fitted; None if there is no such session.
         repeats: ISO 9283 figures of the poses that were measured more than once, of all valid sessions.
         accepted: acceptances of models of this cell, the newest last.
         missing: what is not stated, one sentence each, apart from components of the budget.
@@ -109,7 +109,7 @@ class Acceptance:
 
     @property
     def not_stated(self) -> tuple[str, ...]:
-        """Everything that is not stated, one sentence each."""
+        """Sentences about everything that is not stated."""
         return (*self.budget.missing, *self.missing)
 
     def to_json(self) -> dict[str, Any]:
@@ -136,7 +136,7 @@ class Acceptance:
 def missing_statements(
     instrument: Instrument, repeatability_mm: float | None, measured: str, repeats: tuple[RepeatedPose, ...]
 ) -> tuple[str, ...]:
-    """List what an acceptance lacks.
+    """Return sentences about the statements that an acceptance lacks.
 
     Args:
         instrument: the instrument.

@@ -20,7 +20,7 @@ from pisigma.measurement.dates import EXPECTED_DATE, is_date
 
 Situation = Literal["kinematics", "same_zeros", "other_zeros"]
 """The controller computes with exported kinematics; exported joint zeros are active, with which the rows of the model
-were measured; the active joint zeros differ from those with which the rows of the model were measured."""
+were measured; the active joint zeros differ from the joint zeros with which the rows of the model were measured."""
 Effect = Literal["allow", "warn", "refuse"]
 
 RULES: dict[str, tuple[Effect, Effect, Effect]] = {
@@ -42,7 +42,7 @@ RULES: dict[str, tuple[Effect, Effect, Effect]] = {
     "use": ("allow", "allow", "warn"),
     "calibrate": ("allow", "warn", "allow"),
 }
-"""Effect of every situation on a command. `calibrate` uses only sessions measured with the present joint zeros."""
+"""Effect of every situation on every command. `calibrate` uses only sessions measured with the current joint zeros."""
 
 _TWICE = "a correction would be applied twice"
 _MEANING = {
@@ -75,7 +75,7 @@ class ActiveExport:
 
     Attributes:
         export: the export.
-        since: day from which it is active (ISO 8601).
+        since: day from which the export is active (ISO 8601).
     """
 
     export: ExportEntry
@@ -175,7 +175,7 @@ class Controller:
             command: a key of `RULES`.
             model: the model that the command uses; None if it uses none.
             sessions: all sessions of the cell.
-            at: exports that were active when the rows were measured; None: those that are active now.
+            at: exports that were active when the rows were measured; None for the exports that are active now.
         """
         present = self.active() if at is None else at
         behind = present if model is None else self.active_when_fitted(model, sessions)
@@ -185,7 +185,7 @@ class Controller:
         zeros = present.get("joint_zeros")
         if _hash(behind) != _hash(present):
             then = behind.get("joint_zeros")
-            assert model is not None  # else they are the same
+            assert model is not None  # otherwise the joint zeros are the same
             which["other_zeros"] = (
                 f"the rows of model '{model.name}' were measured "
                 f"{'without exported joint zeros' if then is None else f'with the joint zeros of {then}'}, but now "
@@ -233,7 +233,7 @@ class Findings:
 def valid_sessions(
     sessions: tuple[SessionEntry, ...], events: tuple[Event, ...], controller: Controller
 ) -> tuple[SessionEntry, ...]:
-    """Return the sessions that describe the present arm.
+    """Return the sessions that describe the current state of the arm.
 
     They are not set aside, and were measured since the last event that changed the arm, with the joint zeros that are
     active on the controller now.
@@ -244,7 +244,7 @@ def valid_sessions(
 
 
 def _hash(active: dict[Contents, ActiveExport]) -> str:
-    """Return a hash that identifies joint zeros; empty if none are active."""
+    """Return a hash that identifies the active joint zeros; empty if none are active."""
     return active["joint_zeros"].export.sha256 if "joint_zeros" in active else ""
 
 
@@ -269,7 +269,7 @@ def checked_model_folder(path: Path, command: str) -> tuple[Path, tuple[str, ...
 
 
 def model_in_use_warnings(path: Path, command: str) -> tuple[str, ...]:
-    """Return warnings for a command on the model in use of a cell, if there is one; () for a path that is not a cell.
+    """Return warnings for a command on the model in use of a cell; () without a model in use or a cell.
 
     Raises:
         ModelError: the command is refused because of what is active on the controller.
@@ -281,12 +281,12 @@ def model_in_use_warnings(path: Path, command: str) -> tuple[str, ...]:
 
 
 def record_controller(history: History, sha256: str, day: str, note: str) -> ControllerEntry:
-    """Record which export is active on the controller, in addition to an active one with other contents.
+    """Record the export that is active on the controller, in addition to an active export with other contents.
 
     Args:
         history: history of the cell.
         sha256: SHA-256 of the exported file; empty: no export is active after it.
-        day: day from which it is active (ISO 8601). "": today.
+        day: day from which the export is active (ISO 8601); "" for today.
         note: free text.
 
     Raises:

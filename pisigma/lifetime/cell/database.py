@@ -19,7 +19,7 @@ from typing import Any, TypeVar
 from pisigma.files.errors import OutputError, Place
 
 LOCK_TIMEOUT = 10.0
-"""[s] Longest wait for another process that is writing."""
+"""Longest waiting time for another process that writes [s]."""
 
 Row = TypeVar("Row")
 _SQL_TYPES: dict[Any, str] = {
@@ -30,7 +30,7 @@ _SQL_TYPES: dict[Any, str] = {
     float | None: "REAL",
     bytes: "BLOB NOT NULL",
 }
-"""Types of columns, by those of attributes; the type of any other attribute consists of texts."""
+"""SQL types of columns by types of attributes; any other attribute consists of texts."""
 
 
 NETWORK_TYPES = frozenset(
@@ -156,7 +156,7 @@ class Table:
 
     Attributes:
         name: name of the table.
-        key: columns that identify a row; a new row replaces one with the same values. Empty: every row is kept.
+        key: columns that identify a row; a new row replaces a row with the same values. If empty, every row is kept.
     """
 
     name: str
@@ -217,7 +217,7 @@ class Database:
         )
 
     def upgrade(self) -> int:
-        """Upgrade the file to the present version of the schema; return its version before.
+        """Upgrade the file to the current version of the schema; return its previous version.
 
         Raises:
             OutputError: the file cannot be upgraded; see `open`.
@@ -268,7 +268,7 @@ class Database:
 
     @contextmanager
     def snapshot(self) -> Iterator[None]:
-        """Let all reads in the block see the same state of the file, with one connection.
+        """Make all reads in the block see the same state of the file, with one connection.
 
         Raises:
             OutputError: see `open`.
@@ -307,7 +307,7 @@ class Database:
             ) from None
 
     def _upgrade(self, database: sqlite3.Connection) -> None:
-        """Add the tables and columns that are missing, and what an earlier version stored elsewhere."""
+        """Add missing tables and columns, and data that an earlier version stored elsewhere."""
         with _transaction(database):
             if _version(database) >= self.version:  # another process was faster
                 return
@@ -328,7 +328,7 @@ class Database:
 
 @contextmanager
 def _transaction(database: sqlite3.Connection) -> Iterator[None]:
-    """Make all changes together, or none of them."""
+    """Make all changes in the block together, or none of them."""
     database.execute("BEGIN IMMEDIATE")  # waits for another process that writes
     try:
         yield

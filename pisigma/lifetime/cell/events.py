@@ -14,7 +14,7 @@ the arm was changed (see `ARM_EVENTS`). "firmware" and "accepted", by a person, 
 ARM_EVENTS: frozenset[EventKind] = frozenset(("mastering", "encoder", "collision", "maintenance"))
 """Events after which earlier sessions no longer describe the arm."""
 CHANGING_EVENTS: frozenset[EventKind] = ARM_EVENTS | {"instrument", "tool"}
-"""Events after which rows must not be fitted together with earlier ones as if nothing had changed."""
+"""Events after which rows must not be fitted together with earlier rows as if nothing had changed."""
 
 
 @dataclass(frozen=True)
@@ -22,11 +22,11 @@ class Event:
     """A change of the robot, its tool or its instrument, or the acceptance of a model by a person.
 
     Attributes:
-        day: day on which it happened (ISO 8601); sessions of that day were measured after it.
+        day: day of the event (ISO 8601); sessions of that day were measured after the event.
         kind: what happened: "instrument", "tool", "mastering", "encoder", "collision", "maintenance", "firmware" or
             "accepted".
         note: free text.
-        recorded: time at which it was recorded (ISO 8601, UTC).
+        recorded: time of recording (ISO 8601, UTC).
         person: who accepted the model or reported the change; empty if that is not stated.
         model: name of the accepted model; empty for all other kinds.
     """
@@ -46,7 +46,7 @@ class Event:
         return f"{self.day}: {what}{by}{note}."
 
     def to_json(self) -> dict[str, str]:
-        """Return the event as plain values, without the time at which it was recorded."""
+        """Return the event as plain values, without the time of recording."""
         names = ("day", "kind", "note", "person", "model")
         return {name: getattr(self, name) for name in names}
 
@@ -56,7 +56,7 @@ def check_event(kind: str, day: str, person: str) -> None:
 
     Args:
         kind: kind of the event.
-        day: day on which it happened (ISO 8601).
+        day: day of the event (ISO 8601).
         person: who accepted the model or reports the change.
 
     Raises:

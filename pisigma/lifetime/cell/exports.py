@@ -1,4 +1,4 @@
-"""Entries of a history on exported files, and on which of them is active on the controller."""
+"""Entries of a history about exported files, and about the file that is active on the controller."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -19,9 +19,9 @@ class ExportEntry:
         file: name of the file.
         sha256: SHA-256 of the file.
         format: its `--format`.
-        contains: what it contains, see `Contents`.
+        contains: contents of the exported file, see `Contents`.
         model: name of the model.
-        exported: time at which it was written (ISO 8601, UTC).
+        exported: time of the export (ISO 8601, UTC).
     """
 
     file: str
@@ -37,10 +37,10 @@ class ControllerEntry:
     """A change of the exports that are active on the controller.
 
     Attributes:
-        day: day from which it is active (ISO 8601).
+        day: day from which the export is active (ISO 8601).
         sha256: SHA-256 of the exported file; empty if no export is active after it.
         note: free text.
-        recorded: time at which it was recorded (ISO 8601, UTC).
+        recorded: time of recording (ISO 8601, UTC).
     """
 
     day: str

@@ -23,9 +23,10 @@ from pisigma.lifetime.cell.layout import CELL_FILE, MODELS, PLANS, SESSIONS, new
 from pisigma.measurement.dates import date_in_name
 
 BEFORE_FIT = ("plan", "import")
-"""Commands whose checks conclude nothing from measured rows."""
+"""Commands whose checks do not draw conclusions from measured rows."""
 MIN_MEASURED_SHARE = 0.9
-"""Smallest share of the poses of a plan after which it is treated as measured; some poses may be out of sight."""
+"""Smallest measured share of the poses of a plan with which it is treated as complete; some poses may be out of
+sight."""
 NOT_TRUSTED = ("implausible", "setup_fault", "not_trusted")
 """Verdicts of `verify`, `monitor` and `recalibrate` after which nothing is concluded from a session."""
 
@@ -48,10 +49,11 @@ class CellFacts:
         not_taken_in: names of the files in `sessions/` that are not in the history yet, by their dates.
         not_read: names of the files in `sessions/` that are not measurement files and were not imported.
         no_plan_reason: why no poses can be planned; "" if they can.
-        settings_sha256: SHA-256 of the present settings of a calibration; see `Check`.
-        changed_models: those of the model in use and the newest one that were changed or removed after they were made.
-        incomplete: how many poses of the newest plan have been measured, if they are too few; else "".
-        controller: what was active on the controller when.
+        settings_sha256: SHA-256 of the current settings of a calibration; see `Check`.
+        changed_models: names of those models, of the model in use and the newest model, that were changed or removed
+            after they were made.
+        incomplete: number of measured poses of the newest plan as a text, if they are too few; otherwise "".
+        controller: what was active on the controller, with the times.
     """
 
     folder: str
@@ -74,7 +76,7 @@ class CellFacts:
 
     @cached_property
     def valid_sessions(self) -> tuple[SessionEntry, ...]:
-        """Sessions that describe the present arm; see `valid_sessions`."""
+        """Sessions that describe the current state of the arm; see `valid_sessions`."""
         return valid_sessions(self.sessions, self.events, self.controller)
 
     @property
@@ -90,9 +92,9 @@ class CellFacts:
         return [one for one in self.models if one.name not in self.changed_models]
 
     def later_event(self, model: ModelEntry) -> str:
-        """Return what was recorded only after a model had been fitted to rows before and after it; "" if nothing.
+        """Return the event that was recorded after a model had been fitted to rows before and after it; "" if none.
 
-        A recalibration finds what has moved since its parent, so the calibration that it goes back to counts.
+        A recalibration finds what has moved since its parent, so only the original calibration is considered.
         """
         models = {one.name: one for one in self.models}
         while (parent := models.pop(model.parent, None)) is not None:
@@ -107,7 +109,7 @@ class CellFacts:
 
     @property
     def unmeasured_plan(self) -> str:
-        """Contents of the newest plan, if no session was added after it was made; else ""."""
+        """Contents of the newest plan, if no session was added after it was made; otherwise ""."""
         planned = [one for one in self.checks if one.command == "plan"]
         newest = max((one.taken_in for one in self.sessions), default="")
         return planned[-1].summary if planned and planned[-1].checked > newest else ""
@@ -121,17 +123,17 @@ class CellFacts:
         return shlex.join(["pisigma", "import", rows, "--cell", self.folder])
 
     def checks_of(self, model: str, *commands: str) -> list[Check]:
-        """Return the checks of a model by some commands, newest last, without those of sessions that were set aside."""
+        """Return the checks of a model by given commands, newest last, except of excluded sessions."""
         aside = {one.name for one in self.sessions if one.set_aside}
         checks = [one for one in self.checks if one.model == model and one.command in commands]
         return [one for one in checks if one.session not in aside]
 
     def trusted_checks_of(self, model: str, *commands: str) -> list[Check]:
-        """Return those of `checks_of` whose rows are trusted, so that their errors are those of the model."""
+        """Return the checks of a model whose rows are trusted, so that the errors are errors of the model."""
         return [one for one in self.checks_of(model, *commands) if one.verdict not in NOT_TRUSTED]
 
     def new_sessions(self, model: ModelEntry) -> list[SessionEntry]:
-        """Return the valid sessions that a model was not fitted to, measured on its newest day or later."""
+        """Return the valid sessions to which a model was not fitted, measured on its newest day or later."""
         return [one for one in self.valid_sessions if one.name not in model.made_of and one.day >= model.day]
 
 
@@ -221,7 +223,7 @@ def _facts(folder: Path, history: History) -> CellFacts:
 
 
 def _incomplete(folder: Path, sessions: Sequence[SessionEntry], checks: Sequence[Check]) -> str:
-    """Return how many poses of the newest plan were measured, if too few and nothing was concluded yet; else ""."""
+    """Return a text with the number of measured poses of the newest plan if they are too few; otherwise ""."""
     planned = [one.checked for one in checks if one.command == "plan"]
     if not planned or not any((folder / PLANS).glob("*.csv")):
         return ""

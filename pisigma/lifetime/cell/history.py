@@ -1,7 +1,8 @@
-"""History in one SQLite file: sessions, events, models, checks, which model was in use when, and more.
+"""History in an SQLite file: sessions, events, models, checks, models in use with their times, and more.
 
-A cell has one history; a model outside of a cell has one next to its folder, with monitored sessions only. DuckDB and
-pandas can read the tables directly: `TABLES` maps the classes below to tables, and columns are named after attributes.
+A cell has one history; a model outside of a cell has a history next to its folder, with monitored sessions only.
+DuckDB and pandas can read the tables directly: `TABLES` maps the classes below to tables, and columns are named
+after attributes.
 """
 
 import datetime
@@ -34,12 +35,12 @@ class SessionEntry:
     Attributes:
         name: name of the session and, with ".csv", of its file in `sessions/`.
         sha256: SHA-256 of the file.
-        taken_in: time at which it was added to the cell (ISO 8601, UTC).
+        taken_in: time at which the session was added to the cell (ISO 8601, UTC).
         day: first day on which rows were measured (ISO 8601).
         rows: number of rows.
         sensor: kinds of readings, separated by commas.
         temperature_c: mean temperature [deg C]; None if the rows do not state it.
-        judged_by: what the rows were checked against: "robot" (the nominal robot), or the name of a model.
+        judged_by: reference of the checks of the rows: "robot" (the nominal robot), or the name of a model.
         remark: warnings of the check.
         set_aside: why the session is not used; empty if it is used.
         poses: number of different joint values of the rows; 0 if it is unknown.
@@ -66,7 +67,7 @@ class ModelEntry:
         name: name of its folder in `models/`.
         sha256: SHA-256 of its `model.yaml`.
         made: time at which its rows and events were read (ISO 8601, UTC).
-        sessions: names of the sessions that it was fitted to, separated by commas.
+        sessions: names of the sessions to which the model was fitted, separated by commas.
         day: day of the newest of them (ISO 8601).
         frame_day: day of the instrument event with which the newest frame of the model begins; empty if the model has
             only the first frame.
@@ -77,7 +78,8 @@ class ModelEntry:
         remark: why it is or is not in use.
         scatter_mm: standard deviation of a measured coordinate about the model [mm], from the sensor and the
             repeatability of the robot, as the calibration identified it; None if it is unknown.
-        has_posterior: whether it keeps the posterior of its parameters, which `monitor` and `recalibrate` need.
+        has_posterior: whether the model stores the posterior of its parameters, which `monitor` and `recalibrate`
+            require.
     """
 
     name: str
@@ -95,7 +97,7 @@ class ModelEntry:
 
     @property
     def made_of(self) -> tuple[str, ...]:
-        """Names of the sessions that it was fitted to; empty if it was made outside of the cell."""
+        """Names of the sessions to which the model was fitted; empty if it was made outside of the cell."""
         return tuple(filter(None, self.sessions.split(",")))
 
 
@@ -107,7 +109,7 @@ class Check:
         command: "plan", "import", "calibrate", "verify", "monitor" or "recalibrate".
         model: name of the model; empty if none was written.
         session: name of the session; empty if all valid sessions were used.
-        verdict: verdict in one word; the result class of the command lists them.
+        verdict: verdict in one word; the result class of the command lists the possible verdicts.
         summary: verdict in one sentence.
         p95_mm: 95 % quantile of the position errors [mm]; None if it is unknown.
         recalibrate: whether recalibrating with the session is due.
@@ -135,10 +137,10 @@ class Use:
     """A change of the model in use.
 
     Attributes:
-        model: name of the model; empty if none was in use.
-        since: time from which it was in use (ISO 8601, UTC).
+        model: name of the model; empty if no model was in use.
+        since: time from which the model was in use (ISO 8601, UTC).
         reason: why it was put into use.
-        undo: whether this change undid the last one that had not been undone.
+        undo: whether this change undid the last change that had not been undone.
     """
 
     model: str
@@ -220,7 +222,7 @@ class History:
         self.database = Database(path, TABLES, SCHEMA_VERSION, self._take_over)
 
     def sessions(self) -> tuple[SessionEntry, ...]:
-        """Return all sessions in the order of their days, including those that were set aside."""
+        """Return all sessions in the order of their days, including sessions that were set aside."""
         return tuple(
             sorted(self.database.read(SessionEntry), key=lambda one: (one.day, one.taken_in, one.name))
         )
@@ -250,12 +252,12 @@ class History:
         return self.database.read(ExportEntry)
 
     def controller(self) -> tuple[ControllerEntry, ...]:
-        """Return the changes of what is active on the controller, in the order of their days."""
+        """Return the changes of the active exports on the controller, in the order of their days."""
         return tuple(sorted(self.database.read(ControllerEntry), key=lambda one: (one.day, one.recorded)))
 
     @property
     def model_after_undo(self) -> str | None:
-        """The model that an undo puts into use, "" for none; None if there is nothing to undo."""
+        """Name of the model that an undo puts into use, "" for no model; None if there is nothing to undo."""
         states = [""]
         for one in self.uses():
             if one.undo:
@@ -281,7 +283,7 @@ class History:
         return models[name]
 
     def add(self, *entries: Entry) -> None:
-        """Add entries in one transaction; an entry with the same key (see `TABLES`) is replaced.
+        """Add entries in one transaction; entries with the same key (see `TABLES`) are replaced.
 
         Raises:
             OutputError: the history cannot be written.
@@ -317,11 +319,11 @@ class History:
                 )
 
     def record(self, kind: str, day: str = "", note: str = "", person: str = "") -> Event:
-        """Record that something was changed, or that the model in use was accepted; see `EventKind`.
+        """Record a change, or that the model in use was accepted; see `EventKind`.
 
         Args:
             kind: kind of the event.
-            day: day on which it happened (ISO 8601). "": today.
+            day: day of the event (ISO 8601); "" for today.
             note: free text.
             person: who accepted the model or reports the change.
 

@@ -35,9 +35,9 @@ def newest_plan(path: str | os.PathLike[str]) -> Path:
 
 
 def _made(plan: Path) -> tuple[str, list[tuple[int, str]]]:
-    """Return a sort key of plans: the day in the name, else that of the last change, and the numbers in the name.
+    """Return a sort key of plans: the day in the name, otherwise of the last change, and the numbers in the name.
 
-    Plans of one day are numbered; the times of files do not survive every copy of a cell.
+    Plans of one day are numbered; the times of files may be lost when a cell is copied.
     """
     changed = datetime.date.fromtimestamp(plan.stat().st_mtime).isoformat()
     parts = re.findall(r"(\d+)|(\D+)", plan.stem)
@@ -106,7 +106,7 @@ def cell_of_model(folder: str | os.PathLike[str]) -> Path | None:
 
 
 def history_of_model(folder: str | os.PathLike[str]) -> History:
-    """Return the history with the monitored sessions of a model: that of its cell, else a file next to its folder.
+    """Return the history with a model's monitored sessions: in its cell, otherwise in a file next to its folder.
 
     The file of a model outside of a cell is `MODEL.history.sqlite`.
 

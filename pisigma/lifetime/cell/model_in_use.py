@@ -1,4 +1,4 @@
-"""Follow which model of a cell is in use, in a background thread that looks for changes of the history."""
+"""Follow the model in use of a cell, in a background thread that looks for changes of the history."""
 
 import os
 import threading
@@ -14,9 +14,9 @@ from pisigma.lifetime.cell.history import HISTORY, History
 from pisigma.lifetime.cell.layout import model_folder
 
 INTERVAL = 0.1
-"""[s] Time between two looks at the history: one `os.stat` each."""
+"""Time between two checks of the history [s], one `os.stat` each."""
 SETTLED = 0.05
-"""[s] Age from which the time of a file's last change is unambiguous, as file systems round it."""
+"""Age above which the time of a file's last change is unambiguous [s]; file systems round it."""
 
 
 class ModelInUse:
@@ -65,7 +65,7 @@ class ModelInUse:
             is_settled = state is None or time.time_ns() - state[1] > SETTLED * 1e9
             try:
                 self.findings = self._find()
-                self._seen = state if is_settled else None  # without findings, the next look tries again
+                self._seen = state if is_settled else None  # without findings, the next check tries again
                 folder = model_folder(self.cell)
                 if always or folder != self.folder:
                     self._load(folder)
@@ -107,7 +107,7 @@ class ModelInUse:
 
 
 def _start_following(followed: "weakref.ref[ModelInUse]", report: Callable[[str], None]) -> None:
-    """Start the thread, also in a process that was forked: it has none, and perhaps a lock that nobody releases."""
+    """Start the thread, also in a forked process, which has no thread and perhaps a lock that is never released."""
     if (model := followed()) is not None and model._is_followed:
         model._lock = threading.Lock()
         threading.Thread(target=_follow, args=(followed, report), daemon=True).start()
@@ -124,7 +124,7 @@ def _follow(followed: "weakref.ref[ModelInUse]", report: Callable[[str], None]) 
         model.check()
         for sentence in model.warnings:
             if sentence not in reported:
-                with suppress(OSError, ValueError):  # nobody reads the reports any more
+                with suppress(OSError, ValueError):  # the reports are no longer read
                     report(sentence)
         reported = model.warnings
         del model

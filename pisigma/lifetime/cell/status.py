@@ -14,7 +14,7 @@ from pisigma.lifetime.cell.layout import SESSIONS
 from pisigma.lifetime.cell.step import COMPUTED, State, Step
 
 MAX_DAYS_UNVERIFIED = 92
-"""[days] Time without a session after which the model in use has to be verified again: a quarter of a year."""
+"""Time without a session after which the model in use has to be verified again [days]: a quarter of a year."""
 VERIFICATION_POSES = 10
 """Number of poses of a session for verification or monitoring."""
 MEASURE_AND = f"measure {VERIFICATION_POSES} poses, import them, and"
@@ -120,14 +120,14 @@ def due_step(facts: CellFacts) -> Step:
     """Return the step of the first rule that applies, as if every plan had been measured."""
     steps = (rule(facts) for rule in RULES)
     if (step := next(filter(None, steps), None)) is None:
-        assert facts.in_use is not None  # else a rule of `RULES` applies
+        assert facts.in_use is not None  # otherwise a rule of `RULES` applies
         steps = (rule(facts, facts.in_use) for rule in RULES_IN_USE)
         step = next(filter(None, steps), None) or _up_to_date(facts, facts.in_use)
     return step
 
 
 def plans_check(facts: CellFacts) -> bool:
-    """Return whether a few poses are due that check the present model, instead of those of a calibration."""
+    """Return whether a few poses are due to check the current model, instead of the poses of a calibration."""
     return bool(facts.models) and due_step(facts).state != "outside_limit"
 
 
@@ -221,7 +221,7 @@ def _not_verified(facts: CellFacts) -> Step | None:
     if facts.in_use is not None:
         return None
     model = facts.newest_model
-    assert model is not None  # else an earlier rule applies
+    assert model is not None  # otherwise an earlier rule applies
     if changed := _settings_changed(facts):
         return changed
     if wrong := _wrongly_fitted(facts, model):
@@ -240,7 +240,7 @@ def _not_verified(facts: CellFacts) -> Step | None:
 
 
 def _not_judged(facts: CellFacts, model: ModelEntry, *commands: str) -> list[str]:
-    """Return the names of sessions that are new to a model, and that none of the commands has compared with it."""
+    """Return the names of sessions that are new to a model, and that no command has compared with it."""
     judged = {one.session for one in facts.checks_of(model.name, *commands)}
     return [one.name for one in facts.new_sessions(model) if one.name not in judged]
 
@@ -317,7 +317,7 @@ def _replaced(facts: CellFacts, model: ModelEntry) -> Step | None:
 
 
 def _wrongly_fitted(facts: CellFacts, model: ModelEntry) -> tuple[State, str] | None:
-    """Return the state and the reason if a model was fitted to rows that do not belong together; else None."""
+    """Return the state and the reason if a model was fitted to rows that do not belong together; otherwise None."""
     aside = [one.name for one in facts.sessions if one.set_aside and one.name in model.made_of]
     if aside:
         why = f"model '{model.name}' was fitted to session '{aside[-1]}', which was set aside"

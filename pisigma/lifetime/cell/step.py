@@ -57,7 +57,7 @@ class Step:
     Attributes:
         state: state of the cell.
         reason: why the step is due, in one sentence without its full stop.
-        command: command to run; empty if nothing has to be done.
+        command: command to run; empty if no step is due.
     """
 
     state: State
@@ -70,7 +70,7 @@ class Step:
 
     @property
     def verb(self) -> str | None:
-        """The command to run, if neither rows nor a decision of a person are needed for it; else None."""
+        """Name of the command, if it needs neither rows nor the decision of a person; otherwise None."""
         words = self.command.split()[1:2]
         return words[0] if words and words[0] in COMPUTED else None
 

@@ -1,1 +1,1 @@
-"""Comparison of two models of one robot: parameters, tool positions, and programs taught with one of them."""
+"""Comparison of two models of one robot: parameters, tool positions, and programs taught with either model."""

@@ -17,16 +17,16 @@ from pisigma.robot.se3 import invert, pose_error, transform_from_xyzrpy
 from pisigma.validation.held_out.pose_statistics import PoseErrors
 
 FrameChoice = Literal["fitted", "fixed"]
-"""Whether base and tool of the second model are fitted to those of the first, or are the same by name."""
+"""Whether base and tool of the second model are fitted to those of the first model, or equal by name."""
 
 POINTS = 60
-"""Joint configurations at which models are compared with their uncertainties, half from each model."""
+"""Number of joint configurations at which models are compared with their uncertainties, half from each model."""
 SAMPLES = 3_000
 """Samples of the workspace."""
 FITTED_SAMPLES = 300
 """Samples to which base and tool are fitted."""
 MAX_NOMINAL_DIFFERENCE = 0.02
-"""[rad, or share of the reach] Difference of nominal parameters up to which models belong to one robot."""
+"""Difference of nominal parameters [rad, or share of the reach] up to which models belong to one robot."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +91,7 @@ class ModelPair:
 
     @property
     def workspace(self) -> Float64[Tensor, "samples dof"]:
-        """Joint values that the models store, and random ones within their common ranges [rad or m]."""
+        """Joint values that the models store, and random joint values within their common ranges [rad or m]."""
         kept = torch.unique(torch.cat([self.first.starts, self.second.starts]), dim=0)
         ranges = [(model.starts.amin(0), model.starts.amax(0)) for model in (self.first, self.second)]
         low, high = torch.maximum(ranges[0][0], ranges[1][0]), torch.minimum(ranges[0][1], ranges[1][1])
@@ -108,7 +108,7 @@ class ModelPair:
     def poses(
         self, q: Float64[Tensor, "poses dof"]
     ) -> tuple[Float64[Tensor, "poses 4 4"], Float64[Tensor, "poses 4 4"]]:
-        """Predict the tool poses of both models in the frame of the first [m]; NaN where a model predicts none."""
+        """Predict the tool poses of both models in the frame of the first [m]; NaN where a model predicts no pose."""
         first, second = (
             poses_of_rows(model, Measurements(q=q, frame=(frame,) * len(q), target=(target,) * len(q)))
             for model, (frame, target) in zip((self.first, self.second), self.frame_names, strict=True)
@@ -151,7 +151,7 @@ def nominal_robot(model: CalibratedModel) -> Robot:
 def _frame_names(
     first: CalibratedModel, second: CalibratedModel, frames: FrameChoice
 ) -> tuple[tuple[str, str], tuple[str, str]]:
-    """Return frame and target that each model is compared in: the first common one, else the first of each."""
+    """Return frame and target in which each model is compared: the first common names, otherwise each model's first."""
     names_of_models: tuple[list[str], list[str]] = ([], [])
     for what, mine, others in (
         ("frame", first.bases, second.bases),
@@ -186,7 +186,7 @@ def _check_one_robot(first: CalibratedModel, second: CalibratedModel) -> None:
 
 
 def _difference(one: Robot, other: Robot) -> tuple[str, str]:
-    """Return the quantity in which two nominal robots differ, and how; both "" where they are the same robot."""
+    """Return the quantity in which two nominal robots differ, and how; both are "" for the same robot."""
     if one.dof != other.dof:
         return "joints", f"one has {one.dof} joints and the other {other.dof}"
     types = [[row.type for row in robot.rows] for robot in (one, other)]
@@ -198,7 +198,7 @@ def _difference(one: Robot, other: Robot) -> tuple[str, str]:
         return "coupling", "their joint couplings differ"
     scale = np.array([1.0, one.reach, one.reach, 1.0, 1.0])
     by = one.dh - other.dh
-    by[:, [0, 3, 4]] = 2 * np.sin(by[:, [0, 3, 4]] / 2)  # angles modulo one revolution
+    by[:, [0, 3, 4]] = 2 * np.sin(by[:, [0, 3, 4]] / 2)  # angles are compared modulo one revolution
     apart = np.abs(by) / scale
     row, column = np.unravel_index(int(apart.argmax()), apart.shape)
     if apart[row, column] <= MAX_NOMINAL_DIFFERENCE:
@@ -210,7 +210,7 @@ def _difference(one: Robot, other: Robot) -> tuple[str, str]:
 
 
 def _coupled_alike(one: Robot, other: Robot) -> bool:
-    """Return whether both controllers' values correspond to the same joint values."""
+    """Return whether equal controller values of both robots correspond to the same joint values."""
     if len(one.axes) != len(other.axes):
         return False
     values = np.eye(len(one.axes))
@@ -272,7 +272,7 @@ class Displacement:
         """Return plain values: statistics in mm and deg, and where the largest distance is.
 
         Args:
-            robot: robot by which joint values are converted to those of the controller.
+            robot: robot that converts joint values to controller values.
         """
         values = robot.to_controller(self.q[self.largest].numpy()).tolist()
         return {

@@ -32,11 +32,11 @@ class ParameterDifference:
         unit: "mm", "deg", "px" or "1", of all figures.
         first: value in the first model.
         second: value in the second model.
-        deviations: posterior standard deviations; None if a model keeps no posterior.
-        shift: estimated difference given the significant ones, with base and tool free where these are fitted; None
-            without posteriors, and where the parameter moves the tool as those do.
+        deviations: posterior standard deviations; None if a model stores no posterior.
+        shift: estimated difference given the significant differences, with base and tool free if these are fitted;
+            None without posteriors, and if the parameter moves the tool like those parameters.
         deviation: standard deviation of the shift.
-        p: probability of such a shift or a larger one by chance, times the number of tested parameters (Bonferroni).
+        p: probability of at least such a shift by chance, times the number of tested parameters (Bonferroni).
         alike: names of parameters with the same effect on the tool.
     """
 
@@ -62,7 +62,7 @@ class Remainder:
     """Test of the displacement that base, tool and the significant parameters do not explain.
 
     Attributes:
-        p: probability of such a displacement or a larger one by chance.
+        p: probability of at least such a displacement by chance.
         significant: whether p is below the level.
     """
 
@@ -96,8 +96,8 @@ def parameter_differences(pair: ModelPair, level: float = LEVEL) -> ParameterDif
     is normal with the covariance `X1 C1 X1^T + X2 C2 X2^T`, where X are derivatives with respect to all unknowns,
     including the weights of a joint correction. The corrections may therefore be of different kinds, and unobservable
     differences are ignored. Base and tool are free where frames are fitted. The parameter whose shift alone explains
-    most of d is tested, at the level over the number of parameters (Bonferroni); then the next one in addition, until
-    none is significant.
+    most of d is tested, at the level over the number of parameters (Bonferroni); then the next parameter in
+    addition, until no further parameter is significant.
 
     Args:
         pair: the models.
@@ -125,7 +125,7 @@ def _tested(
     chosen: Sequence[int],
     parameters: Sequence[ParameterDifference],
 ) -> ParameterDifference:
-    """Test a parameter given the significant ones, without itself and those with the same effect."""
+    """Test a parameter given the significant parameters, without itself and parameters with the same effect."""
     alike = effects.parameters_with_same_effect(number)
     estimate = effects.shift(number, [one for one in chosen if one not in (number, *alike)])
     if estimate is None:

@@ -20,21 +20,21 @@ from pisigma.robot.kinematics.parameter_jacobian import identification_jacobian
 from pisigma.robot.se3 import rotation_from_vector, rotation_vector, skew, xyzrpy_from_transform
 
 MODEL_ERROR = 2e-5
-"""[m] Standard deviation of predicted coordinates in addition to the posteriors, about a robot's repeatability."""
+"""Standard deviation of predicted coordinates [m] in addition to the posteriors, about a robot's repeatability."""
 MIN_DISTINCT_SHARE = 0.01
-"""Share of a parameter's effect that is distinct from others, below which it is unobservable: nearly parallel axes."""
+"""Share of a parameter's effect that is distinct from other effects, below which the parameter is unobservable."""
 ALIKE = 1 - MIN_DISTINCT_SHARE**2
 """Correlation of effects above which parameters are exchangeable."""
 FRAME_UNITS = ("m", "m", "m", "rad", "rad", "rad")
 FRAME_MOTIONS = ("along x", "along y", "along z", "about x", "about y", "about z")
 
 Frames = tuple[Float64[Tensor, "4 4"], Float64[Tensor, "4 4"]]
-"""A base and a tool."""
+"""Type of a base and a tool."""
 
 
 @dataclass(frozen=True)
 class Difference:
-    """Difference of one parameter between two models.
+    """Difference of a parameter between two models.
 
     Attributes:
         shift: difference with its name, such as "joint 3" or "a_2"; a joint zero counts in the joint's direction.
@@ -64,8 +64,8 @@ class ParameterEffects:
     along the axes of the measuring frame, and those of the tool, along its own axes.
 
     Attributes:
-        tested: indices of the tested parameters: one of several exchangeable ones, and none that moves the tool as base
-            and tool do where these are free.
+        tested: indices of the tested parameters: one of several exchangeable parameters, and no parameter that moves
+            the tool as base and tool do where these are free.
     """
 
     def __init__(self, pair: ModelPair) -> None:
@@ -110,14 +110,14 @@ class ParameterEffects:
         self.tested = (first & self._observable).nonzero()[:, 0].tolist()
 
     def parameters_with_same_effect(self, number: int) -> tuple[int, ...]:
-        """Return the other parameters with the same effect as one."""
+        """Return the other parameters with the same effect as a parameter."""
         return tuple(other for other in self._alike[number].nonzero()[:, 0].tolist() if other != number)
 
     def shift(self, number: int, given: Sequence[int]) -> tuple[float, float] | None:
-        """Estimate the shift of one parameter given others, and its standard deviation [m or rad].
+        """Estimate the shift of a parameter given others, and its standard deviation [m or rad].
 
         Returns:
-            None if the parameter moves the tool as the others do.
+            The shift and its standard deviation; None if the parameter moves the tool like the given ones.
         """
         left, observable = self._left(given)
         if not bool(observable[number]):
@@ -195,7 +195,7 @@ class ParameterEffects:
     def _frames(
         self, shift: Float64[Tensor, "12"], covariance: Float64[Tensor, "12 12"]
     ) -> tuple[Movement, ...]:
-        """Return how far base and tool of both models differ: the fitted motion plus the linear estimate."""
+        """Return the differences of base and tool of both models: the fitted motion plus the linear estimate."""
         pair, (base, _) = self._pair, frames_of(self._pair.first, self._pair.frame_names[0])
         X, Y, origin = pair.T_base, pair.T_tool, base[:3, 3]
         moved = []
@@ -218,7 +218,7 @@ class ParameterEffects:
     def _left(
         self, given: Sequence[int]
     ) -> tuple[Float64[Tensor, "values parameters"], Bool[Tensor, " parameters"]]:
-        """Project out given parameters and free frames; return columns and which of them are observable."""
+        """Return the columns with given parameters and free frames projected out, and the mask of observable ones."""
         left = self._without(self._W, given)
         return left, left.norm(dim=0) > MIN_DISTINCT_SHARE * self._W.norm(dim=0)
 

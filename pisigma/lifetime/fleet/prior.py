@@ -1,4 +1,4 @@
-"""Fleet prior: distribution of the errors of robots of one type by empirical Bayes, and consistency with it."""
+"""Fleet prior: distribution of the errors of robots of a type by empirical Bayes, and consistency with it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -45,7 +45,7 @@ class FleetPrior:
         model: mean robot, with the uncertainty of another robot of the fleet.
         population: mean and covariance of the errors between robots.
         names: names of the geometric parameters.
-        odd: indices of robots that are inconsistent with the others and were not used.
+        odd: indices of robots that are inconsistent with the others and therefore were not used.
     """
 
     model: CalibratedModel
@@ -56,7 +56,7 @@ class FleetPrior:
 
 @dataclass(frozen=True, eq=False)
 class RobotEvidence(Information):
-    """Information of the rows of one robot on the unknowns of its arm, with base and tool marginalised.
+    """Information of a robot's rows on the unknowns of its arm, with base and tool marginalised.
 
     Attributes:
         noise: noise of each sensor, see `Adaptation.noise`.
@@ -72,11 +72,11 @@ def fleet_prior(name: str, robot: Robot, fleet: Sequence[Measurements]) -> Fleet
     Rubin 1977, J. Royal Statistical Society B 39(1), 1-38) finds μ and Σ, so that each robot is treated as far as its
     rows determine its errors. The usual errors of the robot's class have a small weight, see
     `pisigma.estimation.population.CLASS_ROBOTS`. Robots whose rows are too improbable given the others are left out,
-    and the others are estimated again.
+    and the estimate is repeated.
 
     Args:
         name: name of the fleet.
-        robot: nominal robot, the same for all.
+        robot: nominal robot, common to all robots.
         fleet: rows of each robot.
 
     Raises:
@@ -114,7 +114,7 @@ def class_population(robot: Robot) -> Population:
 def select_arm_rows(
     root: Float64[Tensor, "unknowns directions"], space: ParameterSpace
 ) -> Float64[Tensor, "arm directions"]:
-    """Select the rows of the arm's parameters and weights, without those of base, tool and sensors."""
+    """Return the rows of a root for the arm's parameters and weights, without rows of base, tool and sensors."""
     return torch.cat([root[: space.arm_size], root[len(space.parameters) :]])
 
 
@@ -125,13 +125,13 @@ def mean_robot(
     fleet: Sequence[Measurements],
     noise: CalibrationNoise,
 ) -> CalibratedModel:
-    """Make the mean robot of a population, with the covariance between robots as its uncertainty.
+    """Return the mean robot of a population, with the covariance between robots as its uncertainty.
 
     Args:
         name: name of the model.
         posterior: prior of the nominal robot, with the unknowns of the population.
         population: errors of the robots.
-        fleet: rows of robots, by which the measured joint values are known.
+        fleet: rows of robots, from which the measured joint values follow.
         noise: noise of each sensor, see `Adaptation.noise`.
     """
     usual, size = posterior.uncertainty, population.geometric
@@ -178,7 +178,7 @@ def mean_robot(
 def _correction(
     robot: Robot, features: tuple[AbstractFeature, ...], weights: Float64[Tensor, " weights"]
 ) -> JointCorrection:
-    """Make the joint correction with given weights of the used columns of all features."""
+    """Return the joint correction with given weights of the used columns of all features."""
     correction, start = JointCorrection(robot, list(features), ()), 0
     with torch.no_grad():
         for parameter, feature in zip(correction.linear, features, strict=True):
@@ -206,7 +206,7 @@ def evidence_of(
     kept = torch.cat([X[:, : space.arm_size], X[:, len(space.parameters) :]], 1)
     inner = others.t() @ others
     inner.diagonal().add_(RELOCATION_PRIOR["m"] ** -2)
-    # Every robot has its own base, tool and sensor unknowns: they are eliminated (Schur complement).
+    # Base, tool and sensor unknowns differ between robots, so they are eliminated (Schur complement).
     taken = torch.linalg.solve(inner, others.t() @ torch.cat([kept, y[:, None]], 1))
     normal = kept.t() @ kept - kept.t() @ others @ taken[:, :-1]
     descent = kept.t() @ y - kept.t() @ others @ taken[:, -1]
@@ -231,7 +231,7 @@ def _medians(noises: Sequence[CalibrationNoise]) -> CalibrationNoise:
 
 @dataclass(frozen=True)
 class FleetConsistency:
-    """Consistency of a robot with the others of its fleet.
+    """Consistency of a robot with the other robots of its fleet.
 
     Attributes:
         probability: probability that a robot of the fleet is as far from its mean, or farther.

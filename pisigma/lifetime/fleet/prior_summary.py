@@ -13,7 +13,7 @@ from pisigma.validation.held_out.summary import AbstractSummary
 
 
 class CommonFigures(Section):
-    """Distribution of one parameter's error in the fleet.
+    """Distribution of a parameter's error in the fleet.
 
     Attributes:
         name: name such as "theta_1".
@@ -45,7 +45,7 @@ class FleetPriorSummary(AbstractSummary):
 
     Attributes:
         robots: number of robots that were used.
-        odd: ids of robots that are inconsistent with the others and were not used.
+        odd: ids of robots that are inconsistent with the others and therefore were not used.
         refused: reasons by id of robots whose files cannot be read.
         remarks: remarks on the rows of the robots that were used, one sentence each.
         rows: number of rows of all robots.

@@ -43,7 +43,7 @@ class FleetStatus:
         for cell in cells_in(folder):
             try:
                 cells.append(status_of(cell))
-            except PisigmaError as problem:  # one cell does not hide the others
+            except PisigmaError as problem:  # an unreadable cell must not hide the others
                 unreadable[cell.name] = str(problem)
         return FleetStatus(Path(folder), tuple(cells), unreadable)
 
@@ -81,7 +81,7 @@ class FleetStatus:
 
 
 def urgency(one: CellStatus) -> tuple[int, str]:
-    """Return a sort key: first cells that need attention, then those with steps that can be carried out."""
+    """Return a sort key: first cells that need attention, then cells with steps that can be carried out."""
     state = one.step.state
     if state in ATTENTION:
         return ATTENTION.index(state), state

@@ -9,13 +9,13 @@ from jaxtyping import Float64
 from torch import Tensor
 
 MIN_DEGREES_OF_FREEDOM = 2
-"""Values in excess of the fitted coefficients."""
+"""Smallest number of values in excess of the fitted coefficients."""
 MAX_EVENTS = 8
-"""Changes of a value above which it is described by a drift."""
+"""Number of changes of a value above which it is described by a drift."""
 MAX_EXCHANGES = 5
-"""Passes of exchanging events for better ones."""
+"""Largest number of passes that exchange events for better ones."""
 MIN_SQUARE = 1e-9
-"""Squared length of a column below which it is a combination of others."""
+"""Squared length of a column below which it is a combination of other columns."""
 
 
 @dataclass(frozen=True)
@@ -24,14 +24,14 @@ class Event:
 
     Attributes:
         number: index of the first value after the change.
-        alone: whether that value alone is changed, rather than all later ones as well.
+        alone: whether only that value is changed, rather than all later values as well.
     """
 
     number: int
     alone: bool
 
     def column(self, count: int) -> Float64[Tensor, " count"]:
-        """Return the column of the event: 1 for changed values, 0 for the others."""
+        """Return the column of the event: 1 for changed values, 0 for other values."""
         order = torch.arange(count)
         return (order == self.number if self.alone else order >= self.number).double()
 
@@ -68,7 +68,7 @@ class Series:
     def events(self, steady: Tensor, drift: Tensor) -> tuple[tuple[Event, ...], bool]:
         """Find the events, and whether there is a drift in addition.
 
-        Both with and without a drift, events are added one by one, each time the one that explains most, as long as it
+        Both with and without a drift, events are added one by one, always the event that explains most, as long as it
         explains more than the best of as many candidates would by chance. The two fits are compared by the Bayesian
         information criterion (Schwarz 1978, Annals of Statistics 6, 461-464).
 
@@ -94,7 +94,7 @@ class Series:
         return chosen, float(left.square().sum()) + penalty * len(chosen)
 
     def _exchanged(self, columns: Tensor, chosen: tuple[Event, ...]) -> tuple[Event, ...]:
-        """Exchange events for better ones, given the others, until none improves."""
+        """Return the events after exchanging them for better ones until no exchange improves the fit."""
         for _ in range(MAX_EXCHANGES):
             before = chosen
             for number in range(len(chosen)):
@@ -105,7 +105,7 @@ class Series:
         return chosen
 
     def _best(self, columns: Tensor, chosen: tuple[Event, ...]) -> tuple[Event, float]:
-        """Return the event that explains most given others, and by how much it lowers the square sum."""
+        """Return the event that explains most given other events, and the resulting decrease of the square sum."""
         left, Q = self._left(columns, chosen)
         tried = self.whiten(torch.stack([one.column(len(self.values)) for one in self._tried], 1))
         tried = tried - Q @ (Q.t() @ tried)

@@ -13,15 +13,15 @@ from torch import Tensor
 from pisigma.measurement.sensors.sensor import ShownUnit
 
 FALSE_ALARMS_PER_YEAR = 0.05
-"""False alarms of all charts of a robot together, where nothing changes."""
+"""Number of false alarms of all charts of a robot together per year, if nothing changes."""
 SESSIONS_PER_YEAR = 12
-"""Sessions by which a rate per year is converted to one per session."""
+"""Number of sessions per year, by which a rate per year is converted to a rate per session."""
 WEIGHT = 0.2
 """Weight of the newest session in the moving average."""
 ALLOWANCE = 0.5
-"""[standard deviations of a score] Part of a score that does not add to the cumulative sums."""
+"""Part of a score that is not added to the cumulative sums [standard deviations of a score]."""
 STATES = 101
-"""States of the Markov chain by which the limit of the EWMA is computed."""
+"""Number of states of the Markov chain from which the limit of the EWMA is computed."""
 OVERSHOOT = 1.166
 """Mean overshoot of a cumulative sum over its limit for normal scores, on both sides (Siegmund 1985)."""
 
@@ -43,14 +43,14 @@ class Limits:
 
 @dataclass(frozen=True, eq=False)
 class Chart:
-    """Control chart of one quantity, each session compared with its prediction from the earlier ones and the model.
+    """Control chart of a quantity, which compares sessions with predictions from earlier sessions and the model.
 
     Attributes:
         what: charted quantity, such as "joint 2" or "error".
         unit: unit of the values.
-        values: value in each session; NaN where the session does not determine it.
-        deviations: standard deviations of the values where nothing changes.
-        scores: scores of the sessions, independent and of standard deviation 1 where nothing changes.
+        values: value in each session; NaN if the session does not determine it.
+        deviations: standard deviations of the values if nothing changes.
+        scores: scores of the sessions, which are independent with standard deviation 1 if nothing changes.
         limits: limits of EWMA and CUSUM.
         one_sided: whether only an increase counts.
     """
@@ -85,12 +85,12 @@ class Chart:
 
     @property
     def ewma_share(self) -> Float64[Tensor, " sessions"]:
-        """Moving average over its limit; above 1 it is an alarm."""
+        """Ratio of the moving average to its limit; a value above 1 is an alarm."""
         return (self.ewma if self.one_sided else self.ewma.abs()) / self.limits.ewma
 
     @property
     def cusum_share(self) -> Float64[Tensor, " sessions"]:
-        """Larger cumulative sum over its limit; above 1 it is an alarm."""
+        """Ratio of the larger cumulative sum to its limit; a value above 1 is an alarm."""
         return (self.cusum[:, 0] if self.one_sided else self.cusum.amax(1)) / self.limits.cusum
 
     @cached_property
@@ -115,7 +115,7 @@ class Chart:
         )
 
     def to_json(self, dates: Sequence[str]) -> dict[str, Any]:
-        """Return the chart as plain values, NaN as None; `dates` are those of the sessions."""
+        """Return the chart as plain values, with NaN as None; `dates` are the dates of the sessions."""
         values = {
             f"values_{self.unit}": self.values,
             f"deviations_{self.unit}": self.deviations,
@@ -134,10 +134,10 @@ class Chart:
 def innovations(
     values: Float64[Tensor, " sessions"], covariance: Float64[Tensor, "sessions sessions"]
 ) -> Float64[Tensor, " sessions"]:
-    """Compute independent scores of correlated values, such as those with the same error of the model.
+    """Compute independent scores of correlated values, such as values with a common error of the model.
 
-    With the covariance `L L^T` the scores are `L^-1 values`: every value minus its prediction from the earlier ones,
-    over the standard deviation of the difference. NaN stays NaN.
+    With the covariance `L L^T` the scores are `L^-1 values`: every value minus its prediction from earlier values,
+    divided by the standard deviation of the difference. NaN remains NaN.
     """
     scores = torch.full_like(values, torch.nan)
     there = torch.isfinite(values).nonzero()[:, 0]
@@ -172,7 +172,7 @@ def mean_sessions_to_ewma_alarm(limit: float, one_sided: bool) -> float:
     middle = (edges[1:] + edges[:-1]) / 2
     until = torch.special.ndtr((edges - (1 - WEIGHT) * middle[:, None]) / WEIGHT)
     moves = until.diff(dim=1)
-    if one_sided:  # lower values stay in the lowest state
+    if one_sided:  # lower values remain in the lowest state
         moves[:, 0] += until[:, 0]
     mean = torch.linalg.solve(torch.eye(STATES, dtype=torch.float64) - moves, torch.ones_like(middle))
     return float(mean[int(middle.abs().argmin())])

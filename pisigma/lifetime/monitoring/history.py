@@ -1,4 +1,4 @@
-"""Monitored sessions of a model: what its history contains of them, and which rows are new."""
+"""Monitored sessions of a model: their entries in the history, and the rows that are new."""
 
 import io
 from collections.abc import Sequence
@@ -68,8 +68,8 @@ class Record:
 def store_sessions(history: History, model: str, records: Sequence[Record]) -> tuple[Record, ...]:
     """Store sessions in a history and return all sessions of the model.
 
-    All are stored in one transaction, or none if the process ends before. A session with the same rows replaces the
-    stored one.
+    All sessions are stored in one transaction, or none if the process ends before. A session with the same rows
+    replaces the stored session.
 
     Args:
         history: history of the model, or of its cell.
@@ -161,13 +161,13 @@ def new_rows(
     earlier: Sequence[Record],
     judged: Sequence[Record],
 ) -> tuple[Measurements, tuple[str, ...]]:
-    """Leave out rows that the model was calibrated with, and rows of other sessions.
+    """Return the rows without rows with which the model was calibrated, and without rows of other sessions.
 
     Args:
         model: the model.
         rows: rows of a session.
         date: date of the session.
-        earlier: sessions of the history; one with exactly these rows is replaced, see `store_sessions`.
+        earlier: sessions of the history; a session with exactly these rows is replaced, see `store_sessions`.
         judged: sessions of this call.
 
     Returns:

@@ -1,4 +1,4 @@
-"""Comparison of one session of measurements with a model: what moved, if anything, and whether to recalibrate."""
+"""Compare a session of measurements with a model: what moved, if anything, and whether to recalibrate."""
 
 import math
 from collections.abc import Mapping, Set
@@ -32,9 +32,9 @@ from pisigma.validation.held_out.calibration_validation import pose_errors_of
 
 Verdict = Literal["unchanged", "moved", "unclear"]
 ZERO_PRIOR = 0.02
-"""[rad, or share of the reach] Prior standard deviation of joint zeros that are estimated for charts, about 1 deg."""
+"""Prior standard deviation [rad, or share of the reach] of joint zeros that are estimated for charts, about 1 deg."""
 UNOBSERVABLE = 0.005
-"""[rad, or share of the reach] Posterior standard deviation above which a joint zero is unobservable, about 0.3 deg."""
+"""Posterior standard deviation [rad, or share of the reach] above which a joint zero is unobservable, about 0.3 deg."""
 MIN_GAIN_RATIO = 1.05
 """Expected ratio of errors before and after a recalibration above which it is recommended."""
 MAX_NOISE_FACTOR = 2.0
@@ -71,16 +71,17 @@ class Session:
     Attributes:
         rows: number of rows.
         unchanged: probability that nothing moved.
-        moved: movements, those of the arm first.
+        moved: movements; movements of the arm come first.
         candidates: names and probabilities of possible movements where these are ambiguous; otherwise empty.
-        rms: RMS position error under the model, with the present base and tool [m].
+        rms: RMS position error under the model, with the current base and tool [m].
         rms_after: RMS position error expected after a recalibration [m].
-        rotation_ratio: orientation errors over those expected after a recalibration; 1 where none was measured.
-        error_score: RMS of the errors over their standard deviations; about 1 where nothing changed.
+        rotation_ratio: ratio of orientation errors to the errors expected after a recalibration; 1 if none was
+            measured.
+        error_score: RMS of the errors divided by their standard deviations; about 1 if nothing changed.
         values: number of measured values.
         standing: names of bases and tools that were moved since the model was made.
         observable: whether the rows determine the zero of each joint.
-        outliers: places of rows that are not used because they contradict the others under any movement.
+        outliers: places of rows that are not used, because they contradict the other rows under any movement.
         score_ratio: for images, whose poses have more noise than error: RMS of values over their standard deviations,
             divided by that expected after a recalibration; otherwise 1.
     """
@@ -101,7 +102,7 @@ class Session:
 
     @property
     def verdict(self) -> Verdict:
-        """Whether nothing moved ("unchanged"), something did ("moved"), or the movement is ambiguous ("unclear")."""
+        """Verdict: nothing moved ("unchanged"), something moved ("moved"), or the movement is ambiguous ("unclear")."""
         if self.moved:
             return "moved"
         return "unclear" if self.candidates else "unchanged"
@@ -217,7 +218,7 @@ class _Solved:
 
     @property
     def probable_movements(self) -> tuple[Motion, ...]:
-        """Movements, or the most probable one where these are ambiguous."""
+        """Movements, or the most probable movement if they are ambiguous."""
         return self.explanation.motions or self.explanation.candidates[:1]
 
     @property
@@ -231,7 +232,7 @@ class _Solved:
         return any(is_frame(one.group.what) and one.size >= MIN_MOVE for one in self.probable_movements)
 
     def arm_with(self, motions: tuple[DriftGroup, ...]) -> AdaptedArm:
-        """Return the arm with moved bases and tools and some movements fitted; everything else is as in the model."""
+        """Return the arm with moved bases and tools and given movements fitted, and otherwise as in the model."""
         return AdaptedArm.from_unknowns(self.problem, self.unknowns(motions))
 
     def score_ratio(self, before: tuple[DriftGroup, ...], after: tuple[DriftGroup, ...]) -> float:
@@ -336,7 +337,7 @@ def _judged(solved: _Solved, relocated: dict[FrameKey, float]) -> Session:
 
 
 def _moved(solved: _Solved, relocated: dict[FrameKey, float]) -> tuple[Movement, ...]:
-    """Estimate all movements together, those of the arm first."""
+    """Estimate all movements together; movements of the arm come first."""
     problem, explanation = solved.problem, solved.explanation
     found = [(_freed(one), one.probability) for one in explanation.motions]
     for (kind, name), probability in relocated.items():
@@ -373,7 +374,7 @@ def _joints(solved: _Solved) -> list[DriftGroup]:
 
 
 def format_probability(probability: float | None) -> str:
-    """Write a probability as a percentage that is never rounded to 100 %; "unknown" for None."""
+    """Return a probability as a percentage that is never rounded to 100 %; "unknown" for None."""
     if probability is None:
         return "unknown"
     return "more than 99.9 %" if probability > 0.999 else f"{100 * probability:.1f} %"
@@ -385,7 +386,7 @@ def is_frame(what: str) -> bool:
 
 
 def _rms(arm: AdaptedArm, rows: Measurements) -> tuple[float, float]:
-    """Compute the RMS errors of lengths [m] and of angles [rad]; 0 where none was measured."""
+    """Compute the RMS errors of lengths [m] and of angles [rad]; 0 if none was measured."""
     errors = pose_errors_of(arm, rows)
     return _root_mean_square(errors.position), _root_mean_square(errors.rotation)
 

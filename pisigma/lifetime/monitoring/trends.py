@@ -22,7 +22,7 @@ DAYS_PER_MONTH = 365.25 / 12
 MIN_SESSIONS = 4
 """Sessions on different days from which a drift is estimated."""
 MIN_TEMPERATURE_SPREAD = 3.0
-"""[K] Standard deviation of the temperatures above which a dependence on them is estimated."""
+"""Standard deviation of the temperatures [K] above which a dependence on them is estimated."""
 MAX_MONTHS = 120.0
 """Range of forecasts: ten years."""
 
@@ -117,8 +117,8 @@ class Forecast:
     Attributes:
         limit_mm: the limit [mm].
         passed: whether the error of the last session is above the limit.
-        date: date on which the trend passes it; None if it does not within ten years.
-        earliest: start of the 95 % confidence interval of the date; None likewise.
+        date: date on which the trend reaches the limit; None if it does not within ten years.
+        earliest: start of the 95 % confidence interval of the date; None if it is not reached within ten years.
     """
 
     limit_mm: float
@@ -140,7 +140,7 @@ class Forecast:
 
 
 def charts_of(revolute: Sequence[bool], records: Sequence[Record]) -> tuple[Chart, ...]:
-    """Make control charts of all joint zeros and of the error.
+    """Return control charts of all joint zeros and of the error.
 
     Args:
         revolute: whether each joint of the robot is revolute.
@@ -165,7 +165,7 @@ def charts_of(revolute: Sequence[bool], records: Sequence[Record]) -> tuple[Char
 
 
 def trends_of(revolute: Sequence[bool], records: Sequence[Record]) -> tuple[Trend, ...]:
-    """Estimate the drift of joint zeros with time, and with temperature where the sessions state it.
+    """Estimate the drift of joint zeros with time, and with temperature if the sessions state it.
 
     Jumps and single deviating sessions are fitted together with the drift.
 
@@ -218,7 +218,7 @@ def jumps_of(revolute: Sequence[bool], records: Sequence[Record]) -> tuple[Jump,
 
 
 def _overs(records: Sequence[Record]) -> list[tuple[Literal["month", "kelvin"], Tensor]]:
-    """Return the quantities that zeros may drift with: time, and temperature where it varies."""
+    """Return the quantities with which zeros may drift: time, and temperature if it varies."""
     temperature = torch.tensor(
         [math.nan if one.temperature_c is None else one.temperature_c for one in records], dtype=torch.float64
     )
@@ -235,7 +235,7 @@ class _Zero:
     Attributes:
         series: its shifts [rad or m].
         sessions: indices of these sessions.
-        columns: 1, months and, where they vary, temperatures minus their means.
+        columns: columns of the regression: 1, months and, if they vary, temperatures minus their means.
         events: jumps, and single deviating sessions.
         drifts: whether there is a drift with time in addition.
     """
@@ -263,7 +263,7 @@ class _Zero:
         return _Zero(series, there.tolist(), A, events, drifts)
 
     def fit(self, drifts: bool) -> tuple[list[float], list[float]]:
-        """Fit coefficients; return them and their standard deviations, those of the events last."""
+        """Return fitted coefficients and their standard deviations; coefficients of events come last."""
         columns = self.columns if drifts else self.columns[:, torch.arange(self.columns.shape[1]) != 1]
         return self.series.fit(self.series.with_events(columns, self.events))
 
@@ -291,7 +291,7 @@ def forecast_of(records: Sequence[Record], limit_mm: float) -> Forecast:
         deviation *= max(
             1.0, math.sqrt(float(left) / spare)
         )  # sessions scatter more than their few rows explain
-        # Without a significant rise there is no date; the earliest one has the largest slope of the 95 % interval.
+        # Without a significant rise there is no date; the earliest date has the largest slope of the 95 % interval.
         if slope > NORMAL_95 * deviation:
             date = _after(last.date, (limit_mm - now) / slope)
             earliest = _after(last.date, (limit_mm - now) / (slope + NORMAL_95 * deviation))
@@ -316,7 +316,7 @@ def _joint_values(records: Sequence[Record], joint: int) -> tuple[Tensor, Tensor
 
 
 def _error_score(record: Record) -> float:
-    """Compute the logarithm of the errors over the expected ones, divided by its standard deviation."""
+    """Compute the logarithm of the ratio of errors to expected errors, divided by its standard deviation."""
     return math.log(max(record.session.error_score, 1e-9)) / _log_spread(record)
 
 

@@ -26,9 +26,9 @@ MAX_LINEARISATIONS = 5
 CONVERGENCE_TOLERANCE = 0.05
 """RMS change of predicted values, over their noise, below which linearisation ends."""
 MAX_VALUES = 360
-"""Values from which the sizes of the drift are estimated; the posterior uses all values."""
+"""Largest number of values from which the sizes of the drift are estimated; the posterior uses all values."""
 FIRST_NOISE = {"m": 1e-4, "rad": 1e-4}
-"""[m or rad] Initial noise of sensors that the calibration did not have."""
+"""Initial noise of sensors that the calibration did not have [m or rad]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +75,7 @@ class Adaptation:
         shift: change of all unknowns, parameters relative to the anchors.
         effective: number of directions that the new rows determine.
         rounds: number of linearisations.
-        search: evidence at the solution, by which movements are estimated.
+        search: evidence at the solution, from which movements are estimated.
         values: values that count at the solution.
         update: posterior update at the solution.
     """
@@ -124,8 +124,8 @@ def adapt(
 
     Args:
         problem: rows and prior.
-        usual: noise of each sensor [m or rad], or a factor where the rows state it; None for `usual_noise`.
-        start: initial sizes and noise, such as those of other rows of the session; None for zero drift.
+        usual: noise of each sensor [m or rad], or a factor if the rows state it; None for `usual_noise`.
+        start: initial sizes and noise, for example from other rows of the session; None for zero drift.
     """
     design, mean = problem.design, problem.mean
     usual = usual_noise(problem) if usual is None else usual
@@ -139,7 +139,8 @@ def adapt(
         rounds += 1
         rows = linearise_rows(design, x, effective, group)
         values = replace(linear_values(problem, rows), wrong=wrong)
-        # Sizes of the drift and wrong rows first: both decide how far the posterior may follow the values.
+        # Sizes of the drift and wrong rows come first, because both determine how far the posterior may follow the
+        # values.
         search = _searched(problem, values, drift, usual)
         drift, wrong = search.drift, search.values.wrong
         values = replace(values, wrong=wrong)
@@ -163,7 +164,7 @@ def adapt(
 
 
 def usual_noise(problem: RecalibrationProblem) -> Float64[Tensor, " sensors"]:
-    """Return the noise of all sensors of a problem in the calibration [m or rad]; a factor where the new rows state it.
+    """Return the noise of all sensors of a problem in the calibration [m or rad]; a factor if the new rows state it.
 
     Raises:
         MeasurementError: see `CalibrationNoise.noise_of_earlier_rows`.
@@ -197,7 +198,7 @@ def _with_sizes(groups: tuple[DriftGroup, ...], like: tuple[DriftGroup, ...]) ->
 def _searched(
     problem: RecalibrationProblem, values: LinearValues, drift: Drift, usual: Float64[Tensor, " sensors"]
 ) -> DriftSearch:
-    """Estimate sizes of the drift and wrong rows by evidence, from a selection of the values where there are many."""
+    """Estimate sizes of the drift and wrong rows by evidence, from a selection of the values if there are many."""
     if len(values.y) > MAX_VALUES:
         values = values.select(randomly_chosen_rows(len(values.y), MAX_VALUES).sort().values)
     A = values.X @ problem.root

@@ -32,22 +32,22 @@ OF_FLEET: dict[Kept, str] = NAMES | {
     "recalibrated": "The calibration that starts from the fleet prior",
     "old": "The mean robot of the fleet with base and tool of the new rows",
 }
-"""Names of the candidates where the model is a fleet prior."""
+"""Names of the candidates if the model is a fleet prior."""
 FOLDS = 5
 MIN_RATIO = 1.05
 """Ratio of RMS errors below which another candidate does not replace the recalibrated model."""
 CLEAR_RATIO = 2.0
 """Ratio of RMS errors above which a candidate is better, for any distribution of the errors."""
 OUTLIER_FACTOR = 5.0
-"""Factor over the median error above which rows that every candidate misses are ignored."""
+"""Ratio to the median error above which rows that every candidate predicts badly are ignored."""
 
 
 @dataclass(frozen=True)
 class CandidateChoice:
-    """Cross-validated errors of the candidates, and the one that is kept.
+    """Cross-validated errors of the candidates, and the candidate that is kept.
 
     Attributes:
-        kept: "recalibrated", unless another candidate is better by more than 5 % and by more than chance.
+        kept: "recalibrated", unless another candidate is better by more than 5 %, and significantly.
         rms: RMS error of held-out rows under each candidate [m]; None if the rows are too few for it.
         rows: number of held-out rows that were used.
         p95: 95 % quantile of the same errors [m].
@@ -62,7 +62,7 @@ class CandidateChoice:
 
     @property
     def updates(self) -> bool:
-        """Whether the recalibrated model predicts held-out rows better than the old one, by more than 5 %."""
+        """Whether the recalibrated model predicts held-out rows better than the old model by more than 5 %."""
         old, new = self.rms["old"], self.rms["recalibrated"]
         return old is not None and new is not None and self.kept != "old" and old > MIN_RATIO * new
 
@@ -74,7 +74,7 @@ class CandidateChoice:
 
     @property
     def sentence(self) -> str:
-        """Sentence on which candidate is kept, with the errors of all."""
+        """Sentence about the candidate that is kept, with the errors of all candidates."""
         if not self.rows:
             return f"{self.names[self.kept]} is kept: there are too few rows for a cross-validation."
         sizes = {name: size * 1e3 for name, size in self.rms.items() if size is not None}
@@ -99,7 +99,7 @@ def choose_candidate(
     calibrator: Calibrator,
     progress: Progress,
 ) -> CandidateChoice:
-    """Predict every fold of the rows by every candidate without it, and choose the candidate to keep.
+    """Predict every fold of the rows by every candidate that was made without it, and choose the one to keep.
 
     Args:
         model: the model that is recalibrated.
@@ -132,7 +132,7 @@ def choose_candidate(
 
 
 def _decided(errors: Mapping[Kept, Float64[Tensor, " rows"]]) -> CandidateChoice:
-    """Choose the candidate to keep from the errors of held-out rows [m]."""
+    """Return the choice of the candidate to keep, from the errors of held-out rows [m]."""
     smallest = torch.stack(list(errors.values())).amin(0)
     judged = torch.isfinite(smallest)
     counted = (

@@ -1,4 +1,4 @@
-"""Movements since a model was made, for models that keep a posterior, and why they must not be trusted."""
+"""Movements since a model was made, for models that store a posterior, and reasons not to trust them."""
 
 import math
 from collections.abc import Collection, Sequence
@@ -26,7 +26,7 @@ from pisigma.validation.setup_faults.nominal_robot_faults import evenly_spaced_r
 from pisigma.validation.setup_faults.setup_faults import judged_values
 
 MAX_ROWS = 60
-"""Rows that are used, since the covariance of all their values is needed."""
+"""Largest number of rows that are used, because the covariance of all their values is needed."""
 
 
 def judged_motion(
@@ -40,8 +40,8 @@ def judged_motion(
         fitted: bases or tools that are known to have moved.
 
     Returns:
-        The session without movements of what is fitted; None if the model keeps no posterior, where the rows do not
-        determine what is fitted, and where the rows are implausible, see `session_diagnostics`.
+        The session without movements of fitted frames; None if the model stores no posterior, or if the rows do not
+        determine the fitted frames or are implausible, see `session_diagnostics`.
     """
     with suppress(IdentificationError, ModelError):
         posterior = ModelPosterior.from_model(model)
@@ -62,10 +62,10 @@ def judged_motion(
 def session_diagnostics(
     model: CalibratedModel, rows: Measurements, session: Session
 ) -> tuple[Diagnostic, ...]:
-    """Return why a session is implausible, although the checks of its rows found nothing.
+    """Return findings about why a session is implausible although the checks of its rows found nothing.
 
     Args:
-        model: model that it was compared with.
+        model: model with which the session was compared.
         rows: rows of the session.
         session: result of the comparison.
     """
@@ -84,7 +84,7 @@ def session_diagnostics(
 
 
 def motion_sentence(motion: Session, comparison: ModelComparison) -> str:
-    """Describe movements of the arm, their probability, and the expected gain of a recalibration."""
+    """Return a sentence about movements of the arm, their probability, and the expected gain of a recalibration."""
     means = (length_text(comparison.models[index].position.statistics["mean"] / 1e3) for index in (-1, 0))
     errors = (length_text(rms) for rms in (motion.rms, motion.rms_after))
     return (
@@ -94,7 +94,7 @@ def motion_sentence(motion: Session, comparison: ModelComparison) -> str:
 
 
 def motion_warnings(motion: Session) -> tuple[str, ...]:
-    """Describe movements that do not change the verdict, or a change that cannot be attributed."""
+    """Return sentences about movements that do not change the verdict, or a change that cannot be attributed."""
     if motion.verdict == "unchanged":
         return ()
     return (
@@ -105,7 +105,7 @@ def motion_warnings(motion: Session) -> tuple[str, ...]:
 
 
 def motion_text(motion: Session) -> str:
-    """Describe movements, such as "Joint 3 has moved by 0.24 ± 0.01 deg (probability more than 99.9 %)"."""
+    """Return a text about movements, such as "Joint 3 has moved by 0.24 ± 0.01 deg (probability more than 99.9 %)"."""
     amounts: dict[tuple[str, float | None], list[str]] = {}
     for one in motion.moved:
         amounts.setdefault((one.what, one.probability), []).append(one.size)

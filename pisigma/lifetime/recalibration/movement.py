@@ -33,7 +33,7 @@ class Movement:
         shift: signed change of a joint zero or parameter [`unit`]; a joint zero counts in the positive direction of the
             joint. Of a base or a tool: the distance of its origins, or the angle of its rotation.
         deviation: standard deviation of the shift [`unit`].
-        unit: "mm" or "deg"; a base or a tool has one movement of each.
+        unit: "mm" or "deg"; a base or a tool has a movement in each unit.
         probability: posterior probability of this explanation among all others; None if it was not computed.
     """
 
@@ -89,9 +89,9 @@ def _fields(stored: Any) -> Any:
 
 
 HistoryMovement = Annotated[Movement, BeforeValidator(_fields)]
-"""A movement that a history stores by its fields."""
+"""Type of a movement that a history stores by its fields."""
 SummaryMovement = Annotated[Movement, BeforeValidator(_fields), PlainSerializer(Movement.to_json)]
-"""A movement that a model folder stores as `Movement.to_json`."""
+"""Type of a movement that a model folder stores as `Movement.to_json`."""
 
 
 def significant_movements(adaptation: Adaptation) -> tuple[Movement, ...]:
@@ -119,7 +119,7 @@ def movements_of_group(
     """Return the movements of a group: one per parameter of the arm, or a distance and an angle of a base or a tool.
 
     Args:
-        problem: recalibration problem that the group belongs to.
+        problem: recalibration problem to which the group belongs.
         after: geometry after the movement.
         group: group that moved.
         shift: shifts of its unknowns [m or rad].
@@ -140,7 +140,7 @@ def movements_of_group(
 
 
 def movements_text(moved: tuple[Movement, ...]) -> str:
-    """Write significant movements as a sentence."""
+    """Return a sentence about significant movements."""
     if not moved:
         return "Nothing moved beyond its uncertainty."
     clauses = "; ".join(one.sentence for one in moved)
@@ -155,7 +155,7 @@ def _of_frame(
     shift: Float64[Tensor, " members"],
     of_members: Float64[Tensor, "members members"],
 ) -> list[Movement]:
-    """Return the distance and the angle by which a base or a tool has moved."""
+    """Return the movements of a base or a tool: distance and angle."""
     space, kind = problem.design.problem.space, group.what.split()[0]
     before, after = (
         one.bases if kind == "base" else one.tools for one in (problem.posterior.geometry, geometry)
@@ -184,7 +184,7 @@ def _of_frame(
 
 
 def deviation_along(vector: Float64[Tensor, " 3"], covariance: Float64[Tensor, "3 3"]) -> float:
-    """Compute the standard deviation along a vector; the largest of all directions where the vector is 0."""
+    """Compute the standard deviation along a vector; the largest of all directions if the vector is 0."""
     length = float(vector.norm())
     if length > 0.0:
         return math.sqrt(float(vector @ covariance @ vector)) / length

@@ -30,14 +30,14 @@ from pisigma.validation.setup_faults.explanations import PLAUSIBLE_SHARE
 
 KIND = "recalibration"
 SUSPICIOUS_FACTOR = 5.0
-"""Factor of the errors of held-out rows over the scatter of single positions in the calibration that is suspicious."""
+"""Ratio of the errors of held-out rows to the scatter of positions in the calibration above which it is suspicious."""
 
 
 def recalibrated_model(model: CalibratedModel, adaptation: Adaptation, rows: Measurements) -> CalibratedModel:
-    """Make the recalibrated model, which keeps a posterior again.
+    """Return the recalibrated model, which again stores a posterior.
 
-    The geometric calibration that a hybrid keeps in addition to its own geometry is updated as well: its parameters
-    change by the same amounts, and its bases and tools move as those of the hybrid.
+    The geometric calibration that a hybrid stores in addition to the hybrid's geometry is updated as well: its
+    parameters change by the same amounts, and its bases and tools move like the hybrid's.
 
     Args:
         model: parent model.
@@ -124,7 +124,7 @@ def recalibration_diagnostics(
     wrong: Sequence[int],
     moved: Sequence[Movement],
 ) -> tuple[Diagnostic, ...]:
-    """Return why the result is implausible, although the checks of the rows found nothing.
+    """Return findings about why the result is implausible although the checks of the rows found nothing.
 
     Args:
         parent: model that was recalibrated.
@@ -147,7 +147,7 @@ def recalibration_diagnostics(
 def _large_errors(
     parent: CalibratedModel, judged: CandidateChoice, rows: Measurements
 ) -> tuple[Diagnostic, ...]:
-    """Return a diagnostic where no candidate predicts the held-out rows."""
+    """Return a finding if no candidate predicts the held-out rows."""
     error, limit = judged.rms[judged.kept], PLAUSIBLE_SHARE * parent.robot.reach
     if error is None:
         return ()

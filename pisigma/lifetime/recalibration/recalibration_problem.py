@@ -37,9 +37,9 @@ RELOCATION_PRIOR: dict[ParameterUnit, float] = {"m": 0.1, "rad": 0.1, "px": 100.
 CORRECTION_SCALE = 10.0
 """Drift of a correction at size 1, as a multiple of the RMS of its weights."""
 CORRECTION_PENALTY = 12.0
-"""[nats] Penalty on a drift of the correction, whose many weights explain errors of few rows by chance."""
+"""Penalty on a drift of the correction [nats], whose many weights explain errors of few rows by chance."""
 MOVEMENT_PENALTY = math.log(100)
-"""[nats] Prior odds of 1 to 100 that a given joint, base or tool moved since the calibration, against no movement."""
+"""Penalty on a movement [nats]: prior odds of 1 to 100 that a given joint, base or tool moved since the calibration."""
 
 
 def frame_keys(rows: Measurements, kinds: Collection[str]) -> frozenset[FrameKey]:
@@ -54,11 +54,11 @@ class RecalibrationProblem:
 
     Attributes:
         posterior: posterior of the model.
-        setup: rows, relative to the present bases and tools.
+        setup: rows, relative to the current bases and tools.
         design: unknowns: all parameters of the model and the rows, and the weights of the correction.
         mean: prior mean of the unknowns, parameters counted from `design.problem.nominal`.
         root: root of their prior covariance, parameters relative to the anchors of the setup.
-        change: derivative of the parameters in the user's coordinates with respect to those of the problem.
+        change: derivative of the parameters in the user's coordinates with respect to the problem's parameters.
         groups: groups that may drift, with size 0, and moved bases and tools.
         standing: root of the covariance of unknowns that are held fixed.
     """
@@ -78,7 +78,7 @@ class RecalibrationProblem:
         return groups_to_keep_whole(self.setup.measurements)
 
     def wrong_rows(self, values: LinearValues) -> Bool[Tensor, " rows"]:
-        """Return which rows are not used: dropped by the loss as far off, or of wrong configurations."""
+        """Return the mask of rows that are not used: rejected by the loss, or of wrong configurations."""
         wrong = ~torch.isin(self.configuration, values.configuration)
         return wrong | torch.isin(self.configuration, torch.tensor([*values.wrong]))
 
@@ -101,7 +101,7 @@ def recalibration_problem(
             be named.
 
     Raises:
-        IdentificationError: nothing usable was measured, or too little to guess a moved base or tool.
+        IdentificationError: no usable values were measured, or too few to guess a moved base or tool.
         PoseError: the joint values do not fit the robot.
     """
     posterior.space.robot.check_joint_count(rows.q.shape[1])
@@ -121,9 +121,9 @@ def recalibration_problem(
     parameters = len(posterior.space.parameters)
     root[posterior.positions_in(space)] = posterior.root[:parameters]
     for group, name in new & known:
-        # The posterior says nothing on a frame that was moved; a wide drift group replaces it.
+        # The posterior does not apply to a frame that was moved; a wide drift group replaces it.
         root[frame_slice(space, group, name)] = 0.0
-    # The stored posterior is in the user's coordinates, the problem in those of its anchors.
+    # The stored posterior is in the user's coordinates, the problem in the coordinates of its anchors.
     root[: len(start)] = torch.linalg.pinv(change) @ root[: len(start)]
     root[len(start) :] = posterior.root[parameters:]
     mean = torch.cat([torch.zeros_like(start), posterior.weights])
@@ -159,7 +159,7 @@ def _guess(
     rows: Measurements,
     new: Set[FrameKey],
 ) -> InitialGuess:
-    """Return bases, tools and sensor unknowns as in the model; those that were moved or are new are guessed."""
+    """Return bases, tools and sensor unknowns of the model; moved or new ones are guessed."""
     geometry = posterior.geometry
     bases, tools = dict(geometry.bases), dict(geometry.tools)
     unknowns = {group: dict(owners) for group, owners in geometry.unknowns.items()}

@@ -13,9 +13,9 @@ from pisigma.model.calibrated_model import CalibratedModel, Frames
 from pisigma.model.model_posterior import ModelPosterior
 
 MAX_ROWS = 30
-"""Rows that are used for the decision."""
+"""Largest number of rows that are used for the decision."""
 MIN_MOVE = 1e-3
-"""[m, or share of the reach] Size of the drift below which a base or a tool was not moved."""
+"""Size of the drift [m, or share of the reach] below which a base or a tool was not moved."""
 
 
 def relocated_frames(

@@ -1,4 +1,4 @@
-"""Typed figures of a recalibration, which cards, tables and JSON render and a model folder keeps."""
+"""Figures of a recalibration, which cards, tables and JSON render and a model folder stores."""
 
 from pisigma.files.yaml_file import Section
 from pisigma.lifetime.recalibration.candidates import Kept
@@ -9,7 +9,7 @@ from pisigma.validation.held_out.summary import AbstractSummary
 
 
 class HeldOutFigures(Section):
-    """RMS position error of held-out rows under one candidate [mm]; None if the rows are too few for it."""
+    """RMS position error of held-out rows under a candidate [mm]; None if the rows are too few for it."""
 
     rms_mm: float | None
 
@@ -23,14 +23,14 @@ class RecalibrationSummary(AbstractSummary):
         rows: number of rows that were used.
         outliers: rows that were left out.
         kept: candidate that was kept.
-        verdict: sentence on which candidate was kept, with the errors of all.
+        verdict: sentence about the candidate that was kept, with the errors of all candidates.
         left_out: number of rows that were held out in cross-validation and used.
         cross_validation: errors of held-out rows by candidate.
         changed: sentence on what moved.
         moved: significant movements.
         elsewhere: bases and tools that were moved since the parent was made.
         effective_parameters: number of directions of the unknowns that the rows determine.
-        noise: standard deviation of each sensor [m or rad]; a factor where the rows state it.
+        noise: standard deviation of each sensor [m or rad]; a factor if the rows state it.
         warnings: warnings, one sentence each.
     """
 
