@@ -1,1 +1,1 @@
-"""Tables, figures, cards and pages."""
+"""Results of pisigma as tables, figures, cards of models and HTML pages."""

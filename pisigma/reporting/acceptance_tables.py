@@ -14,7 +14,7 @@ _SHARE = f"{100 * COVERAGE:.0f} %"
 
 
 def acceptance_sentences(acceptance: Acceptance) -> tuple[str, ...]:
-    """Summarise the predicted budget, the measured errors, the limit, and who accepted the model."""
+    """Return sentences on the predicted budget, the measured errors, the limit, and who accepted the model."""
     budget, measured, lines = acceptance.budget, acceptance.measured, list[str]()
     if budget.components:
         start = f"With the stated components alone, {_SHARE}" if budget.missing else _SHARE
@@ -48,7 +48,7 @@ def acceptance_sentences(acceptance: Acceptance) -> tuple[str, ...]:
 
 
 def contradiction(acceptance: Acceptance) -> str:
-    """State that the measured errors are larger than the budget explains."""
+    """Return a sentence that the measured errors are larger than the budget explains."""
     session = "" if acceptance.measured is None else f" of session {acceptance.measured.session}"
     return (
         f"The measured errors{session} are larger than the budget explains: it lacks a component, or the robot "
@@ -57,7 +57,7 @@ def contradiction(acceptance: Acceptance) -> str:
 
 
 def statement_table(acceptance: Acceptance) -> tuple[tuple[str, str], ...]:
-    """Return what is stated about instrument, robot and temperatures, by name."""
+    """Return the statements about instrument, robot and temperatures, by name."""
     instrument, span = acceptance.instrument, acceptance.temperature_span
     U, k = instrument.expanded_uncertainty_mm, instrument.coverage_factor
     maker, scatter = acceptance.repeatability_mm, pooled_deviation(acceptance.repeats)
@@ -116,7 +116,7 @@ def budget_table(acceptance: Acceptance) -> Table:
 
 
 def comparison_table(acceptance: Acceptance) -> Table:
-    """Return predicted figures next to those measured on a session that the model was not fitted to [mm]."""
+    """Return predicted figures next to figures of a session to which the model was not fitted [mm]."""
     budget, measured = acceptance.budget, acceptance.measured
     predicted: Sequence[float] = (math.nan,) * 3
     if budget.components:

@@ -1,4 +1,4 @@
-"""Calibration boards as pages to print at true size."""
+"""Sheets with calibration boards, to be printed at true size."""
 
 import io
 
@@ -21,17 +21,17 @@ PAPERS = {
 }
 """Width and height of paper [mm]."""
 MARGIN = 8.0
-"""[mm] Margin that printers leave blank along the edges of a sheet."""
+"""Margin that printers leave blank along the edges of a sheet [mm]."""
 FOOT = 22.0
-"""[mm] Space below the board for its text and the ruler."""
+"""Height of the space below the board for its text and the ruler [mm]."""
 RULER = 100.0
-"""[mm] Length of the line by which the scale of the print is checked."""
+"""Length of the line by which the scale of the print is checked [mm]."""
 MM = 1 / 25.4
 """One millimetre [inch]."""
 
 
 def board_pdf(board: Board) -> tuple[str, bytes]:
-    """Draw a board as a PDF; see `draw_board_sheet`.
+    """Return a calibration board as PDF at true size; see `draw_board_sheet`.
 
     Returns:
         The paper size, such as "A4" or "A3 landscape", and the PDF.
@@ -44,11 +44,11 @@ def board_pdf(board: Board) -> tuple[str, bytes]:
 
 
 def draw_board_sheet(board: Board) -> tuple[str, Figure]:
-    """Draw a board at true size, with its description and a ruler below, on the smallest paper that it fits on.
+    """Draw a board at true size on the smallest sufficient paper, with its description and a ruler below.
 
     Raises:
-        OutputError: it does not fit on any paper.
-        MeasurementError: its dictionary has too few markers.
+        OutputError: the board does not fit on any paper.
+        MeasurementError: the dictionary of the board has too few markers.
         ImportError: the markers need OpenCV, which is not installed.
     """
     pattern = board_pattern(board)
@@ -74,7 +74,7 @@ def draw_board_sheet(board: Board) -> tuple[str, Figure]:
 
 
 def _paper(board: Board, across: float, down: float) -> tuple[str, tuple[float, float]]:
-    """Return the smallest paper for a board of given width and height [mm], portrait where both fit."""
+    """Return the smallest paper for a board of given width and height [mm], portrait if both formats fit."""
     needs = max(across, RULER) + 2 * MARGIN, down + FOOT + 2 * MARGIN
     for name, (width, height) in PAPERS.items():
         for title, size in ((name, (width, height)), (f"{name} landscape", (height, width))):
@@ -88,7 +88,7 @@ def _paper(board: Board, across: float, down: float) -> tuple[str, tuple[float, 
 
 
 def _outline(pattern: Pattern, corner: np.ndarray) -> Outline:
-    """Join all black rectangles to one outline [mm], so that there are no gaps between them."""
+    """Return one outline of all black rectangles [mm], without gaps between them."""
     left, top, right, bottom = (1e3 * pattern.black + np.tile(corner, 2)).T
     ends = np.stack([[left, top], [right, top], [right, bottom], [left, bottom], [left, top]]).transpose(
         2, 0, 1

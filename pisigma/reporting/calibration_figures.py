@@ -24,13 +24,13 @@ _UNITS = {"position": ("mm", 1e3), "rotation": ("deg", float(np.rad2deg(1.0)))}
 _REDUNDANT = 1 - 1e-6
 """Absolute correlation above which two parameters are marked as redundant."""
 _LETTER = 0.07
-"""[inch] Width of a character of the names along tables."""
+"""Width of a character of the names along tables [inch]."""
 STYLES = {"nominal": (":", "s"), "geometric": ("--", "o"), "hybrid": ("-", "^")}
 """Line and marker of every model, so that they differ without colour."""
 POINTS = 1_000
 """Points of a curve: 9 per period of the 110th harmonic, 2 per pixel."""
 MAX_DOTS = 2_000
-"""Dots of a panel; of more rows an even selection is drawn."""
+"""Largest number of dots in a panel; if there are more rows, an even selection of them is drawn."""
 LOG_RATIO = 5.0
 """Ratio of the largest to the smallest standard deviation above which axes are logarithmic."""
 BINS = 8
@@ -46,7 +46,7 @@ def draw_residuals(
         residuals: measured minus predicted values of the calibration rows by sensor [m or rad]; NaN where nothing was
             measured.
         path: PNG file to write.
-        under: calibration that the residuals belong to, for the title.
+        under: calibration to which the residuals belong, for the title.
     """
     shown = [name for name in _UNITS if name in residuals]
     count = max(len(shown), 1)
@@ -149,10 +149,10 @@ def show_correlations(
 
 
 def draw_corrections(correction: JointCorrection, measurements: Measurements, path: Path) -> None:
-    """Draw the correction of every joint over its own value, and at the measured rows.
+    """Draw the correction of every joint over the value of this joint, and at the measured rows.
 
-    The line has all other joints at their medians, the dots are at the measured joint values; where the dots leave the
-    line, the correction depends on other joints too.
+    Along the line, all other joints have their median values; the dots are at the measured joint values. Where the
+    dots are off the line, the correction depends on other joints too.
 
     Args:
         correction: joint correction Δ.
@@ -189,7 +189,7 @@ def draw_corrections(correction: JointCorrection, measurements: Measurements, pa
 def _over_own_value(
     correction: JointCorrection, q: Float64[Tensor, "rows dof"], joint: int
 ) -> tuple[Float64[np.ndarray, " points"], Float64[np.ndarray, " points"]]:
-    """Return values of one joint over its measured range and its corrections, with the others at their medians."""
+    """Return values of one joint over its measured range and its corrections, with other joints at their medians."""
     values = torch.linspace(float(q[:, joint].min()), float(q[:, joint].max()), POINTS, dtype=torch.float64)
     at = q.median(0).values.repeat(POINTS, 1)
     at[:, joint] = values
@@ -198,7 +198,7 @@ def _over_own_value(
 
 
 def draw_learning_curve(points: Sequence[LearningPoint], path: Path) -> None:
-    """Draw the error on held-out rows over the number of training rows, both logarithmic.
+    """Draw the error on held-out rows over the number of training rows, with logarithmic axes.
 
     Args:
         points: errors by number of training rows, in ascending order.
@@ -269,7 +269,7 @@ def draw_spread(spread: PredictedSpread, path: Path) -> None:
 
 
 def _plain_numbers(axes: Axes) -> None:
-    """Label a logarithmic axis with plain numbers such as 0.02, where it spans few decades."""
+    """Label logarithmic axes with plain numbers such as 0.02, if they span few decades."""
     low, high = axes.get_ylim()
     if low > 0 and high < 1e3 * low:
         axes.yaxis.set_major_locator(LogLocator(subs=(1, 1.5, 2, 3, 5, 7) if high < 30 * low else (1, 2, 5)))

@@ -34,7 +34,7 @@ _say = functools.partial(sentences, "calibration.txt.j2")
 
 
 def parameter_table(parameters: Sequence[ParameterFigures]) -> Table:
-    """Make a table with one row per parameter: its figures, and the remark in a few words.
+    """Return a table with one row per parameter: its figures and a short remark.
 
     Figures are rounded according to their standard errors. A change of less than two standard errors cannot be
     distinguished from 0.
@@ -57,7 +57,7 @@ def _parameter_row(parameter: ParameterFigures) -> tuple[str, ...]:
 
 
 def undetermined_lines(summary: CalibrationSummary) -> list[str]:
-    """Return sentences on what the data cannot determine."""
+    """Return sentences on parameters that the data cannot determine."""
     redundancy = summary.redundancy
     lines = list(redundancy.dependencies)
     if redundancy.no_effect:
@@ -70,7 +70,7 @@ def undetermined_lines(summary: CalibrationSummary) -> list[str]:
 
 
 def _scale(scale: ScaleFigures) -> str:
-    """Describe what a wrong scale of the sensor would explain, and the resulting error of positions."""
+    """Return a sentence on the effect of a wrong scale of the sensor and the resulting error of positions."""
     return (
         f"links that are {scale.factor:.5f} times as long as nominal (standard deviation {scale.sigma:.2g}) cannot "
         "be distinguished from a sensor whose scale is off by that factor, because both give the same held-out "
@@ -81,7 +81,7 @@ def _scale(scale: ScaleFigures) -> str:
 
 
 def warning_lines(summary: CalibrationSummary) -> list[str]:
-    """Return sentences on what to check or to measure next."""
+    """Return sentences that recommend checks and further measurements."""
     return [_sentence(line) for line in summary.warnings]
 
 
@@ -91,7 +91,7 @@ def implausible_lines(summary: CalibrationSummary) -> list[str]:
 
 
 def trial_table(hybrid: HybridFigures) -> Table:
-    """Make a table of the joint corrections that were tried, in order."""
+    """Return a table of the joint corrections that were tried, in order."""
     rows = [
         (
             trial.name,
@@ -112,12 +112,12 @@ def learned_lines(hybrid: HybridFigures) -> list[str]:
 
 
 def coverage_line(figures: AbstractValidationFigures) -> str:
-    """State how often held-out coordinates are within the predicted intervals; "" if none are predicted."""
+    """Return a sentence on how often held-out coordinates are within the predicted intervals; "" without intervals."""
     return "".join(_say("coverage", figures))
 
 
 def curve_table(points: Sequence[LearningPoint]) -> Table:
-    """Make a table of RMS position errors of held-out rows [mm] over the number of training rows."""
+    """Return a table of RMS position errors of held-out rows [mm] over the number of training rows."""
     models = list(points[0].models)
     head = ["training rows", *(f"{name}, RMS [mm]" for name in models)]
     has_coverage = all(point.coverage is not None for point in points)
@@ -136,7 +136,7 @@ def cross_validation_text(figures: ValidationFigures) -> str:
 
 
 def simulations_text(figures: ValidationFigures) -> str:
-    """Describe which simulated rows were held out."""
+    """Return a text on the simulated rows that were held out."""
     return _say("simulations", figures)[0]
 
 
@@ -146,7 +146,7 @@ def held_out_lines(figures: ValidationFigures) -> list[str]:
 
 
 def noise_text(noise: NoiseFigures) -> str:
-    """Describe the scatter of a sensor."""
+    """Return a text on the scatter of a sensor."""
     return _say("noise", noise)[0]
 
 
@@ -157,7 +157,7 @@ def _sentence(line: str) -> str:
 
 
 def write_parameters(parameters: Sequence[ParameterFigures], path: Path) -> None:
-    """Write the parameter table with all digits; a cell is empty if there is no figure.
+    """Write the parameter table as CSV with all digits; cells without a figure are empty.
 
     Args:
         parameters: parameters in mm and deg.
@@ -173,7 +173,7 @@ def write_parameters(parameters: Sequence[ParameterFigures], path: Path) -> None
 
 
 def write_correlations(tables: Sequence[CorrelationTable], path: Path) -> None:
-    """Write the correlations of lengths and of angles, one pair per line; undefined ones are empty.
+    """Write the correlations of lengths and of angles as CSV, one pair per line; undefined correlations are empty.
 
     Args:
         tables: correlations of lengths and of angles.

@@ -1,4 +1,4 @@
-"""A calibration as text: verdict, warnings, errors of held-out rows, what was learned, and all parameters."""
+"""A calibration as text: verdict, warnings, errors of held-out rows, joint correction, and all parameters."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -22,7 +22,7 @@ _SHOWN = {"rms": "RMS", "p95": "95 %", "max": "largest"}
 
 
 def error_table(figures: ValidationFigures) -> Table:
-    """RMS, 95 % quantile and maximum of the errors, one column per calibration."""
+    """Return a table of RMS, 95 % quantile and maximum of the errors, one column per calibration."""
     models = figures.models
     named = [errors.figures_by_name for errors in models.values()]
     rows = []
@@ -36,7 +36,7 @@ def error_table(figures: ValidationFigures) -> Table:
 
 
 def held_out_text(figures: ValidationFigures, summary: CalibrationSummary) -> str:
-    """Describe which rows the errors belong to."""
+    """Return a text on the rows to which the errors belong."""
     if figures is summary.cross_validation:
         repeats = f", {figures.repeats} repeats" if figures.repeats else ""
         if (figures.folds or 1) > 1:
@@ -50,7 +50,7 @@ def held_out_text(figures: ValidationFigures, summary: CalibrationSummary) -> st
 
 
 def error_quantity(summary: CalibrationSummary) -> str:
-    """Describe the quantity of the errors and the frame in which they are measured."""
+    """Return a text on the quantity of the errors and the frame in which they are measured."""
     sensors = {noise.sensor for noise in summary.noise}
     if "corner" in sensors:
         return "the poses that images give, camera relative to board"
@@ -64,7 +64,7 @@ def calibration_verdict(summary: CalibrationSummary, folder: Path | None, warnin
 
     Args:
         summary: its figures.
-        folder: folder of the model; None if none was written.
+        folder: folder of the model; None if no folder was written.
         warnings: number of warnings.
     """
     return Verdict(_accuracy(summary), _trust(summary, warnings), _next_step(summary, folder, warnings))
@@ -133,7 +133,7 @@ def scale_matters(summary: CalibrationSummary, odds: float = LIKELY_SCALE) -> bo
 
 
 def scale_text(scale: ScaleFigures) -> str:
-    """Describe how likely a wrong scale of the sensor is, and the error that it would cause."""
+    """Return a sentence on the odds of a wrong scale of the sensor, and the error that it would cause."""
     digits = 1 - math.floor(math.log10(scale.sigma)) if scale.sigma > 0 else 5
     return (
         f"scale of the sensor: lengths of the arm come out {scale.factor:.{digits}f} +- {scale.sigma:.{digits}f} "
@@ -143,7 +143,7 @@ def scale_text(scale: ScaleFigures) -> str:
 
 
 def scale_error(scale: ScaleFigures) -> str:
-    """Describe the consequence of a wrong scale of the sensor."""
+    """Return a sentence on the consequence of a wrong scale of the sensor."""
     return (
         f"If the sensor's scale is wrong, true positions are off by {scale.rms_mm:.2g} mm RMS in addition to the "
         "errors shown; check it with a scale bar."
@@ -160,7 +160,7 @@ def calibration_text(
 
     Args:
         summary: its figures.
-        folder: where the model was written; None if it was not.
+        folder: folder to which the model was written; None if it was not written.
         seconds: time it took [s].
         also: blocks that are shown first.
     """
@@ -196,7 +196,7 @@ def _accuracy_blocks(summary: CalibrationSummary) -> Iterator[Block]:
 
 
 def _learned(summary: CalibrationSummary) -> Iterator[Block]:
-    """Lay out the joint correction, and the others that were tried."""
+    """Return the joint correction, and other corrections that were tried, as text."""
     if summary.hybrid is not None:
         yield sentences("joint correction", tables.learned_lines(summary.hybrid))
         yield table_block("joint corrections that were tried", *tables.trial_table(summary.hybrid), "trials")
@@ -221,7 +221,7 @@ def _fit(summary: CalibrationSummary) -> Iterator[Block]:
 
 
 def _parameters(summary: CalibrationSummary) -> Iterator[Block]:
-    """Lay out all parameters, and what the data cannot determine."""
+    """Return all parameters, and which of them the data cannot determine, as text."""
     yield table_block(
         "parameters", *parameter_table(summary.parameters), f"{len(summary.parameters)} parameters"
     )

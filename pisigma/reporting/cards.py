@@ -18,7 +18,7 @@ from pisigma.validation.held_out.training_summary import TrainingRun, TrainingSu
 
 @dataclass(frozen=True)
 class CardTexts:
-    """Texts of a card: what the model is, and what was not validated."""
+    """Texts of a card: description of the model, and limits of its validation."""
 
     description: str
     not_validated: str
@@ -34,7 +34,7 @@ def write_calibration_card(
     folder: Path,
     pictures: bool = True,
 ) -> None:
-    """Write the card, its CSV files and its figures into a model folder.
+    """Write the card of a calibration, its CSV files and its figures into a model folder.
 
     Args:
         model: model of the folder.
@@ -42,7 +42,7 @@ def write_calibration_card(
         rows: rows of the calibration.
         validation: errors of held-out rows for the figures, or None.
         summary: all figures of the calibration.
-        texts: description, and what was not validated.
+        texts: description of the model, and limits of its validation.
         folder: model folder.
         pictures: whether to draw figures.
     """
@@ -67,7 +67,7 @@ def _draw_calibration(
     folder: Path,
 ) -> None:
     """Draw the figures of `write_calibration_card`."""
-    from pisigma.reporting import calibration_figures as figures  # here: matplotlib takes 30 MB from the fits
+    from pisigma.reporting import calibration_figures as figures  # late, as matplotlib takes 30 MB
 
     geometric = geometric_result(result)
     correlations = (geometric.pairwise.lengths, geometric.pairwise.angles)
@@ -92,11 +92,11 @@ def _draw_calibration(
 def write_training_card(
     name: str, texts: CardTexts, run: TrainingRun, summary: TrainingSummary, folder: Path
 ) -> None:
-    """Write the card and its figures into a model folder.
+    """Write the card of a trained network and its figures into a model folder.
 
     Args:
         name: name of the model.
-        texts: description, and what was not validated.
+        texts: description of the model, and limits of its validation.
         run: result of the training.
         summary: all figures.
         folder: model folder.

@@ -25,15 +25,15 @@ _Lines = list[tuple[str, Sequence[str]]]
 def comparison_tables(
     comparison: ModelComparison, data: str, width: int, whole: bool = True
 ) -> list[tuple[str, Table]]:
-    """Make titled tables of the errors of every model, and of their differences to the first.
+    """Return titled tables of the errors of every model, and of the differences to the first model.
 
-    They have one column per model. Models that do not fit the width are divided among several tables.
+    The tables have one column per model. If the models do not fit the width, there are several tables.
 
     Args:
         comparison: comparison of one model or more.
         data: name of the rows.
         width: width of the screen [characters].
-        whole: show everything; otherwise only RMS, 95 % quantile and maximum, and the mean difference.
+        whole: show all figures; otherwise only RMS, 95 % quantile and maximum, and the mean difference.
     """
     names = [model.name for model in comparison.models]
     rows = f"{comparison.rows} rows ({comparison.configurations} configurations) of {data}"
@@ -45,7 +45,7 @@ def comparison_tables(
 
 
 def model_rms(figures: ModelFigures, rows: int) -> str:
-    """Write the RMS errors of a model."""
+    """Return the RMS errors of a model as text."""
     errors = (figures.position, figures.orientation)
     return " and ".join(
         f"{rounded(one.statistics['rms'], rows)} {one.unit}" for one in errors if one is not None
@@ -55,7 +55,7 @@ def model_rms(figures: ModelFigures, rows: int) -> str:
 def comparison_blocks(
     comparison: ModelComparison, data: str, width: int, verbose: bool
 ) -> tuple[list[Block], list[Block]]:
-    """Lay out the errors of models on the rows of a file, and what is left out of them without `verbose`."""
+    """Return the errors of models on rows as text; without `verbose`, with remarks on omitted figures."""
 
     def blocks(whole: bool) -> list[Block]:
         tables = comparison_tables(comparison, Path(data).name, width, whole)
@@ -119,7 +119,7 @@ def _statistic_lines(
     shown: Mapping[str, str],
     errors: Sequence[QuantityErrors | Difference],
 ) -> _Lines:
-    """Return statistics of every model, each followed by its confidence intervals where there are any."""
+    """Return statistics of every model, each followed by confidence intervals if there are any."""
     lines: _Lines = []
     for key, statistic in shown.items():
         lines.append(
@@ -149,7 +149,7 @@ def _difference_lines(comparison: ModelComparison, whole: bool) -> _Lines:
 
 
 def _difference(errors: QuantityErrors) -> Difference:
-    assert errors.difference is not None  # only the first model has none
+    assert errors.difference is not None  # only the first model has no differences
     return errors.difference
 
 

@@ -23,7 +23,7 @@ OF_FLEET = CANDIDATES | {"recalibrated": "fleet and these rows", "old": "mean ro
 
 
 def write_recalibration_card(model: CalibratedModel, summary: RecalibrationSummary, folder: Path) -> None:
-    """Write the card into a model folder.
+    """Write the card of a derived model into its folder.
 
     Args:
         model: model of the folder.
@@ -36,7 +36,7 @@ def write_recalibration_card(model: CalibratedModel, summary: RecalibrationSumma
 
 
 def write_frame_card(model: CalibratedModel, summary: FrameSummary, folder: Path) -> None:
-    """Write the card into a model folder.
+    """Write the card of a derived model into its folder.
 
     Args:
         model: model of the folder.
@@ -50,12 +50,12 @@ def write_frame_card(model: CalibratedModel, summary: FrameSummary, folder: Path
 
 
 def candidate_names(summary: RecalibrationSummary) -> dict[str, str]:
-    """Name the candidates, by their keys in the figures."""
+    """Return the names of the candidates by their keys in the figures."""
     return OF_FLEET if summary.parent.kind == FLEET_PRIOR else CANDIDATES
 
 
 def candidate_table(summary: RecalibrationSummary) -> Table:
-    """Make a table of the candidates: RMS error of held-out rows, and which was kept."""
+    """Return a table of the candidates: RMS error of held-out rows, and which candidate was chosen."""
     names = candidate_names(summary)
     rows = (
         (
@@ -73,7 +73,7 @@ _STATISTICS = (("mean", "mean"), ("rms", "RMS"), ("max", "max"))
 
 
 def write_distilled_card(model: CalibratedModel, summary: DistillationSummary, folder: Path) -> None:
-    """Write the card into a model folder.
+    """Write the card of a derived model into its folder.
 
     Args:
         model: distilled model.
@@ -89,7 +89,7 @@ def write_distilled_card(model: CalibratedModel, summary: DistillationSummary, f
 
 
 def size_table(summary: DistillationSummary) -> Table:
-    """Make a table of the network sizes that were tried."""
+    """Return a table of the network sizes that were tried."""
     rows = (
         (
             ", ".join(map(str, size.orders)),
@@ -104,7 +104,7 @@ def size_table(summary: DistillationSummary) -> Table:
 
 
 def correction_table(summary: DistillationSummary) -> Table:
-    """Make a table of the joints: corrections, and errors of the network."""
+    """Return a table of the joints: corrections, and errors of the network."""
     head = [f"{what}: {label}" for what in ("correction", "error") for _, label in _STATISTICS]
     rows = []
     for joint in summary.joints:
@@ -114,7 +114,7 @@ def correction_table(summary: DistillationSummary) -> Table:
 
 
 def _range_table(summary: DistillationSummary) -> Table:
-    """Make a table of the joints: smallest and largest nominal value among the poses."""
+    """Return a table of the joints: smallest and largest nominal value among the poses."""
     joints = summary.region.joints
     rows = ((joint.name, joint.unit, figure_text(joint.lower), figure_text(joint.upper)) for joint in joints)
     return Table(("joint", "unit", "lowest", "highest"), tuple(rows))
@@ -127,7 +127,7 @@ UNDETERMINED = (
 
 
 def write_fleet_prior_card(model: CalibratedModel, summary: FleetPriorSummary, folder: Path) -> None:
-    """Write the card into a model folder.
+    """Write the card of a derived model into its folder.
 
     Args:
         model: mean robot.
@@ -146,13 +146,13 @@ def write_fleet_prior_card(model: CalibratedModel, summary: FleetPriorSummary, f
 
 
 def common_table(summary: FleetPriorSummary) -> Table:
-    """Make a table of the mean and the standard deviation between robots of every geometric parameter."""
+    """Return a table of the mean and the standard deviation between robots of every geometric parameter."""
     rows = ((one.name, one.unit, f"{one.mean:z.4f}", f"{one.deviation:.4f}") for one in summary.parameters)
     return Table(("parameter", "unit", "mean", "between robots"), tuple(rows))
 
 
 def spectrum_table(summary: FleetPriorSummary) -> Table:
-    """Make a table of the standard deviation between robots of the joint correction's weights, by group."""
+    """Return a table of standard deviations between robots of the weights of the joint correction, by group."""
     return Table(
         ("weights", "between robots [deg]"), tuple((one.group, f"{one.deg:.5f}") for one in summary.spectrum)
     )

@@ -16,7 +16,7 @@ _MIN_ENERGY = 1e-32
 
 
 def write_energy_csv(joints: Sequence[str], energies: Float64[Tensor, "epochs joints"], path: Path) -> None:
-    """Write the energy of every joint in every epoch (Jeong et al. 1998, Figs 5 and 8), scaled units."""
+    """Write the energy of every joint in every epoch as CSV, in scaled units (Jeong et al. 1998, Figs 5 and 8)."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["epoch", *(f"energy_{joint}" for joint in joints)])
@@ -87,7 +87,7 @@ def _row_height(x: Float64[np.ndarray, " rows"], y: Float64[np.ndarray, " rows"]
 
 
 def save_figure(figure: Figure, path: Path) -> None:
-    """Write a PNG of 256 colours, a third of the size, without changing matplotlib's global state."""
+    """Write a figure as PNG of 256 colours, which is small, without changing matplotlib's global state."""
     canvas = FigureCanvasAgg(figure)
     figure.set_dpi(120)
     canvas.draw()  # type: ignore[no-untyped-call]

@@ -16,14 +16,14 @@ ERRORS_NOTE = (
 
 
 def state_table(status: FleetStatus) -> Table:
-    """Make a table of the number of cells in each state."""
+    """Return a table of the number of cells in each state."""
     return Table(
         ("state", "cells"), tuple((state, str(len(cells))) for state, cells in status.states.items())
     )
 
 
 def cell_table(cells: Iterable[CellStatus]) -> Table:
-    """Make a table of cells: model in use, last session, error and state."""
+    """Return a table of cells: model in use, last session, error and state."""
     return Table(
         ("cell", "model in use", "last session", "RMS [mm]", "found by", "state"),
         tuple(_row(one) for one in cells),

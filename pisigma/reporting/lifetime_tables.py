@@ -10,7 +10,7 @@ from pisigma.reporting.result_text import Table
 
 
 def session_table(records: Sequence[Record]) -> Table:
-    """Make a table of the sessions: verdict, error, and whether to recalibrate."""
+    """Return a table of the sessions: verdict, error, and whether to recalibrate."""
     rows = tuple(
         (
             *(one.date, one.file, str(one.session.rows), one.session.verdict, f"{one.session.rms * 1e3:.3f}"),
@@ -22,7 +22,7 @@ def session_table(records: Sequence[Record]) -> Table:
 
 
 def chart_table(charts: Sequence[Chart]) -> Table:
-    """Make a table of the charts: last value, and both statistics as shares of their limits."""
+    """Return a table of the charts: last value, and both statistics as shares of their limits."""
     columns = ("chart", "last", "unit", "EWMA / limit", "CUSUM / limit", "alarm")
     return Table(columns, tuple(_chart_row(one) for one in charts))
 
@@ -38,7 +38,7 @@ NO_VALUE = "-"
 
 
 def difference_table(differences: ParameterDifferences, names: tuple[str, str]) -> Table:
-    """Make a table of the DH parameters that differ between two models: values, shift with 95 % interval, and p.
+    """Return a table of DH parameters that differ between two models: values, shift with 95 % interval, and p.
 
     Args:
         differences: differences of the models.
@@ -50,7 +50,7 @@ def difference_table(differences: ParameterDifferences, names: tuple[str, str]) 
 
 
 def _difference_row(one: ParameterDifference) -> tuple[str, ...]:
-    """Return the row of a parameter; without a test it has no shift."""
+    """Return the row of a parameter; without a test, the cells of its shift are empty."""
     values = (f"{value:.4f}" for value in (one.first, one.second))
     if one.shift is None or one.deviation is None or one.p is None:
         return (one.name, one.unit, *values, NO_VALUE, NO_VALUE, NO_VALUE)

@@ -41,7 +41,7 @@ def sentences(template: str, macro: str, *values: object) -> tuple[str, ...]:
 
 
 def write_card(folder: Path, template: str, **content: object) -> None:
-    """Write the card of a model folder; see `render`."""
+    """Write the card of a model folder from a template; see `render`."""
     (folder / CARD).write_text(render(template, **content) + "\n", encoding="utf-8")
 
 

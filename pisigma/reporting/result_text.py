@@ -1,6 +1,6 @@
 """Text of a result, for any layout: the verdict, warnings, sentences and tables.
 
-Commands print it on a screen, and pages show it in the browser.
+Commands print these texts on a screen, and pages show them in the browser.
 """
 
 import re
@@ -11,7 +11,7 @@ from typing import NamedTuple
 from pisigma.reporting.verdict import Verdict
 
 MAX_ALIKE = 10
-"""Warnings of one kind that are shown one by one; more become one warning with their lines."""
+"""Largest number of similar warnings that are shown one by one; more become one warning with their lines."""
 
 _NUMBER = re.compile(r"\d[\d,]*(?:\.\d+)?(?:e[+-]?\d+)?")
 _ROW = re.compile(r"\b(?:line|row|image) (\d+)")
@@ -66,8 +66,8 @@ class ResultText:
         verdict: verdict in three sentences.
         warnings: sentences; all are shown.
         blocks: the most important first.
-        details: what is shown on demand.
-        closing: what was written where.
+        details: blocks that are shown on demand.
+        closing: sentence on the written files.
     """
 
     verdict: Verdict
@@ -78,7 +78,7 @@ class ResultText:
 
 
 def merge_alike_warnings(warnings: Iterable[str]) -> list[str]:
-    """Join more than `MAX_ALIKE` warnings that differ in numbers only into one with their lines."""
+    """Merge more than `MAX_ALIKE` warnings that differ only in numbers into one warning with their lines."""
     kinds: dict[str, list[str]] = {}
     for one in dict.fromkeys(warnings):
         kinds.setdefault(_NUMBER.sub("#", one), []).append(one)
@@ -94,7 +94,7 @@ def _joined(alike: Sequence[str]) -> str:
 
 
 def numbers_as_ranges(numbers: Iterable[int]) -> str:
-    """Write numbers with consecutive ones joined, such as "3, 7 to 9"."""
+    """Return numbers as text with consecutive numbers joined, such as "3, 7 to 9"."""
     found: list[list[int]] = []
     for number in sorted(set(numbers)):
         if found and number == found[-1][-1] + 1:

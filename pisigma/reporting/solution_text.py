@@ -17,7 +17,7 @@ FAILURES = tuple(status for status in Status if status not in (Status.REACHED, S
 
 
 def solution_text(solution: Solution, solver: CorrectedIK) -> ResultText:
-    """Lay out what the statuses mean, warnings, and the joint values; one table where there are several solutions."""
+    """Return joint values with meanings of statuses and warnings as text; several solutions form one table."""
     statuses = statuses_of(solution)
     names = [solution.branches[int(branch)] for branch in solution.branch.tolist()]
     reached = sum(status not in FAILURES for status in statuses)
@@ -66,7 +66,7 @@ def statuses_of(solution: Solution) -> list[Status]:
 
 
 def file_units(solver: CorrectedIK) -> list[str]:
-    """Unit of every joint where values enter or leave."""
+    """Return the unit of every joint in files: "deg" or "mm"."""
     return ["deg" if revolute else "mm" for revolute in solver.revolute]
 
 

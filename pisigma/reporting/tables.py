@@ -12,27 +12,27 @@ _SHOWN = {"rms": "RMS", "p95": "95 %", "max": "maximum"}
 
 
 def markdown_table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Write a Markdown table."""
+    """Return a Markdown table of given columns and rows."""
     lines = [columns, ["---"] * len(columns), *rows]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 def figure_text(value: float) -> str:
-    """Write a figure with four decimals; with two digits and an exponent if it is below 0.001; NaN as "unknown"."""
+    """Return a figure with four decimals, or two digits and an exponent below 0.001; NaN as "unknown"."""
     if math.isnan(value):
         return "unknown"
     return f"{value:.4f}" if value == 0 or abs(value) >= 1e-3 else f"{value:.1e}"
 
 
 def percent_text(share: float) -> str:
-    """Write a share as a percentage, such as "less than 1 %" instead of "0 %"."""
+    """Return a share as a percentage, such as "less than 1 %" instead of "0 %"."""
     if share < 0.005:
         return "less than 1 %"
     return "more than 99 %" if share > 0.995 else f"{100 * share:.0f} %"
 
 
 def p_text(probability: float) -> str:
-    """Write a probability by chance, such as "p = 0.02"."""
+    """Return a p value as text, such as "p = 0.02"."""
     return "p < 1e-12" if probability < 1e-12 else f"p = {probability:.2g}"
 
 
@@ -52,13 +52,13 @@ def joint_rows(joints: Sequence[JointFigures]) -> list[tuple[str, ...]]:
 
 
 def joint_table(joints: Sequence[JointFigures]) -> str:
-    """Write a Markdown table of joint errors, before and after side by side."""
+    """Return a Markdown table of joint errors, before and after correction side by side."""
     figures = (f"{when}: {name}" for when in ("before", "after") for name in _STATISTICS)
     return markdown_table(("joint", "unit", "rows", *figures), joint_rows(joints))
 
 
 def pose_rows(models: Mapping[str, ErrorFigures]) -> Table:
-    """Make a table of pose errors: one column per model, one row per figure.
+    """Return a table of pose errors: one column per model, one row per figure.
 
     Args:
         models: errors by the name of the model.
@@ -69,12 +69,12 @@ def pose_rows(models: Mapping[str, ErrorFigures]) -> Table:
 
 
 def pose_table(models: Mapping[str, ErrorFigures]) -> str:
-    """Write a Markdown table of pose errors; see `pose_rows`."""
+    """Return a Markdown table of pose errors; see `pose_rows`."""
     return markdown_table(*pose_rows(models))
 
 
 def distance_table(distances: SocketDistances) -> Table:
-    """Make a table of stated distances between sockets, and the errors of every model [mm]."""
+    """Return a table of stated distances between sockets, and the errors of every model [mm]."""
     models = list(distances.each[0].errors_mm)
     rows = [
         (

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 MANY_ROWS = 100
 """Number of rows from which errors deserve three digits, because their RMS is known to a few percent."""
 SMALLEST = 1e-4
-"""Errors [mm or deg] below which their size does not matter."""
+"""Errors below which their size does not matter [mm or deg]."""
 
 
 @dataclass(frozen=True)
@@ -21,8 +21,8 @@ class Verdict:
     Attributes:
         accuracy: how accurate it is, with the kind of the figures.
         trust: whether to trust it, and why not.
-        next_step: what to do next.
-        heading: what the first sentence is about.
+        next_step: recommended next step.
+        heading: subject of the first sentence.
     """
 
     accuracy: str
@@ -44,7 +44,7 @@ class Verdict:
 
 
 def rounded(value: float, rows: int = MANY_ROWS) -> str:
-    """Write an error with three digits, or two where few rows were judged."""
+    """Return an error with three digits, or two if few rows were judged."""
     digits = 3 if rows >= MANY_ROWS else 2
     if value == 0 or not math.isfinite(value):
         return f"{value:g}"
@@ -54,17 +54,17 @@ def rounded(value: float, rows: int = MANY_ROWS) -> str:
 
 
 def uncapitalised(sentence: str) -> str:
-    """Return a sentence that continues another one."""
+    """Return a sentence with a lower-case first letter, to continue another sentence."""
     return sentence if sentence[1:2].isupper() else f"{sentence[:1].lower()}{sentence[1:]}"
 
 
 def count_text(count: int, what: str) -> str:
-    """Write a number with a noun, such as "1 warning" or "2 warnings"."""
+    """Return a number with a noun, such as "1 warning" or "2 warnings"."""
     return f"{count} {what}{'' if count == 1 else 's'}"
 
 
 def rms_text(errors: "ErrorFigures", rows: int) -> str:
-    """Write the RMS of positions and of orientations, as far as they are known."""
+    """Return the RMS of positions and of orientations, as far as they are known, as text."""
     figures = ((errors.rms_mm, "mm"), (errors.rms_deg, "deg"))
     known = [f"{rounded(value, rows)} {unit}" for value, unit in figures if value is not None]
     return " and ".join(known) or "unknown"

@@ -1,4 +1,4 @@
-"""Advice on what to measure next and what to trust, as sentences with figures."""
+"""Advice on further measurements and on the trust in a model, as sentences with figures."""
 
 import math
 
@@ -18,9 +18,9 @@ MIN_GAIN_PER_DOUBLING = 0.05
 SIGNIFICANT_ERRORS = 2.0
 """Standard errors below which a change from nominal is not significant."""
 SMALL_RANGE_KG, SMALL_RANGE_C = 0.5, 3.0
-"""Ranges of payload [kg] and temperature [°C] below which rows say nothing about other values."""
+"""Ranges of payload [kg] and temperature [°C] below which rows do not show the effect of other values."""
 COVERAGE_TOLERANCE = 0.03
-"""Deviation of the share within the 95 % intervals from 0.95 above which it is reported."""
+"""Largest deviation from 0.95 of the share within 95 % intervals that is not reported."""
 
 
 def advice_for(
@@ -31,7 +31,7 @@ def advice_for(
     limit: AccuracyLimit,
     causes: tuple[str, ...] = (),
 ) -> tuple[str, ...]:
-    """Recommend what to measure next and what to trust, the most useful advice first.
+    """Return recommendations for measuring and for the use of a model, the most useful one first.
 
     Args:
         model: the model.
@@ -39,7 +39,7 @@ def advice_for(
         rows: judged rows, or None.
         accuracies: error figures.
         limit: what limits the accuracy.
-        causes: diagnosed causes of the errors, with what to do; they come first.
+        causes: diagnosed causes of the errors with their remedies; these sentences come first.
     """
     held_out = [accuracy for accuracy in accuracies if accuracy.held_out]
     of_rows = (
@@ -104,7 +104,7 @@ def _orientations(model: CalibratedModel, summary: CalibrationSummary) -> tuple[
 
 
 def _conditions(rows: JudgedRows | None) -> list[str]:
-    """Describe for which payload and temperature the figures are valid, where a file could have stated them."""
+    """Return sentences on the payload and the temperature for which the figures are valid."""
     if rows is None or (rows.origin == "held_out" and rows.measurements.position is None):
         return []
     lines: list[str] = []

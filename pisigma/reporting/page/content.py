@@ -49,11 +49,12 @@ class Verdict:
     """The first statements of a report.
 
     Attributes:
-        sentence: how accurate the model is, how much better than nominal, where it is worst and what limits it.
-        worst: where it is worst, as a sentence.
-        limit: what limits it, as a sentence: the first diagnosed cause, else scatter or model.
+        sentence: accuracy of the model, improvement over nominal, place of the largest errors, and cause that limits
+            the accuracy.
+        worst: sentence on the place of the largest errors.
+        limit: sentence on the cause that limits the accuracy: the first diagnosed cause, or scatter or model.
         held_out: whether the sentence refers to rows that were not used to make the model.
-        joint: the worst joint of a network, where no pose was judged.
+        joint: the worst joint of a network, if no pose was judged.
     """
 
     sentence: str
@@ -75,11 +76,11 @@ def verdict_of(
 
     Args:
         model: the model.
-        accuracies: error figures, of which the first one counts.
+        accuracies: error figures, of which the first one is decisive.
         joints: errors of joints, which are used if no pose was evaluated.
         rows: judged rows, or None.
         limit: contribution of measurement scatter.
-        causes: diagnosed causes of the errors; the first one is then what limits the accuracy.
+        causes: diagnosed causes of the errors; the first one is the cause that limits the accuracy.
     """
     if not accuracies:
         return _without_poses(model, joints)
@@ -93,7 +94,7 @@ def verdict_of(
 
 
 def causes_of(summary: CalibrationSummary | None, diagnostics: Sequence[Diagnostic]) -> tuple[str, ...]:
-    """Return the diagnosed causes of the errors, one sentence each: those of the judged rows, else of the calibration.
+    """Return sentences on the diagnosed causes of the errors: of the judged rows, or otherwise of the calibration.
 
     Args:
         summary: figures of the calibration; None for other models.
@@ -105,7 +106,7 @@ def causes_of(summary: CalibrationSummary | None, diagnostics: Sequence[Diagnost
 
 
 def _without_poses(model: CalibratedModel, joints: tuple[JudgedJoint, ...]) -> Verdict:
-    """Describe what the joint errors show if no pose was evaluated."""
+    """Return the verdict from joint errors if no pose was evaluated."""
     if not joints:
         advice = "Give a file with measurements that the model was not calibrated with."
         return Verdict(say("no_figures", model)[0], "", advice, held_out=False)
@@ -116,7 +117,7 @@ def _without_poses(model: CalibratedModel, joints: tuple[JudgedJoint, ...]) -> V
 
 
 def _worst(model: CalibratedModel, rows: JudgedRows | None) -> tuple[str, str]:
-    """Describe where errors are largest: a clause for the verdict and a sentence; both are empty without rows."""
+    """Return a clause and a sentence on the place of the largest errors; both are empty without rows."""
     largest = None if rows is None else largest_errors(rows)
     if rows is None or largest is None:
         return "", ""
@@ -145,24 +146,24 @@ class ReportContent:
         model: the model.
         summary: figures of its calibration; None for other models.
         verdict: the first statements.
-        accuracies: error figures; the first ones are those of the verdict.
+        accuracies: error figures; the verdict uses the first ones.
         limit: contribution of measurement scatter to the error.
         rows: judged rows, or None.
-        remarks: remarks on these rows, one sentence each.
+        remarks: sentences about these rows.
         map: points of the error map.
         dependences: errors over joint values, order, payload and temperature.
-        frames: errors per frame; empty if there is only one.
-        targets: errors per target; empty if there is only one.
+        frames: errors per frame; empty if there is only one frame.
+        targets: errors per target; empty if there is only one target.
         correlations: correlations of the parameters.
         curves: curves of the learned correction.
         learned: sentences on the learned correction.
         not_identified: sentences on parameters that the data cannot determine.
-        advice: what to measure next, one sentence each.
+        advice: sentences that recommend further measurements.
         provenance: names and values.
         joints: errors of the joints of a network; empty for other models.
-        missing: what the report cannot state and why, one sentence each.
-        missing_parameters: what the folder does not keep about the parameters, one sentence each.
-        correlation_png: figure of the folder, where it does not keep the correlations as numbers.
+        missing: sentences on figures that the report cannot state, with the reasons.
+        missing_parameters: sentences on figures of parameters that the folder does not store.
+        correlation_png: figure in the folder, if the folder does not store the correlations as numbers.
     """
 
     model: CalibratedModel
@@ -239,8 +240,8 @@ def report_content(
     Args:
         model: the model.
         folder: its folder.
-        measurements: rows to judge it on, or None for the held-out rows that the folder keeps.
-        remarks: remarks on these rows, one sentence each.
+        measurements: rows to judge the model with, or None for the held-out rows that the folder stores.
+        remarks: sentences about these rows.
         diagnostics: why these rows are implausible.
 
     Raises:
@@ -285,7 +286,7 @@ def report_content(
 def _missing_parameters(
     model: CalibratedModel, summary: CalibrationSummary | None, correlations: ParameterCorrelations
 ) -> tuple[str, ...]:
-    """List what the folder does not store about the parameters."""
+    """Return sentences on figures of parameters that the folder does not store."""
     if summary is not None:
         text = "The model folder does not keep the correlations as numbers; calibrate again to have them."
         return () if correlations.tables else (text,)

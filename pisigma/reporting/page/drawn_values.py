@@ -21,7 +21,7 @@ Point = dict[str, Any]
 
 
 def csv_of(figure: Figure) -> str:
-    """Write the values that are drawn in a figure as CSV: panel, series, and a column for each axis and colour.
+    """Return the values that a figure shows as CSV: panel, series, and a column for each axis and colour.
 
     Args:
         figure: lines, steps, dots, arrows and matrices; other artists are left out.
@@ -50,7 +50,7 @@ def _coloured(axes: Axes) -> Iterable[Any]:
 
 
 def _points_of(axes: Axes) -> Iterator[Point]:
-    """Yield the points of one panel."""
+    """Yield the points of one panel of a figure."""
     names = axes.get_xlabel() or "x", axes.get_ylabel() or "y"
     panel = axes.get_title(loc="left") or axes.get_title()
     for line in axes.lines:
@@ -78,7 +78,7 @@ def _points_of(axes: Axes) -> Iterator[Point]:
 
 
 def _series(panel: str, label: object, columns: Iterable[tuple[str, Any]]) -> Iterator[Point]:
-    """Yield the points of one series without those that are not finite."""
+    """Yield the points of one series, except points with values that are not finite."""
     names, values = zip(*columns, strict=True)
     count = len(values[0])
     step = -(-count // MAX_POINTS)
@@ -91,7 +91,7 @@ def _series(panel: str, label: object, columns: Iterable[tuple[str, Any]]) -> It
 
 
 def _entries(axes: Axes, panel: str, matrix: AxesImage) -> Iterator[Point]:
-    """Yield the entries of a matrix with names along both axes; of a picture nothing."""
+    """Yield the entries of a matrix with names along both axes; nothing for a picture."""
     across, down = (
         [one.get_text() for one in labels] for labels in (axes.get_xticklabels(), axes.get_yticklabels())
     )
@@ -102,7 +102,7 @@ def _entries(axes: Axes, panel: str, matrix: AxesImage) -> Iterator[Point]:
 
 
 def _text(value: Any) -> str:
-    """Write a number with five digits, a day by ISO 8601, and what is not finite as an empty text."""
+    """Return a number with five digits, a day by ISO 8601, and "" for values that are not finite."""
     if isinstance(value, (float, np.floating)):
         return f"{value:.5g}" if np.isfinite(value) else ""
     return str(value)

@@ -56,7 +56,8 @@ _STYLE: dict[Any, Any] = {
 }
 _SVG_METADATA: dict[str, Any] = {"Date": None, "Creator": None}
 MAX_MAP_DOTS = 1_500
-"""Dots of the flat map with the largest errors; of the others every fourth is drawn, at most as many."""
+"""Number of rows with the largest errors of which the flat map has dots, and largest number of other dots; of other
+rows, every fourth has a dot."""
 _COLORS = {"nominal": BEFORE, "geometric": OTHER, "hybrid": AFTER}
 
 
@@ -77,7 +78,7 @@ class Drawing:
     figure: Figure
 
     def svg(self) -> str:
-        """Write the figure as SVG, reproducibly."""
+        """Return the figure as SVG; the same figure always gives the same text."""
         stream = io.BytesIO()
         with drawing_style():
             FigureCanvasSVG(self.figure)
@@ -85,7 +86,7 @@ class Drawing:
         return stream.getvalue().decode()
 
     def png(self) -> bytes:
-        """Write the figure as PNG."""
+        """Return the figure as PNG."""
         stream = io.BytesIO()
         with drawing_style():
             FigureCanvasAgg(self.figure)
@@ -93,7 +94,7 @@ class Drawing:
         return stream.getvalue()
 
     def csv(self) -> str:
-        """Write the values that are drawn as CSV."""
+        """Return the values that the figure shows as CSV."""
         return csv_of(self.figure)
 
 
@@ -152,7 +153,7 @@ def check_figures(folder: Path, inputs: Iterable[Input] = ()) -> None:
 
 
 def write_figures(drawings: Sequence[Drawing], folder: Path) -> list[Path]:
-    """Write every figure as PNG and SVG, and what is drawn in it as CSV.
+    """Write every figure as PNG and SVG, and the values that it shows as CSV.
 
     Args:
         drawings: drawings to write; characters that file names cannot have are replaced.
@@ -194,7 +195,7 @@ def draw_figures(content: ReportContent) -> ReportFigures:
 
 
 def draw_dependence(dependence: Dependence) -> Drawing:
-    """Draw errors over one quantity: a dot per row, and RMS errors of bins."""
+    """Draw errors over one quantity: a dot for every row, and RMS errors of bins."""
     with drawing_style():
         figure, axes = make_panel()
         if "before" in dependence.errors:
@@ -207,7 +208,7 @@ def draw_dependence(dependence: Dependence) -> Drawing:
 
 
 def draw_correction(curve: CorrectionCurve) -> Drawing:
-    """Draw the correction of a joint over its own value, with measured values shaded."""
+    """Draw the correction of a joint over the value of this joint, with the measured range shaded."""
     with drawing_style():
         figure, axes = make_panel()
         for low, high in _stretches(curve.values, curve.measured):
@@ -253,7 +254,7 @@ def _correlations(title: str, table: Correlations) -> Drawing:
 
 
 def draw_learning_curve(points: Sequence[LearningPoint]) -> Drawing:
-    """Draw errors of held-out rows over the number of calibration rows, both logarithmic."""
+    """Draw errors of held-out rows over the number of calibration rows, with logarithmic axes."""
     with drawing_style():
         figure, axes = make_panel()
         rows = [point.rows for point in points]
@@ -307,7 +308,7 @@ def draw_map(
 
 
 def make_panel() -> tuple[Figure, Axes]:
-    """Make a panel with fixed margins; computing them would take as long as drawing."""
+    """Return a panel with fixed margins; computing the margins would take as long as drawing."""
     figure = Figure(figsize=SIZE)
     figure.subplots_adjust(left=0.155, right=0.985, bottom=0.165, top=0.9)
     axes = figure.add_subplot()
@@ -330,7 +331,7 @@ def _lengths(axes: Axes, dependence: Dependence) -> None:
         axes.stairs(bins.rms, bins.edges, baseline=None, **style)  # type: ignore[arg-type]
     axes.set(yscale="log", ylabel=f"error [{dependence.error_unit}]")
     _plain_log(axes)
-    if axes.get_legend_handles_labels()[0]:  # without bins there are no lines
+    if axes.get_legend_handles_labels()[0]:  # panels without bins have no lines
         axes.legend(ncols=2, loc="lower left", bbox_to_anchor=(0, 1), borderaxespad=0.1)
 
 

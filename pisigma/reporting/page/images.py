@@ -59,11 +59,11 @@ def arrow_scale(detection: DetectedBoards) -> float:
 
 
 def draw_image(one: BoardImage, detection: DetectedBoards, scale: float) -> Drawing:
-    """Draw an image with magnified arrows from predicted to detected corners.
+    """Return an image with magnified arrows from predicted to detected corners.
 
     Args:
-        one: image.
-        detection: detected boards, with the residuals of corners where the image was used.
+        one: image to draw.
+        detection: detected boards, with the residuals of corners if the image was used.
         scale: magnification of the arrows.
     """
     width, height = one.size
@@ -92,7 +92,7 @@ def draw_image(one: BoardImage, detection: DetectedBoards, scale: float) -> Draw
 
 
 def _thumbnail(one: BoardImage) -> np.ndarray:
-    """Reduce an image to few pixels and gray levels."""
+    """Return a copy of an image with few pixels and gray levels."""
     full = Image.fromarray(read_image(one.file))
     full.thumbnail((MAX_PIXELS, MAX_PIXELS), Image.Resampling.BOX)
     return np.asarray(full) // GRAY_STEP * GRAY_STEP + GRAY_STEP // 2

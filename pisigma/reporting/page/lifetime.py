@@ -35,7 +35,7 @@ from pisigma.validation.held_out.model_comparison import ModelComparison
 from pisigma.validation.report.error_map import Layer
 
 PAGE_WIDTH = 10_000
-"""[characters] Width of tables on a page, which scroll."""
+"""Width of tables on a page, which can scroll [characters]."""
 Mark = tuple[datetime.date, str]
 """Day that is marked in a chart, and its label."""
 
@@ -53,13 +53,13 @@ def monitoring_page(
     """Render sessions and charts as HTML; texts are escaped.
 
     Args:
-        model: model that the sessions were compared with.
+        model: model with which the sessions were compared.
         records: all sessions sorted by date.
         charts: control charts of the sessions.
         sentences: sentences on all sessions together.
-        warnings: warnings, one sentence each.
+        warnings: sentences that warn of problems.
         refused: date, file and reason of every session that must not be trusted.
-        marks: days that are marked in the chart of a quantity; those of "" are marked in all charts.
+        marks: days that are marked in the chart of each quantity; days under the key "" are marked in all charts.
         limit_mm: limit of the RMS error [mm]; None if there is none.
     """
     days = [datetime.date.fromisoformat(one.date) for one in records]
@@ -83,12 +83,12 @@ def monitoring_page(
 
 
 def _marks_of(marks: Mapping[str, Sequence[Mark]], chart: Chart) -> list[Mark]:
-    """Return the marks of a chart, with those of all charts."""
+    """Return the marks of a chart, including marks for all charts."""
     return [*marks.get("", ()), *marks.get(chart.what, ())]
 
 
 def _sessions(records: Sequence[Record], refused: Sequence[tuple[str, str, str]]) -> Table:
-    """Make a table of all sessions, verdict and reason first; refused ones have no error."""
+    """Return a table of all sessions, verdict and reason first; refused sessions have no error."""
     said = [_sentence(" ".join((one.session.sentence, *one.session.unobservable))) for one in records]
     rows: list[tuple[str, ...]] = [
         (date, verdict, line, error, count, pays, file)
@@ -135,7 +135,7 @@ def with_column(table: Table, column: str, cell_of: Callable[[int, str], str]) -
 def draw_values(
     chart: Chart, days: Sequence[datetime.date], marks: Sequence[Mark] = (), limit: float | None = None
 ) -> Drawing:
-    """Draw a quantity over the sessions with 95 % intervals, marked days, and its limit."""
+    """Return a chart of a quantity over the sessions with 95 % intervals, marked days, and its limit."""
     with drawing_style():
         figure, axes = make_panel()
         values, half = chart.values.numpy(), NORMAL_95 * chart.deviations.numpy()
@@ -165,7 +165,7 @@ def draw_values(
 
 
 def _mark(axes: Axes, marks: Sequence[Mark], days: Sequence[datetime.date]) -> None:
-    """Mark the days of events by vertical lines, where they are between the first and the last session."""
+    """Mark days of events by vertical lines, if they are between the first and the last session."""
     for day, label in marks:
         if days[0] <= day <= days[-1]:
             axes.axvline(day, color=OTHER, linewidth=1.0, linestyle=":")  # type: ignore[arg-type]
@@ -235,7 +235,7 @@ def fleet_page(status: FleetStatus, folder: Path) -> str:
 
 
 def _cells(status: FleetStatus, cells: Sequence[CellStatus], folder: Path) -> Table:
-    """Make a table of all cells, state and reason first, with links to the cards of their models."""
+    """Return a table of all cells, state and reason first, with links to the cards of their models."""
     link = Markup('<a href="{}">{}</a>')
     rows: list[tuple[str, ...]] = [
         (name, UNREADABLE, reason, "", "", "", "", "") for name, reason in status.unreadable.items()

@@ -1,4 +1,4 @@
-"""The report as one self-contained HTML page."""
+"""The report on a model as one self-contained HTML page."""
 
 import base64
 import json
@@ -45,7 +45,7 @@ def render_page(content: ReportContent, figures: ReportFigures, acceptance: Acce
     Args:
         content: findings of the report.
         figures: its figures.
-        acceptance: statements by which the robot of a cell is accepted; None without a cell.
+        acceptance: statements for the acceptance of the robot of a cell; None without a cell.
     """
     return html_page(
         "page.html.j2",
@@ -88,7 +88,7 @@ def _acceptance(acceptance: Acceptance) -> dict[str, Any]:
 
 
 def script_json(value: Any) -> Markup:
-    """Write JSON for a script element, escaped so that it cannot end the element or a line."""
+    """Return a value as JSON for a script element, escaped so that it cannot end the element or a line."""
     return Markup(json.dumps(value, allow_nan=False, ensure_ascii=True).translate(_ESCAPED))
 
 

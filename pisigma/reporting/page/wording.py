@@ -37,14 +37,14 @@ LAYER_LABELS: dict[Quantity, str] = {
     "distance": "distance",
     "turn": "rotation",
 }
-"""Labels of what a map shows."""
+"""Labels of the values that an error map shows, by layer."""
 
 say = functools.partial(sentences, "report.txt.j2")
 """Fill in a macro of `report.txt.j2`; see `sentences`."""
 
 
 def rows_text(accuracy: Accuracy) -> str:
-    """Describe which rows the errors belong to and which models predicted them."""
+    """Return a text on the rows to which the errors belong and the models that predicted them."""
     figures = accuracy.validation
     folds = cross_validation_text(figures) if figures is not None and (figures.folds or 1) > 1 else ""
     return say("judged_rows", accuracy, folds)[0]
@@ -61,15 +61,15 @@ def names_text(errors: ErrorsByName) -> str:
 
 
 def map_text(error_map: ErrorMap) -> str:
-    """Describe which points a map shows."""
+    """Return a text on the points that an error map shows."""
     return say("map", error_map)[0]
 
 
 def layer_text(layer: Layer, error_map: ErrorMap) -> str:
-    """Describe the values of a layer."""
+    """Return a text on the values of a layer of an error map."""
     return say("layer", layer.key, error_map.origin)[0]
 
 
 def curve_text(curve: CorrectionCurve) -> str:
-    """Describe how large the correction of a joint is and where it was measured."""
+    """Return a text on the size of the correction of a joint and its measured range."""
     return say("curve", curve)[0]
