@@ -8,10 +8,12 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from pisigma.calibration.frames.frame_fit import FrameChoice, FrameFit, fit_frames
+from pisigma.calibration.frames.misfit_causes import misfit_causes
 from pisigma.calibration.frames.whitened_values import WhitenedValues
 from pisigma.calibration.geometric.problem.parameters import ParameterSpace
 from pisigma.calibration.geometric.problem.setup import IdentifiedGeometry
 from pisigma.calibration.hybrid.uncertainty import PositionUncertainty
+from pisigma.estimation.alternatives import Cause
 from pisigma.estimation.covariance_root import CovarianceRoot
 from pisigma.files.errors import IdentificationError, ModelError
 from pisigma.measurement.conditions import JointState
@@ -34,12 +36,14 @@ class FittedFrames:
         rows: the rows with the names of the model, as commanded.
         model: model with the fitted frames.
         arm_root: root of the covariance of the fitted coordinates by the uncertainty of the arm [m and rad].
+        causes: possible causes of the residuals of a hand-eye calibration; see `misfit_causes`.
     """
 
     fit: FrameFit
     rows: Measurements
     model: CalibratedModel
     arm_root: Float64[Tensor, "frames directions"]
+    causes: tuple[Cause, ...]
 
     @property
     def arm_variance(self) -> tuple[float, ...]:
@@ -51,7 +55,9 @@ def frames_of_robot(robot: Robot, rows: Measurements, only: FrameChoice) -> Fitt
     """Fit frames with the arm of a robot as drawn; for the errors see `fit_frames`."""
     fit = fit_frames(robot, rows, only, {})
     model = model_of_calibration(robot.name, robot, fit.solved.result(), rows)
-    return FittedFrames(fit, rows, replace(model, kind=KIND), torch.zeros(len(fit.frames), 0))
+    return FittedFrames(
+        fit, rows, replace(model, kind=KIND), torch.zeros(len(fit.frames), 0), misfit_causes(fit)
+    )
 
 
 def frames_of_model(model: CalibratedModel, rows: Measurements, only: FrameChoice) -> FittedFrames:
@@ -94,7 +100,9 @@ def frames_of_model(model: CalibratedModel, rows: Measurements, only: FrameChoic
     moved = rows if arm is None else replace(rows, q=corrected_joints(arm, rows))
     fit = fit_frames(robot, moved, only, {name: bases[name] for name in set(rows.frame) & set(bases)})
     arm_root = _arm_root(model, fit, rows)
-    return FittedFrames(fit, rows, _with_frames(model, fit, rows, arm_root), arm_root)
+    known = model.uncertainty
+    causes = misfit_causes(fit, None if known is None else known.root[: known.space.arm_size])
+    return FittedFrames(fit, rows, _with_frames(model, fit, rows, arm_root), arm_root, causes)
 
 
 def _with_tool(robot: Robot, tools: Frames, target: str) -> Robot:

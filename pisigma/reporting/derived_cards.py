@@ -6,7 +6,14 @@ from pisigma.lifetime.fleet.prior_summary import FleetPriorSummary
 from pisigma.lifetime.recalibration.summary import RecalibrationSummary
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.model_posterior import FLEET_PRIOR
-from pisigma.reporting.frame_text import coordinate_table, coordinate_title, fit_lines
+from pisigma.reporting.frame_text import (
+    CAUSE_TITLE,
+    cause_sentence,
+    cause_table,
+    coordinate_table,
+    coordinate_title,
+    fit_lines,
+)
 from pisigma.reporting.rendering import write_card
 from pisigma.reporting.result_text import Table
 from pisigma.reporting.tables import figure_text
@@ -45,7 +52,8 @@ def write_frame_card(model: CalibratedModel, summary: FrameSummary, folder: Path
     """
     write_card(
         folder, "frame_card.md.j2", model=model, summary=summary, title=coordinate_title(summary),
-        coordinates=coordinate_table(summary), lines=fit_lines(summary),
+        coordinates=coordinate_table(summary), lines=[*fit_lines(summary), *cause_sentence(summary)],
+        causes=cause_table(summary), cause_title=CAUSE_TITLE,
     )  # fmt: skip
 
 

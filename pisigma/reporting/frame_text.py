@@ -3,11 +3,26 @@
 import math
 from pathlib import Path
 
+from pisigma.calibration.frames.misfit_causes import CAUSES
+from pisigma.estimation.alternatives import CLEAR
 from pisigma.reporting.result_text import ResultText, Table, sentences, table_block
 from pisigma.reporting.verdict import Verdict, count_text, rounded
 from pisigma.validation.held_out.frame_summary import CoordinateFigures, FrameSummary
 
+REMEDIES = {
+    "arm": "calibrate the arm with 40 images or more (`pisigma calibrate` without --only), or state a calibrated model",
+    "joint zeros": "set the joint zeros again, or calibrate the arm with `--set free=joint_offsets`",
+    "joint noise": "read the joint values when the arm has settled, and check clocks and backlash",
+    "camera": "calibrate the camera again with `pisigma camera`",
+    "board": "measure the squares of the board and correct `square_mm`",
+}
+"""What to do about every cause."""
 COLUMNS = ("coordinate", "unit", "before", "estimated", "standard error")
+
+
+MAX_DIRECTIONS = 3
+"""Weak directions that are shown, the weakest; JSON has all."""
+CAUSE_TITLE = "possible causes of the residuals, each alone compared with noise alone"
 
 
 def coordinate_table(summary: FrameSummary) -> Table:
@@ -28,6 +43,41 @@ def _coordinate_row(one: CoordinateFigures) -> tuple[str, ...]:
     )
 
 
+def cause_table(summary: FrameSummary) -> Table:
+    """Make a table of the possible causes of the residuals."""
+    columns = ("cause", "log Bayes factor", "explains alone [%]", "most probable size", "named")
+    rows = (
+        (
+            CAUSES[one.cause],
+            f"{one.log_bayes_factor:.1f}",
+            f"{100 * one.share:.0f}",
+            one.size if one.log_bayes_factor > 0 else "",
+            "yes" if one.named else "no",
+        )
+        for one in summary.causes
+    )
+    return Table(columns, tuple(rows))
+
+
+def cause_sentence(summary: FrameSummary) -> tuple[str, ...]:
+    """Return what causes the residuals and what to do; empty if nothing does beyond their noise."""
+    named = [one for one in summary.causes if one.named]
+    if not named:
+        return ()
+    first = named[0]
+    rivals = [
+        CAUSES[one.cause]
+        for one in summary.causes
+        if not one.named and one.log_bayes_factor > first.log_bayes_factor - CLEAR
+    ]
+    which = " and the ".join(f"{CAUSES[one.cause]}, {one.size}" for one in named)
+    unclear = f" The rows can hardly tell it from: {', '.join(rivals)}." if rivals else ""
+    remedies = ", and ".join(REMEDIES[one.cause] for one in named)
+    return (
+        f"The residuals are larger than their noise because of the {which}.{unclear} Remedy: {remedies}.",
+    )
+
+
 def coordinate_title(summary: FrameSummary) -> str:
     """Name the frames that the coordinates belong to."""
     bases = "base of the robot in the measuring frame"
@@ -43,7 +93,7 @@ def fit_lines(summary: FrameSummary) -> list[str]:
         if value is not None
     ]
     lines = [f"The residuals of the rows are {' and '.join(sizes)} RMS."] if sizes else []
-    return lines + [f"{one[0].upper()}{one[1:]}." for one in summary.weak_directions]
+    return lines + [f"{one[0].upper()}{one[1:]}." for one in summary.weak_directions[:MAX_DIRECTIONS]]
 
 
 def frame_text(summary: FrameSummary, folder: Path | None, seconds: float) -> ResultText:
@@ -54,13 +104,14 @@ def frame_text(summary: FrameSummary, folder: Path | None, seconds: float) -> Re
         folder: where the model was written; None if it was not.
         seconds: time it took [s].
     """
-    warnings = (*(one.sentence for one in summary.outliers), *summary.warnings)
+    warnings = (*cause_sentence(summary), *(one.sentence for one in summary.outliers), *summary.warnings)
     written = () if folder is None else (f"Model written to {folder} in {seconds:.1f} s.",)
     return ResultText(
         _verdict(summary, folder, len(warnings)),
         warnings,
         (
             table_block(coordinate_title(summary), *coordinate_table(summary)),
+            *([table_block(CAUSE_TITLE, *cause_table(summary), "causes")] if summary.causes else []),
             sentences("the fit", fit_lines(summary)),
         ),
         (),

@@ -45,13 +45,20 @@ class CameraCell:
 
 
 @functools.cache
-def camera_cell(count: int, seed: int = 0, noise: ImageNoise = NOISE, is_fixed: bool = False) -> CameraCell:
+def camera_cell(
+    count: int,
+    seed: int = 0,
+    noise: ImageNoise = NOISE,
+    is_fixed: bool = False,
+    length: float = LENGTH,
+    angle: float = ANGLE,
+) -> CameraCell:
     """Return images of the whole board from 0.3 to 0.7 m, tilted by at most 40 deg, with all branches of the arm."""
     with no_type_checker():
         nominal = Robot.load("ur5")
         first = CAMERA_IN_BASE if is_fixed else BOARD_IN_BASE
         rng = np.random.default_rng(seed)
-        errors = rng.standard_normal(nominal.dh.shape) * [ANGLE, LENGTH, LENGTH, ANGLE, ANGLE]
+        errors = rng.standard_normal(nominal.dh.shape) * [angle, length, length, angle, angle]
         base = xyzrpy_from_transform(invert(_transform(first))).numpy()
         true = nominal.with_geometry(nominal.dh + errors, base=base, tool=ON_FLANGE)
         q = _joints_of_views(nominal, count, rng, is_fixed)

@@ -4,6 +4,8 @@ import math
 from typing import Literal
 
 from pisigma.calibration.frames.frame_fit import FrameFit, WrongRow
+from pisigma.calibration.frames.misfit_causes import size_text
+from pisigma.estimation.alternatives import Cause
 from pisigma.files.yaml_file import Section
 from pisigma.measurement.sensors.sensor import SHOWN_UNITS
 from pisigma.validation.held_out.calibration_summary import NoiseFigures, noise_figures
@@ -32,6 +34,24 @@ class CoordinateFigures(Section):
     by_noise: float | None
 
 
+class CauseFigures(Section):
+    """A possible cause of the residuals of a hand-eye calibration.
+
+    Attributes:
+        cause: "arm", "joint zeros", "joint noise", "camera" or "board".
+        log_bayes_factor: log evidence with this cause alone, minus that with noise alone [nats].
+        share: share of the squared residuals, in units of their noise, that it explains alone.
+        size: most probable size of its errors, with units.
+        named: whether the evidence names it.
+    """
+
+    cause: str
+    log_bayes_factor: float
+    share: float
+    size: str
+    named: bool
+
+
 class FrameSummary(AbstractSummary):
     """All figures of a calibrated base, tool or hand-eye transform.
 
@@ -45,6 +65,7 @@ class FrameSummary(AbstractSummary):
         rms_mm: RMS residual of the positions [mm].
         rms_deg: RMS residual of the orientations [deg].
         outliers: rows that were left out, as the others contradict them.
+        causes: possible causes of the residuals, those that the evidence names first; not set if not compared.
         warnings: warnings, one sentence each.
     """
 
@@ -59,6 +80,7 @@ class FrameSummary(AbstractSummary):
     rms_mm: float | None = None
     rms_deg: float | None = None
     outliers: tuple[ContradictingRowFigures, ...]
+    causes: tuple[CauseFigures, ...] = ()
     warnings: tuple[str, ...]
 
 
@@ -98,6 +120,16 @@ def weak_direction_sentences(fit: FrameFit) -> tuple[str, ...]:
     )
 
 
+def _cause_figures(cause: Cause) -> CauseFigures:
+    return CauseFigures(
+        cause=cause.name,
+        log_bayes_factor=cause.log_bayes_factor,
+        share=cause.share,
+        size=size_text(cause),
+        named=cause.named,
+    )
+
+
 def wrong_row_figures(wrong: WrongRow) -> ContradictingRowFigures:
     """Return the figures of a row that was left out."""
     sizes = {"residual_mm": wrong.distance * 1e3, "residual_deg": math.degrees(wrong.angle)}
@@ -106,13 +138,18 @@ def wrong_row_figures(wrong: WrongRow) -> ContradictingRowFigures:
 
 
 def frame_summary(
-    fit: FrameFit, arm_variance: tuple[float, ...], parent: ParentFigures | None, warnings: tuple[str, ...]
+    fit: FrameFit,
+    arm_variance: tuple[float, ...],
+    causes: tuple[Cause, ...],
+    parent: ParentFigures | None,
+    warnings: tuple[str, ...],
 ) -> FrameSummary:
     """Gather the figures of a fit.
 
     Args:
         fit: the fit.
         arm_variance: see `coordinate_figures`.
+        causes: possible causes of the residuals.
         parent: model whose arm was used.
         warnings: warnings, one sentence each.
     """
@@ -132,6 +169,7 @@ def frame_summary(
     )
     return summary.with_figures(
         parent=parent,
+        causes=tuple(map(_cause_figures, causes)) or None,
         rms_mm=rms["m"] * 1e3 if "m" in rms else None,
         rms_deg=math.degrees(rms["rad"]) if "rad" in rms else None,
     )

@@ -83,7 +83,7 @@ def calibrate_frame(
     arm = _drawn(robot) if model is None else model.robot
     rows = read_rows(data, arm, cameras)
     found = frames_of_robot(arm, rows, only) if model is None else frames_of_model(model, rows, only)
-    summary = frame_summary(found.fit, found.arm_variance, parent, row_warnings(arm, rows))
+    summary = frame_summary(found.fit, found.arm_variance, found.causes, parent, row_warnings(arm, rows))
     summary = summary.with_figures(
         command=f"pisigma.calibrate_frame({arm.name!r}, {rows.file_names!r}, {only!r})"
     )

@@ -1,0 +1,162 @@
+"""Why a hand-eye calibration does not fit: the camera, the board, the arm or the joint readings."""
+
+import math
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from pisigma.calibration.frames.frame_fit import FrameFit
+from pisigma.calibration.frames.whitened_values import WhitenedValues
+from pisigma.calibration.geometric.calibrator import GeometricCalibrator
+from pisigma.calibration.geometric.problem.noise import sensor_view_of
+from pisigma.calibration.geometric.result import SolvedCalibration
+from pisigma.calibration.hybrid.sensor_values import joint_columns
+from pisigma.estimation.alternatives import Cause, FitResiduals
+from pisigma.estimation.loss import SquaredLoss
+from pisigma.measurement.camera.camera import INTRINSICS, USUAL_DEVIATIONS
+from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.sensors.intrinsics import (
+    INTRINSICS_COLUMN,
+    SCALE_COLUMN,
+    ImageIntrinsics,
+    boards,
+    cameras,
+    texts_of,
+    without_stated_priors,
+)
+from pisigma.measurement.sensors.sensor import distinct_names
+
+UNIT = 1e-3
+"""[m or rad] Size of the errors of arm, joints and board (as a share) at size 1: 1 mm, 1 mrad, 0.1 %."""
+CAMERA_UNIT = 3.0
+"""Errors of the intrinsics at size 1, in standard deviations of a typical calibration."""
+MIN_ROWS = 6
+"""Rows below which causes are not compared: 36 values, of which base and tool absorb 12."""
+
+CAUSES = {
+    "arm": "arm (lengths, angles and zeros of all joints)",
+    "joint zeros": "joint readings (zeros)",
+    "joint noise": "joint readings (noise or timing)",
+    "camera": "camera (intrinsics and distortion)",
+    "board": "board (scale)",
+}
+"""What every cause is about."""
+
+
+def misfit_causes(
+    fit: FrameFit, arm_root: Float64[Tensor, "arm directions"] | None = None
+) -> tuple[Cause, ...]:
+    """Compare the possible causes of the residuals of a hand-eye calibration.
+
+    The cause "joint noise" stands for errors of the joint readings that differ from row to row: noise, backlash, or a
+    delay between the image and the reading. Camera and board can be told from the arm with the corners of images only.
+
+    Args:
+        fit: base and tool that were fitted with the arm as given.
+        arm_root: root of the covariance of the arm's parameters, if a calibration states it; the arm is a cause if its
+            errors are larger.
+
+    Returns:
+        The causes, those that the evidence names first; none with fewer than `MIN_ROWS` poses.
+    """
+    rows = fit.rows.select(torch.tensor(fit.used))
+    if fit.only != "hand-eye" or rows.rows < MIN_ROWS or not fit.solved.problem.needs_rotation:
+        return ()
+    counted = {"camera": set(cameras(rows) or ()), "board": set(boards(rows) or ())}
+    robot = fit.solved.problem.space.robot
+    calibrator = GeometricCalibrator(robot, free=(), prior=None, loss=SquaredLoss())
+    solved = calibrator.solve(without_stated_priors(rows, counted))
+    return _residuals(solved, rows, arm_root).compare()
+
+
+def _residuals(
+    solved: SolvedCalibration, rows: Measurements, arm_root: Float64[Tensor, "arm directions"] | None
+) -> FitResiduals:
+    """Return the residuals with the stated intrinsics, linear in everything that may cause them."""
+    space, setup = solved.problem.space, solved.setup
+    unknowns = setup.free_unknowns
+    arm = list(range(space.arm_size))
+    frames = [*space.indices_of("base"), *space.indices_of("tool")]
+    values = WhitenedValues.at_solution(solved, [*arm, *frames, *unknowns])
+    X_arm, X_frames, X_unknowns = torch.split(values.X, [len(arm), len(frames), len(unknowns)], 1)
+    moved = solved.solution.linearisation.point[unknowns] - setup.start[unknowns]
+    unit = _noise_units(solved, values)
+    zeros = X_arm[:, joint_columns(space)]
+    causes = {"arm": UNIT * X_arm, "joint zeros": UNIT * zeros, "joint noise": UNIT * _per_row(values)}
+    groups = [space.parameters[index].group for index in unknowns]
+    for kind in ("camera", "board"):
+        chosen = [k for k, group in enumerate(groups) if group == kind]
+        if chosen:
+            sizes = [_usual_error(kind, space.names[unknowns[k]]) for k in chosen]
+            causes[kind] = X_unknowns[:, chosen] * torch.tensor(sizes, dtype=torch.float64)
+    known = X_unknowns * _stated_deviations(solved, rows)
+    if arm_root is not None:
+        known = torch.cat([known, X_arm @ arm_root], 1)
+    return FitResiduals.from_fit(
+        y=unit * (values.y + X_unknowns @ moved),
+        fitted=unit[:, None] * X_frames,
+        known=unit[:, None] * known,
+        exact=values.exact,
+        is_stated=bool(rows.is_measured("corner").any()),
+        causes={name: unit[:, None] * Z for name, Z in causes.items()},
+    )
+
+
+def _usual_error(kind: str, name: str) -> float:
+    """Return the error of an unknown of a camera or a board at size 1."""
+    if kind == "board":
+        return UNIT
+    return CAMERA_UNIT * USUAL_DEVIATIONS[INTRINSICS.index(name.rsplit("_", 1)[-1])]
+
+
+def _noise_units(solved: SolvedCalibration, values: WhitenedValues) -> Float64[Tensor, " values"]:
+    """Return the factors that undo the estimated noise where the rows state theirs (corners of images)."""
+    deviation = sensor_view_of(solved.refined).variances.sqrt()
+    noise = solved.setup.measurements.readings.get("corner_noise")
+    factors = []
+    for (one, _), sigma in zip(values.sensors, deviation, strict=True):
+        factor = torch.ones(len(one.row), dtype=torch.float64)
+        if one.name == "corner" and isinstance(noise, Tensor):
+            factor = float(sigma) / noise[one.row]
+        factors.append(factor.repeat_interleave(one.components))
+    return torch.cat(factors)
+
+
+def _per_row(values: WhitenedValues) -> Float64[Tensor, "values _joints"]:
+    """Return the derivatives with respect to the joint values of every row separately."""
+    rows, dof = int(values.row.max()) + 1, values.joints.shape[1]
+    columns = values.joints.new_zeros(len(values.y), rows, dof)
+    columns[torch.arange(len(values.y)), values.row] = values.joints
+    return columns.flatten(1)
+
+
+def _stated_deviations(solved: SolvedCalibration, rows: Measurements) -> Float64[Tensor, " unknowns"]:
+    """Return the stated standard deviation of every unknown of cameras and boards; 0 where none is stated."""
+    space, unknowns = solved.problem.space, solved.setup.free_unknowns
+    images = ImageIntrinsics.from_texts(texts_of(rows, INTRINSICS_COLUMN))
+    stated = {
+        ("camera", name): images.sigma[(cameras(rows) or ()).index(name)].tolist()
+        for name in distinct_names(cameras(rows))
+    }
+    for name in distinct_names(boards(rows)):
+        text = texts_of(rows, SCALE_COLUMN)[(boards(rows) or ()).index(name)]
+        stated["board", name] = [float(text) if text else 0.0]
+    columns = {own.name: own.columns for own in space.unknowns}
+    deviations = []
+    for one in (space.parameters[index] for index in unknowns):
+        known = stated.get((one.group, one.owner))
+        number = columns[one.group].index(one.name.rsplit("_", 1)[-1])
+        deviations.append(0.0 if known is None else known[number])
+    return torch.tensor(deviations, dtype=torch.float64)
+
+
+def size_text(cause: Cause) -> str:
+    """Describe the size of a cause."""
+    error = cause.size * UNIT
+    if cause.name == "camera":
+        return f"{cause.size * CAMERA_UNIT:.2g} x a typical calibration"
+    if cause.name == "board":
+        return f"{error * 100:.2g} %"
+    angle = f"{math.degrees(error):.2g} deg"
+    return f"{error * 1e3:.2g} mm, {angle}" if cause.name == "arm" else angle
