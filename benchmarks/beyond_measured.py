@@ -1,10 +1,10 @@
-"""Error of a hybrid far outside its measured joint values: from series C to series B of the measured UR10.
+"""Error of a hybrid far outside its measured joint values, from series C to series B of the measured UR10.
 
 Run `OMP_NUM_THREADS=2 python benchmarks/beyond_measured.py` with the measured files in `PISIGMA_DATA`. Every line is
 the root mean square of the position errors of series B [mm] for a hybrid fitted to series C, with base and tool fitted
-to series B. The prior sizes are estimated from series C; or from both series together; or replaced by the amplitude of
-every harmonic of every joint in both series, so that only its phase is unknown. The last is a bound for every rule that
-estimates sizes from series C.
+to series B. The prior sizes are estimated from series C, or from both series together, or replaced by the amplitude of
+every harmonic of every joint in both series, so that only the phases are unknown. The last error is a lower bound for
+every rule that estimates sizes from series C.
 """
 
 import os
@@ -54,7 +54,7 @@ def together(first: Measurements, second: Measurements) -> Measurements:
 def fitted(
     solved: SolvedCalibration, features: tuple[AbstractFeature, ...], prior: GaussianPrior | None = None
 ) -> RefinedFit:
-    """Return the hybrid with some features, with prior sizes estimated or given."""
+    """Return the hybrid with the given features, with estimated or given prior sizes."""
     problem, group = solved.problem, held_out_groups(solved.setup.measurements)
     view, design = sensor_view_of(solved.solution.linearisation), Design(problem, features)
     x = torch.zeros(design.unknowns, dtype=torch.float64)

@@ -1,10 +1,10 @@
-"""Geometric calibration compared with other packages: one data set, one process, ratios of time and held-out error.
+"""Compare the time and the held-out error of geometric calibration with other packages on one data set.
 
 Install with `pip install -e ".[bench]"` in a separate environment (pybotics needs an older numpy), then run
-`OMP_NUM_THREADS=1 python benchmarks/calibration.py`. A 6R arm (UR10) has errors of 0.5 mm and 1 mrad in all DH
-and Hayati parameters, unknown base and tool, and position noise of 0.05 mm per axis; errors are those of the true tool
-position at 2000 new poses. The peers start from the true base and tool with errors of 10 mm and 10 mrad; pisigma
-has no initial guess. Every fit runs several times and the fastest counts. pybotics is stopped after 3000
+`OMP_NUM_THREADS=1 python benchmarks/calibration.py`. A 6R arm (UR10) has errors of 0.5 mm and 1 mrad in all DH and
+Hayati parameters, unknown base and tool, and position noise of 0.05 mm per axis. The printed errors are those of the
+true tool position at 2000 new poses. The peers start from the true base and tool with errors of 10 mm and 10 mrad;
+pisigma has no initial guess. Every fit runs several times, and the fastest run counts. pybotics is stopped after 3000
 evaluations, which take about a minute, and runs once.
 """
 

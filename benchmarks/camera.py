@@ -1,14 +1,14 @@
-"""Calibration of a UR5 with a camera on its flange: true error over the workspace, compared with the Cramér-Rao bound.
+"""Compare the true error of a UR5 calibrated with a camera on its flange with the Cramér-Rao bound.
 
     OMP_NUM_THREADS=1 python benchmarks/camera.py [--draws 20] [--images 50]
 
 True arms have errors of 1 mm and 0.3 deg in every parameter. The camera (1920 x 1200 px, f = 1400 px) views a board of
 9 x 6 corners 30 mm apart from 0.3 to 0.7 m, tilted by up to 40 deg; the noise of the corners is 0.3 px, the
-repeatability of the robot 0.02 mm and 0.01 deg. The intrinsics are known, or stated by a typical calibration (fx, fy
-0.5 px; cx, cy 1 px; k1 0.002; k2 0.01; p1, p2 2e-4) with errors of that size; then they are used as prior, ignored
-(free), or taken as true (held). Errors are those of the camera centre's position after the best rigid alignment, over
-other views of the board (region) and over 400 postures of the whole joint space (workspace), pooled over draws. The
-bound includes the prior of the intrinsics, but not that of the arm.
+repeatability of the robot 0.02 mm and 0.01 deg. The intrinsics are known, or stated by a typical calibration with
+errors of the stated standard deviations (fx, fy 0.5 px; cx, cy 1 px; k1 0.002; k2 0.01; p1, p2 2e-4); the stated
+intrinsics are used as prior, ignored (free), or taken as true (held). Errors are those of the camera centre's position
+after the best rigid alignment, over other views of the board (region) and over 400 postures of the whole joint space
+(workspace), pooled over draws. The bound includes the prior of the intrinsics, but not that of the arm.
 """
 
 import argparse
@@ -133,7 +133,7 @@ def aligned_error(true: Tensor, estimated: Tensor) -> float:
 
 
 def bound(true: Robot, rows: Measurements, q: Tensor) -> float:
-    """Return the Cramér-Rao bound [m] of the same figure: no prior, noise of corners and repeatability known."""
+    """Return the Cramér-Rao bound [m] of `aligned_error` without a prior, for known noise of corners and robot."""
     setup = GeometricCalibrator(true, prior=None).build(rows)
     problem, point = setup.problem, setup.start
     unknown = [*range(problem.space.indices_of("tool").stop), *setup.free_unknowns]

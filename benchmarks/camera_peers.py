@@ -147,7 +147,9 @@ def main(draws: int, count: int) -> None:
         )
     print(f"scipy takes {seconds['scipy'] / seconds['pisigma']:.1f} times as long")
     if methods:
-        print(f"the best of OpenCV's methods is {min(ratios):.0f} times as inaccurate or more in every draw")
+        print(
+            f"the most accurate of OpenCV's methods has at least {min(ratios):.0f} times the error in every draw"
+        )
     else:
         print("OpenCV 5 has no hand-eye calibration for Python; see above for how to run it with OpenCV 4")
 

@@ -1,4 +1,4 @@
-"""Calibration of a UR5 from rendered images, compared with ideal corners.
+"""Compare calibrations of a UR5 from rendered images with calibrations from ideal corners.
 
     OMP_NUM_THREADS=1 python benchmarks/camera_pixels.py [--draws 5] [--images 40]
 

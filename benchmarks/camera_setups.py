@@ -1,13 +1,14 @@
-"""Other set-ups than one camera on the flange, wrong corners and images, and transmission errors.
+"""Calibrations with several cameras and other sensors, with wrong corners and images, and with transmission errors.
 
     OMP_NUM_THREADS=1 python benchmarks/camera_setups.py [mixed] [wrong] [bent] [gears] [--draws 10]
 
-Arms, cameras, boards and noise are those of `camera.py`, with fixed intrinsics. mixed: a fixed camera with the
-board on the flange, two cameras, and a camera with 10 positions of a tracker (0.02 mm), each compared with its parts.
-wrong: 5 % of the corners off by 5 px and three images with two joint values swapped. bent: a board bowed by 0.3 mm,
-taken as flat and with its flatness stated. gears: joints with two harmonics of 0.015 deg, 150 images, the
-hybrid compared with the geometry alone. Errors are those of the target's position over 400 postures of the whole joint
-space after the best rigid alignment, pooled over draws.
+Arms, cameras, boards and noise are those of `camera.py`, with fixed intrinsics. The part "mixed" compares a fixed
+camera with the board on the flange, two cameras, and a camera with 10 positions of a tracker (0.02 mm) with each of
+these instruments alone. The part "wrong" has 5 % of the corners off by 5 px and three images with two swapped joint
+values. The part "bent" has a board bowed by 0.3 mm, which is taken as flat or whose flatness is stated. The part
+"gears" has joints with two harmonics of 0.015 deg and 150 images, and compares the hybrid with the geometry alone.
+Errors are those of the target's position over 400 postures of the whole joint space after the best rigid alignment,
+pooled over draws.
 """
 
 import argparse
@@ -246,7 +247,7 @@ def main(chosen: list[str], draws: int) -> None:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser()
-    parser.add_argument("parts", nargs="*", help="mixed, wrong, bent, gears (default: all)")
+    parser.add_argument("parts", nargs="*", help="Parts to run: mixed, wrong, bent, gears (default: all).")
     parser.add_argument("--draws", type=int, default=10)
     arguments = parser.parse_args()
     main(arguments.parts, arguments.draws)

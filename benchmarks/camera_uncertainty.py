@@ -80,7 +80,9 @@ def main(draws: int) -> None:
         share = torch.stack(
             [inside(cell, cell.draw(number), choice).double().mean() for number in range(draws)]
         )
-        print(f"predicted 95 %, intrinsics {choice}: {float(share.mean()):.1%} inside")
+        print(
+            f"predicted 95 % intervals, intrinsics {choice}: contain {float(share.mean()):.1%} of the coordinates"
+        )
     smaller = replace(BOARD, square=BOARD.square / (1 + SCALE))
     q = cell.judged["workspace"]
     for choice in CHOICES:

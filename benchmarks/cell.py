@@ -1,12 +1,12 @@
-"""Simulated arms from URDF to a verified model through a cell: is `pisigma status` right after every command?
+"""Test with simulated arms whether `pisigma status` is right after every command, from a URDF file to a verified model.
 
 Run `OMP_NUM_THREADS=1 python benchmarks/cell.py FOLDER_OF_SIM [--arms kr10 scara] [--seeds 10] [--subprocess]`.
 
-FOLDER_OF_SIM holds the independent simulator `sim.py` and its URDF files. Every arm takes eight commands: new, plan,
+FOLDER_OF_SIM contains the independent simulator `sim.py` and its URDF files. Every arm takes eight commands: new, plan,
 import, calibrate, plan, import, verify and serve. `new` states the robot, the folder, the sensor and the limit; every
 other command is `next.command` of `pisigma status CELL --json`, word by word, with the name of the file of rows in
-place of `ROWS.csv`. The simulator measures the poses of the plans. It also judges the model in use at 300 other poses,
-and, in comparison, the nominal robot and the model of `pisigma calibrate URDF ROWS.csv` without a cell.
+place of `ROWS.csv`. The simulator measures the poses of the plans. It also evaluates the model in use at 300 other
+poses, compared with the nominal robot and the model of `pisigma calibrate URDF ROWS.csv` without a cell.
 """
 
 import argparse
@@ -42,7 +42,7 @@ class Arm:
     """One arm with its cell, and the figures of the table.
 
     Attributes:
-        commands: number of commands that ended with status 0.
+        commands: number of commands that ended with exit status 0.
         right: number of right next steps.
     """
 

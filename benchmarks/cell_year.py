@@ -1,14 +1,14 @@
-"""A simulated year of a cell: are events named in their month, are wrong sessions refused, is the model in use right?
+"""Simulate years of a cell: are events named in their month, wrong sessions refused, and the model in use accurate?
 
 `python benchmarks/cell_year.py FOLDER_OF_SIM [--arm irb120] [--seeds 20]`
 
-FOLDER_OF_SIM holds the independent simulator `sim.py` and its URDF files. An arm is calibrated with 80 poses and
-verified with 10. Then 12 sessions of 10 poses are taken in, one a month, while joint 2 drifts by 0.005 deg a month, a
+FOLDER_OF_SIM contains the independent simulator `sim.py` and its URDF files. An arm is calibrated with 80 poses and
+verified with 10. Then 12 sessions of 10 poses are imported, one a month, while joint 2 drifts by 0.005 deg a month, a
 collision moves joint 3 by 0.05 deg in month 7, the tracker is set up again in month 9, and the reflector is changed in
-month 10. Nobody records these events. A session of another robot and one in inches are offered, too. The steps that
-`pisigma status` names are done: monitor, recalibrate. Every month the simulator judges the model in use at 300 other
-poses, after a rigid fit, and in comparison the model before, a recalibration with the session, and a calibration from
-all rows since the last true event.
+month 10. No event is recorded by hand. A session of another robot and a session in inches are imported too. The steps
+that `pisigma status` names (monitor, recalibrate) are carried out. Every month the simulator evaluates the model in use
+at 300 other poses after a rigid fit, compared with the previous model, a recalibration with the session, and a
+calibration from all rows since the last true event.
 """
 
 import argparse
@@ -69,7 +69,7 @@ class Year:
         return position_error(model, self.judged, x)
 
     def happen(self, month: int) -> None:
-        """Change the arm and its set-up as the month has it."""
+        """Apply the changes of a month to the arm and its set-up."""
         self.true.perturb[1] = np.deg2rad(0.005 * month)
         if month == 7:
             self.true.perturb[2] = np.deg2rad(0.05)
@@ -82,7 +82,7 @@ class Year:
             self.since = []
 
     def month(self, month: int) -> tuple[set[str], float, list[float]]:
-        """Take in the session of a month; return what was named, and errors [mm] of the model in use and of others."""
+        """Import the session of a month; return the named changes, and the errors [mm] of all compared models."""
         self.happen(month)
         rows = self.rows(10, 100 + month)
         before = self.cell.model
@@ -108,7 +108,7 @@ class Year:
         return named, self.error(in_use), others
 
     def refuses(self, path: Path, day: str) -> bool:
-        """Whether a wrong session is refused."""
+        """Return whether a wrong session is refused."""
         try:
             self.cell.take_in(path, day=day)
         except PisigmaError:
@@ -122,7 +122,7 @@ def sim_folder(sim: Any) -> Path:
 
 
 def main() -> None:
-    """Run the years of several seeds and print what was found."""
+    """Simulate the years of several seeds and print the results."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -1,13 +1,13 @@
-"""The closed loop in MuJoCo: does an arm that pisigma knows only from its drawing reach the poses that are wanted?
+"""Close the loop in MuJoCo: does an arm that pisigma knows only from its drawing reach the commanded poses?
 
 `python benchmarks/closed_loop.py [--arm ur5] [--case rigid] [--seeds 5] [--jobs 1] [--out FOLDER]`
 
-MuJoCo reads a drawn URDF, and the arm in it is made false (`mujoco_arm.py`). A cell is made of the drawing; 60 planned
-poses are driven by MuJoCo's position controllers, and a tracker measures the reflector with a noise of 0.03 mm per axis
-in a frame of its own. The cell is calibrated, and verified with 10 further planned poses. Then 500 poses that
-nobody has measured are solved by the corrected inverse kinematics, their joint values are commanded to the controllers,
-and the true positions of the reflector are compared with the wanted ones. The nominal arm with base and tool fitted to
-the same 60 rows is driven to the same poses. Needs the extra `bench`.
+MuJoCo reads a drawn URDF file, and errors are added to the arm (`mujoco_arm.py`). A cell is created from the drawing;
+MuJoCo's position controllers drive 60 planned poses, and a tracker, whose frame is unknown, measures the reflector with
+a noise of 0.03 mm per axis. The cell is calibrated, and verified with 10 further planned poses. Then the corrected
+inverse kinematics solves 500 poses that were not measured, their joint values are commanded to the controllers, and the
+true positions of the reflector are compared with the requested ones. The nominal arm with base and tool fitted to the
+same 60 rows is driven to the same poses. The program needs the extra `bench`.
 """
 
 import argparse
@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from mujoco_arm import ArmErrors, DrawnArm, Driven, FalseArm
+from mujoco_arm import ArmErrors, DrawnArm, Driven, PerturbedArm
 from scipy.spatial.transform import Rotation
 
 import pisigma
@@ -51,16 +51,16 @@ ARMS = {
 
 @dataclass(frozen=True)
 class Case:
-    """What is wrong with an arm, and what is measured.
+    """Kinds of errors of an arm, and contents of the measured rows.
 
     Attributes:
-        text: the case in the table.
+        text: name of the case in the table.
         is_elastic: whether gears are elastic.
         play_deg: free play of every gear [deg].
         states_payload: whether the rows state the payload.
         measured: whether rows contain the joint values that the encoders read; the controllers then have an integral
             part. Otherwise they contain the commanded values, which a proportional controller does not quite reach.
-        limit_mm: largest RMS error that is asked for [mm].
+        limit_mm: limit of the RMS error [mm].
     """
 
     text: str
@@ -86,7 +86,7 @@ CASES = {
 
 @dataclass(frozen=True)
 class Closed:
-    """Result of one loop; errors are distances of true positions from wanted ones [mm].
+    """Result of one loop; errors are distances of true positions from requested ones [mm].
 
     Attributes:
         arm: name of the arm.
@@ -95,18 +95,18 @@ class Closed:
         nominal_mm: RMS error of the nominal arm.
         rms_mm: RMS error with the calibrated arm.
         p95_mm: 95 % quantile of its errors.
-        predicted_p95_mm: the same as the model predicts it, without the noise of the tracker.
-        planned_p95_mm: the same as the plan predicted it.
+        predicted_p95_mm: prediction of this quantile by the model, without the noise of the tracker.
+        planned_p95_mm: prediction of this quantile by the plan.
         rows: number of calibration rows: planned poses with a collision-free path.
-        reached: number of wanted poses with a solution.
-        outside: number of wanted poses outside the measured joint values.
+        reached: number of requested poses with a solution.
+        outside: number of requested poses outside the measured joint values.
         correction: features of the joint correction that were kept.
         verdict: verdict of the verification.
         warnings: warnings of the calibration.
         seconds: computing time [s].
         errors_mm: all errors.
         nominal_errors_mm: all errors of the nominal arm.
-        was_refused: whether the import refused rows, although they are right; they were then accepted by hand.
+        was_refused: whether the import refused valid rows, which were then accepted explicitly.
     """
 
     arm: str
@@ -130,15 +130,15 @@ class Closed:
 
 
 class Loop:
-    """One false arm, its tracker, and the cell in which pisigma calibrates it."""
+    """An arm with errors, its tracker, and the cell in which pisigma calibrates it."""
 
     def __init__(self, arm: str, case: str, seed: int, folder: Path) -> None:
-        """Make the arm false, set the tracker up, and make the cell from the drawing."""
+        """Create the arm with its errors, the tracker, and the cell from the drawing."""
         drawn, self.case = ARMS[arm], CASES[case]
         self.rng = np.random.default_rng([seed, 7])
         self.payload = round(float(self.rng.uniform(1, 3)), 2)
         errors = ArmErrors(elastic=drawn.elastic if self.case.is_elastic else (), play_deg=self.case.play_deg)
-        self.arm = FalseArm(drawn, errors, seed, self.payload)
+        self.arm = PerturbedArm(drawn, errors, seed, self.payload)
         turn = Rotation.from_euler("z", self.rng.uniform(-180, 180), degrees=True)
         self.tracker = turn * Rotation.from_rotvec(self.rng.normal(0, 0.01, 3)), self.rng.uniform(-3, 3, 3)
         self.folder, self.was_refused = folder, False
@@ -150,13 +150,13 @@ class Loop:
         self.robot = self.cell.robot
 
     def drive(self, commands: np.ndarray) -> Driven:
-        """Drive through joint values; positions are true, and in the frame of the tracker."""
+        """Drive to joint values; the result contains true positions in the frame of the tracker."""
         driven = self.arm.drive(commands, SERVO if self.case.measured else 0)
         turn, shift = self.tracker
         return replace(driven, position=turn.apply(driven.position) + shift)
 
     def measure(self, commands: np.ndarray, name: str) -> Measurements:
-        """Drive through joint values and write what the tracker measures as a file of rows."""
+        """Drive to joint values and write the measurements of the tracker as a file of rows."""
         driven = self.drive(commands)
         rows = Measurements(
             q=torch.from_numpy(driven.encoders if self.case.measured else commands),
@@ -179,7 +179,7 @@ class Loop:
 
 @cache
 def plan_of(arm: str, poses: int = POSES, candidates: int = 5000) -> pisigma.Plan:
-    """Plan the poses of the calibration and of its verification, which depend on the drawing only."""
+    """Plan the poses of the calibration and of its verification, which depend only on the drawing."""
     drawn = ARMS[arm]
     with tempfile.TemporaryDirectory() as folder:
         cell = Cell.create(Path(folder) / "cell", drawn.urdf, base=drawn.base, tip=drawn.tip)
@@ -189,7 +189,7 @@ def plan_of(arm: str, poses: int = POSES, candidates: int = 5000) -> pisigma.Pla
 def close_loop(
     arm: str, case: str, seed: int, folder: Path, plan: pisigma.Plan, count: int = WANTED
 ) -> Closed:
-    """Measure the planned poses, calibrate, verify, command `count` other poses, and compare with them."""
+    """Measure the planned poses, calibrate, verify, and compare the positions attained at `count` other poses."""
     began = time.perf_counter()
     loop = Loop(arm, case, seed, folder)
     planned, check = plan.stored.q.numpy(), plan.stored.check.numpy()
@@ -251,7 +251,7 @@ def predicted_p95(model: Any, q: np.ndarray) -> float:
 
 
 def run_one(task: tuple[str, str, int]) -> Closed:
-    """Close one loop in a scratch folder; `task` is arm, case and seed."""
+    """Close one loop in a temporary folder; `task` contains arm, case and seed."""
     torch.set_num_threads(1)
     with tempfile.TemporaryDirectory() as folder:
         return close_loop(*task, Path(folder), plan_of(task[0]))
@@ -330,7 +330,7 @@ def draw(results: Sequence[Closed], file: Path) -> None:
 
 
 def line(one: Closed) -> str:
-    """Return the line that is printed after each loop."""
+    """Return the line to print after a loop."""
     return (
         f"{one.arm} {one.case} {one.seed}: nominal {one.nominal_mm:.3f}, calibrated {one.rms_mm:.3f} mm RMS; "
         f"95 %: true {one.p95_mm:.3f}, predicted {one.predicted_p95_mm:.3f}, planned {one.planned_p95_mm:.3f}; "
@@ -350,7 +350,7 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0, help="First seed.")
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument(
-        "--out", type=Path, help="JSON lines of all results; those in it are not computed again."
+        "--out", type=Path, help="JSON lines of all results; results in the file are not computed again."
     )
     parser.add_argument("--figure", type=Path, help="Picture of all results.")
     stated = parser.parse_args()

@@ -1,11 +1,11 @@
-"""True error of calibrated arms with coupled joints or a rail, relative to that of the same arm without.
+"""True error of calibrated arms with coupled joints or a rail, relative to the same arm without them.
 
 Run `OMP_NUM_THREADS=1 python benchmarks/coupling.py [SEEDS]`. Every arm is simulated with random errors of its
 geometry, gears (harmonics 1, 2 and 7, before the coupling), gravity, 0.03 mm noise and 0.02 mm repeatability,
 calibrated with 120 positions, and evaluated at 2,000 other poses without noise. Its coupling has errors too: 0.1 % in
 factors, some 0.3 mm in the bars of a parallelogram; the rail bends by 0.3 mm sideways and vertically and yaws by 0.02
 deg. The figures are medians over the seeds of the root mean square of the true error of the hybrid. Single seeds
-scatter widely (the first two of the first arm: 1.98 and 0.82), so a few of them are not conclusive.
+scatter widely (ratios of 1.98 and 0.82 for the first two seeds of the first arm), so a few seeds are not conclusive.
 """
 
 import statistics

@@ -1,4 +1,4 @@
-"""Time of a cross-validated hybrid of the UR10 with `--jobs 1` and `--jobs 2`, with the same figures.
+"""Time of a cross-validated hybrid of the UR10 with `--jobs 1` and `--jobs 2`, which give the same figures.
 
 Run `OMP_NUM_THREADS=1 python benchmarks/cross_validation_jobs.py` with the public data sets in `PISIGMA_DATA`.
 """

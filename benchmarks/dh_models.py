@@ -1,7 +1,7 @@
 """Models of MuJoCo, pinocchio, Drake and the Robotics Toolbox from an exported DH table.
 
-It does not import pisigma, and reads the table by the convention and the units that the file states:
-A_i = RotZ(theta_i + direction q_i) Trans(a_i, 0, d_i) RotX(alpha_i) RotY(beta_i), a prismatic joint adds to d_i.
+The module does not import pisigma, and reads the table by the convention and the units that the file states: A_i =
+RotZ(theta_i + direction q_i) Trans(a_i, 0, d_i) RotX(alpha_i) RotY(beta_i), a prismatic joint adds to d_i.
 """
 
 import csv
@@ -20,7 +20,7 @@ BASE, TOOL = "base", "tool"
 
 @dataclass(frozen=True)
 class Row:
-    """A row: type, direction (1 or -1), theta, alpha and beta [rad], d and a [m]."""
+    """A row of the table, with type, direction (1 or -1), theta, alpha and beta [rad], d and a [m]."""
 
     type: str
     direction: int
@@ -42,7 +42,7 @@ class Table:
     def links(self) -> Iterator[tuple[str, int, np.ndarray]]:
         """Yield type, direction and pose of the frame that moves about or along its z axis in the previous one.
 
-        A rotation about z and a translation along it commute, so it is behind RotZ(theta) Trans(0, 0, d).
+        A rotation about z and a translation along it commute, so the frame comes after RotZ(theta) Trans(0, 0, d).
         """
         T = self.T_base
         for row in self.rows:

@@ -45,7 +45,7 @@ def write_fleet(folder: Path, robots: int, poses: int, model: str) -> None:
 
 
 def command(out: str, *options: str) -> list[str]:
-    """Return the command line of a run on a copy of the cells, which is made if it does not exist."""
+    """Return the command line of a run on a copy of the cells, which is created if it does not exist."""
     if not Path(out).exists():
         shutil.copytree("cells", out)
     return [sys.executable, "-m", "pisigma", "fleet", "run", out, "--json", *options]
@@ -82,7 +82,7 @@ def memory_below(pid: int) -> float:
 
 
 def results(out: str) -> list[dict[str, object]]:
-    """Return the results of a run, without the names and hashes of models, which a kill after writing one changes."""
+    """Return the results of a run without the names and hashes of models, which depend on when a process is killed."""
     table = parquet.read_table(f"{out}/results.parquet")
     rows: list[dict[str, object]] = table.drop_columns(["model", "model_sha256"]).to_pylist()
     return rows
@@ -152,11 +152,11 @@ def kills(robots: int, count: int) -> None:
 def main() -> None:
     """Run the requested parts."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("parts", nargs="*", help="engines, kills (default: both), before")
-    parser.add_argument("--before", type=Path, help="checkout of an earlier version with manifests")
+    parser.add_argument("parts", nargs="*", help="Parts to run: engines, kills (default: both), before.")
+    parser.add_argument("--before", type=Path, help="Checkout of an earlier version with manifests.")
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--robots", type=int, default=200)
-    parser.add_argument("--poses", type=int, default=100, help="per robot")
+    parser.add_argument("--poses", type=int, default=100, help="Number of poses per robot.")
     parser.add_argument("--model", default="hybrid", choices=("hybrid", "geometric"))
     parser.add_argument("--kills", type=int, default=20)
     wanted = parser.parse_args()

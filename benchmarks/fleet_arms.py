@@ -1,10 +1,10 @@
 """Ten poses of a simulated arm with the prior of its fleet, compared with ten and thirty poses without it.
 
 Run `OMP_NUM_THREADS=1 python benchmarks/fleet_arms.py [--fleets 11] [--robots 30] [--judged 10]` with the simulator of
-arms (`sim.py`) in `PISIGMA_SIMULATED`. Every arm is a kr10 with common and individual errors; 60 positions of each make
-the prior. All figures are root mean squares of position errors at 300 other poses without noise [mm]. "exact" is the
-expected error after ten positions if the distribution of the arms is known, averaged over the same number of draws of
-poses: the minimum for all estimates that are linear in the measured values.
+arms (`sim.py`) in `PISIGMA_SIMULATED`. Every arm is a kr10 with common and individual errors; the prior is estimated
+from 60 positions of each arm. All figures are root mean squares of position errors at 300 other poses without noise
+[mm]. "exact" is the expected error after ten positions if the distribution of the arms is known, averaged over the same
+number of draws of poses, which is the minimum for all estimates that are linear in the measured values.
 """
 
 import argparse
@@ -48,9 +48,10 @@ class Fleet:
 
     Attributes:
         errors: size of the individual errors of the geometry and of joint offsets, as a share of the common ones.
-        gears: share of the amplitudes of harmonics that is individual; the rest is common with its phase.
-        noise: of a coordinate [m].
-        kind: "position" or "pose", what is measured.
+        gears: individual share of the amplitudes of harmonics; the remaining share has the same amplitude and phase in
+            all arms.
+        noise: noise of a coordinate [m].
+        kind: measured quantity, "position" or "pose".
     """
 
     errors: float
@@ -147,7 +148,7 @@ class Fleet:
         return arm.measure(q, noise=0.0, rep=0.0)[0]
 
     def figures(self, robots: int, judged: int) -> np.ndarray:
-        """Return errors after 10 poses with the prior, 10 planned ones, 10 and 30 without, and 30 with it [mm]."""
+        """Return errors [mm] after 10 random, 10 planned and 30 poses with the prior, and 10 and 30 without it."""
         arms = [self.arm(number) for number in range(robots)]
         rows = [self.rows(arm, arm.sample(60, number), number) for number, arm in enumerate(arms)]
         prior = fleet_prior("fleet", self.nominal, rows).model
@@ -177,7 +178,7 @@ FLEETS = (
 def main() -> None:
     """Print one line per fleet."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--fleets", type=int, default=len(FLEETS), help="number of lines of the table")
+    parser.add_argument("--fleets", type=int, default=len(FLEETS), help="Number of lines of the table.")
     parser.add_argument("--robots", type=int, default=30)
     parser.add_argument("--judged", type=int, default=10)
     wanted = parser.parse_args()

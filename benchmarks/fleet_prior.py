@@ -1,8 +1,8 @@
 """Calibrations with few poses, with and without the prior of a fleet, and robots that differ from the fleet.
 
-Run `OMP_NUM_THREADS=1 python benchmarks/fleet_prior.py [--fleets 7] [--robots 50] [--odd 5] [--judged 10]`. Robots
-have common errors of 1 mm and 1 mrad, and individual ones; 60 poses of each make the prior. All figures are root mean
-squares of position errors at 400 other poses without noise [mm].
+Run `OMP_NUM_THREADS=1 python benchmarks/fleet_prior.py [--fleets 7] [--robots 50] [--odd 5] [--judged 10]`. Robots have
+common errors of 1 mm and 1 mrad, and individual errors; the prior is estimated from 60 poses of each robot. All figures
+are root mean squares of position errors at 400 other poses without noise [mm].
 """
 
 import argparse
@@ -43,7 +43,7 @@ def rms(predicts: Any, test: Measurements) -> float:
 
 
 def true_prior(individual: float, gears: float) -> CalibratedModel:
-    """Return the distribution that the robots are drawn from, as a prior."""
+    """Return the distribution from which the robots are drawn, as a prior."""
     posterior = RobotPosterior.from_robot(NOMINAL)
     size = posterior.uncertainty.space.arm_size
     means, deviations = [common_errors().flatten()], [torch.full((size,), individual, dtype=torch.float64)]
@@ -97,7 +97,7 @@ def fleet_table(fleets: int, robots: int, odd: int, judged: int) -> FleetPrior:
 
 
 def gated(prior: FleetPrior, number: int, odd: bool) -> list[float]:
-    """Return what `pisigma calibrate --prior` keeps, and the calibration without prior, for 10 and 30 poses."""
+    """Return the model kept by `calibrate --prior`, and the calibration without a prior, for 10 and 30 poses."""
     test, figures = rows_of(number, 400, 9000 + number, odd, noise=0.0), []
     for count in (10, 30):
         rows = rows_of(number, count, 7000 + number, odd)
@@ -114,9 +114,9 @@ def gated(prior: FleetPrior, number: int, odd: bool) -> list[float]:
 
 
 def main() -> None:
-    """Print the table of fleets, and what is kept for robots like the typical fleet and for different ones."""
+    """Print the table of fleets, and the models kept for robots of the typical fleet and for different robots."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--fleets", type=int, default=len(FLEETS), help="number of lines of the table")
+    parser.add_argument("--fleets", type=int, default=len(FLEETS), help="Number of lines of the table.")
     parser.add_argument("--robots", type=int, default=50)
     parser.add_argument("--odd", type=int, default=5)
     parser.add_argument("--judged", type=int, default=10)

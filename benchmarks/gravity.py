@@ -1,9 +1,10 @@
-"""Inclined simulated arms: how accurately does the hybrid calibration find the direction of gravity?
+"""Test with inclined simulated arms how accurately the hybrid calibration determines the direction of gravity.
 
 Run `OMP_NUM_THREADS=1 python benchmarks/gravity.py FOLDER_OF_SIM [--arm irb120] [--incline 45] [--poses 60]`.
 
-FOLDER_OF_SIM has the independent simulator `sim.py` and its URDF files. The pedestal of the arm is inclined towards a
-random side, which the nominal robot does not know; positions have 0.03 mm noise, and the repeatability is 0.02 mm.
+FOLDER_OF_SIM contains the independent simulator `sim.py` and its URDF files. The pedestal of the arm is inclined
+towards a random side, which the nominal robot does not include; positions have 0.03 mm noise, and the repeatability is
+0.02 mm.
 """
 
 import argparse
@@ -33,13 +34,13 @@ def inclined_arm(sim: Any, name: str, incline: float, side: float, seed: int) ->
 
 
 def main() -> None:
-    """Print the angle between true and found direction for every seed."""
+    """Print the angle between the true and the estimated direction for every seed."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("folder", type=Path)
     parser.add_argument("--arm", default="kr10", choices=("kr10", "irb120", "arm7"))
-    parser.add_argument("--incline", type=float, default=45.0, help="[deg]")
+    parser.add_argument("--incline", type=float, default=45.0, help="Inclination of the pedestal [deg].")
     parser.add_argument("--poses", type=int, default=60)
     parser.add_argument("--seeds", type=int, default=20)
     stated = parser.parse_args()

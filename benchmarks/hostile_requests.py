@@ -1,4 +1,4 @@
-"""Random requests to the page of a cell that have to be refused, or change nothing."""
+"""Random requests to the page of a cell that must be refused or must not change anything."""
 
 import json
 import random
@@ -36,7 +36,7 @@ FUZZED = {
 
 
 def hostile_request(chosen: random.Random) -> tuple[str, str, str]:
-    """Return path, method and body of a request that has to be refused, or changes nothing."""
+    """Return path, method and body of a request that must be refused or must not change anything."""
     value, kind = chosen.choice(HOSTILE), chosen.randrange(6)
     if kind == 0:
         body = "".join(chosen.choices("q1_deg,x_mm;\t\n0123456789.-\"'eE\0", k=chosen.randrange(400)))

@@ -1,10 +1,10 @@
-"""Held-out accuracy of the hybrid on measured robots: random folds, few rows, and outside the measured joint values.
+"""Held-out accuracy of the hybrid on measured robots, for random folds, few rows, and extrapolation.
 
 Run `OMP_NUM_THREADS=1 python benchmarks/hybrid_accuracy.py [PART ...]` with the measured files in `PISIGMA_DATA`. A
-part is one of the names in `PARTS`. Every line is one fit: root mean square of the position error of the held-out rows
-with the geometric and the hybrid calibration, their ratio, and the share of held-out coordinates within the predicted
-95 % intervals. A box is trained on the rows with all joints within their 4 % and 96 % quantiles and evaluated on all
-others; a half is trained on one side of a joint's median and evaluated on the other side.
+part is one of the names in `PARTS`. Every line is one fit, with the root mean square of the position error of the
+held-out rows for the geometric and the hybrid calibration, their ratio, and the share of held-out coordinates within
+the predicted 95 % intervals. A box is trained on the rows with all joints within their 4 % and 96 % quantiles and
+evaluated on all others; a half is trained on one side of a joint's median and evaluated on the other side.
 """
 
 import argparse
@@ -32,7 +32,7 @@ FEW = (300, 100, 50, 30)
 
 @dataclass(frozen=True)
 class Case:
-    """One split: rows to fit, and rows to judge."""
+    """One split into rows to fit and rows to evaluate."""
 
     name: str
     robot: Robot
@@ -42,7 +42,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Judged:
-    """Return squared position errors of the held-out rows [m²] and their predicted values."""
+    """Squared position errors of the held-out rows [m²] and their predicted values."""
 
     geometric: Tensor
     hybrid: Tensor
@@ -84,7 +84,7 @@ PARTS = {"folds": folds, "few": few, "boxes": boxes, "halves": halves}
 
 
 def judged(case: Case) -> Judged:
-    """Fit and judge one split."""
+    """Fit and evaluate one split."""
     began = time.perf_counter()
     result = HybridCalibrator(case.robot).fit(case.train)
     seconds = time.perf_counter() - began

@@ -1,4 +1,4 @@
-"""How many reachable poses the corrected inverse kinematics reaches, and how exactly, in kernels and in torch.
+"""Share of reachable poses that the corrected inverse kinematics reaches, and its residuals, for kernels and torch.
 
 Run `OMP_NUM_THREADS=1 python benchmarks/inverse_reach.py`, and with `--tasks` for tasks in which some axes of the tool
 are ignored and for arms with fewer or more than six joints. Poses are those of random joint values within the joint
@@ -182,14 +182,14 @@ def report_branches(rows: int, starts: int = 40) -> None:
 
 
 def main() -> None:
-    """Print the figures of all robots, or of those named."""
+    """Print the figures of all robots, or of the named robots."""
     parser = argparse.ArgumentParser()
     parser.add_argument(
         "robots", nargs="*", default=["kiro3", "kiro4", "rb5", "panda", "ur5", "ur10", "urdf"]
     )
     parser.add_argument("--poses", type=int, default=10_000)
     parser.add_argument(
-        "--tasks", action="store_true", help="tasks with fewer degrees of freedom, 1,000 poses each"
+        "--tasks", action="store_true", help="Solve tasks with fewer degrees of freedom, 1,000 poses each."
     )
     options = parser.parse_args()
     if options.tasks:

@@ -1,12 +1,12 @@
-"""Speed of the corrected inverse kinematics: poses per second and microseconds per call, compared with scipy.
+"""Speed of the corrected inverse kinematics in poses per second and microseconds per call, compared with scipy.
 
 Run `OMP_NUM_THREADS=1 python benchmarks/inverse_speed.py` (scipy comes with `pip install -e ".[bench]"`). The arm has
 errors of 0.5 mm and 1 mrad in every row, base and tool, and a correction from a Fourier series, gravity torques and
-product units; every joint value counts as measured. With a model folder instead of a robot, that model is used within
-its measured joint values, or with `--anywhere` over the whole limits, mostly outside its domain. scipy solves the same
-poses of the arm without its correction, starting 0.05 rad from the solution. Poses are those of
-uniformly drawn joint values; they are checked before solving and the residual is computed after it. The kernels are
-compiled before the measurement starts.
+product units; every joint value is treated as measured. With a model folder instead of a robot, that model is used
+within its measured joint values, or with `--anywhere` over the whole limits, mostly outside its domain. scipy solves
+the same poses of the arm without its correction, starting 0.05 rad from the solution. Poses are those of uniformly
+drawn joint values; they are checked before solving and the residual is computed after it. The kernels are compiled
+before the measurement starts.
 """
 
 import argparse
@@ -95,13 +95,13 @@ def time_scipy(kernels: object, T: np.ndarray, q: np.ndarray) -> float:
 def main() -> None:
     """Print the figures of one robot."""
     parser = argparse.ArgumentParser()
-    parser.add_argument("robot", nargs="?", default="ur10", help="catalogue name or model folder")
+    parser.add_argument("robot", nargs="?", default="ur10", help="Catalogue name or model folder.")
     parser.add_argument("--poses", type=int, default=100_000)
     parser.add_argument("--harmonics", type=int, default=24)
     parser.add_argument(
         "--anywhere",
         action="store_true",
-        help="for a model folder: joint values over the whole limits, not only between measured ones",
+        help="For a model folder, draw joint values over the whole limits, not only between measured values.",
     )
     options = parser.parse_args()
     torch.set_num_threads(1)

@@ -1,13 +1,13 @@
 """Poses per second of forward kinematics and joint Jacobian, compared with pytorch-kinematics in one run.
 
-Both compute in float64 on one thread, on the same joint values, alternately, and the fastest round of each
-counts. The peer's chain is built in float64 from the rows of the robot (a chain converted with
-``.to(torch.float64)`` has errors of 2e-8 m), and the results are compared before the measurement starts.
+Both packages compute the same joint values in float64 on one thread, alternately, and the fastest round of each counts.
+The peer's chain is built in float64 from the rows of the robot (a chain converted with ``.to(torch.float64)`` has
+errors of 2e-8 m), and the results are compared before the measurement starts.
 
 Then forward kinematics of NumPy arrays, which uses compiled kernels, is compared with Robotics Toolbox's
 ``ets.eval`` (C++) if ``roboticstoolbox`` can be imported.
 
-Run with ``python benchmarks/kinematics_speed.py [--poses 10000] [--rounds 30]``.
+Run ``python benchmarks/kinematics_speed.py [--poses 10000] [--rounds 30]``.
 """
 
 import argparse
@@ -40,10 +40,9 @@ from pisigma.robot.kinematics.jacobian import joint_jacobian
 
 
 def build_peer(robot: Robot) -> SerialChain:
-    """The same robot as a pytorch-kinematics chain in float64.
+    """Return the same robot as a pytorch-kinematics chain in float64.
 
-    A frame of the peer turns about its own z axis first, so the fixed part of a row moves into the next
-    frame.
+    A frame of the peer first rotates about its z axis, so the fixed part of a row belongs to the next frame.
     """
     like = torch.zeros((), dtype=torch.float64)
     fixed = compose_xyzrpy(IDENTITY, robot.base.tolist())
@@ -146,11 +145,13 @@ def compare_arrays(name: str, poses: int, rounds: int) -> None:
 
 
 def main() -> None:
-    """Print the table for all robots of the catalogue, or those named."""
+    """Print the table for all robots of the catalogue, or for the named robots."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("robots", nargs="*", default=list(catalogue()), help="catalogue names (default: all)")
+    parser.add_argument(
+        "robots", nargs="*", default=list(catalogue()), help="Catalogue names (default: all)."
+    )
     parser.add_argument("--poses", type=int, default=10_000)
     parser.add_argument("--rounds", type=int, default=30)
     arguments = parser.parse_args()

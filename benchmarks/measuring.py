@@ -1,10 +1,10 @@
-"""Measuring sessions of simulated arms: detection of wrong rows, and poses until the limit is reached.
+"""Detection of wrong rows, and number of poses until the limit is reached, in measuring sessions of simulated arms.
 
 Run `OMP_NUM_THREADS=1 python benchmarks/measuring.py [PART ...] [--seeds N]` with the simulator of arms (`sim.py`) in
-`PISIGMA_SIMULATED`. "alarms": among 40 random rows one has an error of 5 mm, or the points of two are exchanged;
-printed are the share that is detected at once, the same from the seventh row on and at the end, and the share of
-correct rows that are called wrong at once. "sessions": poses until 95 % of the errors are expected below the limit,
-planned and random, and the true 95 % quantile of the errors.
+`PISIGMA_SIMULATED`. In the part "alarms", one of 40 random rows has an error of 5 mm, or the points of two rows are
+exchanged. It prints the share of these errors that is detected at once, from the seventh row on and at the end, and the
+share of correct rows that are called wrong at once. The part "sessions" prints the number of planned and random poses
+until 95 % of the errors are expected to be below the limit, and the true 95 % quantile of the errors.
 """
 
 import argparse

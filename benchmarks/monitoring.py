@@ -1,10 +1,10 @@
-"""How often `pisigma monitor` names the joint that moved, and its false alarms, on measured robots.
+"""Share of sessions in which `pisigma monitor` names the joint that moved, and its false alarms, on measured robots.
 
 Run `OMP_NUM_THREADS=1 python benchmarks/monitoring.py [--draws N]` with the measured files in `PISIGMA_DATA`. A model
 is fitted to 600 random rows of a series; sessions are drawn from its other rows, with 0.05 deg added to the zero of one
-joint or none. In some cases the tracker is moved as well. Then ten simulated arms (`PISIGMA_SIMULATED`) are monitored
-for two years with ten rows a month, with and without a drift of joint 2. The last lines time twelve sessions of ten
-rows.
+joint or of no joint. In some cases the tracker is moved as well. Then ten simulated arms (`PISIGMA_SIMULATED`) are
+monitored for two years with ten rows a month, with and without a drift of joint 2. The last lines time twelve sessions
+of ten rows.
 """
 
 import argparse
@@ -66,7 +66,7 @@ def moved(rows: Measurements, joint: int, tracker: bool) -> Measurements:
 
 
 def is_right(session: Session, joint: int) -> bool:
-    """Return whether exactly the moved joint is named; for no joint, whether there is no alarm."""
+    """Return whether exactly the moved joint is named, or no alarm is raised if no joint moved."""
     named = [one.what for one in session.moved if not is_frame(one.what)]
     return named == ([f"joint {joint}"] if joint else []) and session.verdict != "unclear"
 
@@ -90,7 +90,7 @@ def months() -> None:
                 firsts.append(alarmed.index(True) + 1 if True in alarmed else MONTHS + 1)
             else:
                 alarms += sum(now and not before for before, now in pairwise([False, *alarmed]))
-        print(f"arm {seed}: first alarm after {firsts[-1]} months; {alarms} false ones so far", flush=True)
+        print(f"arm {seed}: first alarm after {firsts[-1]} months; {alarms} false alarms so far", flush=True)
     years = ARMS * MONTHS / 12
     print(
         f"drift of 0.01 deg a month: first alarm after {max(firsts)} months at most; without drift {alarms} alarms in "
@@ -110,8 +110,10 @@ def _alarmed(monitoring: pisigma.Monitoring) -> list[bool]:
 def main() -> None:
     """Print one line per robot, number of rows and joint."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--draws", type=int, default=100, help="number of sessions per line")
-    parser.add_argument("--months", action="store_true", help="only the simulated arms over the months")
+    parser.add_argument("--draws", type=int, default=100, help="Number of sessions per line.")
+    parser.add_argument(
+        "--months", action="store_true", help="Only monitor the simulated arms over the months."
+    )
     wanted = parser.parse_args()
     draws = wanted.draws
     if wanted.months:

@@ -1,7 +1,7 @@
-"""A false arm in MuJoCo: a drawn URDF whose bodies and joints are changed, position-controlled, with a reflector.
+"""An arm with errors in MuJoCo: a drawn URDF with changed bodies and joints, position controllers and a reflector.
 
-MuJoCo itself reads the drawn URDF. Poses of bodies are then changed, joints become elastic or have free play, and a
-payload is attached to the tip. Nothing here uses pisigma.
+MuJoCo reads the drawn URDF file. Then poses of bodies are changed, joints become elastic or have free play, and a
+payload is attached to the tip. The module does not use pisigma.
 """
 
 from collections.abc import Sequence
@@ -39,11 +39,11 @@ ROTOR = 0.1
 
 @dataclass(frozen=True)
 class ArmErrors:
-    """How the true arm differs from the drawn one.
+    """Differences of the true arm from the drawn one.
 
     Attributes:
         length_mm: standard deviation of the position of every body in its parent, per axis [mm].
-        axis_mrad: standard deviation of its orientation, about each axis [mrad].
+        axis_mrad: standard deviation of the orientation of every body in its parent, about each axis [mrad].
         zero_mrad: standard deviation of the zero of a revolute joint [mrad].
         zero_mm: standard deviation of the zero of a prismatic joint [mm].
         elastic: stiffness of the gears of revolute joints [Nm/rad], in the order of the joints; the last one also
@@ -65,7 +65,7 @@ class DrawnArm:
 
     Attributes:
         file: name of the URDF file, in `drawn_arms` or in a package.
-        base: link in whose frame pisigma gives poses.
+        base: link in whose frame pisigma states poses.
         tip: link that carries reflector and payload.
         kp: stiffness of the position controllers [Nm/rad, or N/m for prismatic joints], in the order of the joints; the
             last one also applies to all others.
@@ -104,8 +104,8 @@ class Driven:
     unsettled: float
 
 
-class FalseArm:
-    """An arm that differs from its drawing, in MuJoCo."""
+class PerturbedArm:
+    """An arm in MuJoCo that differs from its drawing."""
 
     def __init__(self, drawn: DrawnArm, errors: ArmErrors, seed: int, payload_kg: float = 0.0) -> None:
         """Build the arm; equal seeds make equal arms, with any payload."""
@@ -121,7 +121,7 @@ class FalseArm:
         self.joints: list[str] = []
         for body in chain:
             if body.joints:
-                _make_false(body, body.joints[0], errors, rng)
+                _perturb_body(body, body.joints[0], errors, rng)
                 _add_gear(body, body.joints[0], errors, len(self.joints))
                 _add_controller(spec, body.joints[0], _of(drawn.kp, len(self.joints)))
                 self.joints.append(body.joints[0].name)
@@ -141,12 +141,12 @@ class FalseArm:
         self._play = np.deg2rad(errors.play_deg / 2)
 
     def drive(self, commands: np.ndarray, servo: int = 0) -> Driven:
-        """Move through commanded joint values, in order, and measure each after the arm came to rest.
+        """Move to the commanded joint values in their order, and measure each pose after the arm has come to rest.
 
         Args:
             commands: joint values [rad or m], shape (poses, joints), as commanded to the controllers.
-            servo: number of corrections of every command by what the encoders miss, as controllers with an integral
-                part do; 0 leaves the deviation of a proportional controller.
+            servo: number of corrections of every command by the difference between command and encoders, as by
+                controllers with an integral part; with 0 the deviation of a proportional controller remains.
         """
         if not np.abs(commands).max() < MAX_COMMAND:
             raise ValueError(f"a joint value of {np.abs(commands).max():g} was commanded")
@@ -185,7 +185,7 @@ class FalseArm:
 
 
 def _without_shapes(urdf: Path) -> bytes:
-    """Return a URDF file without shapes, and with all its links."""
+    """Return a URDF file without shapes, but with all links."""
     root = etree.parse(urdf).getroot()
     for kind in ("visual", "collision", "transmission", "gazebo", "material"):
         for element in list(root.iter(kind)):
@@ -206,7 +206,7 @@ def _of(values: Sequence[float], joint: int) -> float:
     return values[min(joint, len(values) - 1)]
 
 
-def _make_false(
+def _perturb_body(
     body: "mujoco.MjsBody", joint: "mujoco.MjsJoint", errors: ArmErrors, rng: np.random.Generator
 ) -> None:
     """Change the pose of a body in its parent, and the zero of its joint."""
@@ -225,7 +225,7 @@ def _make_false(
 
 
 def _add_gear(body: "mujoco.MjsBody", joint: "mujoco.MjsJoint", errors: ArmErrors, number: int) -> None:
-    """Add a coaxial joint behind the encoder of a revolute joint: its elastic gear."""
+    """Add a coaxial joint after the encoder of a revolute joint, as its elastic gear."""
     if not errors.elastic or joint.type != mujoco.mjtJoint.mjJNT_HINGE:
         return
     stiffness = _of(errors.elastic, number)

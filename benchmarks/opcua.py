@@ -1,10 +1,10 @@
-"""Calls of `pisigma serve --opcua` by many clients, while the server is ended and begun again.
+"""Calls of `pisigma serve --opcua` by many clients while the server is ended and restarted.
 
 Run `python benchmarks/opcua.py models/my_ur10 --calls 10000 --clients 20`. Every client of asyncua calls
-`CorrectedJoints` with poses of the model's training rows and joint values near them, and compares the answers
-with those of Python. After a third of the calls the server gets SIGTERM, and after two thirds SIGKILL; it is
-begun again after a second. A call that gets no answer is repeated until it gets one. Printed are the number of
-wrong answers, of calls that were repeated and of clients that did not go on, and the times of the calls.
+`CorrectedJoints` with poses of the model's training rows and joint values near them, and compares the answers with
+those of Python. After a third of the calls the server gets SIGTERM, and after two thirds SIGKILL; it is restarted after
+a second. A call without an answer is repeated until it is answered. The program prints the number of wrong answers, of
+repeated calls and of clients that did not continue, and the times of the calls.
 """
 
 import argparse
@@ -30,7 +30,7 @@ MAX_WAIT = 60.0
 
 
 def begin(model: Path, port: int) -> tuple["subprocess.Popen[str]", int]:
-    """Start a server, and return it and its port when it is ready."""
+    """Start a server and return it with its port when it is ready."""
     command = [sys.executable, "-m", "pisigma", "serve", str(model), "--opcua", "--opcua-port", str(port)]
     server = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     assert server.stdout is not None
@@ -38,7 +38,7 @@ def begin(model: Path, port: int) -> tuple["subprocess.Popen[str]", int]:
 
 
 class Load:
-    """Clients that share the calls, and what they counted."""
+    """Clients that share the calls, with their counts."""
 
     def __init__(self, port: int, poses: np.ndarray, near: np.ndarray, expected: np.ndarray) -> None:
         self.port, self.poses, self.near, self.expected = port, poses, near, expected

@@ -1,4 +1,4 @@
-"""Calibrations from planned images of a board compared with random views: true and predicted errors.
+"""True and predicted errors of calibrations from planned images of a board, compared with random views.
 
     OMP_NUM_THREADS=1 python benchmarks/plan_camera.py [--draws 5] [--candidates 3000] [--images 25 50]
 

@@ -1,9 +1,9 @@
 """Accuracy of calibrations from chosen and from random poses, and its prediction.
 
 Run `OMP_NUM_THREADS=1 python benchmarks/planning.py [PART ...]` with the measured files in `PISIGMA_DATA`, and the
-simulator of arms (`sim.py`) in `PISIGMA_SIMULATED`. Measured: some rows are chosen from pools of 400 random ones, and
-all other rows judge. Simulated: candidates are drawn within the joint limits; 400 poses without noise judge. Every
-figure is a root mean square of position errors [mm].
+simulator of arms (`sim.py`) in `PISIGMA_SIMULATED`. For measured robots, some rows are chosen from pools of 400 random
+rows, and the model is evaluated on all other rows. For simulated arms, candidates are drawn within the joint limits,
+and the model is evaluated at 400 poses without noise. Every figure is a root mean square of position errors [mm].
 """
 
 import argparse
@@ -46,7 +46,7 @@ STEPS = (14, 18, 22, 26, 30, 34, 38, 42, 46, 50, 56, 62, 70, 80)
 
 @dataclass(frozen=True)
 class Figures:
-    """Result of one choice: true RMS, RMS predicted before measuring, and RMS predicted by the calibration [mm]."""
+    """Result of one choice [mm]: true RMS, RMS predicted before measuring, and RMS predicted by the calibration."""
 
     true: float
     predicted: float
@@ -70,7 +70,7 @@ def pools(name: str, draws: range) -> Iterator[tuple[Measurements, Measurements]
 def measured(
     name: str, counts: tuple[int, ...], hybrid: bool, draws: range, criteria: tuple[Criterion, ...]
 ) -> None:
-    """Compare random rows of a pool with chosen ones."""
+    """Compare random rows of a pool with chosen rows."""
     robot = Robot.load(name)
     posterior = RobotPosterior.from_robot(robot, hybrid=hybrid)
     calibrator: Calibrator = HybridCalibrator(robot) if hybrid else GeometricCalibrator(robot)
@@ -89,7 +89,7 @@ def measured(
 
 
 def sequential(name: str, counts: tuple[int, ...], draws: range) -> None:
-    """Choose poses in rounds, with the posterior of a hybrid of the earlier ones."""
+    """Choose poses in rounds, each with the posterior of a hybrid fitted to the earlier poses."""
     robot = Robot.load(name)
     table: dict[tuple[int, str], list[float]] = {}
     for pool, test in pools(name, draws):
@@ -225,9 +225,9 @@ def main() -> None:
     parts = ("ur10", "rounds", "ur5", "predicted", "needed", "speed")
     parser.add_argument("parts", nargs="*", default=list(parts), metavar="PART", help=", ".join(parts))
     parser.add_argument(
-        "--draws", type=int, default=10, help="number of pools, or of simulated arms of a kind"
+        "--draws", type=int, default=10, help="Number of pools, or of simulated arms of a kind."
     )
-    parser.add_argument("--first", type=int, default=0, help="seed of the first one")
+    parser.add_argument("--first", type=int, default=0, help="Seed of the first draw.")
     arguments = parser.parse_args()
     seeds = range(arguments.first, arguments.first + arguments.draws)
     both: tuple[Criterion, ...] = ("D", "I")

@@ -1,8 +1,8 @@
-"""Recalibration with few rows: accuracy from one series to another, choice of the model, a collision, a chain, time.
+"""Recalibration with few rows: accuracy between series, choice of the model, a collision, a chain, and time.
 
 Run `OMP_NUM_THREADS=1 python benchmarks/recalibration.py [PART ...]` with the measured files in `PISIGMA_DATA` and the
-simulator in `PISIGMA_SIMULATED`. A part is one of the names in `PARTS`. Errors are RMS of the positions of all rows
-that were not used for the recalibration [mm]; a draw is a random choice of rows.
+simulator in `PISIGMA_SIMULATED`. A part is one of the names in `PARTS`. Errors are RMS position errors [mm] of all rows
+that were not used for the recalibration; a draw is a random choice of rows.
 """
 
 import argparse
@@ -85,13 +85,13 @@ def accuracy() -> None:
                 errors.append(error_of(result.model, others))
             mean, shown = np.mean(errors), " ".join(f"{error:.3f}" for error in errors)
             print(
-                f"B to C, moved {moved or 'not stated'}, {count} rows: {mean:.3f} (asked {asked}): {shown}",
+                f"B to C, moved {moved or 'not stated'}, {count} rows: {mean:.3f} (limit {asked}): {shown}",
                 flush=True,
             )
 
 
 def planned() -> None:
-    """Do the same with rows that `pisigma plan` chooses from all of series C with the model of series B."""
+    """Recalibrate from series B to rows that `pisigma plan` chooses from all of series C with the model of series B."""
     rows, every = series("C"), np.arange(series("C").rows)
     with tempfile.TemporaryDirectory() as folder:
         candidates = Path(folder) / "candidates.csv"
@@ -105,7 +105,7 @@ def planned() -> None:
             for moved in (None, ("base", "tool")):
                 result = recalibrate(model_of("B"), few, RecalibrationSettings(moved))
                 error, shown = error_of(result.model, others), moved or "not stated"
-                print(f"B to C, moved {shown}, {count} planned rows: {error:.3f} (asked {asked})", flush=True)
+                print(f"B to C, moved {shown}, {count} planned rows: {error:.3f} (limit {asked})", flush=True)
 
 
 def candidates_of(result: Recalibration, few: Measurements, others: Measurements) -> dict[str, float]:
@@ -123,7 +123,7 @@ def candidates_of(result: Recalibration, few: Measurements, others: Measurements
 
 
 def gate() -> None:
-    """Print the ratio of the kept candidate's error to the best one's, mean and maximum over the draws."""
+    """Print the ratio of the kept candidate's error to that of the best one, as mean and maximum over the draws."""
     for before, after in (("B", "C"), ("C", "B")):
         for count in GATE_ROWS:
             kept, best, ratios, chosen = 0.0, 0.0, [], []
@@ -226,7 +226,7 @@ PARTS = {
 
 
 def main() -> None:
-    """Run the parts that are named, or all."""
+    """Run the named parts, or all parts."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

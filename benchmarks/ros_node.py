@@ -1,9 +1,10 @@
 """Round trips of the ROS 2 node over DDS on one machine, with requests to an empty node in between.
 
-Run `python benchmarks/ros_node.py models/my_ur10 --ros ROS_ENVIRONMENT`, a virtual environment with the wheels of
-`integrations/ros2/requirements.txt`. Three processes run in it: the node of `pisigma_ros`, an empty node that answers
-the same messages with stored joint values, and a client that asks them in turn, with poses of the model's training
-rows. Printed are how many answers were lost or wrong compared with Python, the medians of both nodes, and their ratio.
+Run `python benchmarks/ros_node.py models/my_ur10 --ros ROS_ENVIRONMENT`, where ROS_ENVIRONMENT is a virtual environment
+with the wheels of `integrations/ros2/requirements.txt`. Three processes run in it: the node of `pisigma_ros`, an empty
+node that answers the same messages with stored joint values, and a client that sends requests to both nodes
+alternately, with poses of the model's training rows. The program prints the number of answers that were lost or wrong
+compared with Python, the medians of both nodes, and their ratio.
 """
 
 import argparse
@@ -48,7 +49,7 @@ def empty_node() -> None:
 
 
 class Client:
-    """Asks a node, and waits for the answer with the same time stamp."""
+    """Client that sends a request to a node and waits for the answer with the same time stamp."""
 
     def __init__(self, node: Any, name: str) -> None:
         from geometry_msgs.msg import PoseStamped
@@ -60,7 +61,7 @@ class Client:
         self.message = PoseStamped()
 
     def wait(self) -> None:
-        """Wait until the node is there."""
+        """Wait until the node is available."""
         import rclpy
 
         end = time.monotonic() + MAX_START
@@ -91,7 +92,7 @@ class Client:
 
 
 def client(file: Path) -> None:
-    """Ask both nodes in turn, and print what was counted."""
+    """Send requests to both nodes alternately, and print the counts."""
     import rclpy
     from rclpy.node import Node
 
@@ -148,13 +149,13 @@ def work_of(model: Path, requests: int) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Start all processes, and print what the client counted."""
+    """Start all processes and print the counts of the client."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("model", type=Path)
     parser.add_argument(
-        "--ros", type=Path, required=True, help="virtual environment with the wheels of ROS 2"
+        "--ros", type=Path, required=True, help="Virtual environment with the wheels of ROS 2."
     )
     parser.add_argument("--requests", type=int, default=10000)
     options = parser.parse_args()

@@ -1,15 +1,15 @@
 """Response times of `pisigma serve`: two clients with 1,000 requests per second in total, over loopback.
 
-Run `OMP_NUM_THREADS=1 python benchmarks/serve.py models/my_ur10 --seconds 600` on an otherwise idle machine.
-Every client sends a pose of the model's training rows with joint values near it, waits for the answer,
-compares it with that of Python, and sleeps until its next request, half a period after that of the other client. It
-polls for 100 µs, as the loop of a real-time controller does, then sleeps; with `--awake-us 0` the system wakes
-it for every answer, and the times then include the wake-up, which takes longer than the answer itself on some machines.
-Printed are the times from before a request is sent until its answer is read, per protocol; how many answers
-were lost or wrong; and the memory of the server at the start and at the end. For comparison the same clients first use
-two minimal loops, for at most a minute each, that poll for the next request as long as the server does: one sends
-stored answers, the other reads, solves once and sends. The first shows the cost of sockets and
-clients, the second what the server adds to a solve.
+Run `OMP_NUM_THREADS=1 python benchmarks/serve.py models/my_ur10 --seconds 600` on an otherwise idle machine. Every
+client sends a pose of the model's training rows with joint values near it, waits for the answer, compares it with that
+of Python, and sleeps until its next request, half a period after that of the other client. A client polls for 100 µs,
+as the loop of a real-time controller does, and then sleeps; with `--awake-us 0` the system wakes it for every answer,
+and the times then include the wake-up, which takes longer than the answer itself on some machines. For each protocol
+the program prints the times from before a request is sent until its answer is read, the number of answers that were
+lost or wrong, and the memory of the server at the start and at the end. For comparison the same clients first use two
+minimal loops, for at most a minute each, that poll for the next request as long as the server does: one of them sends
+stored answers, and the other one reads, solves once and sends. The first loop shows the cost of sockets and clients,
+and the second one the cost that the server adds to a solve.
 """
 
 import argparse
@@ -205,7 +205,7 @@ def cost(pid: int) -> tuple[float, float]:
 
 
 def inside(json_port: int) -> str:
-    """Return the time that the server took for its last answers, from reading the request."""
+    """Return the time from reading a request until the answer is ready, for the last answers of the server."""
     with socket.create_connection(("127.0.0.1", json_port)) as stream, stream.makefile("rb") as file:
         stream.sendall(b'{"ask": "health"}\n')
         health = json.loads(file.readline())
@@ -240,9 +240,9 @@ def main() -> None:
     parser.add_argument("model", nargs="?", default="models/kiro4")
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument(
-        "--poll-ms", type=float, default=2.5, help="polling time of the server and the minimal loops [ms]"
+        "--poll-ms", type=float, default=2.5, help="Polling time of the server and the minimal loops [ms]."
     )
-    parser.add_argument("--awake-us", type=float, default=100.0, help="polling time of the clients [us]")
+    parser.add_argument("--awake-us", type=float, default=100.0, help="Polling time of the clients [us].")
     options = parser.parse_args()
     command = [sys.executable, "-m", "pisigma", "serve", options.model, "--set", f"poll_ms={options.poll_ms}"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:

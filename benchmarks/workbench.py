@@ -1,14 +1,14 @@
-"""The workbench in Chromium: simulated arms by clicks and keys alone, mistakes in uploads, times, and hostile requests.
+"""Test the workbench in Chromium by clicks and keys alone: all steps, mistakes, times, and hostile requests.
 
 Run `python benchmarks/workbench.py FOLDER_OF_SIM [--arms kr10 rail] [--parts arms mistakes times fuzz]` on an otherwise
 idle machine with the extra `view`, playwright and chromium. FOLDER_OF_SIM contains `sim.py` and URDF files of the arms.
 
-- arms: from an empty folder to a corrected KRL program, with the forms of the page; the files of the cell are compared
-  with those of the same commands, byte by byte.
-- mistakes: inches, the sign of joint 4, two swapped joint columns and a moved tracker are uploaded by hand: times until
-  they are named, and until the repair by its button is checked.
-- times: until the page is shown, until an appended row is shown, and 10,000 rows in three dimensions.
-- fuzz: hostile uploads and forms, reloads during a calibration, and two browsers at once.
+- arms: go from an empty folder to a corrected KRL program with the forms of the page, and compare the files of the cell
+  with those of the same commands byte by byte.
+- mistakes: upload rows in inches, with a reversed sign of joint 4, with two swapped joint columns and with a moved
+  tracker, and measure the times until the mistake is named and until its repair by the button is checked.
+- times: measure the times until the page and an appended row are shown, with 10,000 rows in three dimensions.
+- fuzz: send hostile uploads and forms, reload the page during a calibration, and use two browsers at once.
 """
 
 import argparse
@@ -61,7 +61,7 @@ COMPARED = (
 
 
 def by_clicks(browser: Browser, folder: Path, urdf: Path, first: Path, second: Path, program: Path) -> float:
-    """Do everything on the page; return the time until it is shown [s]."""
+    """Carry out all steps on the page; return the time until it is shown [s]."""
     with opened(browser, folder) as (page, _, seconds):
         page.set_input_files("[data-links]", urdf)
         page.wait_for_selector("[name=tip] option:nth-child(2)", state="attached")
@@ -94,7 +94,7 @@ def by_clicks(browser: Browser, folder: Path, urdf: Path, first: Path, second: P
 
 
 def by_commands(folder: Path, urdf: Path, first: Path, second: Path, program: Path) -> None:
-    """Do the same with commands."""
+    """Carry out the same steps with commands."""
     command("new", urdf, "--out", folder)
     command("plan", folder, *(word for key, value in PLAN.items() for word in (f"--{key}", value)))
     command("import", first, "--cell", folder)
@@ -213,7 +213,7 @@ def run_times(browser: Browser, simulated: Path, work: Path) -> None:
     with opened(browser, folder, scene=True, rows=growing) as (page, bench, seconds):
         scene = next(one for one in page.frames if "/scene/" in one.url)
         scene.wait_for_selector("canvas")
-        print(f"page shown: {seconds:.2f} s (asked: 3 s)")
+        print(f"page shown: {seconds:.2f} s (limit: 3 s)")
         true = sim.True_("kr10", seed=3)
         q, rng = true.sample(MANY_ROWS, 5), np.random.default_rng(0)
         no = np.zeros(MANY_ROWS, dtype=bool)
@@ -262,7 +262,7 @@ ASK = """async ([path, method, body]) => {
 
 
 def run_fuzz(browser: Browser, simulated: Path, work: Path, seed: int) -> None:
-    """Send hostile requests, reload the page during a calibration, and look at it with two browsers."""
+    """Send hostile requests, reload the page during a calibration, and open it in two browsers."""
     folder, chosen = work / "fuzz", random.Random(seed)
     cell = Cell.create(folder, simulated / "kr10.urdf")
     cell.take_in(measured(import_simulator(simulated), "kr10", ROWS, 1, work / "2026-11-01.csv"))

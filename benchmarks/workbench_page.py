@@ -1,4 +1,4 @@
-"""The page of a cell in a browser: open it, show a tab, do a step and upload rows, by clicks and keys alone."""
+"""Use the page of a cell by clicks and keys alone: open it, show a tab, carry out a step and upload rows."""
 
 import contextlib
 import time
@@ -75,7 +75,7 @@ def do(page: Page, step: str, **fields: str) -> None:
 
 
 def upload(page: Page, path: Path) -> tuple[float, float]:
-    """Upload rows; return the times until their columns, and what the check finds, are shown [s]."""
+    """Upload rows; return the times until their columns and the findings of the check are shown [s]."""
     begun = time.perf_counter()
     page.set_input_files("#files", path)
     page.wait_for_selector(f"#proposal form:has-text('{path.name}')")
