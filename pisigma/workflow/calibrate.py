@@ -65,12 +65,12 @@ class Calibration(AbstractModelResult):
     Attributes:
         model: the calibrated model, with all figures as its metrics, as `pisigma.load` would read it.
         result: the geometric or hybrid calibration that the model was built from.
-        rows: measurements that it was calibrated with.
+        rows: measurements with which the model was calibrated.
         validation: errors of held-out rows; None without a validation.
         test: errors of the rows of the set "test"; None without rows of this set.
         held_out: all held-out rows with their errors, as in the model folder; None without a validation.
         summary: all figures.
-        texts: description, and what was not validated.
+        texts: description of the model, and limits of its validation.
         settings: settings of the calibration; None for a recipe.
         seconds: computing time [s].
         figures: whether the card has figures.
@@ -90,7 +90,7 @@ class Calibration(AbstractModelResult):
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Warnings, such as what to check or to measure next, one sentence each."""
+        """Return warnings and recommendations, one sentence each."""
         return self.summary.warnings
 
     def _describe(self, model: CalibratedModel, summary: CalibrationSummary, folder: Path) -> None:
@@ -113,7 +113,7 @@ def calibrate(
 
     Args:
         robot: the nominal robot, or its catalogue name or robot file (YAML or URDF).
-        data: measurements, or CSV files of them. Rows of the set "test" are not calibrated with; the final model is
+        data: measurements, or CSV files of them. Rows of the set "test" are not used to calibrate; the final model is
             tested on them.
         settings: see `CalibrationSettings`.
         progress: called with the current step.
@@ -188,13 +188,13 @@ def compose_calibration(
     Args:
         calibrator: the calibrator.
         result: its calibration.
-        rows: measurements that it was calibrated with.
+        rows: measurements with which the model was calibrated.
         summary: figures so far.
         texts: texts of the card.
         validation: errors of held-out rows.
         test: errors of the rows of the set "test".
-        held_out: rows of the validation whose errors the model folder keeps; None keeps none.
-        recipe: name and SHA-256 of the recipe; empty without one.
+        held_out: rows of the validation whose errors the model folder stores; None stores no errors.
+        recipe: name and SHA-256 of the recipe; empty without a recipe.
         found: what was found before the calibration.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Compare two models of one robot: parameters, tool positions, errors on rows, and programs."""
+"""Comparison of two models of one robot: parameters, tool positions, errors on rows, and programs."""
 
 import os
 import time
@@ -38,12 +38,12 @@ class ComparedModels:
     Attributes:
         models: the first and the second model by their names in tables.
         settings: settings of the comparison.
-        parameters: all parameters side by side, and those that differ.
+        parameters: all parameters side by side, and the parameters that differ.
         workspace: distances between the tool poses of both models over the workspace.
         rows: errors of both models on the same rows; None without rows.
         program: distances along a program that was taught with the first model; None without a program.
         diagnostics: why the rows must not be trusted; see `pisigma.validation.gate`.
-        warnings: warnings, one sentence each.
+        warnings: sentences that warn of problems.
         seconds: computing time [s].
     """
 
@@ -69,7 +69,7 @@ class ComparedModels:
 
     @property
     def displacements(self) -> dict[str, Displacement]:
-        """Distances of the tool over the workspace and, if there is one, along the program."""
+        """Return distances between the tools over the workspace and, if there is a program, along the program."""
         along = {} if self.program is None else {f"along {self.program.source}": self.program}
         return {f"over {self.workspace.source}": self.workspace, **along}
 
@@ -83,7 +83,7 @@ class ComparedModels:
         )
 
     def to_json(self) -> dict[str, Any]:
-        """Return everything as plain values, in mm and deg: the result of `pisigma compare --json`."""
+        """Return all results as plain values, in mm and deg: the result of `pisigma compare --json`."""
         differences, (first, _) = self.parameters, self.models.values()
         return {
             "models": [{"name": name, "kind": model.kind} for name, model in self.models.items()],
@@ -104,7 +104,7 @@ class ComparedModels:
         }
 
     def save_page(self, page: str | os.PathLike[str]) -> None:
-        """Write the comparison as one HTML page.
+        """Write the comparison as one HTML file.
 
         Raises:
             OutputError: the page is not an .html file, or cannot be written.
@@ -121,7 +121,7 @@ class ComparedModels:
         return None if self.rows is None else self.rows.models[1].position.difference
 
     def _displacements_in_words(self) -> tuple[str, ...]:
-        """Return how far the tools are apart over the workspace and along a program."""
+        """Return a text on the distances of the tools over the workspace and along a program."""
         first, second = self.models
         figures = self.workspace.errors.figures.figures_by_name
         where = " with base and tool fitted" if self.settings.frames == "fitted" else ""
@@ -138,7 +138,7 @@ class ComparedModels:
         return tuple(lines)
 
     def _rows_in_words(self) -> tuple[str, ...]:
-        """Return which model predicts the rows better."""
+        """Return a text on which model predicts the rows better."""
         difference = self._difference
         if difference is None or self.rows is None:
             return ()
@@ -170,7 +170,7 @@ def compare(
     Args:
         first: a model or its folder, or "nominal" (the nominal robot) or "geometric" (the geometric part of a hybrid)
             of the other model.
-        second: the model to compare it with, likewise.
+        second: the model to compare with, given in the same way.
         rows: measurements, or their file, to compare both models on. Where rows are marked, only those of the set
             "test" are used.
         program: file of joint values, or of poses in the base frame, that was taught with the first model.

@@ -50,14 +50,14 @@ CHOICE_SHARE, HELD_OUT_SHARE = 0.2, 0.4
 """Numbers of poses for model selection and for testing, relative to the number of poses to fit to."""
 
 MAX_ERROR_SHARE = 0.2
-"""Error against the full solution, relative to the nominal error, above which a warning is given."""
+"""Ratio of the error of the network to the nominal error above which a warning is given."""
 
 DOMAIN_SAMPLES = 512
 MIN_POSES = 100
 """Minimum number of poses to fit to."""
 
 _MIN_ROWS_PER_JOINT = 20
-"""Rows per joint below which a region is sparsely covered."""
+"""Number of rows per joint below which a region is sparsely covered."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +84,7 @@ class Distillation(AbstractModelResult):
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Reasons not to use the model, one sentence each."""
+        """Return reasons not to use the model, one sentence each."""
         return self.summary.warnings
 
     def _describe(self, model: CalibratedModel, summary: DistillationSummary, folder: Path) -> None:

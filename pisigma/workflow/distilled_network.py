@@ -23,8 +23,8 @@ from pisigma.workflow.solved_poses import SolvedPoses
 VALIDATION_SHARE = 0.1
 
 OVERTONE_SCALE = 1e4
-"""Factor by which overtones are scaled down after the fit, and their weights up. Overtones do not show where in its
-range a joint is, and the domain is measured in scaled inputs."""
+"""Factor by which overtones are scaled down and their weights are scaled up after the fit. Overtones do not show
+where in its range a joint is, and the domain is measured in scaled inputs."""
 
 NEGLIGIBLE_ERROR = 5e-6
 """RMS error of the tool's position [m] below which no larger size is tried: no robot repeats better."""
@@ -39,7 +39,7 @@ _MIN_MOTION = 1e-6
 
 @dataclass(frozen=True)
 class NetworkSize:
-    """Size of a network, which is the same for every joint.
+    """Size of the networks of all joints.
 
     Attributes:
         orders: number of summing units of every product unit.
@@ -63,7 +63,7 @@ RIPPLED = (NetworkSize((1, 2)), NetworkSize((1, 2, 3)), NetworkSize((1, 2, 3), 8
 
 
 def sizes_for(model: CalibratedModel, poses: int) -> tuple[NetworkSize, ...]:
-    """Return the sizes to try for a model, given the number of poses to fit to, small ones first.
+    """Return the sizes to try for a model, given the number of poses to fit, in ascending order.
 
     Raises:
         IdentificationError: the poses are too few for any size.
@@ -98,8 +98,8 @@ def choose_network(
     Args:
         parent: the model that is distilled.
         poses: poses with its full solutions.
-        chosen: slices of the poses to fit to, and of those for model selection.
-        sizes: sizes to fit, small ones first.
+        chosen: slices of the poses to fit, and of the poses for model selection.
+        sizes: sizes to fit, in ascending order.
         search: random seed, and maximum number of iterations for a joint.
         progress: called with the current step.
     """
@@ -175,7 +175,7 @@ def _fit_size(
 
 
 def _sections(robot: Robot, size: NetworkSize, q: Float64[Tensor, "poses dof"]) -> list[NetworkSection]:
-    """Return one group of all joints, or one group for each joint where its overtones are inputs.
+    """Return one group of all joints, or one group for each joint if its overtones are inputs.
 
     Raises:
         IdentificationError: no joint moves in the region.

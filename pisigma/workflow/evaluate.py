@@ -60,8 +60,8 @@ class Evaluation:
         comparison: figures of every model, with confidence intervals and differences to the first.
         evaluated: the models by their names in the comparison, without the references.
         missed: limits that are missed, as clauses without a full stop.
-        diagnostics: why errors of a model cannot be those of a calibrated robot; empty if they can.
-        warnings: further remarks, one sentence each.
+        diagnostics: reasons why errors of a model are too large for a calibrated robot; empty if they are plausible.
+        warnings: sentences with further remarks.
         seconds: computing time [s].
     """
 
@@ -86,7 +86,7 @@ class Evaluation:
         return not self.missed and not self.diagnostics
 
     def to_json(self) -> dict[str, object]:
-        """Return everything as plain values: the result of `pisigma evaluate --json`."""
+        """Return all results as plain values: the result of `pisigma evaluate --json`."""
         comparison = self.comparison.to_json()
         comparison["models"] = [
             model.to_json() | (asdict(self.evaluated[model.name]) if model.name in self.evaluated else {})
@@ -190,7 +190,7 @@ def evaluate(
 
 
 def test_rows(measurements: Measurements) -> Measurements:
-    """Select the rows of the set "test"; all rows where there are no sets.
+    """Return the rows of the set "test", or all rows if there are no sets.
 
     Raises:
         MeasurementError: all rows are marked as train.

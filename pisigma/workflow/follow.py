@@ -1,4 +1,4 @@
-"""Follow a growing file of measurements: rows are checked at once, and the accuracy is updated in another process."""
+"""Following of a growing file: rows are checked at once, and the accuracy is updated in another process."""
 
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -27,10 +27,10 @@ class SessionStep:
 
     Attributes:
         growth: new rows of the file.
-        alarms: faults of the new rows, or of earlier rows in the light of the new ones.
+        alarms: faults of the new rows, or of earlier rows that the new rows reveal.
         state: state of the session.
         points: accuracies that were computed since the last step.
-        replanned: whether the remaining poses differ from the planned ones, or from those of the last step.
+        replanned: whether the remaining poses differ from the planned poses, or from the poses after the last step.
     """
 
     growth: FileGrowth

@@ -39,7 +39,7 @@ class ImportProposal:
 
     @property
     def is_stated(self) -> bool:
-        """Whether the caller stated the meaning of every column, so that there is nothing to ask."""
+        """Whether the caller stated the meaning of every column, so that no confirmation is necessary."""
         return all(column.is_stated for mapping in self.mappings for column in mapping.columns)
 
     def columns_json(self) -> list[dict[str, object]]:
@@ -57,7 +57,7 @@ class ImportProposal:
         ]
 
     def save_map(self, path: str | os.PathLike[str]) -> None:
-        """Write the mapping as a file that `--map` takes.
+        """Write the mapping of columns as a file for the option `--map`.
 
         Raises:
             OutputError: it cannot be written.
@@ -72,8 +72,8 @@ class ImportedRows:
     Attributes:
         proposal: meaning of the columns.
         content: the measurement file.
-        accounts: for every file, which rows were imported and which were left out.
-        warnings: further remarks, one sentence each.
+        accounts: imported and omitted rows of every file.
+        warnings: sentences with further remarks.
     """
 
     proposal: ImportProposal
@@ -102,7 +102,7 @@ class ImportedRows:
         return Measurements.from_fields(fields_of(self.content.table))
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the measurement file.
+        """Write the imported rows as a measurement file.
 
         Raises:
             OutputError: it cannot be written, or is one of the exports.
@@ -112,7 +112,7 @@ class ImportedRows:
         write_atomically(Path(path), self.content.text())
 
     def to_json(self) -> dict[str, object]:
-        """Return what was imported and left out as plain values."""
+        """Return a summary of imported and omitted rows as plain values."""
         return {
             "rows": self.rows,
             "files": [file.to_json() for file in self.accounts],
@@ -164,7 +164,7 @@ def import_rows(
 ) -> ImportedRows:
     """Import exports of instruments and controllers as measurements.
 
-    Numbers keep all of their digits. Lengths are written in mm, and angles in deg or rad as in the export. Rotations
+    No number is rounded. Lengths are written in mm, and angles in deg or rad as in the export. Rotations
     are written as quaternions, unless they are RotZ(roll)·RotY(pitch)·RotX(yaw) already.
 
     Args:
@@ -195,7 +195,7 @@ def import_rows(
 
 
 def _in_new_frames(content: MeasurementTable, lines: Sequence[int]) -> MeasurementTable:
-    """Write the names of new frames, which start at some lines, to the column `frame`.
+    """Return the content with the names of new frames, which start at given lines, in the column `frame`.
 
     Raises:
         MeasurementError: the rows are of several files, or see `with_new_frames`.

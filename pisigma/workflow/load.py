@@ -1,4 +1,4 @@
-"""Load corrected inverse kinematics from a model folder, or from a cell with the model that is in use there."""
+"""Loading of corrected inverse kinematics from a model folder, or from a cell with its model in use."""
 
 import math
 import os
@@ -23,8 +23,8 @@ from pisigma.robot.row import FRAME_COLUMNS, MAX_MAGNITUDE
 class CellIK(CorrectedIK):
     """Corrected inverse kinematics of the model in use of a cell, which takes over a change of this model.
 
-    Every call, a path included, is answered by one model, which `Solution.model` names. Copies such as those of
-    `for_task` and `under` keep their model. All other attributes are those of `present`.
+    Every call, also for a path, is answered by one model, which `Solution.model` names. Copies such as the results
+    of `for_task` and `under` do not change their model. All other attributes are taken from `present`.
 
     """
 
@@ -32,8 +32,8 @@ class CellIK(CorrectedIK):
         """Load the model in use, and look for changes in a background thread.
 
         Raises:
-            ModelError: no model of the cell is in use, it cannot be loaded, or it must not be used with what is active
-                on the controller.
+            ModelError: no model of the cell is in use, the model cannot be loaded, or an export that is active on
+                the controller forbids its use.
         """
         self._in_use = ModelInUse(cell, "load", self._load)
         self._in_use.follow()
@@ -46,18 +46,18 @@ class CellIK(CorrectedIK):
         """Corrected inverse kinematics of the model in use.
 
         Raises:
-            ModelError: the model must not be used with what is active on the controller.
+            ModelError: an export that is active on the controller forbids the use of the model.
         """
         self._in_use.findings.checked_warnings(self._in_use.cell)
         return self._loaded
 
     def __call__(self, *arguments: Any, **options: Any) -> Solution:
-        """See `CorrectedIK.__call__`."""
+        """Solve poses with the current model; see `CorrectedIK.__call__`."""
         return self.current(*arguments, **options)
 
     @property
     def warnings(self) -> tuple[str, ...]:  # type: ignore[override]
-        """Warnings of the model, and why it must be used with care or a newer one could not be loaded."""
+        """Return warnings of the model, and reasons for care or for a newer model that could not be loaded."""
         return (*self._loaded.warnings, *self._in_use.warnings)
 
     def __getattribute__(self, name: str) -> Any:
@@ -71,7 +71,7 @@ def load(folder: str | os.PathLike[str], pin: bool = False) -> CorrectedIK:
 
     Args:
         folder: folder written by `pisigma calibrate`, `pisigma train` or `pisigma new`.
-        pin: of a cell, keep the model that is in use now; else a change is taken over between two calls.
+        pin: of a cell, always use the model that is in use now; otherwise, a change takes effect between two calls.
 
     Raises:
         ModelError: the folder is not a complete model; the message names the file at fault; or no model of the cell is
@@ -86,13 +86,13 @@ def load(folder: str | os.PathLike[str], pin: bool = False) -> CorrectedIK:
 
 
 def stated_pose(values: Sequence[float]) -> Float64[np.ndarray, "1 4 4"]:
-    """Return a stated pose T_base_tool as a batch of one [m].
+    """Return a stated pose T_base_tool as a batch `(1, 4, 4)` [m].
 
     Args:
         values: x, y, z [mm], roll, pitch and yaw [deg] of the tool in the base frame.
 
     Raises:
-        PoseError: a pose cannot have such a value.
+        PoseError: a value is not valid for a pose.
     """
     for name, value in zip(FRAME_COLUMNS, values, strict=True):
         if not abs(value) <= MAX_MAGNITUDE:

@@ -1,4 +1,4 @@
-"""Measuring with a plan: accepts rows as they are measured, and returns faults, the next pose and when to stop."""
+"""Measuring with a plan: accepts rows one by one, and returns faults, the next pose and advice to stop."""
 
 import contextlib
 import os
@@ -45,7 +45,7 @@ from pisigma.robot.se3 import transform_from_xyzrpy
 from pisigma.workflow.settings.measuring import MeasureSettings
 
 STEP = 5
-"""Poses between two points of the accuracy curve."""
+"""Number of poses between two points of the accuracy curve."""
 
 
 class OutdatedError(Exception):
@@ -69,7 +69,7 @@ class MeasuringSession:
         """Start a session.
 
         Args:
-            plan: the poses, and what they were planned with.
+            plan: the poses, and the settings with which they were planned.
             settings: see `MeasureSettings`.
         """
         plan = replace(plan, arm=allow_measured_poses(plan.settings, plan.arm))
@@ -107,14 +107,14 @@ class MeasuringSession:
         return MeasuringSession(read_plan(path), settings)
 
     def add(self, rows: Measurements | None, left_out: Sequence[UnusableRow] = ()) -> tuple[Alarm, ...]:
-        """Add new rows, and check every row against the others.
+        """Add new rows, and check every row against all other rows.
 
         Args:
             rows: the new rows in their order; None for none.
             left_out: new rows that cannot be read.
 
         Returns:
-            Faults of the new rows, or of earlier rows in the light of the new ones, in the order of the file.
+            Faults of the new rows, or of earlier rows that the new rows reveal, in the order of the file.
         """
         with self._lock:
             alarms = self._judged.add(rows, left_out, self._planned, self._names)
@@ -133,7 +133,7 @@ class MeasuringSession:
 
     @property
     def is_update_due(self) -> bool:
-        """Whether there are enough new rows to update the accuracy: one, before the first update and after the plan."""
+        """Whether enough new rows exist to update the accuracy; one row before the first update or after the plan."""
         with self._lock:
             new = self._training_rows - self._worked_out
             soon = self._so_far is None or not len(self._open)
@@ -179,7 +179,7 @@ class MeasuringSession:
             counting, check, rows = self._counting, self._check, self._rows
         training = rows.select(counting & ~check)
         kept_apart = rows.select(counting & check) if bool((counting & check).any()) else None
-        # a session that starts with rows also gets the point before its first one, like an uninterrupted session
+        # a session that starts with rows also gets the point before its first row, like an uninterrupted session
         counts = [training.rows] if self._reached else [training.rows - self._settings.every, training.rows]
         parts = [training.select(torch.arange(max(count, 0))) for count in counts]
         found = [
@@ -195,7 +195,7 @@ class MeasuringSession:
         return alarms
 
     def check_setup(self) -> tuple[Alarm, ...]:
-        """Look for a fault of the setup that all rows share, and return it if it is new."""
+        """Look for a fault of the setup that affects all rows, and return the fault if it is new."""
         with self._lock:
             rows, usable, before = self._rows, self._judged.usable, self._setup
             counts = self._judged.judgement.counts
@@ -310,7 +310,7 @@ class MeasuringSession:
 
         Args:
             path: CSV file of the plan.
-            programs: files of robot programs; not written where no poses remain.
+            programs: files of robot programs; not written if no poses remain.
 
         Raises:
             OutputError: a file cannot be written.
@@ -322,7 +322,7 @@ class MeasuringSession:
             write_atomically(program, planned_program(remaining, program))
 
     def _adopt(self, plan: StoredPlan) -> None:
-        """Continue with another plan: known poses keep their numbers, and new ones get the next numbers."""
+        """Continue with another plan: numbers of known poses remain, and new poses get the next numbers."""
         is_known = (plan.q[:, None] - self._planned).abs().amax(-1) <= 1e-9
         numbers = [self._numbers[int(row.int().argmax())] if bool(row.any()) else 0 for row in is_known]
         further = counting_from(1 + max(self._numbers))
@@ -354,7 +354,7 @@ class MeasuringSession:
 
     @property
     def _check(self) -> Bool[Tensor, " rows"]:
-        """Rows that test the calibration: those of the set "test" or, without sets, at test poses of the plan."""
+        """Return which rows test the calibration: the set "test" or, without sets, rows at test poses of the plan."""
         assert self._rows is not None
         if self._rows.split is not None:
             return torch.tensor([name == "test" for name in self._rows.split])
@@ -366,7 +366,7 @@ class MeasuringSession:
     def _open(self) -> Int64[Tensor, " remaining"]:
         """Remaining poses of the plan, in its order and starting from the pose that was measured last.
 
-        A pose that has to be measured again comes first until another one is measured, and last afterwards.
+        A pose that has to be measured again comes first until another pose is measured, and last afterwards.
         """
         if self._rows is None:
             return torch.arange(len(self.plan.q))
@@ -384,7 +384,7 @@ class MeasuringSession:
         return RowsSoFar(rows.line, rows.q.numpy(), *self._judged.errors(), *flags)
 
     def _advice(self, left: int) -> Advice:
-        """Return the advice: correct a fault of the setup, else repeat a wrong row, else continue or stop."""
+        """Return the advice: correct a fault of the setup, repeat a wrong row, continue, or stop, in this order."""
         if self._setup:
             return Advice("correct", alarm_of_all_rows(self._setup).sentence)
         last = None if self._rows is None else self._rows.line[-1]

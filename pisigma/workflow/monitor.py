@@ -1,4 +1,4 @@
-"""Monitor a robot: compare sessions of few rows with its model, one by one and over the months."""
+"""Monitoring of a robot: comparison of sessions of few rows with its model, one by one and over months."""
 
 import datetime
 import os
@@ -88,17 +88,17 @@ class UntrustedSession:
 
 @dataclass(frozen=True, eq=False)
 class Monitoring:
-    """Result of `monitor`: sessions of a robot, and how it changes over the months.
+    """Result of `monitor`: sessions of a robot, and its changes over the months.
 
     Attributes:
-        model: the model that the sessions were compared with.
+        model: the model with which the sessions were compared.
         sessions: sessions of this call.
-        records: all sessions of the model, including those of its history, in the order of their dates.
+        records: all sessions of the model, including sessions of its history, in the order of their dates.
         charts: control charts of the joint zeros and of the error, over all sessions.
         trends: trends of the joint zeros.
         jumps: jumps of the joint zeros between two sessions.
         forecast: forecast of the error; None without a limit.
-        warnings: warnings, one sentence each.
+        warnings: sentences that warn of problems.
         cameras: cameras and boards of files of detected board corners.
         untrusted: sessions of this call that must not be trusted.
         cell: folder of the cell of the model; None if it is outside of a cell.
@@ -131,7 +131,7 @@ class Monitoring:
     def advised_session(self) -> Record | None:
         """The last session with which a recalibration pays.
 
-        None if there is none, or where a later session that observes as many joints agrees with the model.
+        None without such a session, or if a later session that observes as many joints agrees with the model.
         """
         paying = [one for one in self.sessions if one.session.recalibrate]
         if not paying:
@@ -143,7 +143,7 @@ class Monitoring:
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """Results of all sessions in sentences: alarms, clear trends, the forecast, and what to do."""
+        """Return results of all sessions as sentences: alarms, clear trends, the forecast, and the next step."""
         alarms = (
             f"{'the RMS error' if chart.one_sided else chart.what} has been outside the limits "
             f"({' and '.join(chart.kinds)}) since {self.records[chart.alarm].date}."
@@ -159,9 +159,7 @@ class Monitoring:
         advice: tuple[str, ...] = ()
         if (best := self.advised_session) is not None:
             command = RecalibrationSettings(cameras=self.cameras).command(self.model.name, best.file)
-            if (
-                self.cell is not None
-            ):  # a model folder that the cell does not know would never be put into use
+            if self.cell is not None:  # the cell would never use a model folder that it does not know
                 command = shlex.join(["pisigma", "recalibrate", os.fspath(self.cell)])
             advice = (
                 f"Recalibrating pays: errors like those of {best.file} are expected to fall from "
@@ -191,7 +189,7 @@ class Monitoring:
         }
 
     def save_page(self, page: str | os.PathLike[str]) -> None:
-        """Write the sessions and charts as one HTML page.
+        """Write the sessions and charts as one HTML file.
 
         Raises:
             OutputError: the page is not an .html file, or cannot be written.
@@ -332,7 +330,7 @@ def _by_day(sessions: Sequence[Measurements], dates: Sequence[str]) -> list[tupl
 
 
 def _date_of_file(source: str) -> str:
-    """Return the day in a file's name, else that of its last modification; today for rows that are not from a file."""
+    """Return the day in the name of a file, or of its last modification; today for rows without a file."""
     path = Path(source)
     if date := date_in_name(path.name):
         return date

@@ -1,4 +1,4 @@
-"""Plan which poses to measure; a plan is written as a table, and as robot programs."""
+"""Planning of the poses to measure; a plan is written as a table, and as robot programs."""
 
 import math
 import os
@@ -48,11 +48,11 @@ from pisigma.validation.checks.check import MOVES
 from pisigma.validation.gate import check_rows
 
 STEP = 10
-"""Poses between two points of the accuracy curve."""
+"""Number of poses between two points of the accuracy curve."""
 MIN_WEAK_SHARE = 0.1
-"""Share of the remaining variance above which its cause is named."""
+"""Share of the remaining variance above which a warning names its cause."""
 MIN_RANGE_SHARE = 0.1
-"""Share of a joint's range that the candidates have to cover in order to represent the workspace."""
+"""Share of the range of a joint that the candidates have to cover in order to represent the workspace."""
 MAX_ROUNDS = 4
 """Maximum number of times that unreachable poses are replaced."""
 
@@ -66,11 +66,11 @@ class Plan:
         candidates: poses that they were chosen from.
         curve: expected errors of the tool's position over the task against the number of poses, from 0 poses where
             there are earlier measurements.
-        needed: number of poses with which the limit is expected to be reached; None without a limit, or where it is
+        needed: number of poses with which the limit is expected to be reached; None without a limit, or if it is
             not reached.
         remaining: sources of the expected remaining error, the largest first.
         travel: time of the measurement [s].
-        warnings: further remarks, one sentence each.
+        warnings: sentences with further remarks.
         camera: what limits a calibration with images; None without a camera.
         seconds: computing time [s].
     """
@@ -135,7 +135,7 @@ class Plan:
         }
 
     def save(self, path: str | os.PathLike[str], programs: Sequence[str | os.PathLike[str]] = ()) -> None:
-        """Write the poses as a CSV file, the settings as a YAML file next to it, and robot programs.
+        """Write the poses as a CSV file, the settings as a YAML file next to it, and robot programs of the poses.
 
         Args:
             path: the CSV file.
@@ -178,7 +178,7 @@ def plan(
 
     Args:
         subject: the nominal robot (a robot, a catalogue name, a robot file in YAML or URDF), or a model of it (a model,
-            an object that contains one, such as a `CorrectedIK` or a `Calibration`, or a folder).
+            an object that contains a model, such as a `CorrectedIK` or a `Calibration`, or a folder).
         settings: see `PlanSettings`. None: the defaults.
         surroundings: surroundings of the robot, or their YAML file. None: no obstacles.
         progress: called with the current step.
@@ -236,7 +236,7 @@ class _Problem:
         arm: the robot in its surroundings.
         candidates: poses to choose from.
         posterior: distribution of the unknowns before the first pose is measured.
-        task: joint values [rad or m] where the robot has to be accurate.
+        task: joint values at which the robot has to be accurate [rad or m].
     """
 
     subject: Subject
@@ -258,7 +258,7 @@ class _Problem:
 
     @cached_property
     def tool(self) -> Float64[Tensor, "tasks 3 directions"]:
-        """Uncertainty of the tool's position over the task; see `RobotPosterior.tool`."""
+        """Return the uncertainty of the position of the tool over the task; see `RobotPosterior.tool`."""
         return self.posterior.tool(self.task)
 
     @property
@@ -298,7 +298,7 @@ class _Problem:
         )
 
     def curve(self, chosen: Int64[Tensor, " chosen"]) -> tuple[ExpectedAccuracy, ...]:
-        """Return the expected accuracy against the number of poses, from 0 where there are earlier measurements."""
+        """Return the expected accuracy by the number of poses, from 0 poses if there are earlier measurements."""
         first, count = 0 if self.has_measurements else STEP, len(chosen)
         return self._curve(chosen, [*range(first, count, STEP), count])
 
@@ -306,7 +306,7 @@ class _Problem:
         self, chosen: Int64[Tensor, " chosen"], points: Sequence[ExpectedAccuracy]
     ) -> int | None:
         """Return the smallest number of the chosen poses with which the limit is expected to be reached."""
-        limit = (self.settings.limit_mm or 0.0) / 1e3  # without a limit, 0 m, which is never reached
+        limit = (self.settings.limit_mm or 0.0) / 1e3  # without a limit: 0 m, which is never reached
         reached = next((index for index, point in enumerate(points) if point.p95 <= limit), None)
         if reached is None:
             return None
@@ -350,7 +350,7 @@ class _Problem:
         )
 
     def view_warnings(self, chosen: Int64[Tensor, " chosen"]) -> tuple[str, ...]:
-        """Return warnings about images that are too frontal, or of one configuration of the arm."""
+        """Return warnings about images that are too frontal, or show only one configuration of the arm."""
         if self.views is None:
             return ()
         q = self.candidates.q[chosen]
@@ -362,10 +362,10 @@ class _Problem:
 
 
 def _check_measured(model: CalibratedModel | None, settings: PlanSettings, robot: Robot) -> tuple[str, ...]:
-    """Refuse measurements with a fault of the setup, and those that the model was made from.
+    """Refuse measurements with a fault of the setup, and measurements to which the model was fitted.
 
     Returns:
-        Warnings, such as where the model may have been made from some of them.
+        Warnings, such as that the model may have been fitted to some of the measurements.
 
     Raises:
         MeasurementError: they cannot be used; the message names the fault.

@@ -69,7 +69,7 @@ class Recalibration(AbstractModelResult):
         parent: the model that the rows were added to.
         adaptation: adaptation of the parent to all rows.
         gate: errors of held-out rows under every candidate.
-        moved: what has moved significantly.
+        moved: parts that have moved significantly.
         summary: all figures.
         seconds: computing time [s].
     """
@@ -84,7 +84,7 @@ class Recalibration(AbstractModelResult):
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Warnings, one sentence each."""
+        """Return warnings, one sentence each."""
         return self.summary.warnings
 
     def _describe(self, model: CalibratedModel, summary: RecalibrationSummary, folder: Path) -> None:
@@ -98,20 +98,20 @@ def recalibrate(
     progress: Progress = lambda what: None,
     nominal: Robot | None = None,
 ) -> Recalibration:
-    """Update a model with new rows, and keep the candidate that predicts held-out rows best.
+    """Update a model with new rows, and choose the candidate that predicts held-out rows best.
 
     The candidates are the old model, the model updated with the rows, and a calibration from scratch.
 
     Args:
-        model: model of `pisigma calibrate`, `pisigma recalibrate` or `pisigma fleet prior`, an object that contains one
-            (a `CorrectedIK`, a `Calibration`), or its folder.
+        model: model of `pisigma calibrate`, `pisigma recalibrate` or `pisigma fleet prior`, an object that contains
+            such a model (a `CorrectedIK`, a `Calibration`), or its folder.
         data: new rows of any sensors, or CSV files of them. Rows of the set "test" are not used.
         settings: see `RecalibrationSettings`.
         progress: called with the current step.
         nominal: nominal robot; the model then has to be the prior of its fleet. None: any model.
 
     Returns:
-        The kept model with its figures; `save` writes it as a model folder.
+        The chosen model with its figures; `save` writes it as a model folder.
 
     Raises:
         ModelError: the folder is not that of a model, or the model is of another robot, has no posterior, or is not
@@ -182,7 +182,7 @@ def _adapted(
     elsewhere: frozenset[FrameKey],
     far: Sequence[int],
 ) -> tuple[Measurements, Adaptation, tuple[ContradictingRowFigures, ...]]:
-    """Return the rows without wrong ones, the model adapted to them, and the wrong rows including `far`."""
+    """Return the rows that are not wrong, the model adapted to them, and the wrong rows including `far`."""
     left = [row for row in range(rows.rows) if row not in far]
     right = rows.select(torch.tensor(left)) if far else rows
     adaptation = adapt(recalibration_problem(parent, posterior, right, elsewhere))
@@ -202,7 +202,7 @@ def _kept(
     calibrator: HybridCalibrator,
     progress: Progress,
 ) -> tuple[CandidateChoice, CalibratedModel]:
-    """Return the candidate that is kept, and its model.
+    """Return the name of the chosen candidate, and its model.
 
     A robot unlike its fleet keeps the calibration from scratch, if its rows are enough for one.
     """
@@ -223,7 +223,7 @@ def _kept_model(
     calibrator: HybridCalibrator,
     progress: Progress,
 ) -> CalibratedModel:
-    """Return the model of the candidate that is kept."""
+    """Return the model of the chosen candidate."""
     if choice.kept == "scratch":
         fitted = fit_if_better if choice.rms["scratch"] is None else fit
         result = fitted(calibrator, rows, progress)
@@ -237,7 +237,7 @@ def _kept_model(
 def _outliers(
     adaptation: Adaptation, rows: Measurements, wrong: Sequence[int]
 ) -> tuple[ContradictingRowFigures, ...]:
-    """Return the rows that were left out as wrong, with their residuals under the others' calibration."""
+    """Return the rows that were left out as wrong, with their residuals for a calibration with the other rows."""
     errors = pose_errors_of(adaptation, rows)
     sizes = {"residual_mm": (errors.position, 1e3), "residual_deg": (errors.rotation, math.degrees(1.0))}
     outliers = []
@@ -300,9 +300,9 @@ def _fleet_consistency(model: CalibratedModel, rows: Measurements) -> "FleetCons
 def _moved_frames(
     model: CalibratedModel, posterior: ModelPosterior, rows: Measurements, settings: RecalibrationSettings
 ) -> frozenset[FrameKey]:
-    """Return the bases and tools that have moved: those that are stated to, or else those that the evidence shows.
+    """Return the bases and tools that have moved, as stated or, without a statement, as the evidence shows.
 
-    With the prior of a fleet, all of them: every robot has its own base and tool.
+    With the prior of a fleet, all bases and tools are returned, because they differ between robots.
     """
     if model.kind == FLEET_PRIOR:
         return frame_keys(rows, ("base", "tool"))
@@ -330,7 +330,7 @@ def may_move(settings: RecalibrationSettings) -> frozenset[Move]:
 def filtered_rows(
     settings: RecalibrationSettings, model: CalibratedModel, rows: Measurements
 ) -> FilteredRows:
-    """Return the rows without single wrong ones, also with base and tool fitted where these may have moved."""
+    """Return the rows except single wrong rows, with base and tool fitted if these may have moved."""
     right = without_wrong_rows([model], rows, settings.fitted)
     if right.warnings or settings.moved is not None:
         return right

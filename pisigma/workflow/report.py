@@ -1,4 +1,4 @@
-"""Report on a calibration as one HTML page."""
+"""Report on a calibration as one HTML file."""
 
 import os
 import time
@@ -34,7 +34,7 @@ class Report:
         figures: drawn figures.
         diagnostics: why the rows must not be trusted; see `pisigma.validation.gate`.
         seconds: computing time [s].
-        acceptance: statements by which the robot of a cell is accepted; None without a cell.
+        acceptance: statements for the acceptance of the robot of a cell; None without a cell.
     """
 
     content: ReportContent
@@ -45,7 +45,7 @@ class Report:
 
     @property
     def verdict(self) -> str:
-        """Accuracy of the model, its improvement over nominal, where it is worst and what limits it, in a sentence."""
+        """Return a sentence on accuracy, improvement over nominal, place of the largest errors, and their cause."""
         return self.content.verdict.sentence
 
     def to_json(self) -> dict[str, Any]:
@@ -57,7 +57,7 @@ class Report:
     def save(
         self, page: str | os.PathLike[str], figures: str | os.PathLike[str] | None = None
     ) -> tuple[Path, ...]:
-        """Write the page and, if a folder is given, every figure as PNG and SVG.
+        """Write the HTML page and, if a folder is given, every figure as PNG and SVG.
 
         Args:
             page: file of the page (.html); replaced completely or not at all.
@@ -101,7 +101,7 @@ def report(
     cameras: CameraFiles | None = None,
     acceptance: Acceptance | None = None,
 ) -> Report:
-    """Report on a calibration: its accuracy, where it is worst, what limits it and what to measure next.
+    """Report on a calibration: accuracy, place and cause of the largest errors, and what to measure next.
 
     Args:
         model: folder of the model.
@@ -130,7 +130,7 @@ def report(
 
 
 def _filtered_rows(model: CalibratedModel, rows: Measurements) -> tuple[Measurements, tuple[str, ...]]:
-    """Return the rows without single wrong ones, unless the model was made from exactly these, and warnings."""
+    """Return the rows except single wrong rows, unless the model was fitted to exactly these rows, and warnings."""
     remarks = limit_warnings(model.robot, rows)
     if model.provenance.data_sha256 == rows.content_hash():
         return rows, remarks

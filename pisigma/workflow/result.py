@@ -33,7 +33,7 @@ class AbstractModelResult(ABC):
 
     @property
     def diagnostics(self) -> tuple[Diagnostic, ...]:
-        """Faults of the result, first those that make it implausible."""
+        """Return faults of the result, beginning with faults that make it implausible."""
         return self.summary.diagnostics
 
     @property

@@ -17,9 +17,9 @@ from pisigma.workflow.report import Report
 from pisigma.workflow.verify import Verification
 
 MAX_POINTS = 8
-"""Rows of the table of expected errors."""
+"""Largest number of rows of the table of expected errors."""
 MAX_SESSIONS = 6
-"""Sessions that are shown at once, the last ones."""
+"""Number of the last sessions that are shown at once."""
 
 NEXT_STEPS = {
     "better": "use the model, and verify again after a change of tool, base or arm.",
@@ -33,11 +33,11 @@ NEXT_STEPS = {
 
 
 def plan_text(planned: Plan, files: Sequence[Path]) -> ResultText:
-    """Lay out what is expected of planned poses, and what remains uncertain.
+    """Return the expected accuracy with planned poses, and the remaining uncertainty, as text.
 
     Args:
         planned: the plan.
-        files: what was written, the plan first.
+        files: written files, the plan first.
     """
     columns = ("poses", "RMS [mm]", "95 % [mm]", "RMS of random poses [mm]")
     rows = [
@@ -67,7 +67,7 @@ def plan_text(planned: Plan, files: Sequence[Path]) -> ResultText:
 
 
 def _plan_verdict(planned: Plan, file: Path) -> Verdict:
-    """Describe how accurate a calibration with the poses is expected to be."""
+    """Return the verdict on the expected accuracy of a calibration with the poses."""
     last, settings, warnings = planned.curve[-1], planned.stored.settings, planned.warnings
     cautions = f"with caution ({count_text(len(warnings), 'warning')})" if warnings else "yes"
     checked = f"; {count_text(planned.checks, 'pose')} will check it" if planned.checks else ""
@@ -82,7 +82,7 @@ def _plan_verdict(planned: Plan, file: Path) -> Verdict:
 
 
 def _curve_lines(planned: Plan) -> list[str]:
-    """Describe what the curve does not show, and how many poses the limit requires, if there is one."""
+    """Return sentences on the limits of the curve, and on the number of poses that the accuracy limit requires."""
     lines, last, settings = [], planned.curve[-1], planned.stored.settings
     limit = settings.limit_mm
     if settings.criterion == "D" and last.rms > last.random_rms:
@@ -127,7 +127,7 @@ def session_text(state: SessionState, closing: Sequence[str] = ()) -> ResultText
 
     Args:
         state: state of the session.
-        closing: what was written where.
+        closing: sentence on the written files.
     """
     counting = int((~state.rows.alarmed).sum())
     reached = "not known yet." if state.accuracy is None else accuracy_text(state.accuracy)
@@ -147,14 +147,14 @@ def session_text(state: SessionState, closing: Sequence[str] = ()) -> ResultText
 
 
 def _narrow(state: SessionState) -> list[str]:
-    """List which joints were measured over less than half of the planned range."""
+    """Return a text on the joints that were measured over less than half of the planned range."""
     narrow = [span for span in state.coverage if span.planned < 0.5]
     names = ", ".join(f"{span.name} ({100 * span.planned:.0f} %)" for span in narrow)
     return [f"less than half of the planned range was measured of: {names}."] if narrow else []
 
 
 def accuracy_text(point: AccuracyPoint) -> str:
-    """Describe how accurate a calibration is."""
+    """Return a text on the accuracy of a calibration."""
     texts = [_errors("predicted", point.predicted_rms, point.predicted_p95)]
     texts += [_errors("held-out rows", point.cross_validated_rms, point.cross_validated_p95)]
     texts += [_errors("check poses", point.checked_rms, point.checked_p95)]
@@ -170,7 +170,7 @@ def monitoring_text(monitoring: Monitoring, closing: Sequence[str] = ()) -> Resu
 
     Args:
         monitoring: the monitoring.
-        closing: what was written where.
+        closing: sentence on the written files.
     """
     sessions, name = monitoring.sessions, monitoring.model.name
     said = [f"{one.date}: {one.session.sentence}" for one in sessions if one.session.verdict != "unchanged"]
@@ -215,7 +215,7 @@ def _monitoring_verdict(monitoring: Monitoring, advice: str) -> Verdict:
 
 
 def recalibration_text(recalibration: Recalibration, folder: Path | None) -> ResultText:
-    """Lay out a recalibration: the verdict, what has moved, and the models that were candidates.
+    """Return a recalibration as text: the verdict, moved parts, and the candidate models.
 
     Args:
         recalibration: the recalibration.
@@ -258,11 +258,11 @@ def _recalibration_verdict(recalibration: Recalibration, folder: Path | None) ->
 
 
 def report_text(result: Report, closing: Sequence[str] = ()) -> ResultText:
-    """Lay out a report: its verdict, the advice on what to measure, and the acceptance of a cell.
+    """Return a report as text: its verdict, the advice on measuring, and the acceptance of a cell.
 
     Args:
         result: the report.
-        closing: what was written where.
+        closing: sentence on the written files.
     """
     content, accepted = result.content, result.acceptance
     trust = "yes: these rows were held out."
@@ -289,7 +289,7 @@ def report_text(result: Report, closing: Sequence[str] = ()) -> ResultText:
 
 
 def report_doubt(result: Report) -> str:
-    """Say why the rows of a report must not be trusted, or contradict the acceptance; "" if nothing does."""
+    """Return the reason why rows of a report must not be trusted or contradict the acceptance; otherwise ""."""
     if result.acceptance is not None and result.acceptance.contradicted and not result.diagnostics:
         return contradiction(result.acceptance)
     return " ".join(one.sentence for one in result.diagnostics)

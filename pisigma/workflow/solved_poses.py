@@ -18,16 +18,17 @@ from pisigma.robot.kinematics.tolerances import LIMIT_TOLERANCE
 from pisigma.robot.se3 import wrap_to_pi
 
 SINGULAR_BELOW = 0.05
-"""Nominal `singularity_measure` below which poses are refused: corrections are steep there."""
+"""Nominal `singularity_measure` below which poses are refused, because corrections are steep near singularities."""
 
 POSES_PER_CHUNK = 2_000
-"""Poses solved between two reports of progress."""
+"""Number of poses that are solved between two reports of progress."""
 
 MAX_TRIES = 20
-"""Number of random poses per reachable one above which a region is refused."""
+"""Number of random poses per reachable pose above which a region is refused."""
 
 _SAME_BRANCH = 0.05
-"""Largest distance [rad or m] of a nominal solution from the joint values drawn; beyond, it is on another branch."""
+"""Largest distance of a nominal solution from the drawn joint values [rad or m]; a solution farther away is on
+another branch."""
 
 Box = tuple[float, float, float, float, float, float]
 """x_min, x_max, y_min, y_max, z_min, z_max [m] in the base frame."""
@@ -35,7 +36,7 @@ Box = tuple[float, float, float, float, float, float]
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """Region in which poses are drawn.
+    """Region in which random poses are drawn.
 
     Attributes:
         q: joint values [rad or m]; poses are drawn between a row and its neighbours.
@@ -69,7 +70,7 @@ class SolvedPoses:
     refused: dict[str, int]
 
     def select(self, rows: slice) -> "SolvedPoses":
-        """Select some of the poses; `drawn` and `refused` remain those of all."""
+        """Return some of the poses; `drawn` and `refused` still count all poses."""
         T, q_nominal, correction = self.T[rows], self.q_nominal[rows], self.correction[rows]
         return SolvedPoses(
             T, q_nominal, correction, self.branch[rows], self.status[rows], self.drawn, self.refused
@@ -116,7 +117,7 @@ def draw_between(
 ) -> Float64[Tensor, "drawn dof"]:
     """Draw joint values between a row of q and its neighbours, as means with random weights.
 
-    The neighbours are `dof` rows, drawn from the 2 `dof` nearest ones. Revolute joints are compared and interpolated
+    The neighbours are `dof` rows, drawn from the 2 `dof` nearest rows. Revolute joints are compared and interpolated
     the short way round.
     """
     first = torch.randint(len(q), (count,), generator=generator)
@@ -132,7 +133,7 @@ def draw_between(
     order = torch.rand(count, nearby, generator=generator).argsort(-1)[:, : robot.dof]
     others = torch.cat(neighbours)[first].gather(1, order)
     way = wrapped_difference(robot, q[others], q[first][:, None])
-    # normalised exponential variables are uniform over the simplex; squared, they concentrate at its corners (rows)
+    # normalised exponential variables are uniform over the simplex; their squares concentrate at the corners (rows)
     weight = torch.rand(count, way.shape[1] + 1, generator=generator, dtype=torch.float64).log().square()
     weight = weight / weight.sum(-1, keepdim=True)
     return q[first] + (weight[:, 1:, None] * way).sum(1)
@@ -141,7 +142,7 @@ def draw_between(
 def _solve(
     ik: CorrectedIK, region: Region, count: int, generator: torch.Generator
 ) -> tuple[tuple[Tensor, ...], dict[str, int]]:
-    """Draw `count` poses, and return the solved ones and how many were refused for which reason."""
+    """Draw `count` poses; return the solved poses and the number of refused poses by reason."""
     robot = ik.model.robot
     q = draw_between(robot, region.q, count, generator)
     T = forward_kinematics(robot, q)

@@ -78,7 +78,7 @@ class InverseTraining(AbstractModelResult):
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Warnings, one sentence each."""
+        """Return warnings, one sentence each."""
         rows = self.summary.rows
         return (f"{rows.left_out} rows were left out of the training: {rows.rule}.",) if rows.rule else ()
 
@@ -105,7 +105,7 @@ def train(
         progress: called with the current step.
 
     Returns:
-        `InverseTraining` for a recipe of inverse calibration, else a `Calibration`.
+        `InverseTraining` for a recipe of inverse calibration, otherwise `Calibration`.
 
     Raises:
         RecipeError: the recipe cannot be read, or does not use `data` or `settings`.
@@ -246,7 +246,7 @@ def train_networks(
         recipe_sha256: SHA-256 of the recipe file, for provenance.
 
     Raises:
-        PisigmaError: the data or the recipe cannot be used; the message says what to do.
+        PisigmaError: the data or the recipe cannot be used; the message states a remedy.
     """
     from pisigma.network.networks import fit_networks  # imports lightning, which takes seconds
     from pisigma.network.trainer import Checkpoints
@@ -346,10 +346,10 @@ def _compared_fold(
 
 
 def _check_one_pose(measurements: Measurements) -> None:
-    """Check that all rows are of one frame and one target, because an inverse calibration has one base and one tool.
+    """Check that all rows have one frame and one target, as an inverse calibration has one base and one tool.
 
     Raises:
-        MeasurementError: there are several; the message names the first row of another one.
+        MeasurementError: there are several frames or targets; the message names the first row with a second name.
     """
     for what, names in (("frame", measurements.frame), ("target", measurements.target)):
         other = next((row for row, name in enumerate(names) if name != names[0]), None)
@@ -364,7 +364,7 @@ def _check_one_pose(measurements: Measurements) -> None:
 
 
 def _held_out_pairs(name: str, robot: Robot, held_out: Measurements) -> TrainingPairs:
-    """Return pairs of held-out simulated poses, all of which must have a joint error.
+    """Return pairs of held-out simulated poses; all poses must have a joint error.
 
     Raises:
         RecipeError: the nominal robot cannot reach some of the poses.

@@ -17,7 +17,7 @@ class UpgradeResult:
 
     Attributes:
         models: results of the models.
-        before: version of the schema of the history before; the same as `after` if there was no history.
+        before: previous version of the schema of the history; equal to `after` if there was no history.
         after: version of the schema of the history now.
     """
 
@@ -27,10 +27,10 @@ class UpgradeResult:
 
 
 def upgrade(path: str | os.PathLike[str]) -> UpgradeResult:
-    """Convert a model folder or a cell to the present formats; the history then names the upgraded models.
+    """Convert a model folder or a cell to the current formats; the history then names the upgraded models.
 
     Args:
-        path: a model folder, whose history is upgraded too, or a cell, all of whose models are upgraded.
+        path: a model folder, whose history is also upgraded, or a cell, of which all models are upgraded.
 
     Raises:
         ModelError: a folder is not a model, or cannot be upgraded; see `upgrade_folder`.

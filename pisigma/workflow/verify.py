@@ -46,7 +46,7 @@ RESAMPLES = (200, 2000)
 NOMINAL, GEOMETRIC, CORRECTED = "nominal", "geometric", "corrected"
 
 HALVED = 0.5
-"""Largest ratio of the errors at which the corrected model is treated as better although a setup fault was found."""
+"""Largest ratio of corrected to nominal error at which the corrected model is called better despite a setup fault."""
 
 MOTIONS = {"joint_zero", "frame", "tool"}
 """Setup faults that the posterior of a model explains in more detail."""
@@ -72,20 +72,21 @@ class Verification:
         data: file of the rows.
         rows: number of evaluated rows.
         settings: settings of the verification.
-        verdict: "better" or "not_better" where the confidence interval of the mean difference shows that the corrected
-            model explains the rows better than the nominal robot, or not; "undecided" where it shows neither; "moved"
-            where the arm has moved according to the model's posterior and recalibrating pays; "setup_fault" where a
-            setup fault explains the errors, so they prove nothing; "implausible" where they are too large for a
-            calibrated robot and nothing explains them.
+        verdict: "better" or "not_better" if the confidence interval of the mean difference shows that the corrected
+            model explains the rows better than the nominal robot, or not; "undecided" if it shows neither; "moved"
+            if the arm has moved according to the posterior of the model and recalibrating pays; "setup_fault" if a
+            setup fault explains the errors, which then prove nothing; "implausible" if the errors are too large for
+            a calibrated robot and no fault explains them.
         sentence: the verdict with figures.
-        ratio: mean position error of the corrected model over that of the nominal robot; NaN if that is 0.
+        ratio: mean position error of the corrected model divided by the mean position error of the nominal robot;
+            NaN if the latter is 0.
         better_share: fraction of the configurations in which the corrected model has the smaller error.
         comparison: figures of "nominal", "geometric" (of a hybrid) and "corrected".
         diagnostics: why the rows must not be trusted; see `pisigma.validation.gate`.
         setup_faults: setup faults that explain large errors; empty if `motion` explains them.
-        motion: what has moved since the model was made; None if the model or the rows do not show it.
+        motion: parts that have moved since the model was made; None if the model or the rows do not show motions.
         recalibration: command that updates the model; empty if that does not pay.
-        warnings: further remarks, one sentence each.
+        warnings: sentences with further remarks.
         seconds: computing time [s].
     """
 
@@ -111,7 +112,7 @@ class Verification:
         return self.verdict == "better"
 
     def to_json(self) -> dict[str, object]:
-        """Return everything as plain values: the result of `pisigma verify --json`."""
+        """Return all results as plain values: the result of `pisigma verify --json`."""
         return {
             "model": self.model,
             "data": self.data,
@@ -138,7 +139,7 @@ def read_for_verification(
 ) -> Measurements:
     """Read measurements without checking joint limits, because swapped columns exceed them.
 
-    Rows of the set "train" are left out where the file has a column "set".
+    Rows of the set "train" are left out if the file has a column "set".
 
     Raises:
         MeasurementError: the file cannot be used, or its column `set` leaves no row for tests.
@@ -161,7 +162,7 @@ def verify(
     Raises:
         MeasurementError: the file cannot be used, no lengths were measured, or the model does not have a frame or a
             target of the rows.
-        ModelError: the folder cannot be used, or the model does not keep enough joint values to fit base and tool of
+        ModelError: the folder cannot be used, or the model does not store enough joint values to fit base and tool of
             the nominal robot.
         PoseError: the joint values do not fit the robot.
     """
@@ -241,7 +242,7 @@ def _motion(
     comparison: ModelComparison,
     faults: Sequence[SetupFault],
 ) -> Session | None:
-    """Return what has moved; None if another setup fault or the nominal robot explains the rows better."""
+    """Return the moved parts; None if another setup fault or the nominal robot explains the rows better."""
     if any(not MOTIONS.issuperset(fault.kinds) for fault in faults):
         return None
     motion = judged_motion(model, rows, fitted)

@@ -24,11 +24,11 @@ NO_SESSION = "no session that the model was not fitted to was measured since its
 def acceptance_of(cell: Cell) -> Acceptance:
     """Collect instrument, uncertainty budget, measured figures and acceptances of the model in use.
 
-    The measured figures and the poses of the budget are those of the newest valid session that the model was not fitted
-    to; without one, the budget is that of the poses of the calibration.
+    Measured figures and poses of the budget are from the newest valid session to which the model was not fitted;
+    without such a session, the budget is for the poses of the calibration.
 
     Args:
-        cell: the cell; nothing is added to it.
+        cell: cell to read; nothing is added to it.
 
     Raises:
         ModelError: no model is in use.

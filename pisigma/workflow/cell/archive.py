@@ -1,4 +1,4 @@
-"""Packing of a cell into one ZIP file, and unpacking; links and paths that lead out of the folder are refused."""
+"""Packing of a cell into a ZIP file, and unpacking, which refuses links and paths that lead out of the folder."""
 
 import os
 import stat
@@ -13,7 +13,7 @@ from pisigma.lifetime.cell.layout import CELL_FILE
 from pisigma.workflow.cell.cell import Cell
 
 MAX_BYTES = 2 * 10**9
-"""Largest total size of the files of a cell."""
+"""Largest total size of the files of a cell [bytes]."""
 _CHUNK = 2**20
 
 
@@ -50,7 +50,7 @@ def pack(cell: Cell, path: str | os.PathLike[str]) -> int:
     try:
         with scratch_beside(target, FILE) as scratch, scratch_beside(target, FILE) as history:
             if cell.history.path in files:
-                cell.history.database.copy(history)  # as a whole, even if another process writes
+                cell.history.database.copy(history)  # completely, even if another process writes
             with zipfile.ZipFile(scratch, "w", zipfile.ZIP_DEFLATED) as archive:
                 for one in files:
                     source = history if one == cell.history.path else one
@@ -121,7 +121,7 @@ def _check_members(archive: zipfile.ZipFile, path: str | os.PathLike[str]) -> No
 def _extract(
     archive: zipfile.ZipFile, member: zipfile.ZipInfo, folder: Path, path: str | os.PathLike[str]
 ) -> None:
-    """Write one file; refuse it if it is longer than the archive states."""
+    """Extract one file of an archive; refuse a file that is longer than the archive states."""
     target = folder / member.filename
     if member.is_dir():
         target.mkdir(parents=True, exist_ok=True)

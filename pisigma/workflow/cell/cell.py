@@ -1,7 +1,7 @@
 """One robot on its mount: every step of its calibration, with rows and settings from its folder.
 
 `Cell.open` reads a folder that `Cell.create` made. Each step calls the function of the same name in
-`pisigma.workflow`, records what it found in the history, and decides which model is in use.
+`pisigma.workflow`, records the results in the history, and decides which model is in use.
 """
 
 import datetime
@@ -61,7 +61,7 @@ class Cell:
     def __init__(self, folder: Path, file: CellFile) -> None:
         self.folder, self.file = folder, file
         self.history = History(folder / HISTORY)
-        self._settings_sha256 = settings_hash(folder)  # of the file as it was read
+        self._settings_sha256 = settings_hash(folder)  # hash of the file that was read
 
     @staticmethod
     def open(folder: str | os.PathLike[str]) -> "Cell":
@@ -129,7 +129,7 @@ class Cell:
             name: name of the model. None: the model in use.
 
         Raises:
-            ModelError: there is no model with this name, or none is in use.
+            ModelError: there is no model with this name, or no model is in use.
         """
         if name is None:
             return model_folder(self.folder)
@@ -140,9 +140,9 @@ class Cell:
     def plan(
         self, progress: Progress = lambda what: None, programs: Sequence[Path] = (), **changed: Any
     ) -> tuple[Plan, Path]:
-        """Plan which poses to measure, different ones in every plan of a cell.
+        """Plan which poses to measure; every plan of a cell has different poses.
 
-        Without a model they are for a calibration; with one they verify or monitor it or, above the limit, improve it.
+        Without a model, the poses are for a calibration; with a model, they verify, monitor or improve the model.
 
         Args:
             progress: called with the name of each step.
@@ -150,13 +150,13 @@ class Cell:
             **changed: options of `pisigma plan` that override `cell.yaml`, by its keys.
 
         Returns:
-            The plan, and the CSV file in `plans/` to which it was written.
+            The plan, and its CSV file in `plans/`.
         """
         facts = self.status().facts
         entry, settings = facts.in_use or facts.newest_model, self.file.plan_settings(facts, **changed)
         subject = self.model_folder(entry.name) if entry is not None and entry.has_posterior else self.robot
         planned = plan(subject, settings, self.file.document.surroundings, progress)
-        with self.history.database.transaction():  # no other process chooses the same name meanwhile
+        with self.history.database.transaction():  # so that no other process chooses the same name
             path = free_path(self.folder / PLANS, datetime.date.today().isoformat(), ".csv")
             planned.save(path, programs)
         made = f"plan '{path.stem}' of {planned.poses + planned.checks} poses"
@@ -184,18 +184,18 @@ class Cell:
     ) -> tuple[Calibration | Recalibration, ModelEntry | None]:
         """Calibrate with all rows since the last event that changed the arm, and store the model.
 
-        The first model is put into use by `verify`. A later one is put into use if it is better on held-out rows: the
-        newest session, if it has ten rows or more, is held out, and the calibration without it is compared with the
-        model in use.
+        The first model is put into use by `verify`. A later model is put into use if it is better on held-out rows:
+        the newest session, if it has ten rows or more, is held out, and the calibration without this session is
+        compared with the model in use.
 
         Args:
             progress: called with the name of each step.
-            accept_implausible: store the model even if it must not be trusted; it is then not put into use.
+            accept_implausible: store the model even if it must not be trusted; such a model is not put into use.
             prior: model folder of `pisigma fleet prior` to start from. None: calibrate from scratch.
             **changed: options of `pisigma calibrate` that override `cell.yaml`, by its keys.
 
         Returns:
-            The calibration and the entry of its model; None if it was not stored because it must not be trusted.
+            The calibration and the entry of its model; the entry is None if an untrusted model was not stored.
 
         Raises:
             MeasurementError: there are no valid sessions.
@@ -226,7 +226,7 @@ class Cell:
     def verify(
         self, session: str | None = None, model: str | None = None, **changed: Any
     ) -> tuple[Verification, ModelEntry]:
-        """Verify a model with a session to which it was not fitted; put it into use if it passes and is newer.
+        """Verify a model with a session to which it was not fitted; use it from now on if it passes and is newer.
 
         Args:
             session: name of the session. None: the newest to which the model was not fitted.
@@ -252,7 +252,7 @@ class Cell:
         return found, entry
 
     def monitor(self, progress: Progress = lambda what: None, **changed: Any) -> Monitoring:
-        """Compare every session that is newer than the model in use with this model, to detect what has moved.
+        """Compare every session that is newer than the model in use with this model, to detect moved parts.
 
         Args:
             progress: called with the name of each step.
@@ -308,11 +308,11 @@ class Cell:
         Args:
             session: name of the session. None: the newest to which the model was not fitted.
             progress: called with the name of each step.
-            accept_implausible: store the model even if it must not be trusted; it is then not put into use.
+            accept_implausible: store the model even if it must not be trusted; such a model is not put into use.
             **changed: options of `pisigma recalibrate` that override `cell.yaml`, by its keys.
 
         Returns:
-            The recalibration and the entry of its model; None if it was not stored because it must not be trusted.
+            The recalibration and the entry of its model; the entry is None if an untrusted model was not stored.
 
         Raises:
             ModelError: there is no model.
@@ -341,10 +341,10 @@ class Cell:
         return result, entry
 
     def use(self, model: str | None, reason: str) -> tuple[str, ...]:
-        """Put a model into use by hand, or undo the last change of the model in use; all models are kept.
+        """Put a model into use by hand, or undo the last change of the model in use; no model is deleted.
 
         Args:
-            model: name of the model. None: the one before the last change; repeated calls go further back.
+            model: name of the model. None: the model before the last change; repeated calls go further back.
             reason: reason to record in the history.
 
         Returns:
@@ -365,7 +365,7 @@ class Cell:
         return status_of(self.folder)
 
     def controller_warnings(self, command: str, model: ModelEntry | None) -> tuple[str, ...]:
-        """Return warnings because of what is active on the controller; raise a ModelError if a rule refuses it."""
+        """Return warnings about active exports on the controller; raise a ModelError if a rule refuses the command."""
         return findings(self.history, command, model).checked_warnings(self.folder)
 
     def _saved(self, result: Calibration | Recalibration, accept_implausible: bool) -> Path:
@@ -376,7 +376,7 @@ class Cell:
         )
 
     def _candidate(self, model: str | None) -> ModelEntry:
-        """Return the named model, else the model in use, else the newest."""
+        """Return the named model; without a name, the model in use or the newest model."""
         if model is not None:
             return self.history.model(model)
         if (entry := self.history.in_use) is not None:
@@ -389,7 +389,7 @@ class Cell:
     def _new_rows(
         self, command: str, model: str | None, session: str | None
     ) -> tuple[ModelEntry, SessionEntry, ModelRows]:
-        """Return a model, a session (by default the newest to which it was not fitted), and its rows with its names."""
+        """Return a model, a session (by default the newest to which it was not fitted), and rows of the session."""
         entry = self._candidate(model)
         self.controller_warnings(command, entry)
         chosen = self.sessions.choose(entry, session)

@@ -48,7 +48,8 @@ STEPS: dict[str, type] = {
 """Class of the settings of every step, by its section of `cell.yaml`, which has the name of the command."""
 CAMERA_KEYS = ("camera", "board", "fixed_camera", "intrinsics", "repeatability_mm", "repeatability_deg")
 STATED_ABOVE = {"plan": ("limit_mm", "sensor"), "measure": ("limit_mm",)}
-"""Keys of a step whose values are those of the cell, in addition to `CAMERA_KEYS`. `monitor` has another limit."""
+"""Keys of steps whose values `cell.yaml` states once for the whole cell, in addition to `CAMERA_KEYS`. `monitor` has
+another limit."""
 MEASURED_JOINTS = (
     "The rows contain joint values that the encoders read, so the model corrects these and not the deviation of the "
     "controller: a commanded pose is reached if the encoders then read the corrected joint values."
@@ -137,7 +138,7 @@ class CellDocument(Section):
 
 @dataclass(frozen=True)
 class CellFile:
-    """`cell.yaml` as it was read.
+    """Content of the file `cell.yaml` of a cell.
 
     Attributes:
         path: path of the file.
@@ -235,7 +236,7 @@ class CellFile:
         return (MEASURED_JOINTS,) if self.document.joint_values == "measured" else ()
 
     def plan_settings(self, facts: CellFacts, **changed: Any) -> PlanSettings:
-        """Return the settings of the next plan: a few poses if a model has to be checked, other ones in every plan.
+        """Return the settings of the next plan: few poses if a model has to be checked, and new poses in every plan.
 
         Args:
             facts: facts about the cell.
@@ -270,7 +271,7 @@ def settings_from(
     folder: Path,
     outside: Collection[str] = (),
 ) -> Group:
-    """Make an instance of a class of settings from the values of a file.
+    """Return an instance of a class of settings with the values of a file.
 
     Args:
         group: class of the settings.

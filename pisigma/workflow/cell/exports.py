@@ -1,4 +1,4 @@
-"""Exports of a cell: they are recorded, and so is which of them is active on the controller."""
+"""Exports of a cell: records of exported files, and of the file that is active on the controller."""
 
 import hashlib
 import os
@@ -27,7 +27,7 @@ def export_from_cell(cell: Cell, form: str, request: ExportRequest) -> Exported:
         request: file and options; its model is ignored.
 
     Raises:
-        ModelError: no model is in use, or a correction would be applied twice with what is active on the controller.
+        ModelError: no model is in use, or an export that is active on the controller would be applied in addition.
         PisigmaError: see `export_model`.
     """
     contains = export_format(form).contents_for(request)
@@ -44,8 +44,8 @@ def set_controller(
 
     Args:
         cell: the cell.
-        file: the file as `export_from_cell` wrote it; "none": no export is active after it.
-        day: day from which it is active (ISO 8601). "": today.
+        file: unchanged file of `export_from_cell`; "none" if no export is active from this day.
+        day: day from which the export is active (ISO 8601); "" for today.
         note: free text.
     """
     if os.fspath(file) == NONE:

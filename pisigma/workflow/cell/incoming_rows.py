@@ -1,4 +1,4 @@
-"""Files of an instrument on their way into a cell: how they are read, what is wrong with them, and what corrects it."""
+"""Files of an instrument that are added to a cell: how they are read, their faults, and repairs."""
 
 import shlex
 from collections.abc import Mapping, Sequence
@@ -39,12 +39,12 @@ MISNAMED = {"mm_named_m": 1e-3, "m_named_mm": 1e3}
 
 @dataclass(frozen=True)
 class Repair:
-    """Settings of the import that correct what a check found.
+    """Settings of the import that correct a finding of the check.
 
     Attributes:
-        text: what they do, such as "read x_mm, y_mm, z_mm as x_in!, y_in!, z_in!".
+        text: effect of the settings, such as "read x_mm, y_mm, z_mm as x_in!, y_in!, z_in!".
         settings: all settings of the import with the correction.
-        options: the same on a command line.
+        options: the settings as options of a command line.
     """
 
     text: str
@@ -57,7 +57,7 @@ class Repair:
 
 
 def stated_options(settings: ImportSettings) -> str:
-    """Return stated meanings of columns and new frames as options of `pisigma import`; "" if nothing is stated."""
+    """Return stated meanings of columns and new frames as options of `pisigma import`; "" without statements."""
     pairs = ",".join(f"{key}={text}" for one in settings.maps for key, text in one.items())
     words = ["--map", pairs] if pairs else []
     for line in settings.new_frame_at:
@@ -90,13 +90,13 @@ class IncomingRows:
 
     @cached_property
     def is_ready(self) -> bool:
-        """Whether they are one measurement file that is taken as it is."""
+        """Whether the files are a single measurement file, which needs no conversion."""
         stated = self.settings.maps or self.settings.new_frame_at
         return len(self.files) == 1 and not stated and is_measurement_file(self.files[0])
 
     @cached_property
     def imported(self) -> ImportedRows | None:
-        """The converted rows; None for a measurement file that is taken as it is.
+        """Return the converted rows; None for a measurement file, which needs no conversion.
 
         Raises:
             MeasurementError: see `import_rows`.
@@ -117,7 +117,7 @@ class IncomingRows:
         return self.files[0] if self.imported is None else self.imported.measurements
 
     def check(self, day: str = "") -> tuple[Diagnostic, ...]:
-        """Check the rows as `add` does, and return what was found.
+        """Check the rows as `Sessions.add` does, and return the findings.
 
         Raises:
             MeasurementError: see `Sessions.take_in`.
@@ -152,7 +152,7 @@ class IncomingRows:
         return entry
 
     def repair(self, finding: Diagnostic) -> Repair | None:
-        """Return the settings of the import that correct a finding; None if none do, or if several might."""
+        """Return the settings of the import that correct a finding; None if there is no unique repair."""
         values = finding.values
         if finding.kind == "row_order" and finding.cause == "frame" and "first_line" in values:
             line = int(str(values["first_line"]))
@@ -174,7 +174,7 @@ class IncomingRows:
 
 
 def _corrected(mapping: FileMapping, finding: Diagnostic) -> Mapping[str, str]:
-    """Return the meanings of the columns of a file that correct a finding, by heading; empty if none do."""
+    """Return the meanings of the columns of a file that correct a finding, by heading; empty without a repair."""
     kinds, values = set(finding.cause.split("+")) - {"frame", "tool"}, finding.values
     columns, ratio = values.get("columns"), values.get("ratio", MISNAMED.get(finding.cause))
     targets: list[tuple[MappedColumn, Target]] = []
@@ -204,7 +204,7 @@ def _written(mapping: FileMapping, column: MappedColumn) -> str:
 
 
 def _unit(stated: str, ratio: float) -> str | None:
-    """Return the unit whose size is that of a stated one times a ratio; None if there is none."""
+    """Return the unit that is larger than a stated unit by a ratio; None if there is no such unit."""
     kinds = (("mm", "m", "cm", "in"), ("deg", "rad", "gon"))
     likely = next((kind for kind in kinds if stated in kind), ())
     return next((one for one in likely if np.isclose(SIZES[one], ratio * SIZES[stated])), None)

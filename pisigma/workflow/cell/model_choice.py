@@ -1,4 +1,4 @@
-"""Models of a cell: their entries in the history, which is in use, and whether a new one is better on new rows."""
+"""Models of a cell: entries in the history, the model in use, and comparison of a new model on new rows."""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
@@ -84,7 +84,7 @@ def is_better(
 
 
 def with_setup_names_of(model: CalibratedModel, entry: ModelEntry, other: ModelEntry) -> CalibratedModel:
-    """Return a model whose newest frame and tool are renamed to those of another model."""
+    """Return a model whose newest frame and tool have the names of frame and tool of another model."""
 
     def with_day(values: Mapping[str, Value], day: str, other_day: str) -> dict[str, Value]:
         newest = {setup_name(name, other_day): value for name, value in _of_day(values, day).items()}
@@ -119,11 +119,11 @@ def check_entry(
 ) -> Check:
     """Return the history entry of a session's monitoring result.
 
-    Recalibrating is due if something moved, or if the recalibrated model predicts held-out rows better.
+    A recalibration is due if something moved, or if the recalibrated model predicts held-out rows better.
 
     Args:
         found: result of the session.
-        entry: the model that the session was compared with.
+        entry: the model with which the session was compared.
         session: the session.
         seen: rows of the session with the names of the model.
         settings: settings of the recalibration.
@@ -146,13 +146,13 @@ def check_entry(
 def unrecorded_changes(
     result: Recalibration, session: SessionEntry, recorded: Collection[str], valid: Sequence[SessionEntry]
 ) -> list[Event]:
-    """Return the changes of instrument and tool that a recalibration found, and that nobody has recorded.
+    """Return the unrecorded changes of instrument and tool that a recalibration found.
 
     None is returned if another session was measured on the same day, maybe before the change.
 
     Args:
         result: the recalibration.
-        session: the session that it was made with.
+        session: session of the recalibration.
         recorded: "base" or "tool" or both, if events since the parent record that they were changed.
         valid: all valid sessions.
     """
@@ -211,10 +211,10 @@ def model_entry(
     """Return the history entry of a new model.
 
     Args:
-        events: events that were recorded when its rows were read; a recalibration keeps the names of its parent.
+        events: events that were recorded when the rows were read; a recalibrated model has the names of its parent.
         made: time at which they were read (ISO 8601, UTC).
         path: folder of the model.
-        sessions: sessions to which it was fitted.
+        sessions: sessions to which the model was fitted.
         remark: why it is or is not in use.
         result: calibration or recalibration that made it.
         parent: model that was recalibrated; None for a calibration.
@@ -251,7 +251,7 @@ def put_into_use(history: History, model: str, reason: str, undo: bool = False) 
 
     Args:
         history: history of the cell.
-        model: name of a model of the cell; empty if none is in use after it.
+        model: name of a model of the cell; empty if no model is in use from now on.
         reason: reason to record.
         undo: whether this undoes the last change.
 
@@ -264,7 +264,7 @@ def put_into_use(history: History, model: str, reason: str, undo: bool = False) 
 
 
 def with_warnings(result: Result, warnings: tuple[str, ...]) -> Result:
-    """Return a calibration or a recalibration with further warnings, which its card states too."""
+    """Return a calibration or a recalibration with further warnings, which its card also states."""
     if not warnings:
         return result
     summary = result.summary.model_copy(update={"warnings": (*warnings, *result.summary.warnings)})

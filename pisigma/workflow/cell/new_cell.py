@@ -53,7 +53,7 @@ class NewCell:
     model: Path | None = None
 
     def write(self, folder: Path) -> None:
-        """Write the cell into a folder that does not exist, or is empty.
+        """Write the cell into a folder that does not exist or is empty.
 
         Raises:
             OutputError: the folder exists and is not empty, or cannot be written.
@@ -99,12 +99,12 @@ class NewCell:
         write_atomically(folder / CELL_FILE, cell_template(known, self.calibrate))
         try:
             CellFile.read(folder)
-        except PisigmaError as problem:  # the file is not kept, so its place means nothing
+        except PisigmaError as problem:  # the file is temporary, so its path is not stored
             texts = {name: getattr(problem, name) for name in ("expected", "value", "remedy")}
             raise type(problem)(problem.problem, option=str(problem.column or ""), **texts) from None
 
     def _add_model(self, model: Path, folder: Path) -> None:
-        """Copy a model folder and put the model into use, unless it was accepted although it must not be trusted."""
+        """Copy a model folder and put the model into use, unless the model must not be trusted."""
         name, made = (
             model.resolve().name,
             datetime.datetime.fromtimestamp((model / DESCRIPTION).stat().st_mtime),
@@ -142,7 +142,7 @@ def cell_from_model(model: Path, cell: NewCell) -> NewCell:
     """Return a cell with a model folder and the robot of the model.
 
     Raises:
-        ModelError: the folder is not that of a model of one robot.
+        ModelError: the folder does not contain a model of one robot.
     """
     loaded = load_model(model)
     if loaded.kind == FLEET_PRIOR:

@@ -50,8 +50,8 @@ def save_new(folder: Path, save: Callable[[Path], object], taken: Collection[str
 
     Args:
         folder: folder of the models.
-        save: function that writes the folder of the model, and refuses an existing one.
-        taken: further names that are taken, such as those of models whose folders were removed.
+        save: function that writes the folder of the model, and refuses an existing folder.
+        taken: further names that are taken, such as names of models whose folders were removed.
 
     Raises:
         OutputError: the model cannot be written.
@@ -62,12 +62,12 @@ def save_new(folder: Path, save: Callable[[Path], object], taken: Collection[str
             save(path)
             return path
         except OutputError:
-            if not path.exists():  # else another process took the name
+            if not path.exists():  # otherwise another process took the name
                 raise
 
 
 def write_new(folder: Path, name: str, content: bytes, taken: Collection[str]) -> Path:
-    """Write a session under a new name, completely or not at all, even if other processes write to the folder.
+    """Write a session with a new name, completely or not at all, even if other processes write to the folder.
 
     Args:
         folder: folder of the sessions.

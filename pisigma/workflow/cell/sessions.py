@@ -78,13 +78,13 @@ class Sessions:
     ) -> SessionEntry:
         """Check the rows of a session and store them; they are never changed afterwards.
 
-        Rows that the model in use was fitted to outside of the cell become a session that it is made of.
+        Rows to which the model in use was fitted outside of the cell become a session of this model.
 
         Args:
             file: measurements (CSV), or rows in memory.
             accept_implausible: add them even if the check finds that they must not be trusted.
-            day: day on which they were measured (ISO 8601). "": from the column `date`, else from the name of the
-                file, else today.
+            day: day on which the rows were measured (ISO 8601). If empty: from the column `date`, otherwise from the
+                name of the file, otherwise today.
             remark: how the rows were imported, which the entry records before the findings.
 
         Returns:
@@ -115,7 +115,7 @@ class Sessions:
         return entry
 
     def add_next_file(self) -> bool:
-        """Add the oldest file in the folder that has not been added yet; return whether there was one.
+        """Add the oldest file in the folder that has not been added yet; return whether there was such a file.
 
         Raises:
             PisigmaError: the rows cannot be used; the history records the reason.
@@ -134,7 +134,7 @@ class Sessions:
         return True
 
     def check(self, file: str | os.PathLike[str] | Measurements, day: str = "") -> RowVerdict:
-        """Read and check rows without storing them; see `take_in` for what it raises."""
+        """Read and check rows without storing them; see `take_in` for exceptions."""
         rows = self._read(file)
         return self._verdict(rows, _checked_day(rows, day))[0]
 
@@ -159,7 +159,7 @@ class Sessions:
     def _verdict(
         self, rows: Measurements, day: str
     ) -> tuple[RowVerdict, tuple[str, ...], ModelEntry | None, bool]:
-        """Check rows; return the findings, warnings, the model that they were compared with, and if it is of them."""
+        """Check rows; return findings, warnings, the model for comparison, and whether it was fitted to the rows."""
         known = [one for one in self.history.sessions() if not one.set_aside]
         again = torch.zeros(rows.rows, dtype=torch.bool)
         for one in known:
@@ -172,10 +172,8 @@ class Sessions:
             self.folder.parent
         )
         if model is None or found or not is_unchanged(self._folder_of(model), model.sha256):
-            model, verdict = (
-                None,
-                check_rows(rows, self.robot),
-            )  # other joint zeros: it does not describe the arm
+            # a model with other joint zeros does not describe the arm
+            model, verdict = None, check_rows(rows, self.robot)
         else:
             seen = self.rows_with_model_names(model, rows, day)
             stated = RecalibrationSettings(seen.moved or None)
@@ -213,7 +211,7 @@ class Sessions:
         return self.folder.parent / MODELS / model.name
 
     def set_aside(self, session: str, reason: str) -> None:
-        """Exclude a session, or a file in the folder that has not been added, from all further steps; it is kept.
+        """Exclude a session, or a file that has not been added, from all further steps, without deleting it.
 
         Raises:
             MeasurementError: there is no session or file with this name, or the reason is empty.
@@ -237,7 +235,7 @@ class Sessions:
                 self.set_aside(file.name.removesuffix(".csv"), f"imported as session '{session.name}'")
 
     def valid_sessions(self) -> list[SessionEntry]:
-        """Return the sessions that describe the present arm by their days, after adding new files in the folder.
+        """Return the sessions that describe the current arm by their days, after adding new files in the folder.
 
         Raises:
             MeasurementError: there is none.
@@ -324,7 +322,7 @@ class Sessions:
         return rows
 
     def rows_with_model_names(self, model: ModelEntry, rows: Measurements, day: str) -> ModelRows:
-        """Return rows with the names of a model's frame and target, and what was moved between them and the model.
+        """Return rows with the names of frame and target of a model, and what was moved since the model was made.
 
         Args:
             model: the model.
@@ -342,13 +340,13 @@ class Sessions:
 
 
 def with_session(model: ModelEntry, session: SessionEntry) -> ModelEntry:
-    """Return a model that was fitted to a session, too."""
+    """Return the entry of a model with a session added to the sessions to which it was fitted."""
     day = max(model.day, session.day) if model.made_of else session.day
     return replace(model, sessions=",".join((*model.made_of, session.name)), day=day)
 
 
 def _untrusted(rows: Measurements, findings: Sequence[Diagnostic]) -> AcceptanceError:
-    """Return the refusal of rows because of what was found."""
+    """Return the error that refuses rows because of findings."""
     refusal = AcceptanceError(
         f"the rows must not be trusted: {findings[0].sentence.rstrip('.')}",
         at=Place(rows.source),
@@ -359,7 +357,7 @@ def _untrusted(rows: Measurements, findings: Sequence[Diagnostic]) -> Acceptance
 
 
 def _checked_day(rows: Measurements, day: str) -> str:
-    """Return the day of rows: the stated one, or that of `_day_of`.
+    """Return the day of rows: the stated day, or the result of `_day_of`.
 
     Raises:
         MeasurementError: the stated day is not a date, or contradicts the rows.
@@ -377,7 +375,7 @@ def _checked_day(rows: Measurements, day: str) -> str:
 
 
 def _check_new(rows: Measurements, known: Bool[Tensor, " rows"]) -> None:
-    """Refuse rows that the cell contains: a model would be verified with rows that it was fitted to.
+    """Refuse rows that the cell already contains, so that no model is verified with rows to which it was fitted.
 
     Raises:
         MeasurementError: some rows are known, or there are no rows.
@@ -393,7 +391,7 @@ def _check_new(rows: Measurements, known: Bool[Tensor, " rows"]) -> None:
 
 
 def _day_of(rows: Measurements) -> str:
-    """Return the first day of rows: from the column `date`, else from the name of their file, else today."""
+    """Return the first day of rows: from the column `date`, the name of the file, or today, in this order."""
     if dates := [one for one in rows.date or () if one]:
         return min(dates)
     return date_in_name(Path(rows.source).name) or datetime.date.today().isoformat()

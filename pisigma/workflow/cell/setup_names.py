@@ -27,7 +27,7 @@ class ModelRows:
         return replace(settings, cameras=None, fit_frame=fit_frame, fit_tool=fit_tool)
 
     def settings_to_recalibrate(self, settings: RecalibrationSettings) -> RecalibrationSettings:
-        """Return settings with what was moved, unless they state it; cameras are removed, because rows are read."""
+        """Return settings with the moved parts, unless stated; cameras are removed, because rows are already read."""
         moved = (self.moved or None) if settings.moved is None else settings.moved
         return replace(settings, cameras=None, moved=moved)
 
@@ -50,7 +50,7 @@ def with_setup_names(rows: Measurements, frame_day: str, target_day: str) -> Mea
 
 
 def setup_name(name: str, day: str) -> str:
-    """Return the name of a frame or target that was set up on a day; day "" for the first one."""
+    """Return the name of a frame or target that was set up on a day; day "" for the first setup."""
     return f"{name} since {day}".lstrip() if day else name
 
 

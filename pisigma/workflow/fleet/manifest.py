@@ -1,4 +1,4 @@
-"""Make the cells of a fleet from a manifest (CSV), or from a folder with the rows of every robot."""
+"""Creation of the cells of a fleet from a manifest (CSV), or from a folder with the rows of every robot."""
 
 import os
 import re
@@ -54,7 +54,7 @@ class NewCells:
 
 
 def new_cells(source: Path, out: Path, common: NewCell) -> NewCells:
-    """Make a cell for every robot of a manifest or a folder; add only new sessions to cells that exist.
+    """Create a cell for every robot of a manifest or a folder; add only new sessions to existing cells.
 
     A manifest has the columns `id` and `data`, and optionally `robot`, `date`, `model`, `options` (settings of
     `pisigma calibrate`, such as `free=joint_offsets; model=geometric`), `camera` and `board` (several as `a.yaml;
@@ -84,7 +84,7 @@ def new_cells(source: Path, out: Path, common: NewCell) -> NewCells:
             else:
                 cell.write(out / name)
                 created, copied = created + 1, copied + len(cell.sessions)
-        except PisigmaError as problem:  # one robot does not stop the others
+        except PisigmaError as problem:  # a fault of one robot does not stop other robots
             refused[name] = problem
     if len(refused) == len(robots):
         raise next(iter(refused.values()))

@@ -69,10 +69,10 @@ def estimate_fleet_prior(
             cell = Cell.open(path)
             some = cell.sessions.as_measured(cell.sessions.valid_sessions()[0]).split_sets()[0]
             causes = [one for one in setup_diagnostics(cell.robot, some) if one.severity == "implausible"]
-            if causes:  # a wrong unit would are treated as a large scatter between robots
+            if causes:  # a wrong unit would look like a large scatter between robots
                 raise FleetError(f"{some.source}: {causes[0].sentence}")
             robots[path.name], rows[path.name] = cell.robot, some
-        except PisigmaError as problem:  # one cell does not stop the others
+        except PisigmaError as problem:  # a fault of one cell does not stop other cells
             refused[path.name] = str(problem)
     if len(rows) < MIN_ROBOTS and refused:
         raise FleetError(

@@ -1,4 +1,4 @@
-"""Carry out the steps that are due in the cells of a folder, in processes or on Ray, and write one table of results."""
+"""Steps that are due in the cells of a folder, run in processes or on Ray, with one table of results."""
 
 import functools
 import io
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from pisigma.workflow.cell.cell import Cell
 
 CELLS_PER_CHUNK = 4
-"""Cells that a worker processes at once, which takes some seconds."""
+"""Number of cells that a worker processes at once, which takes some seconds."""
 _LOST = "the process that worked on it ended twice; check the memory and its files."
 RESULTS = "results.parquet"
 """Name of the table in the folder of the cells."""
@@ -40,9 +40,9 @@ def advance_cell(
 ) -> CellStatus:
     """Calibrate, verify, monitor and recalibrate a cell as its status says, for every new session in turn.
 
-    New files in `sessions/` are added one by one in the order of their dates, each after all steps that the earlier
-    ones make possible: a model of the first session is verified with the second, and monitored with the third. A cell
-    whose status names no such step is not changed.
+    New files in `sessions/` are added one by one in the order of their dates, each after all steps that earlier
+    files make possible: a model of the first session is verified with the second, and monitored with the third. A
+    cell whose status names no such step is not changed.
 
     Args:
         cell: the cell.
@@ -120,7 +120,7 @@ def read_parameters(path: Path) -> Parameters:
 
 
 def write_results(path: Path, cells: Sequence[CellFacts], parameters: Parameters) -> None:
-    """Write one row for every check of every cell; the row of a new model has its parameters.
+    """Write one row for every check of every cell; the row of a new model contains its parameters.
 
     Args:
         path: file to write.
@@ -128,7 +128,7 @@ def write_results(path: Path, cells: Sequence[CellFacts], parameters: Parameters
         parameters: estimated parameters of the models.
 
     Raises:
-        OutputError: the file cannot be written; an existing one is kept.
+        OutputError: the file cannot be written; an existing file remains unchanged.
         ImportError: pyarrow is not installed.
     """
     import pyarrow
@@ -181,7 +181,7 @@ class FleetRun:
 
     Attributes:
         cells: number of cells.
-        unchanged: number of cells in which nothing was due.
+        unchanged: number of cells without due steps.
         refused: names of the cells that need attention, and reasons.
         results: file of the table of all checks.
         seconds: computing time [s].
@@ -217,7 +217,7 @@ def run_fleet(
 ) -> FleetRun:
     """Advance all cells in a folder: calibrate, verify, monitor and recalibrate as the status of each requires.
 
-    See `advance_cell`. A cell with bad rows is reported and does not stop the others. The
+    See `advance_cell`. A cell with bad rows is reported and does not stop other cells. The
     contents of a cell are always complete, so a later call continues after an interruption; a cell whose status names
     no step is not opened.
 
@@ -234,7 +234,7 @@ def run_fleet(
     """
     started, path = time.perf_counter(), Path(folder) / RESULTS
     for extra in ("pyarrow", *(("ray",) if settings.engine == "ray" else ())):
-        import_module(extra)  # before the work, and before anything is written
+        import_module(extra)  # at once, before any step and any writing
     cells = cells_in(folder)
     if settings.prior is not None:
         from pisigma.model.folder.model_folder import load_model
@@ -261,7 +261,7 @@ def run_fleet(
     for facts in after:
         try:
             parameters |= _parameters(facts, parameters.keys())
-        except PisigmaError as problem:  # one cell must not stop the others
+        except PisigmaError as problem:  # a fault of one cell must not stop other cells
             reasons.setdefault(Path(facts.folder).name, str(problem))
     write_results(path, after, parameters)
     return FleetRun(
@@ -274,14 +274,16 @@ def run_fleet(
 
 
 def _advance(folder: Path, prior: Path | None) -> tuple[str, dict[str, list[ParameterValue]]]:
-    """Advance a cell; return why it needs attention, "" if it does not, and the parameters of its models."""
-    from pisigma.workflow.cell.cell import Cell  # torch takes seconds, and most calls have nothing to do
+    """Advance a cell; return the reason why it needs attention (or "") and the parameters of its models."""
+    from pisigma.workflow.cell.cell import (
+        Cell,
+    )  # importing torch takes seconds, and most calls have nothing to do
 
     reason = ""
     try:
         step = advance_cell(Cell.open(folder), prior).step
         reason = step.reason if step.state in ATTENTION else ""
-    except Exception as problem:  # one cell must not stop the others; a later call tries it again
+    except Exception as problem:  # a fault of one cell must not stop other cells; a later call tries again
         known = isinstance(problem, PisigmaError | OSError | MemoryError)
         defect = f"a defect of pisigma ({type(problem).__name__}: {problem}); please report it."
         reason = str(problem) if known else defect
@@ -292,7 +294,7 @@ def _advance(folder: Path, prior: Path | None) -> tuple[str, dict[str, list[Para
 
 
 def _parameters(facts: CellFacts, known: Iterable[str] = ()) -> dict[str, list[ParameterValue]]:
-    """Return the estimated parameters of the models of a cell, except known ones, by the SHA-256 of the models."""
+    """Return the estimated parameters of models of a cell that are not known yet, by the SHA-256 of the models."""
     new = {one.sha256: Path(facts.folder) / MODELS / one.name for one in facts.models}
     there = {sha256: folder for sha256, folder in new.items() if sha256 not in known and folder.is_dir()}
     if not there:
@@ -303,7 +305,7 @@ def _parameters(facts: CellFacts, known: Iterable[str] = ()) -> dict[str, list[P
 
 
 def parameters_of(model: "CalibratedModel") -> list[ParameterValue]:
-    """Return the geometric parameters of a calibration, or those of which a recalibrated model has a posterior."""
+    """Return the geometric parameters of a calibration, or of the posterior of a recalibrated model."""
     estimated = model.metrics.get("parameters")
     if estimated is not None:
         names = ("name", "unit", "estimated", "change", "standard_error")

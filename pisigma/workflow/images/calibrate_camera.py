@@ -70,7 +70,7 @@ class CameraCalibration:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Warnings, one sentence each."""
+        """Return warnings, one sentence each."""
         calibration, warnings = self.calibration, list[str]()
         empty = [name for name, cells in CORNERS.items() if not calibration.covered[cells].any()]
         if empty:
@@ -102,7 +102,7 @@ class CameraCalibration:
         return (("Intrinsics", Table(columns, tuple(_row(*one) for one in self.parameters))),)
 
     def to_json(self) -> dict[str, object]:
-        """Return everything but the corners as plain values: the result of `pisigma camera --json`."""
+        """Return all results except the corners as plain values: the result of `pisigma camera --json`."""
         calibration = self.calibration
         return {
             "camera": calibration.camera.name,
@@ -120,7 +120,7 @@ class CameraCalibration:
         }
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the camera's file.
+        """Write the camera to a file.
 
         Raises:
             OutputError: it cannot be written.
@@ -128,7 +128,7 @@ class CameraCalibration:
         write_atomically(Path(path), self.calibration.camera.to_yaml())
 
     def save_page(self, page: str | os.PathLike[str]) -> None:
-        """Write intrinsics and images with the residuals of their corners as one HTML page.
+        """Write intrinsics and images with residuals of corners as one HTML file.
 
         Raises:
             OutputError: the page is not an .html file, or cannot be written.
@@ -150,7 +150,7 @@ def calibrate_camera(
     """Calibrate the intrinsics of a camera with images of a board, including standard deviations.
 
     Args:
-        images: image files of one size, or folders of them.
+        images: image files of one size, or folders of image files.
         board: file of the board; see `Board.load`.
         settings: see `IntrinsicsSettings`.
         progress: called with the name of every image.
@@ -177,6 +177,6 @@ def calibrate_camera(
 
 
 def _row(name: str, value: float, sigma: float, unit: str) -> tuple[str, ...]:
-    """Return the cells of a parameter, with two digits of its standard deviation (0 where it is fixed)."""
+    """Return the cells of a parameter, with two digits of its standard deviation (0 if it is fixed)."""
     decimals = max(1 - math.floor(math.log10(sigma)), 0) if sigma > 0 else 0
     return (name, f"{value:.{decimals}f}", f"{sigma:.{decimals}f}" if sigma > 0 else "held", unit)

@@ -54,7 +54,7 @@ class DetectedCorners:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Warnings, one sentence each."""
+        """Return warnings, one sentence each."""
         return () if self.joints is None else self.joints.remarks
 
     @property
@@ -63,7 +63,7 @@ class DetectedCorners:
         return ()
 
     def to_json(self) -> dict[str, object]:
-        """Return everything but the corners as plain values: the result of `pisigma detect --json`."""
+        """Return all results except the corners as plain values: the result of `pisigma detect --json`."""
         return {
             "rows": len(self.rows) - 1,
             **self.detection.to_json(),
@@ -72,7 +72,7 @@ class DetectedCorners:
         }
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the file of corners.
+        """Write the detected corners to a file.
 
         Raises:
             OutputError: it cannot be written.
@@ -82,7 +82,7 @@ class DetectedCorners:
         write_atomically(Path(path), text.getvalue())
 
     def save_page(self, page: str | os.PathLike[str]) -> None:
-        """Write the images with the residuals of their corners as one HTML page.
+        """Write the images with residuals of corners as one HTML file.
 
         Raises:
             OutputError: the page is not an .html file, or cannot be written.

@@ -1,1 +1,1 @@
-"""Recipe files, which state what to train and on which data."""
+"""Recipe files, which state a model to train and its data."""

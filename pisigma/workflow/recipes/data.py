@@ -31,8 +31,8 @@ class RecipeData:
         robot: the nominal robot.
         training: rows to train on.
         test: rows of the set "test" of measured data; None without such rows.
-        simulations: training and held-out rows of every repeat of a simulation, first those of the model; empty for
-            measured data.
+        simulations: training and held-out rows of every repeat of a simulation, beginning with rows of the model;
+            empty for measured data.
         folds: how measured rows are split for a cross-validation; None for simulated data.
     """
 
@@ -62,14 +62,14 @@ class RecipeData:
 
 
 def load_data(recipe: Recipe, data: Measurements | str | os.PathLike[str] | None = None) -> RecipeData:
-    """Simulate the rows of a recipe, or read the measured ones.
+    """Simulate the rows of a recipe, or read measured rows.
 
     Args:
         recipe: the recipe.
         data: measurements or their CSV file, for a recipe that uses measured data.
 
     Raises:
-        RecipeError: `data` is given for a recipe that simulates its data, or missing for one that does not.
+        RecipeError: `data` is given for a recipe that simulates its data, or missing for another recipe.
         RobotError: the robot of the recipe cannot be used.
         MeasurementError: the file cannot be used.
     """
@@ -112,7 +112,7 @@ def simulate(recipe: Recipe, repeats: int = 1) -> RecipeData:
 
 
 def simulate_at(recipe: Recipe, poses: str | os.PathLike[str]) -> tuple[Robot, Measurements]:
-    """Simulate what the tracker of a recipe measures at other joint values, the same at every call.
+    """Return simulated rows of the tracker of a recipe at other joint values; equal calls give equal rows.
 
     Args:
         recipe: a recipe with a simulated tracker.

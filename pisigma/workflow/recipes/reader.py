@@ -31,7 +31,7 @@ from pisigma.workflow.recipes.recipe import (
 
 Key = tuple[str | int, ...]
 Check = tuple[Key, Callable[[], object]]
-"""The keys that lead to the checked value, and the check."""
+"""Keys that lead to a value of a recipe, and the function that checks the value."""
 
 
 class _KindOnly(Section):
@@ -42,7 +42,7 @@ class _KindOnly(Section):
 
 
 def read_recipe(path: str | os.PathLike[str]) -> Recipe:
-    """Read a recipe of the kind that it states, and check it against its robot.
+    """Read a recipe of any kind, and check it against its robot.
 
     Raises:
         RecipeError: the file cannot be read, or a value is not valid; it names file, line and key.
@@ -127,7 +127,7 @@ def _where_checks(keys: Key, section: SimulatedPoses, robot: Robot) -> Iterator[
     elif isinstance(section.poses, JointsRandom):
         yield (*keys, "poses"), partial(section.poses.joints, robot)
     elif section.branch is not None:
-        none = torch.zeros(0, 4, 4, dtype=torch.float64)  # no poses: checks the names only
+        none = torch.zeros(0, 4, 4, dtype=torch.float64)  # without poses, only the names are checked
         yield (*keys, "branch"), partial(section.branch.start, robot, none)
 
 

@@ -1,4 +1,4 @@
-"""Recipes: what to train, on which data, how, and which published figures to compare it with."""
+"""Recipes: models to train, data, settings of the training, and published figures for comparison."""
 
 from typing import Annotated, Literal
 
@@ -21,8 +21,8 @@ class AbstractRecipe(Section):
 
     Attributes:
         name: name of the recipe and, by default, of the model.
-        description: what the recipe shows, for the model's card.
-        not_validated: what the results do not prove, for the model's card.
+        description: purpose of the recipe, for the card of the model.
+        not_validated: limits of the validation, for the card of the model.
         robot: catalogue name or robot file of the nominal robot.
     """
 
@@ -53,7 +53,7 @@ class MeasuredData(Section):
 
     Attributes:
         kind: "measured".
-        folds: number of folds of the cross-validation. Rows of equal joint values stay together.
+        folds: number of folds of the cross-validation. Rows of equal joint values are in the same fold.
         seed: random seed of the folds.
     """
 
@@ -66,7 +66,7 @@ class SingularRows(Section):
     """Treatment of training rows near a singularity, where joint differences become arbitrarily large.
 
     Attributes:
-        rule: "keep" all rows, or "leave_out" those whose smallest singular value is below `below`.
+        rule: "keep" all rows, or "leave_out" rows whose smallest singular value is below `below`.
         below: limit of the smallest singular value of the Jacobian, whose translations are divided by the
             characteristic length.
     """
@@ -81,8 +81,8 @@ class InverseRecipe(AbstractRecipe):
     Attributes:
         kind: "inverse_calibration", the default.
         name: name of the recipe and, by default, of the model.
-        description: what the recipe shows, for the model's card.
-        not_validated: what the results do not prove, for the model's card.
+        description: purpose of the recipe, for the card of the model.
+        not_validated: limits of the validation, for the card of the model.
         robot: catalogue name or robot file of the nominal robot.
         data: source of the measurements.
         network: groups of joints to correct, with a network each.
@@ -157,8 +157,8 @@ class GeometricRecipe(AbstractRecipe):
     Attributes:
         kind: "geometric_calibration".
         name: name of the recipe and, by default, of the model.
-        description: what the recipe shows, for the model's card.
-        not_validated: what the results do not prove, for the model's card.
+        description: purpose of the recipe, for the card of the model.
+        not_validated: limits of the validation, for the card of the model.
         robot: catalogue name or robot file of the nominal robot.
         errors: all error sources of the true robot.
         measurements: measurements for the calibration.
@@ -176,7 +176,7 @@ class GeometricRecipe(AbstractRecipe):
 
 
 class HybridSection(Section):
-    """Candidates that `HybridCalibrator` chooses from; those that do not improve the fit are dropped.
+    """Candidates for `HybridCalibrator`, which omits candidates that do not improve the fit.
 
     Attributes:
         features: features of the unit of order 1 to try.
@@ -191,7 +191,7 @@ class HybridSection(Section):
     gravity: tuple[float, float, float] | None = HybridCalibrator.gravity
 
     def calibrator(self, geometric: GeometricCalibrator) -> HybridCalibrator:
-        """Return the calibrator that extends a geometric one.
+        """Return the hybrid calibrator that extends a geometric calibrator.
 
         Raises:
             IdentificationError: a setting is not a valid choice.
@@ -217,11 +217,11 @@ class HybridRecipe(AbstractRecipe):
     Attributes:
         kind: "hybrid_calibration".
         name: name of the recipe and, by default, of the model.
-        description: what the recipe shows, for the model's card.
-        not_validated: what the results do not prove, for the model's card.
+        description: purpose of the recipe, for the card of the model.
+        not_validated: limits of the validation, for the card of the model.
         robot: catalogue name or robot file of the nominal robot.
-        data: source of the measurements. Measured ones are validated in folds, simulated ones on held-out rows.
-        repeats: number of repeats of a simulation, each with all seeds one higher. The model is that of the first.
+        data: source of the measurements. Measured rows are validated in folds, simulated rows on held-out rows.
+        repeats: number of repeats of a simulation, each with all seeds one higher. The model is from the first repeat.
         calibration: settings of the geometric calibrator.
         hybrid: settings of the hybrid calibrator.
         learning_curve: learning curve to compute, null for none.

@@ -1,1 +1,1 @@
-"""Settings of the workflow's steps; they import without torch, so that command lines start at once."""
+"""Settings of the steps of the workflow; they do not import torch, so that commands start quickly."""

@@ -22,7 +22,7 @@ def parse_free_parameters(stated: str) -> str | tuple[str, ...]:
     """Return the free parameters from "identifiable", "joint_offsets" or comma-separated names.
 
     Raises:
-        IdentificationError: the text names nothing.
+        IdentificationError: the text contains no name.
     """
     if not stated.strip():
         raise IdentificationError(
