@@ -25,7 +25,7 @@ from pisigma.robot.se3 import (
 
 MAX_ITERATIONS = 50
 UNOBSERVABLE = 1e-6
-"""A parameter is unobservable if its column has a smaller share outside the span of base and tool."""
+"""Share of the column of a parameter outside the span of base and tool below which the parameter is unobservable."""
 NO_EFFECT = 1e-4
 """Directions of the unknowns with a smaller effect, relative to the largest, are not changed: base and tool would move
 far without a benefit."""
@@ -183,7 +183,7 @@ class GeometricApproximation:
 
     Attributes:
         robot: robot with fitted parameters, base and tool.
-        observable: for every free parameter whether it is observable together with base, tool and preceding ones.
+        observable: for every free parameter whether it is observable together with base, tool and preceding parameters.
         q: held-out joint values [rad or m].
         T: poses of the model's tool at these.
     """
@@ -223,11 +223,11 @@ def approximate_model(
     """Fit parameters, base and tool of a robot to a model by least squares.
 
     Angles are weighted by half the robot's reach. The poses are predictions of the model in its calibrated region, at
-    random joint values between pairs of its stored ones.
+    random joint values between pairs of stored joint values.
 
     Args:
         model: model to approximate.
-        start: initial robot, whose other parameters are kept.
+        start: initial robot, whose other parameters do not change.
         parameters: indices into the flattened `Robot.dh` of the free parameters.
         seed: random seed of the joint values.
 

@@ -24,7 +24,7 @@ TABLE_SUFFIXES = (".csv", ".yaml", ".yml")
 
 
 def dh_yaml(robot: Robot, comments: tuple[str, ...] = ()) -> str:
-    """Write a robot file, which `Robot.load` reads, with comments at the top."""
+    """Return a robot file, which `Robot.load` reads, with comments at the top."""
     return header_comment((CONVENTION, *comments)) + robot_to_yaml(robot)
 
 
@@ -35,7 +35,7 @@ def dh_json(robot: Robot, comments: tuple[str, ...] = ()) -> str:
 
 
 def dh_csv(robot: Robot, comments: tuple[str, ...] = ()) -> str:
-    """Write the robot as a table: base, one line per row, tool; cells that do not apply are empty.
+    """Return the robot as a CSV table: base, one line per row, tool; cells that do not apply are empty.
 
     Lines at the top that start with # state the convention and the comments.
     """
@@ -66,7 +66,7 @@ def _coupling_sentences(robot: Robot) -> tuple[str, ...]:
 def csv_table(
     columns: Iterable[str], lines: Iterable[Mapping[str, object]], sentences: tuple[str, ...]
 ) -> str:
-    """Write lines as CSV with comments at the top; cells that a line does not have are empty."""
+    """Return lines as CSV with comments at the top; missing cells of a line are empty."""
     text = io.StringIO()
     writer = csv.DictWriter(text, tuple(columns), restval="", lineterminator="\n")
     writer.writeheader()

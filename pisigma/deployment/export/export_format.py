@@ -18,19 +18,19 @@ class ExportRequest:
     Attributes:
         model: model folder.
         out: file to write.
-        like: file whose other content is kept; for urdf, mjcf and xacro a URDF file, by default the one in the model
+        like: file whose other content remains; for urdf, mjcf and xacro a URDF file, by default the file in the model
             folder, and for mjcf also an MJCF file.
         tip: link of the tool in `like`.
         geometry: "geometric" or "hybrid", for urdf, mjcf and dh.
         poses: file of poses, for targets.
         targets: "joints" or "cartesian", for targets.
-        branch: branch to use instead of the trained one, for targets.
+        branch: branch to use instead of the trained branch, for targets.
         config: configuration of the arm, for Cartesian targets of FANUC.
         program: existing program whose targets are rewritten.
         frames: file of frames and tools that `program` does not state.
         tolerance_mm: largest deviation of the tool from a straight line between waypoints of `program` [mm].
         counts_per_turn: comma-separated encoder counts per turn of every joint, for counts.
-        present_counts: comma-separated present counts of the controller, for counts.
+        present_counts: comma-separated current counts of the controller, for counts.
         payload_kg: mass that the robot carries [kg].
         temperature_c: temperature of the robot [deg C].
     """
@@ -97,12 +97,12 @@ OPTIONS = (
     "payload_kg",
     "temperature_c",
 )
-"""All options; every format declares those that it accepts."""
+"""Names of all options; every format declares the options that it accepts."""
 
 
 @dataclass(frozen=True)
 class Exported:
-    """Content of an exported file, and what is reported about it.
+    """Content of an exported file, and the report about it.
 
     Attributes:
         content: content of the file, or of several files by name in a folder.
@@ -111,8 +111,8 @@ class Exported:
         warnings: warnings, which are printed to stderr.
         summary: sentence on the written file up to its name; "" for the contents of the format.
         details: part of that sentence after the file's name.
-        failure: fault of the input although the file was written; None without one.
-        shortfall: limit that is missed although the file was written; None without one.
+        failure: fault of the input although the file was written; None without such a fault.
+        shortfall: sentence on a missed limit although the file was written; None if no limit is missed.
         shown: text that is printed first, such as a diff.
     """
 
@@ -136,7 +136,7 @@ class ExportFormat:
         contents: contents of a file, for example "a DH table".
         suffixes: suffixes of its files; () if it writes a folder.
         write: function that returns the content of a file, or raises a `PisigmaError`.
-        options: those of `OPTIONS` that it accepts.
+        options: options of `OPTIONS` that the format accepts.
         check: function that raises a `PisigmaError` for invalid requests before anything is loaded.
         contains: what its files contain, which says whether a correction would be applied twice on a controller.
     """
@@ -150,7 +150,7 @@ class ExportFormat:
     contains: Contents = "description"
 
     def contents_for(self, request: ExportRequest) -> Contents:
-        """Return what the file of a request contains; targets of programs may be poses instead of joint values."""
+        """Return the contents of the file of a request; targets of programs may be poses instead of joint values."""
         is_pose = request.program is not None or request.targets == "cartesian"
         return "poses" if is_pose else self.contains
 

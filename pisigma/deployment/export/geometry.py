@@ -1,4 +1,4 @@
-"""The geometry of a model as one robot, and remarks for files that include nothing but the geometry."""
+"""Geometry of a model as one robot, and remarks for files that contain only the geometry."""
 
 from dataclasses import dataclass, replace
 
@@ -11,7 +11,7 @@ from pisigma.model.stated_conditions import condition_warnings
 from pisigma.robot.description import Robot
 
 GEOMETRIC, HYBRID = "geometric", "hybrid"
-"""Geometries of a model: the geometric fit, used alone, and the one that belongs to a hybrid's correction."""
+"""Names of the geometries of a model: the geometric fit, used alone, and the geometry of a hybrid model."""
 
 
 @dataclass(frozen=True, eq=False)

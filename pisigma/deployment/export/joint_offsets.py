@@ -23,7 +23,7 @@ class JointOffsets:
     Attributes:
         robot: nominal robot except for theta of revolute and d of prismatic joints, base and tool.
         values: offset of every axis of the controller [rad or m], in its direction: the real robot commanded to q is
-            where the nominal one is at q + offset.
+            where the nominal robot is at q + offset.
         unobservable: joints whose offset is set to 0 because base or tool have the same effect.
         lost: remaining deviation from the whole model.
         nominal: deviation of the nominal robot with the model's base and tool, for comparison.
@@ -61,7 +61,7 @@ def fit_joint_offsets(model: CalibratedModel) -> JointOffsets:
 
 
 def offsets_between(nominal: Robot, moved: Robot) -> Float64[np.ndarray, " axes"]:
-    """Compute the offsets [rad or m] of a robot's zero positions from the nominal ones, per axis of the controller.
+    """Return offsets of the zero positions of a robot from nominal, per axis of the controller [rad or m].
 
     Raises:
         RobotError: see `joints_by_axes`.
@@ -117,7 +117,7 @@ def offset_sentences(offsets: JointOffsets) -> tuple[str, ...]:
 
 
 def offsets_csv(offsets: JointOffsets, comments: tuple[str, ...] = ()) -> str:
-    """Write one line per joint, then base and tool; cells that do not apply are empty."""
+    """Return joint offsets as CSV: one line per joint, then base and tool; cells that do not apply are empty."""
     frame = in_file_units(FRAME_COLUMNS, offsets.robot.base)
     columns = ("part", "name", "type", "offset_deg", "offset_mm", *frame)
     lines = [{"part": "joint", **entry} for entry in _joints(offsets)]
@@ -128,7 +128,7 @@ def offsets_csv(offsets: JointOffsets, comments: tuple[str, ...] = ()) -> str:
 
 
 def offsets_yaml(offsets: JointOffsets, comments: tuple[str, ...] = ()) -> str:
-    """Write offsets, base, tool and the loss of accuracy."""
+    """Return offsets, base, tool and the loss of accuracy as YAML."""
     document: dict[str, object] = {"robot": offsets.robot.name, "joints": _joints(offsets)}
     for part in ("base", "tool"):
         document[part] = in_file_units(FRAME_COLUMNS, getattr(offsets.robot, part))

@@ -30,7 +30,7 @@ from pisigma.robot.urdf_rows import rows_of_chain
 from pisigma.robot.writing import comment_text, robot_to_urdf, unused_name
 
 SAME = 2e-3
-"""[m or rad] Largest difference from rows of the drawn model, which may be rounded to millimetres."""
+"""Largest difference from rows of the drawn model, which may be rounded to millimetres [m or rad]."""
 SNAP = 1e-5
 """Deviations of drawn right angles [rad] up to this are due to rounding."""
 DIGITS = 6
@@ -74,8 +74,8 @@ FORMAT = ExportFormat(
 def urdf_to_mjcf(urdf: str) -> tuple[str, tuple[str, ...]]:
     """Convert a URDF to MJCF with the same forward kinematics, masses, inertias, limits, shapes and meshes.
 
-    Links become bodies and joints keep their names. A joint that mimics another becomes an equality constraint, which
-    MuJoCo fulfils while it simulates. Meshes that MuJoCo cannot read are left out.
+    Links become bodies, and the names of joints remain. A joint that mimics another becomes an equality constraint,
+    which MuJoCo fulfils while it simulates. Meshes that MuJoCo cannot read are left out.
 
     Returns:
         The MJCF, and the files of the meshes that were left out.
@@ -220,17 +220,17 @@ def update_mjcf(
     tip: str | None = None,
     comments: tuple[str, ...] = (),
 ) -> str:
-    """Return a drawn MJCF model with calibrated bodies; meshes, inertias, actuators and all else are kept.
+    """Return a drawn MJCF model with calibrated bodies; meshes, inertias, actuators and all else remain.
 
-    Every moved body after the first has its calibrated pose in the preceding one. Two sites are added:
+    Every moved body after the first has its calibrated pose in the preceding body. Two sites are added:
     `calibrated_frame`, in the body before the first joint, is the frame of the model's poses, and `calibrated_tool`, in
     the last moved body, is the model's tool.
 
     Args:
         calibrated: robot with identified geometry.
-        nominal: robot of the model, of which the file is a drawing.
+        nominal: nominal robot, which the file shows.
         path: MJCF file.
-        tip: body behind the last joint; only needed if the joints have other names than those of the robot.
+        tip: body behind the last joint; only needed if the names of joints differ from the robot.
         comments: sentences to write at the top.
 
     Raises:
@@ -261,7 +261,7 @@ def update_mjcf(
 
 
 def _segments(robot: Robot) -> list[Frame]:
-    """Return the first row's frame in that of the poses, and the frame behind every moved row in its own, with tool."""
+    """Return the frame of the first row in the frame of the poses, and the transform of every moved row, with tool."""
     segments = [frame_of(robot.base)]
     for row, parameters in zip(robot.rows, robot.dh.tolist(), strict=True):
         if row.type != "fixed":
@@ -272,13 +272,13 @@ def _segments(robot: Robot) -> list[Frame]:
 
 
 def _row_frames(nominal: Robot, origins: Sequence[Frame], path: str | os.PathLike[str]) -> list[Frame]:
-    """Return the frames of the nominal robot's moved rows in the drawn ones.
+    """Return the frames of the moved rows of the nominal robot in the drawn frames.
 
     Both are converted to rows in the same way, so they agree except for the start of the first row along its axis.
 
     Args:
         nominal: the robot.
-        origins: frames of the drawn axes, each in the one before.
+        origins: frames of the drawn axes, each in the preceding frame.
         path: MJCF file, for the message.
 
     Raises:
@@ -299,7 +299,7 @@ def _row_frames(nominal: Robot, origins: Sequence[Frame], path: str | os.PathLik
 
 
 def _without_rounding(T: Frame) -> Frame:
-    """Make drawn right angles exact, because the row from one axis to the next depends on whether they intersect."""
+    """Return a frame with exact right angles, because a row depends on whether its axes intersect."""
     snapped = T.copy()
     snapped[:3, 3] = T[:3, 3].round(DIGITS)
     if np.abs(T[:3, :3] - T[:3, :3].round()).max() < SNAP:
@@ -308,7 +308,7 @@ def _without_rounding(T: Frame) -> Frame:
 
 
 def _chain(rows: Sequence[Row], origins: Sequence[Frame]) -> Chain:
-    """Make a chain of axes along or against z, each in the frame of the one before."""
+    """Return a chain of axes along or against z, each in the frame of the preceding axis."""
     joints = [
         ChainJoint(row.name, _kind(row), origin, np.array([0.0, 0.0, row.direction]), -math.inf, math.inf)
         for row, origin in zip(rows, origins, strict=True)

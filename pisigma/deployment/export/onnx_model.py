@@ -47,7 +47,7 @@ def add_network(graph: OnnxGraph, network: CorrectionNetwork, q: str, T: str | N
 
 
 def _add_group(graph: OnnxGraph, group: JointGroup, net: PiSigma, q: str, T: str | None) -> str:
-    """Add one network, and return the name of its outputs `(batch, outputs)`."""
+    """Add one network to a graph, and return the name of its outputs `(batch, outputs)`."""
     values, order = _add_inputs(graph, group, q, T)
     offset, scale = (part.detach().numpy()[order] for part in (net.input_offset, net.input_scale))
     scaled = graph.add_node("Div", graph.add_node("Sub", values, offset), scale)
@@ -160,7 +160,7 @@ def export_onnx(model: CalibratedModel, model_sha256: str = "") -> bytes:
 
     Raises:
         MissingExtraError: onnx is not installed.
-        ModelError: the model has no network, one without an ONNX form, or coupled joints.
+        ModelError: the model has no network, a network without an ONNX form, or coupled joints.
     """
     import_onnx()
     if model.robot.coupling is not None:

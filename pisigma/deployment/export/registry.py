@@ -85,7 +85,7 @@ def export_format(name: str) -> ExportFormat:
 
 
 def export_model(name: str, request: ExportRequest) -> Exported:
-    """Write a model in a format, every file completely or not at all.
+    """Export a model in a format; every file is written completely or not at all.
 
     Args:
         name: name of the format.

@@ -45,7 +45,7 @@ def sentences(targets: Targets) -> tuple[str, ...]:
 
 
 def targets_csv(targets: Targets) -> str:
-    """Write one row per pose; the values of a pose without a target are empty.
+    """Return CSV with one row per pose; the values of a pose without a target are empty.
 
     Columns are line (in the file of poses), status, branch, the joint values to command, the nominal robot's pose at
     these, and the predicted accuracy (1 sigma).
@@ -104,7 +104,7 @@ def _check_options(request: ExportRequest) -> None:
 
 
 def _write(request: ExportRequest) -> Exported:
-    """Make the targets, with warnings."""
+    """Return the exported targets, with warnings."""
     if request.program is not None:
         return rewrite_program(request)
     _check_options(request)

@@ -44,7 +44,7 @@ MISSING = (
     f"{INERTIA} kg m2, {EFFORT}, {VELOCITY}), in {{links}}. Enter the maker's values before you simulate forces."
 )
 SAME = 1e-9
-"""[m or rad] Largest difference of rows that are treated as those of the file."""
+"""Largest difference of rows that are treated as equal to the rows of the file [m or rad]."""
 
 
 def check_tip(request: ExportRequest) -> None:
@@ -76,7 +76,7 @@ def _write(request: ExportRequest) -> Exported:
 def updated_urdf_text(
     request: ExportRequest, robot: Robot, nominal: Robot, comments: tuple[str, ...]
 ) -> str | None:
-    """Write a robot into the URDF file of --like, or by default into the one that the model folder includes.
+    """Return the URDF file of --like, or by default of the model folder, with the geometry of a robot.
 
     Args:
         request: model and options.
@@ -99,8 +99,8 @@ def to_pinocchio(model: "CalibratedModel | CorrectedIK") -> Any:
     """Return the identified geometry as a `pinocchio.Model`, without the joint correction of a hybrid.
 
     The pose of a model is that of its frame `calibrated_tool` in `calibrated_frame` if the robot was loaded from a URDF
-    file, whose masses, inertias and limits are kept, and of `tool0` in `base_link` otherwise; the joints are those of
-    the robot, in order. Pinocchio takes cosine and sine of joints without limits. See `update_urdf`.
+    file, whose masses, inertias and limits remain, and of `tool0` in `base_link` otherwise; the joints are in the
+    order of the robot. Pinocchio takes cosine and sine of joints without limits. See `update_urdf`.
 
     Args:
         model: the result of `pisigma.load` or of a calibration.
@@ -156,13 +156,13 @@ def update_urdf(
     comments: tuple[str, ...] = (),
     base: str | None = None,
 ) -> str:
-    """Return the file with the origins of a calibrated robot; links, meshes, limits and everything else are kept.
+    """Return a URDF file with the origins of a calibrated robot; links, meshes, limits and all else remain.
 
-    Every joint after the first has its calibrated pose in the preceding link. Links keep their poses relative to their
-    joints, so that meshes still fit. Two links are added: `calibrated_frame`, the parent of the base, is the frame of
-    the model's poses, and `calibrated_tool`, a child of the tip, is the model's tool; the forward kinematics between
-    them is that of the calibrated robot. Masses, inertias, efforts and velocities that are missing or 0 become
-    placeholders, as simulators require them; a comment says so.
+    Every joint after the first has its calibrated pose in the preceding link. The poses of links do not change
+    relative to their joints, so that meshes still fit. Two links are added: `calibrated_frame`, the parent of the
+    base, is the frame of the model's poses, and `calibrated_tool`, a child of the tip, is the model's tool; the
+    forward kinematics between them is that of the calibrated robot. Masses, inertias, efforts and velocities that
+    are missing or 0 become placeholders, as simulators require them; a comment says so.
 
     Args:
         calibrated: robot with identified geometry.
@@ -232,7 +232,7 @@ def check_same_geometry(
         differences: differences of the DH parameters [m or rad].
         largest: largest difference that is accepted [m or rad].
         path: the file, for the message.
-        remedy: what the user should do.
+        remedy: action that corrects the fault, for the message.
 
     Raises:
         RobotError: a difference is larger.
@@ -253,14 +253,14 @@ def _new_origins(chain: Chain, rows: ChainRows, calibrated: Robot, urdf: Any) ->
     origins: dict[str, Frame] = {}
     for i, joint in enumerate(chain.joints[1:], 1):
         whole = rows.frames[i - 1] @ row_frame(*calibrated.dh[i - 1].tolist()) @ inverse(rows.frames[i])
-        # Fixed joints in between are kept; their product precedes the joint's own origin.
+        # Fixed joints in between remain; their product precedes the origin of the joint.
         before = joint.origin @ inverse(origin_of(urdf.joint_map[joint.name]))
         origins[joint.name] = inverse(before) @ whole
     return origins
 
 
 def _widen_limits(elements: dict[str, Any], nominal: Robot) -> None:
-    """Widen limits of the file that calibration rows exceeded, like those of the model."""
+    """Widen limits of the file that calibration rows exceeded, like the limits of the model."""
     for axis in nominal.axes:
         limit = next(elements[axis.name].iterchildren("{*}limit"), None)
         if limit is None or limit.get("lower") is None or limit.get("upper") is None:
@@ -330,7 +330,7 @@ def _set_origin(element: Any, origin: Frame) -> None:
 
 
 def _add_link(root: Any, name: str, parent: str | None = None, origin: Frame | None = None) -> str:
-    """Add a link, with a fixed joint to its parent if there is one, and return its name."""
+    """Add a link, with a fixed joint to its parent if it has a parent, and return its name."""
     from lxml import etree
 
     name = unused_name(name, {element.get("name") for element in root.iterchildren("{*}link")})

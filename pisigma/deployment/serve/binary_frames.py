@@ -16,7 +16,8 @@ JOINTS = 8
 HEAD = struct.Struct("<4sIQII")
 """Magic, length of the whole frame, id; then model index and flags, or status and number of joints."""
 REQUEST = struct.Struct(f"<4sIQII16d{JOINTS}d")
-"""The pose T_base_tool row by row [m], and joint values that the solution should be near [rad or m], NaN for none."""
+"""Format of requests: the pose T_base_tool row by row [m], and joint values near which the solution should be [rad
+or m] (NaN: none)."""
 _POSE, _NEAR = HEAD.size, HEAD.size + 128
 ANSWER = struct.Struct(f"<4sIQII{JOINTS}d2d8s")
 """Joint values [rad or m], NaN after the last joint, the residuals of position [m] and rotation [rad], and the first
@@ -28,7 +29,7 @@ TOKEN = 1
 
 
 class Refusal(enum.IntEnum):
-    """Statuses of answers in addition to those of `Status`."""
+    """Statuses of answers in addition to `Status`."""
 
     NO_SUCH_MODEL = 100
     UNKNOWN_FLAGS = 101

@@ -1,4 +1,4 @@
-"""One connection of a server: its received and unsent bytes, and the time since which it has been waited for."""
+"""One connection of a server: received and unsent bytes, and the time of the oldest awaited byte."""
 
 import selectors
 import socket
@@ -8,11 +8,11 @@ from collections.abc import Callable
 from pisigma.deployment.serve.protocol import AbstractProtocol, BrokenStreamError, tokens_match
 
 CHUNK = 4096
-"""[bytes] Read at a time, so that no client delays the others by sending a lot at once."""
+"""Largest number of bytes that is read at a time, so that no client delays other clients by long messages."""
 MAX_DRAIN_BYTES = 2**22
-"""[bytes] Most that is read of a client when the server stops, so that a client that keeps sending cannot delay it."""
+"""Largest number of bytes that is read from a client when the server stops, so that no client can delay the stop."""
 MESSAGES_PER_TURN = 100
-"""Messages of a client that are answered before those of others when the server stops."""
+"""Number of messages of a client that are answered in one turn when the server stops."""
 
 Submit = Callable[["Connection", Callable[[], bytes]], None]
 
@@ -21,12 +21,12 @@ class Connection:
     """Connection to a client, whose messages are answered one after the other, in order.
 
     It is not read while an answer is computed or waits to be received by the client, so that the memory for a client is
-    bounded by one message, one answer and a chunk.
+    limited by one message, one answer and a chunk.
 
     Attributes:
         closed: whether the connection is closed.
         waits_since: `time.monotonic()` since which the remainder of a message, the token, or space for an answer has
-            been awaited; None if the client owes nothing.
+            been awaited; None if nothing is awaited from the client.
         busy: whether another thread computes an answer.
     """
 
@@ -38,14 +38,14 @@ class Connection:
         submit: Submit,
         token: bytes | None,
     ) -> None:
-        """Take a new connection.
+        """Accept a new connection of a client.
 
         Args:
             stream: socket of the client.
             protocol: protocol of the client.
             selector: selector that reports when the socket can be read or written.
             submit: function that has another thread compute an answer and pass it to `send_answer`.
-            token: token that the first message must have; None if none is required.
+            token: token that the first message must have; None if no token is required.
         """
         stream.setblocking(False)
         stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -59,7 +59,7 @@ class Connection:
         selector.register(stream, self._watched, self.handle_events)
 
     def handle_events(self, events: int) -> None:
-        """Continue after the client has sent something or can receive something."""
+        """Read and answer messages after the client has sent bytes or can receive bytes."""
         try:
             if self._unsent:
                 self._send(b"")
@@ -85,7 +85,7 @@ class Connection:
             self.close()
 
     def read_remaining(self) -> None:
-        """Read what the client has sent before the server stops; later bytes are not read."""
+        """Read the bytes that the client has sent before the server stops; later bytes are not read."""
         self._stopping = self._ending = True
         try:
             while len(self._received) < MAX_DRAIN_BYTES and not self.closed:
@@ -98,7 +98,7 @@ class Connection:
             self.close()
 
     def answer_remaining(self) -> bool:
-        """Answer some of the complete messages, close after the last one, and return whether there are more."""
+        """Answer some of the complete messages, close after the last message, and return whether there are more."""
         try:
             if not self.closed:
                 self.answer_messages()

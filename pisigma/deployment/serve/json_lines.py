@@ -30,11 +30,11 @@ from pisigma.robot.kernels.array_kinematics import xyzrpy_of
 from pisigma.robot.kinematics.status import Status
 
 MAX_LINE_BYTES = 2**20
-"""A path of about 8,000 poses."""
+"""Largest length of a line, which is sufficient for a path of about 8,000 poses [bytes]."""
 MAX_ID_CHARACTERS = 200
 
 _TASKS = ("pose", "path", "q_deg", "q", "ask")
-"""Keys of which a request has exactly one, which determines its task."""
+"""Keys that determine the task of a request; every request has exactly one of them."""
 _NEAR = ("near_deg", "near")
 _AXES = ("ignore_axes", "tolerance_mm", "tolerance_deg", "elbow_deg")
 _KEYS = {
@@ -53,7 +53,7 @@ _POSE = struct.Struct("<16d")
 
 _REACHING = frozenset(float(status) for status in Status if status.reaches)
 _Job = Callable[[], tuple[str, dict[str, Any]]]
-"""A function that computes status and values of an answer."""
+"""Function that computes status and values of an answer."""
 _encode = json.JSONEncoder(allow_nan=False, separators=(", ", ": ")).encode
 
 
@@ -262,7 +262,7 @@ def _solve(model: ServedModel, request: dict[str, Any]) -> tuple[str, dict[str, 
 
 
 def _record(model: ServedModel, row: list[float], ignored_axes: tuple[str, ...]) -> dict[str, Any]:
-    """Make the answer to one pose from the row of `CompiledIK.solve_packed`."""
+    """Return the answer to one pose from a row of `CompiledIK.solve_packed`."""
     units = model.file_units_per_si
     position, rotation, measure, status, branch = row[2 * len(units) :]
     values: dict[str, Any] = {model.joints_key: None, "status": STATUS_NAMES[status]}
@@ -337,7 +337,7 @@ def _near(model: ServedModel, request: dict[str, Any]) -> list[float] | None:
 
 
 def _joints(model: ServedModel, request: dict[str, Any], in_degrees: str, mixed: str) -> list[float]:
-    """Read joint values [rad or m] from `in_degrees` if all joints are revolute, else from `mixed`.
+    """Return joint values [rad or m] from the key `in_degrees` if all joints are revolute, otherwise from `mixed`.
 
     Raises:
         RequestError: the request has the other key, or the values are invalid.

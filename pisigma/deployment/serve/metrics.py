@@ -34,7 +34,7 @@ class MetricsSummary:
 
 
 class Metrics:
-    """Counters of requests; one count takes less than a microsecond.
+    """Counters of requests; counting a request takes less than a microsecond.
 
     Attributes:
         connections: number of open connections.
@@ -59,7 +59,7 @@ class Metrics:
             self._durations.append(time.perf_counter_ns() - begun_ns)
 
     def summary(self) -> MetricsSummary:
-        """Return the present figures."""
+        """Return the current figures of the server."""
         with self._lock:
             durations, statuses = list(self._durations), dict(self._statuses.most_common())
         durations.sort()

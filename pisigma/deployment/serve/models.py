@@ -30,7 +30,7 @@ class ServedModel:
     """A model of a server.
 
     Attributes:
-        folder: folder that it was read from.
+        folder: folder from which the model was read.
         ik: its corrected inverse kinematics.
         sha256: SHA-256 of its `model.yaml`.
     """
@@ -46,7 +46,7 @@ class ServedModel:
         Raises:
             ModelError: the folder is not a complete model.
         """
-        # before it is loaded, because the folder may be written again meanwhile
+        # before loading, because the folder may be written again meanwhile
         sha256 = model_hash(folder) if is_model(folder) else ""
         ik = load(folder)
         ik(np.eye(4), near=np.zeros(len(ik.joints)), throw=False)
@@ -79,7 +79,7 @@ class ServedModel:
 
     @cached_property
     def joints_key(self) -> str:
-        """Key of joint values in messages: `q_deg` if all joints are revolute, else `q` [deg or mm]."""
+        """Return the key of joint values in messages: `q_deg` if all joints are revolute, else `q` [deg or mm]."""
         return "q_deg" if self.ik.revolute.all() else "q"
 
     @cached_property
@@ -111,7 +111,7 @@ class ServedModel:
 
     @cached_property
     def byte_solver(self) -> CompiledIK | None:
-        """The kernels, if they can solve poses directly from the bytes of a message, else None."""
+        """Return the kernels if they can solve poses directly from the bytes of a message, otherwise None."""
         return self.ik.compiled if self.ik.controller is None and sys.byteorder == "little" else None
 
     def solve(self, T_base_tool: bytes, near: bytes) -> list[float]:
@@ -119,7 +119,7 @@ class ServedModel:
 
         Args:
             T_base_tool: 16 doubles, row by row [m].
-            near: one double for every joint [rad or m]; all NaN for none.
+            near: one double for every joint [rad or m]; all NaN without desired joint values.
 
         Returns:
             The row of `CompiledIK.solve_packed`.
@@ -143,7 +143,7 @@ class ModelStatus:
     Attributes:
         model: name of the model.
         sha256: SHA-256 of its `model.yaml`.
-        day: day of the newest rows that it was fitted to (ISO 8601); empty if no cell states it.
+        day: day of the newest rows to which the model was fitted (ISO 8601); empty if no cell states it.
         age_days: days since then; None if unknown.
         state: state of the cell, as printed by `pisigma status`; "not_in_cell" for a model outside of a cell,
             "not_in_use" if the cell uses another model, "unreadable" if the state cannot be determined.
@@ -186,7 +186,7 @@ def solution_row(solution: Solution) -> list[float]:
 
 
 def model_folders(folder: Path) -> list[Path]:
-    """List the model folders in a folder by name, including damaged ones, so that loading reports the damage.
+    """Return the model folders in a folder by name, including damaged folders, so that loading reports the damage.
 
     Raises:
         ModelError: there are none.
@@ -203,7 +203,7 @@ def model_folders(folder: Path) -> list[Path]:
 
 
 def _loadable(folders: Iterable[Path], problems: list[str]) -> list[ServedModel]:
-    """Load the models that can be loaded, and append a sentence to `problems` for every other one."""
+    """Load the models that can be loaded, and append a sentence to `problems` for every other model."""
     models = []
     for folder in folders:
         try:
@@ -214,7 +214,7 @@ def _loadable(folders: Iterable[Path], problems: list[str]) -> list[ServedModel]
 
 
 class ServedModels:
-    """Models by index and by name; an index keeps referring to its model while the server runs.
+    """Models by index and by name; the index of a model does not change while the server runs.
 
     Attributes:
         problems: with `within`, sentences on folders that could not be loaded and are not served; of a cell,
@@ -232,7 +232,7 @@ class ServedModels:
             cell: cell whose model in use is served instead, also after a change; see `follow_changes`.
 
         Raises:
-            ModelError: a folder is not a complete model; with `within`, no folder is one.
+            ModelError: a folder is not a complete model; with `within`, no folder is a complete model.
         """
         self._within, self._lock = within, threading.Lock()
         self.problems: list[str] = []
@@ -258,7 +258,7 @@ class ServedModels:
 
     @property
     def is_refused(self) -> bool:
-        """Whether no model must be used with what is active on the controller of the cell."""
+        """Whether exports that are active on the controller of the cell forbid the use of any model."""
         return self._in_use is not None and bool(self._in_use.findings.refusal)
 
     def find_model(self, name: object) -> ServedModel:
@@ -266,7 +266,7 @@ class ServedModels:
 
         Raises:
             RequestError: there is no such model, None is given and there are several, or the model must not be used
-                with what is active on the controller.
+                with the export that is active on the controller.
         """
         if self.is_refused and self._in_use is not None:
             raise RequestError(self._in_use.findings.refusal)
@@ -286,7 +286,7 @@ class ServedModels:
         )
 
     def reload(self) -> list[str]:
-        """Reload the models whose folders have changed and, with `within`, load new ones; return the problems.
+        """Reload the models whose folders have changed and, with `within`, load new models; return the problems.
 
         A model that cannot be reloaded continues to answer as before.
         """
@@ -307,7 +307,7 @@ class ServedModels:
 
     @contextlib.contextmanager
     def follow_changes(self, report: Callable[[str], None]) -> Iterator[None]:
-        """Take over changes of the model in use of a cell, between requests, until the block ends.
+        """Load every new model in use of a cell, between requests, until the block ends.
 
         Args:
             report: function that is called with warnings, and with a sentence for every model that could not be loaded.
@@ -319,7 +319,7 @@ class ServedModels:
             self._in_use.stop()
 
     def _replace(self, folder: Path) -> None:
-        """Answer all further requests with the model in a folder, if it is another one."""
+        """Answer all further requests with the model in a folder, if it is a new model."""
         if not (
             self._models and (folder, model_hash(folder)) == (self._models[0].folder, self._models[0].sha256)
         ):

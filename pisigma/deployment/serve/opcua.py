@@ -31,9 +31,9 @@ NAMESPACE = "urn:pisigma:server"
 USER = "pisigma"
 """Name of the user whose password is the token of the server."""
 POLL_INTERVAL = 0.5
-"""[s] Time between two looks at which models are served."""
+"""Time between two checks which models are served [s]."""
 STATUS_INTERVAL = 10.0
-"""[s] Time after which age and state of a model are determined again."""
+"""Time after which age and state of a model are determined again [s]."""
 _CERTIFICATE, _KEY, _TRUSTED = "server_certificate.der", "server_key.pem", "trusted"
 _CERTIFICATE_DAYS = 3650
 _TEXTS = ("Name", "Sha256", "Day", "State", "Reason", "Joints", "Units")
@@ -120,7 +120,7 @@ class OpcUa:
             await self._look(server, index, robots)
         listener = server.bserver and server.bserver._server
         if listener is not None:
-            listener.close()  # before the connections, as clients that connect again at once would never let it end
+            listener.close()  # before the connections, because clients that connect again at once would prevent the end
         await server.stop()
 
     async def _server(self) -> "asyncua.Server":
@@ -234,7 +234,7 @@ class _Robot:
         return _Robot(variables)
 
     async def update(self, model: ServedModel) -> None:
-        """Write the variables if the model is another one, or if its age and state may have changed."""
+        """Write the variables if there is a new model, or if age and state of the model may have changed."""
         from asyncua import ua
 
         if model.sha256 == self._sha256 and time.monotonic() < self._next:
@@ -259,7 +259,7 @@ class _Robot:
 
 
 def _argument(name: str, kind: int, meaning: str, length: int | None = None) -> "asyncua.ua.Argument":
-    """Describe an argument: an array of a length; None for a single value."""
+    """Return the description of an argument: an array of a length, or a single value for the length None."""
     from asyncua import ua
 
     return ua.Argument(
@@ -321,7 +321,7 @@ def _trusted_certificates(folder: Path) -> frozenset[bytes]:
 
 
 def _make_own_certificate(folder: Path, uri: str) -> None:
-    """Write a key and a self-signed certificate of the server, unless the folder has them, so that clients can keep it.
+    """Write a key and a self-signed certificate of the server, unless the folder already has them.
 
     Raises:
         OutputError: the folder has only one of both files, or they cannot be written.

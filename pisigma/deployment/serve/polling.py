@@ -5,11 +5,11 @@ import selectors
 import time
 
 POLL_DURATION = 2.5e-3
-"""[s] Duration of polling after a request, long enough for clients that ask every 2 ms."""
+"""Duration of polling after a request, which is long enough for clients that ask every 2 ms [s]."""
 MAX_GAP = 5e-4
-"""[s] A longer gap between two polls means that other programs or threads used the processor."""
+"""Gap between two polls above which other programs or threads used the processor [s]."""
 REST_FACTOR = 100.0
-"""Polling then pauses for this multiple of the gap, so that at most one request in a hundred is delayed by it."""
+"""Duration of a pause of polling as a multiple of the gap, so that gaps delay at most one request in a hundred."""
 
 
 class Polling:

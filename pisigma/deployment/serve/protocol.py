@@ -13,7 +13,7 @@ from pisigma.robot.kinematics.status import Status
 STATUS_NAMES = {float(status): status.name.lower() for status in Status}
 """Names of statuses by their value in solutions."""
 Reply = bytes | Callable[[], bytes]
-"""The answer to a message, or a slow function that computes it and is called in another thread."""
+"""Answer to a message, or a slow function that computes the answer and is called in another thread."""
 
 
 class BrokenStreamError(Exception):
@@ -41,7 +41,7 @@ class AbstractProtocol(ABC):
 
     @abstractmethod
     def answer_message(self, message: bytes) -> Reply:
-        """Answer one complete message; never raises an error."""
+        """Return the answer to one complete message, without ever raising an error."""
 
     @abstractmethod
     def invalid_message_answer(self) -> bytes:
@@ -57,12 +57,12 @@ class AbstractProtocol(ABC):
 
 
 def tokens_match(given: bytes | None, wanted: bytes) -> bool:
-    """Compare tokens in a time that does not depend on where they differ."""
+    """Return whether tokens are equal, in a time that does not depend on their first difference."""
     return given is not None and hmac.compare_digest(given, wanted)
 
 
 MAX_NUMBER = 1e9
-"""[mm or deg] Largest accepted value of a pose or joint."""
+"""Largest accepted value of a pose or joint [mm or deg]."""
 
 
 def pose_entries(pose: Any, name: str) -> tuple[float, ...]:
@@ -92,7 +92,7 @@ def read_numbers(request: dict[str, Any], key: str, count: int) -> list[float]:
 
 
 def read_tolerance(request: dict[str, Any], key: str) -> list[float] | None:
-    """Read the tolerances of three axes, as a list or one number for all; None if not given."""
+    """Return the tolerances of three axes, given as a list or one number for all; None if not given."""
     if key not in request:
         return None
     stated = request[key]

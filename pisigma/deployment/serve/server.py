@@ -25,7 +25,7 @@ from pisigma.files.errors import OutputError
 
 MAX_CONNECTIONS = 512
 SWITCH_INTERVAL = 1e-4
-"""[s] Longest time for which the thread of slow answers holds the interpreter while quick answers wait."""
+"""Longest time for which the thread of slow answers holds the interpreter while quick answers wait [s]."""
 
 
 class Server:
@@ -108,7 +108,7 @@ class Server:
         self._notify()
 
     def reload(self, report: Callable[[str], None]) -> None:
-        """Reload the models while the old ones continue to answer.
+        """Reload the models while the old models continue to answer.
 
         Args:
             report: function that is called with a sentence for every model that could not be loaded.
@@ -142,7 +142,7 @@ class Server:
         return int(listener.getsockname()[1])
 
     def _accept(self, listener: socket.socket, protocol: AbstractProtocol, events: int) -> bool:
-        """Accept a new connection, and return whether there was one."""
+        """Accept a new connection, and return whether a client was waiting."""
         try:
             stream, _ = listener.accept()
         except OSError:
@@ -191,7 +191,7 @@ class Server:
             connection.send_answer(reply)
 
     def _sweep(self, now: float) -> None:
-        """Remove closed connections, and close those that are too slow."""
+        """Remove closed connections, and close connections that are too slow."""
         for connection in list(self._connections):
             since = connection.waits_since
             if since is not None and now - since > self._settings.client_timeout:
@@ -202,7 +202,7 @@ class Server:
         self.metrics.connections = len(self._connections)
 
     def _finish(self) -> None:
-        """Answer all complete requests, including those of clients that wait to be accepted, then close everything."""
+        """Answer all complete requests, also of clients that are not accepted yet, then close all connections."""
         for listener in self._listeners:
             accept = self._selector.get_key(listener).data
             while accept(selectors.EVENT_READ):

@@ -13,7 +13,8 @@ from pisigma.files.setting import HIDDEN, Option
 
 LAST_PORT = 65535
 CLIENT_TIMEOUT = 10.0
-"""[s] A client that takes longer for the remainder of a message, its token, or to receive an answer is cut off."""
+"""Longest time for the remainder of a message, a token, or the reception of an answer, before a client is
+disconnected [s]."""
 
 
 def read_token(file: Path) -> str:

@@ -11,9 +11,9 @@ from pisigma.deployment.serve.protocol import AbstractProtocol, BrokenStreamErro
 from pisigma.files.errors import OutputError
 
 SILENCE_MS = 500
-"""[ms] After this time without a message, all messages sent before the server stops have arrived."""
+"""Time without a message after which all messages that were sent before the stop have arrived [ms]."""
 SEND_TIMEOUT_MS = 2000
-"""[ms] Longest wait for a client that does not read its answers, before one of them is dropped."""
+"""Longest waiting time for a client that does not read its answers, before an answer is dropped [ms]."""
 MAX_QUEUED = 100
 """Largest number of messages of a client, and of answers to it, in a queue."""
 
@@ -34,8 +34,8 @@ class ZeroMq:
             models: models of the server.
             metrics: counters of the answers.
             host: address of this machine.
-            port: port to listen on; 0 for a free one.
-            token: token in a separate part before every message; None if none is required.
+            port: port to listen on; 0 for a free port.
+            token: token in a separate part before every message; None if no token is required.
 
         Raises:
             ImportError: pyzmq is not installed.
@@ -89,7 +89,7 @@ class ZeroMq:
     def _run(self) -> None:
         drained = 0
         while drained < MAX_DRAIN_BYTES:
-            stopping = self._stopping.is_set()  # before reading, so that earlier messages are answered
+            stopping = self._stopping.is_set()  # set before reading, so that earlier messages are answered
             try:
                 # waits also when stopping, because the next messages of a full queue take a moment
                 client, *parts = self._socket.recv_multipart()
@@ -103,7 +103,7 @@ class ZeroMq:
         self._close()
 
     def _send(self, client: bytes, parts: list[bytes]) -> None:
-        """Send, and wait only once for a client that does not read, so that it does not delay the others."""
+        """Send parts, and wait only once for a client that does not read, so that other clients are not delayed."""
         try:
             self._socket.send_multipart(parts, self._no_wait if client in self._not_reading else 0)
             self._not_reading.discard(client)
@@ -113,7 +113,7 @@ class ZeroMq:
             self._not_reading.discard(client)
 
     def _reply(self, parts: list[bytes]) -> bytes:
-        """Answer the parts of a message after its envelope: the token, if one is required, and the request."""
+        """Return the answer to the parts of a message after its envelope: a token, if required, and the request."""
         message = parts[-1] if parts else b""
         protocol: AbstractProtocol = self._binary if message.startswith(MAGIC) else self._json
         if len(parts) != (1 if self._token is None else 2) or (

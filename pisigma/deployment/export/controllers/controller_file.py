@@ -39,7 +39,7 @@ class FileContent:
 
 @dataclass(frozen=True, eq=False)
 class Frames:
-    """Frames of a controller relative to those of a robot description.
+    """Frames of a controller relative to the frames of a robot description.
 
     Attributes:
         sentence: a sentence that states them.
@@ -63,7 +63,7 @@ class Convention:
 
     Attributes:
         nominal: robot of the controller without the file, in its frames and parameters.
-        frames: these frames relative to those of the robot description; None if they are the same.
+        frames: frames of the controller relative to frames of the robot description; None if they are equal.
         published: values published by the maker or a user that the file was tested against, with their source; None
             without such values.
     """
@@ -74,7 +74,7 @@ class Convention:
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """Sentences about what the file was tested against, and about the frames of its poses."""
+        """Return sentences on how the file was tested, and on the frames of its poses."""
         tried = (
             f"Reading and writing were tested against {self.published}."
             if self.published
@@ -92,17 +92,17 @@ class ControllerFile:
         name: name of the `--format`.
         contents: contents of a file, with an article.
         suffixes: suffixes of its files.
-        source: a sentence on where the format is described and where it was tested; see `untested_on_controller`.
+        source: sentence on the source of the format and on how it was tested; see `untested_on_controller`.
         convention: function for the controller's description of a robot; raises a `PisigmaError` if there is none.
-        relies: sentences on what the file requires of the controller.
+        relies: sentences on requirements of the file on the controller.
         text: function that returns the text of a file.
         read: function from text, file name and nominal robot to the robot of a file. None if the file includes base and
             tool and is loaded as a robot file.
         check: function that raises a `PisigmaError` for robots that the file cannot describe.
         parameters: function for the indices into the flattened `Robot.dh` that the file includes.
-        options: those of `OPTIONS` that the format accepts.
+        options: options of `OPTIONS` that the format accepts.
         refuse: function that raises a `PisigmaError` for invalid requests before anything is loaded.
-        contains: what a file contains.
+        contains: contents of a file of this format.
     """
 
     name: str

@@ -32,7 +32,7 @@ class EncoderCounts:
     Attributes:
         per_turn: encoder counts per turn of the joint, including its gear, or per 1 mm of a prismatic joint; negative
             if the encoder counts in the opposite direction.
-        present: present counts of the controller.
+        present: current counts of the controller.
         new: counts to enter.
     """
 
@@ -47,12 +47,12 @@ class EncoderCounts:
 
 
 def _unit(robot: Robot) -> Float64[np.ndarray, " axes"]:
-    """Return one turn or 1 mm in [rad or m] for every axis of the controller."""
+    """Return one turn or 1 mm for every axis of the controller [rad or m]."""
     return np.where([axis.type == "revolute" for axis in robot.axes], 2 * np.pi, 1e-3)
 
 
 def write_counts(content: FileContent) -> str:
-    """Write one line per joint with its counts and the offset of the rounded counts, then base and tool."""
+    """Return one line per joint with its counts and the offset of the rounded counts, then base and tool."""
     nominal, robot, request = content.nominal, content.robot, content.request
     per_turn = _numbers(request.counts_per_turn, "counts-per-turn", nominal)
     present = _numbers(request.present_counts, "present-counts", nominal)

@@ -20,7 +20,7 @@ def read_offsets(text: str, source: str, nominal: Robot) -> Robot:
     The table is CSV or YAML as written by `--format offsets`, or CSV with counts, which then determine the offsets.
 
     Raises:
-        RobotError: an entry is missing or not a number, or the joints are not those of the robot.
+        RobotError: an entry is missing or not a number, or the joints differ from the joints of the robot.
     """
     entries = _csv_entries(text) if text.lstrip("# ").find("part,") >= 0 else _yaml_entries(text, source)
     joints = {str(entry.get("name")): entry for entry in entries if entry.get("part") == "joint"}

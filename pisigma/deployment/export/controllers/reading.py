@@ -17,11 +17,11 @@ from pisigma.files.input_file import read_text
 from pisigma.robot.description import Robot
 
 MAX_CHANGE = 5.0
-"""[mm] Largest plausible mean distance between the tools of a calibrated and the nominal robot on the same base; the
+"""Largest plausible mean distance [mm] between the tools of a calibrated and the nominal robot on the same base; the
 largest of five published calibrations of Universal Robots is 4.2 mm."""
 
 LEVER = 0.1
-"""[m] The limit also applies to points at this distance from the flange, so that rotations of the flange count too."""
+"""Distance from the flange of points to which the limit also applies, so that rotations of the flange count [m]."""
 
 READERS: dict[str, ControllerFile | None] = {
     ".conf": universal_robots.FILE,
@@ -30,7 +30,7 @@ READERS: dict[str, ControllerFile | None] = {
     ".yaml": None,
     ".yml": None,
 }
-"""Maker's file by suffix; None for tables of pisigma. The kinematics of a ROS driver are YAML too."""
+"""Kinds of files of makers by suffix; None for tables of pisigma. The kinematics of a ROS driver are also YAML."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +40,7 @@ class ControllerReading:
     Attributes:
         robot: nominal robot with the parameters of the file; its `source` names the file and the frames of its poses.
         change: distance of its tool from that of the nominal robot, in the same frame.
-        frames: the controller's frames relative to those of the nominal robot; None if they are the same.
+        frames: frames of the controller relative to frames of the nominal robot; None if they are equal.
         remarks: sentences on the description of the format, its tests, and the frames of poses.
     """
 

@@ -1,4 +1,4 @@
-"""Universal Robots' `calibration.conf`: differences of DH parameters from the nominal ones."""
+"""Universal Robots' `calibration.conf`: differences of calibrated from nominal DH parameters."""
 
 import math
 import re
@@ -38,9 +38,9 @@ _LINE = r"(?m)^[ \t]*{key}[ \t]*=[ \t]*\[([^\]\n]*)\]"
 def without_beta(origins: list[Frame], own: Robot) -> Robot:
     """Convert a robot to the maker's rows, in which beta is 0 and the last row has neither a nor alpha.
 
-    Two lines have one common normal. If they are nearly parallel it is far away, so d of that row and of the next
-    are large and nearly cancel, as in the maker's files. Of the two directions of a normal, the one that changes theta
-    by less than 90 deg is used.
+    Two lines have one common normal. If the lines are nearly parallel, the normal is far away, so d of that row and
+    of the next are large and nearly cancel, as in files of the maker. Of the two directions of a normal, the one
+    that changes theta by less than 90 deg is used.
 
     Args:
         origins: frames of the joints, see `ControllerGeometry.origins`.
@@ -62,7 +62,7 @@ def without_beta(origins: list[Frame], own: Robot) -> Robot:
 
 
 def write_calibration(content: FileContent) -> str:
-    """Write `calibration.conf`, keeping the other lines of the controller's file if one is given."""
+    """Return `calibration.conf`, with other lines of the file of the controller if it is given."""
     own = controller_geometry(content.nominal)
     robot = without_beta(*own.origins(content.robot))
     difference = robot.dh - own.robot.dh
@@ -94,7 +94,7 @@ def read_calibration(text: str, source: str, nominal: Robot) -> Robot:
     pisigma writes.
 
     Raises:
-        RobotError: a line is missing or does not have one number per joint, or the robot cannot have such a file.
+        RobotError: a line is missing or does not have one number per joint, or the file does not suit the robot.
     """
     own = controller_geometry(nominal).robot
     dh = own.dh.copy()

@@ -1,4 +1,4 @@
-"""DH parameters of Universal Robots, and their frames relative to those of a robot description."""
+"""DH parameters of Universal Robots, and their frames relative to the frames of a robot description."""
 
 from dataclasses import dataclass
 
@@ -74,9 +74,9 @@ class ControllerGeometry:
     described: Robot
 
     def origins(self, calibrated: Robot) -> tuple[list[Frame], Robot]:
-        """Return the frames of a calibrated robot's joints in the controller's convention, each in the previous one.
+        """Return the frames of a calibrated robot's joints as the controller defines them, each in the previous.
 
-        Shifting a joint's frame along and about its axis does not change the motion, so the tool stays in place.
+        Shifting the frame of a joint along and about its axis does not change the motion or the tool.
 
         Args:
             calibrated: the description with other parameters, base and tool.
@@ -138,7 +138,7 @@ def _frame_words(T: Frame) -> str:
 
 
 def controller_geometry(described: Robot) -> ControllerGeometry:
-    """Identify the model of Universal Robots that a nominal or calibrated robot belongs to, and their relative frames.
+    """Return the model of Universal Robots to which a nominal or calibrated robot belongs, and their relative frames.
 
     Raises:
         RobotError: it is not a known model.
@@ -182,7 +182,7 @@ def check_robot(robot: Robot) -> None:
 
 
 def _robot(described: Robot, model: str) -> Robot:
-    """Make the nominal robot of a model with the names and limits of a description."""
+    """Return the nominal robot of a model with the names and limits of a description."""
     (d_1, *wrist), (a_2, a_3) = _D_AND_A[model]
     dh = np.zeros((JOINTS, 5))
     dh[:, 1], dh[:, 2], dh[:, 3] = (d_1, 0, 0, *wrist), (0, -a_2, -a_3, 0, 0, 0), _ALPHA
@@ -248,7 +248,7 @@ def _clean(T: Frame) -> Frame:
 
 
 def _right(T: Frame) -> Frame:
-    """Return the frame before calibration, if that had right angles at the origin, else the frame itself."""
+    """Return the frame before calibration, if it had right angles at the origin, otherwise the given frame."""
     values = xyzrpy_of(T)
     rounded = _rounded(values, _NEAR_ANGLE, _NEAR_LENGTH)
     quarters = rounded[3:] / (np.pi / 2)

@@ -1,4 +1,4 @@
-"""The kinematics YAML of Universal Robots' ROS driver: one transform per link, and the hash of the calibration."""
+"""Kinematics YAML of Universal Robots' ROS driver: one transform per link, and the hash of the calibration."""
 
 import numpy as np
 from pydantic import Field
@@ -79,11 +79,11 @@ LINKS = tuple(KinematicsSection.model_fields)[:JOINTS]
 
 
 ORDER = "Rotations are RotZ(yaw) RotY(pitch) RotX(roll), as URDF reads them."
-"""Sentence by which files of pisigma are recognised."""
+"""Sentence in the comments that identifies files of pisigma."""
 
 
 def write_kinematics(content: FileContent) -> str:
-    """Write the file; the frame after the last joint is part of the tool in the comments."""
+    """Return the kinematics YAML; the frame after the last joint is part of the tool in the comments."""
     origins, own = controller_geometry(content.nominal).origins(content.robot)
     links: dict[str, object] = {
         link: {column: float(value) + 0.0 for column, value in zip(COLUMNS, xyzrpy_of(origin), strict=True)}
@@ -94,11 +94,11 @@ def write_kinematics(content: FileContent) -> str:
 
 
 def read_kinematics(text: str, source: str, nominal: Robot) -> Robot:
-    """Read the robot of the file, with the names and limits of the nominal one.
+    """Return the robot of a kinematics YAML, with names and limits of the nominal robot.
 
     The driver extracts angles in one order and URDF reads them in the other (ur_calibration/src/calibration.cpp,
     `eulerAngles(0, 1, 2)`), which moves the tool by about 0.1 mm. The order that yields the hash of the file is used;
-    if neither does, that of URDF if pisigma wrote the file, else that of the driver.
+    if neither does, the convention of URDF if pisigma wrote the file, otherwise the convention of the driver.
 
     Poses are those of the link `tool0` in the controller's frame `base` (the driver's `base_link_inertia`), or with the
     base and tool of the comments that pisigma writes.
@@ -116,7 +116,7 @@ def read_kinematics(text: str, source: str, nominal: Robot) -> Robot:
 
 
 def calibration_hash(robot: Robot) -> str:
-    """Compute the driver's hash of DH parameters, which it compares with that of the connected robot.
+    """Return the hash of DH parameters that the driver compares with the hash of the connected robot.
 
     It is `calib_` and the GNU C++ library's `std::hash` of theta, d, a and alpha of all joints as printed by C++
     streams, with 6 digits and no separators.

@@ -29,7 +29,7 @@ def urdf_to_xacro(urdf: str) -> str:
 
 
 def write_xacro(content: FileContent) -> str:
-    """Write the xacro file from the URDF file that the nominal robot was loaded from.
+    """Return the xacro file, made from the URDF file from which the nominal robot was loaded.
 
     Raises:
         OutputError: there is no such file.

@@ -35,7 +35,7 @@ _GAP = 16
 
 
 def _compiler() -> str:
-    """Find a C compiler: that of the environment variable CC, or the first available one.
+    """Return the C compiler of the environment variable CC, or the first available compiler.
 
     Raises:
         OutputError: there is no compiler.
@@ -93,7 +93,7 @@ FORMAT = ExportFormat(
 
 
 def library_key() -> int:
-    """Return the first 64 bits of the sources' hash, by which a library recognises its model files."""
+    """Return the first 64 bits of the hash of the sources, by which a library recognises its model files."""
     return int(source_hash()[:16], 16)
 
 

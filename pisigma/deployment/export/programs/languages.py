@@ -45,12 +45,12 @@ class Program:
     Attributes:
         name: name of the program.
         robot: nominal robot.
-        heading: sentences on what the program does and requires.
+        heading: sentences on the purpose and the requirements of the program.
         q: joint values of every stop [rad].
         labels: comment before the move to every stop.
         waits: waiting time at every stop [s]; 0 for none.
-        cartesian: targets, if the program has poses instead of joint values; else None.
-        config: configuration of the arm in all poses, if the language requires one; else "".
+        cartesian: targets, if the program has poses instead of joint values; otherwise None.
+        config: configuration of the arm in all poses, if the language requires a configuration; otherwise "".
     """
 
     name: str
@@ -64,7 +64,7 @@ class Program:
 
     @staticmethod
     def from_targets(targets: Targets, name: str, cartesian: bool, config: str = "") -> "Program":
-        """Make the program that moves to targets, none of which may be missing."""
+        """Return the program that moves to targets, of which no target may be missing."""
         sentences = [targets.title, TEST, COUNTING.format(robot=targets.robot.name)]
         sentences += [*CARTESIAN, *targets.remarks] if cartesian else []
         sentences += [targets.domain_warning] if targets.domain_warning else []
@@ -96,9 +96,9 @@ class Language:
         most_lines: largest number of numbered lines of a program; None for any number.
         keeps_branch: whether Cartesian targets may be on several branches.
         capitals: whether names are written in capitals.
-        configuration: pattern of the arm's configuration, if Cartesian targets require one.
+        configuration: pattern of configurations of the arm, if Cartesian targets require a configuration.
         cautions: notes for the user of a program, in addition to those for all languages.
-        cartesian_cautions: the same for Cartesian targets.
+        cartesian_cautions: additional notes for Cartesian targets.
     """
 
     name: str
@@ -117,7 +117,7 @@ class Language:
         """Return the program's name, which is that of its file.
 
         Raises:
-            OutputError: the name is not valid in the language; the message proposes a valid one.
+            OutputError: the name is not valid in the language; the message proposes a valid name.
         """
         stem = path.stem.upper() if self.capitals else path.stem
         fits = re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", stem, re.ASCII) and len(stem) <= self.longest
@@ -137,7 +137,7 @@ class Language:
         )
 
     def write(self, program: Program) -> str:
-        """Write the text of a program.
+        """Return the text of a program.
 
         Raises:
             OutputError: it has more lines than the language allows.
@@ -218,7 +218,7 @@ KRL = Language(
 RAPID = Language(
     name="RAPID",
     template="rapid.j2",
-    longest=27,  # of 32, with _tool appended
+    longest=27,  # names have at most 32 characters, and _tool is appended
     reserved=reserved_words(
         "alias and backward bool case connect const default div do else elseif endfor endfunc endif endmodule endproc "
         "endrecord endtest endtrap endwhile error exit false for from func goto if inout local mod module nostepin not "
@@ -301,7 +301,7 @@ def program_text(targets: Targets, path: Path, cartesian: bool, config: str | No
         targets: targets of the program.
         path: file to write; its suffix is one of `LANGUAGES`, its stem is the name of the program.
         cartesian: whether to write poses instead of joint values.
-        config: configuration of all poses, if the language requires one.
+        config: configuration of all poses, if the language requires a configuration.
 
     Raises:
         OutputError: the program cannot be written to this file.
@@ -326,7 +326,7 @@ def program_text(targets: Targets, path: Path, cartesian: bool, config: str | No
 
 
 def _check_turns(targets: Targets) -> None:
-    """Check that all joint values have the same number of turns, because one configuration states it for all."""
+    """Check that all joint values have the same number of turns, which one configuration states for all."""
     turns = torch.floor(targets.q / (2 * torch.pi) + 0.5)
     if len(turns) and bool((turns != turns[0]).any()):
         row = int((turns != turns[0]).any(-1).nonzero()[0, 0])

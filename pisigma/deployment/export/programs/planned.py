@@ -15,7 +15,7 @@ TEST = (
 
 
 def planned_program(plan: StoredPlan, path: Path) -> str:
-    """Write the program that moves to all poses of a plan and waits at each for its measurement.
+    """Write the program that moves to all poses of a plan and waits for a measurement at each pose.
 
     Args:
         plan: plan of a robot with six revolute joints.

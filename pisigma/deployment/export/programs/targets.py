@@ -74,7 +74,7 @@ class Targets:
 
     @property
     def failure_sentence(self) -> str | None:
-        """Sentence on poses without a target, and the reasons; None if all have one."""
+        """Return a sentence on poses without a target, and the reasons; None if all poses have targets."""
         failed = [(n, s) for n, s in zip(self.line, self.status, strict=True) if s not in WITH_TARGET]
         if not failed:
             return None
@@ -96,7 +96,7 @@ class Targets:
         )
 
     def check_complete(self) -> None:
-        """Check that no target is missing, because a program must not skip one.
+        """Check that no target is missing, because a program must not skip targets.
 
         Raises:
             UnreachablePoseError: a pose has no target; the message states line and status.
@@ -106,7 +106,7 @@ class Targets:
 
 
 def targets_of(solution: Solution, source: str, line: tuple[int, ...], accuracy: bool = True) -> Targets:
-    """Make targets from the corrected inverse kinematics of a file of poses.
+    """Return the targets of solutions of the corrected inverse kinematics for a file of poses.
 
     Args:
         solution: solutions of a model for poses with one batch axis, as tensors.

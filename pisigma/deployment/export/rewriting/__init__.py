@@ -1,1 +1,1 @@
-"""Existing programs of controllers whose pose targets are rewritten; everything else in them is unchanged."""
+"""Rewriting of pose targets in existing programs of controllers; other parts of the programs do not change."""

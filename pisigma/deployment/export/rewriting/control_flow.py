@@ -28,10 +28,10 @@ class Step(NamedTuple):
 class ActiveFrames:
     """Frame or tool of every name, or the reason why it is not certain, while a reader advances through the steps.
 
-    A value is certain if all paths through the program lead to the same one. A value that is set in a loop or a branch
-    is certain after its statement in that block, but neither after the block nor earlier in the same loop. Values that
-    a called routine sets are not certain, nor are those at the start of a routine, if the program sets them in several
-    places. A routine of another file may set all of them.
+    A value is certain if all paths through the program lead to the same value. A value that is set in a loop or a
+    branch is certain after its statement in that block, but neither after the block nor earlier in the same loop.
+    Values that a called routine sets are not certain, nor are values at the start of a routine, if the program sets
+    them in several places. A routine of another file may set all of them.
     """
 
     def __init__(self, steps: Sequence[Step], before: dict[str, Frame | str]) -> None:
@@ -45,7 +45,7 @@ class ActiveFrames:
         self._saved: list[dict[str, Frame | str]] = []
         self._places = Counter(step.name for step in steps if step.kind == "set")
         self._open: list[tuple[int, ...]] = []
-        """For every step, the steps that started the blocks around it."""
+        """For every step, the steps that started the enclosing blocks."""
         self._ends: dict[int, int] = {}
         """For steps that end a block, the step that started it."""
         blocks: list[int] = []
@@ -56,7 +56,7 @@ class ActiveFrames:
             if step.kind in ("routine", "loop", "branch"):
                 blocks.append(number)
         self._of_routine: dict[int, list[int]] = {-1: []}
-        """Steps of every routine by the step that started it; -1 for those outside all routines."""
+        """For every step, the step that started its routine; -1 outside all routines."""
         for number in range(len(steps)):
             self._of_routine.setdefault(self._routine(number), []).append(number)
         self._set_by: dict[str, set[str]] = {step.name: set() for step in steps if step.kind == "routine"}
@@ -68,7 +68,7 @@ class ActiveFrames:
         }
         self._called = {step.name for step in steps if step.kind == "call"}
         self._certain_before = {name for name, value in before.items() if not isinstance(value, str)}
-        for _ in acting:  # a name propagates through at most all routines
+        for _ in acting:  # the longest path of a name passes every routine once
             for first, inside in acting.items():
                 self._set_by[steps[first].name].update(*map(self._set_at, inside))
 

@@ -1,4 +1,4 @@
-"""Correction of a program's targets, with waypoints where a move would leave its line or arc."""
+"""Correction of the targets of a program, with waypoints on moves that would leave their line or arc."""
 
 import difflib
 import math
@@ -18,12 +18,12 @@ from pisigma.robot.kinematics.status import Status
 from pisigma.robot.se3 import invert, rotation_from_vector, rotation_vector, transform, transform_from_xyzrpy
 
 SPACING = 0.01
-"""[m] Largest step in which a path is evaluated."""
+"""Largest distance between points at which a path is evaluated [m]."""
 STEP_ANGLE = 0.035
-"""[rad] Largest rotation of a step, two degrees."""
+"""Largest rotation between points at which a path is evaluated, two degrees [rad]."""
 MAX_STEPS = 512
 LEVER = 0.1
-"""[m] A rotational deviation from the path is converted to a distance at this distance from the tool."""
+"""Distance from the tool at which a rotational deviation from the path is converted to a length [m]."""
 
 
 _LINE_NUMBER = re.compile(r"(?m)^ *\d+:")
@@ -46,7 +46,7 @@ class CorrectedProgram:
         text: text of the program.
         statuses: line and status of every target.
         waypoints: number of inserted waypoints.
-        left: line and reason of everything that was left unchanged.
+        left: line and reason of every target that was not changed.
         largest_shift: largest shift of a target [m].
         branches: names of the branches of the corrected targets.
     """
@@ -96,7 +96,7 @@ class ProgramCorrection:
 
     Attributes:
         solver: corrected inverse kinematics of the model.
-        branch: branch to use instead of the trained one.
+        branch: branch to use instead of the trained branch.
         tolerance: largest deviation of the tool from a straight line or an arc between waypoints [m].
     """
 
@@ -105,7 +105,7 @@ class ProgramCorrection:
     tolerance: float
 
     def correct_program(self, program: ScannedProgram) -> CorrectedProgram:
-        """Rewrite all targets that are understood and reached; other text is kept.
+        """Rewrite all targets that are understood and reached; other text does not change.
 
         A target is the pose for the real tool. It is replaced by the nominal robot's pose at the corrected joint
         values. A straight move is split where the line between two of these poses deviates from the corrected line by
@@ -247,7 +247,7 @@ def _round(
     end: Float64[Tensor, "ways 4 4"],
     steps: int,
 ) -> Float64[Tensor, "ways points 4 4"]:
-    """Interpolate poses from start by via to end: an arc, and a rotation about one axis from start to end."""
+    """Return poses from start by via to end: along an arc, with a rotation about one axis from start to end."""
     arcs = CircularArcs.through_points(*(T[:, :3, 3] for T in (start, via, end)))
     return transform(_between(start, end, steps)[..., :3, :3], arcs.sample(steps))
 
@@ -255,14 +255,14 @@ def _round(
 def _between(
     start: Float64[Tensor, "ways 4 4"], end: Float64[Tensor, "ways 4 4"], steps: int
 ) -> Float64[Tensor, "ways points 4 4"]:
-    """Interpolate poses from start to end: a straight line, and a rotation about one axis."""
+    """Return poses from start to end: along a straight line, with a rotation about one axis."""
     share = torch.linspace(0, 1, steps + 1, dtype=torch.float64)[:, None]
     R = start[:, None, :3, :3] @ rotation_from_vector(share * _turn(start, end)[:, None])
     return transform(R, start[:, None, :3, 3] + share * (end - start)[:, None, :3, 3])
 
 
 def _edited(text: str, edits: Sequence[Edit]) -> str:
-    """Apply all edits to a text; edits at the same position keep their order."""
+    """Return a text with all edits; edits at the same position remain in order."""
     parts, position = [], 0
     for edit in sorted(edits, key=lambda edit: edit.span):
         parts += [text[position : edit.span[0]], edit.text]
@@ -272,13 +272,13 @@ def _edited(text: str, edits: Sequence[Edit]) -> str:
 
 @dataclass(frozen=True, eq=False)
 class CircularArcs:
-    """Arcs that start at first points, pass second ones and end at third ones.
+    """Arcs that start at first points, pass second points and end at third points.
 
     Attributes:
         centre: centres of the circles [m].
         radius: vectors from the centres to the first points [m].
         axis: axes of counter-clockwise motion.
-        passing: angle at the second points [rad], from 0 at the first ones.
+        passing: angle from the first to the second points [rad].
         angle: at the third points [rad], below a full turn.
     """
 
@@ -302,7 +302,7 @@ class CircularArcs:
         return CircularArcs(first + middle, -middle, axis, passing, angle)
 
     def sample(self, steps: int) -> Float64[Tensor, "arcs points 3"]:
-        """Return equidistant points along the arcs [m], from the first points to the third ones."""
+        """Return equidistant points along the arcs, from the first to the third points [m]."""
         angles = torch.linspace(0, 1, steps + 1, dtype=torch.float64) * self.angle[:, None]
         turned = rotation_from_vector(angles[..., None] * self.axis[:, None]) @ self.radius[:, None, :, None]
         return self.centre[:, None] + turned[..., 0]
@@ -316,6 +316,6 @@ def is_straight(first: Points, second: Points, third: Points) -> bool:
 
 
 def _angle(start: Points, end: Points, axis: Points) -> Float64[Tensor, " arcs"]:
-    """Compute the angle about the axis from one direction to another, 0 to 2 pi [rad]."""
+    """Return the angle about an axis from one direction to another, 0 to 2 pi [rad]."""
     sine = (axis * torch.linalg.cross(start, end)).sum(-1)
     return torch.atan2(sine, (start * end).sum(-1)) % (2 * math.pi)

@@ -65,7 +65,7 @@ def check_rewriting(request: ExportRequest) -> None:
 
 
 def rewrite_program(request: ExportRequest) -> Exported:
-    """Rewrite the targets of a program that are understood, and report what was changed and what was not.
+    """Return a program with corrected targets where these are understood, and a report of the changes.
 
     Raises:
         OutputError: the program cannot be read, or has no target whose frame and tool are stated.
@@ -108,7 +108,7 @@ def _exported(
     corrected: CorrectedProgram,
     tolerance_mm: float,
 ) -> Exported:
-    """Make the result with the new program, facts and warnings."""
+    """Return the result with the new program, facts and warnings."""
     assert request.program is not None
     diff = corrected.diff(scanned.text, (str(request.program), str(request.out)))
     language = LANGUAGES.get(request.program.suffix.lower())
@@ -146,7 +146,7 @@ def _exported(
 
 
 def _warnings(corrected: CorrectedProgram, source: str) -> tuple[str, ...]:
-    """Return warnings on the branches of the targets, and on everything that was left unchanged."""
+    """Return warnings on branches of targets, and on targets that were not changed."""
     sentences = [
         f"Targets are corrected for the branch {' and '.join(corrected.branches) or 'of the model'}. The program's "
         "configuration was not checked: if the arm is in another configuration, use --branch."

@@ -68,7 +68,7 @@ class _Reader:
     redefined: list[re.Match[str]] = field(default_factory=list)
     axes_in_use: dict[str, int] = field(default_factory=dict)
     call: re.Match[str] | None = None
-    """The first call of a routine of another file; `uncertain` is the position after which frames are uncertain."""
+    """First call of a routine of another file; `uncertain` is the position after which frames are uncertain."""
     uncertain: float = math.inf
 
     def read(self) -> ScannedProgram:
@@ -128,7 +128,7 @@ class _Reader:
             self.scan.add_move(line.start(), pose, frame, tool, cut, circular)
 
     def _stated(self, kind: str, index: str, position: int) -> Frame | str:
-        """Return a stated frame or tool, unless the program, or a routine that it has called, may set it."""
+        """Return a stated frame or tool, unless the program or a called routine may set it."""
         if any(kind in (match[1], match[3]) and match[2] in (None, index) for match in self.redefined):
             return f"the program sets {kind} {index}"
         name = f"{kind} {index}"
@@ -176,7 +176,7 @@ class _Reader:
 
 
 def _written(text: str, T: Frame) -> str:
-    """Replace the values of a position by those of a pose."""
+    """Return the text of a position with the values of a pose."""
     x, y, z, r, p, w = millimetres_and_euler(T).tolist()
     values = iter([x, y, z, w, p, r])
     return _VALUE.sub(lambda match: match[1] + number(next(values), DIGITS), text)

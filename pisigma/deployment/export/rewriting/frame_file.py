@@ -16,9 +16,9 @@ from pisigma.robot.se3 import transform_from_xyzrpy
 class FrameFile(Section):
     """Frames relative to the origin of the robot description, and tools relative to its flange (the last row).
 
-    Names are those of the program, such as `UFRAME 1`, `BASE_DATA[3]` or `wobj_table`; `tcp` is the tool that a
+    The file uses the names of the program, such as `UFRAME 1`, `BASE_DATA[3]` or `wobj_table`; `tcp` is the tool that a
     URScript program does not set. `routines` are routines of other files that set neither frame nor tool: after a call
-    of any other one, poses are left unchanged until the program sets frame and tool again.
+    of any other routine, poses are not changed until the program sets frame and tool again.
     """
 
     frames: dict[str, FrameSection] = Field(default_factory=dict)
@@ -27,7 +27,7 @@ class FrameFile(Section):
 
     @staticmethod
     def read(path: Path | None) -> "FrameFile":
-        """Read a file; None stands for an empty one.
+        """Read the file of frames and tools; None stands for an empty file.
 
         Raises:
             OutputError: the file is not a valid frame file (YAML); the message states file, line and key.

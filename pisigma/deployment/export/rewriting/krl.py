@@ -65,7 +65,7 @@ STATED_ARC = "the angle of the arc or its orientation is stated, so it has no wa
 
 
 def scan_krl(text: str, stated: FrameFile) -> ScannedProgram:
-    """Scan a program; poses are those of `$TOOL` in `$BASE`, which the program has to set before them.
+    """Scan a program in KRL; its poses of `$TOOL` in `$BASE` are known after the program has set both.
 
     Args:
         text: text of the program.
@@ -182,7 +182,7 @@ class _Reader:
             self.scan.add_move(match.start(), pose, *self._frames(match["target"]), cut, circular)
 
     def _frames(self, target: str) -> tuple[Frame | str, Frame | str]:
-        """Return frame and tool of a move, which it may state itself after WITH."""
+        """Return frame and tool of a move, which the move may state after WITH."""
         own = {f"${match[1].upper()}" for match in _WITH.finditer(target)}
         base, tool = (
             f"the move states {name}" if name in own else self.frames[name] for name in _FRAMES_OF_MOVES

@@ -67,7 +67,7 @@ _CALL = re.compile(
     r"(?=(?P<name>[A-Za-z]\w*|%)(?:\s*;|[ \t]+[^\s:=;.{]|\\|(?<=%)))",
     re.MULTILINE,
 )
-"""A statement that is a call, or one of the words that start statements."""
+"""Pattern of a call, or of a word that starts a statement."""
 _FLOW = (
     "PROC|ENDPROC|FUNC|ENDFUNC|TRAP|ENDTRAP|IF|ELSEIF|ELSE|ENDIF|FOR|ENDFOR|WHILE|ENDWHILE|TEST|CASE|DEFAULT|ENDTEST|"
     "GOTO|RETURN|ERROR"
@@ -80,7 +80,7 @@ _STATEMENT = re.compile(
 
 
 def scan_rapid(text: str, stated: FrameFile) -> ScannedProgram:
-    """Scan a module; tool and work object are those of each move.
+    """Scan a module in RAPID; every move states tool and work object.
 
     Args:
         text: text of the module.
@@ -99,7 +99,7 @@ class _Reader:
     frames: dict[str, Frame | str] = field(default_factory=dict)
     axes_in_use: dict[str, int] = field(default_factory=dict)
     foreign: str = ""
-    """Reason why no frame and no tool is certain; "" without one."""
+    """Reason why no frame and no tool is certain; "" without such a reason."""
 
     def __post_init__(self) -> None:
         self.names = NamedPoses(self.text, _SET, str.upper)
@@ -255,7 +255,7 @@ def _product(literal: re.Match[str]) -> Frame | str:
 
 
 def _not_normalised(text: str) -> str:
-    """Return the reason why position and quaternion are not a frame; "" if they are one."""
+    """Return the reason why position and quaternion do not form a frame; "" if they form a frame."""
     quaternion = numbers_in(text)[3:]
     norm = math.hypot(*quaternion)
     if abs(norm - 1) <= MAX_SKEWNESS:

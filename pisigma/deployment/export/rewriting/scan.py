@@ -62,7 +62,7 @@ class Target:
 
 @dataclass(frozen=True, eq=False)
 class PathMove:
-    """A straight move to a target, or an arc through another one.
+    """Straight move to a target, or arc through another target.
 
     Attributes:
         line: line of the move.
@@ -91,7 +91,7 @@ class ScannedProgram:
         text: text of the program.
         targets: targets whose frame and tool are known, in the order of the text.
         moves: straight moves and arcs to these.
-        left: line and reason of everything that is left unchanged.
+        left: line and reason of every target that is not changed.
         joint_lines: lines of moves to joint values, which are not changed.
         finish: function that is applied to the text after the edits, for example to number its lines.
     """
@@ -123,7 +123,7 @@ class NamedPoses:
         self._reasons: dict[str, str] = {}
 
     def is_set_once(self, name: str) -> bool:
-        """Return whether exactly one statement sets the name."""
+        """Return whether exactly one statement sets a name."""
         return self._set[self._fold(name)] == 1
 
     def add(self, name: str, pose: Pose | str) -> None:
@@ -172,7 +172,7 @@ class Scan:
         return self.text.rfind("\n", 0, position) + 1
 
     def leave_unchanged(self, position: int, reason: str) -> None:
-        """Record that a line is left unchanged; its first reason is kept."""
+        """Record the first reason why a line is not changed."""
         self._left.setdefault(self.line_number(position), reason)
 
     def mark_unknown_start(self) -> None:
@@ -201,7 +201,7 @@ class Scan:
 
         Args:
             position: position of the move in the text.
-            pose: the pose, or the reason why it is not understood; likewise `frame` and `tool`.
+            pose: the pose, or the reason why it is not understood; the same applies to `frame` and `tool`.
             frame: frame of the pose, relative to the origin of the robot description.
             tool: tool, relative to the last row of the robot description.
             waypoints: function for the waypoints of a straight move or an arc, see `PathMove`.
@@ -285,7 +285,7 @@ def _stripped(text: str, start: int, end: int) -> tuple[int, int]:
 
 
 def waypoint_groups(poses: Sequence[_Item], count: int) -> list[Sequence[_Item]]:
-    """Group waypoints, or their names, by inserted move: one each, or two for arcs; see `PathMove`."""
+    """Return waypoints, or their names, in groups by inserted move: one each, or two for arcs; see `PathMove`."""
     return [poses[first : first + count] for first in range(0, len(poses) - count + 1, count)]
 
 
@@ -299,7 +299,7 @@ def axes_in_use(values: Mapping[str, str]) -> dict[str, str]:
 
 
 def external_axes(values: Mapping[str, str], in_use: Mapping[str, int]) -> str:
-    """Return the reason why external axes leave a pose unchanged; "" if none of them is in use.
+    """Return the reason why a pose with external axes is not changed; "" if no external axis is in use.
 
     The robot description has no external axes: it describes the robot with all of them at 0. A pose that does not state
     an axis leaves it where the program has moved it before.

@@ -43,7 +43,7 @@ _TURNING = re.compile(r"mode\s*=\s*(?!0$)")
 _Span = tuple[int, int]
 
 BLEND = 1e-3
-"""[m] Blend radius at waypoints, smaller if they are close together."""
+"""Blend radius at waypoints, which is smaller if they are close together [m]."""
 
 
 def scan_urscript(text: str, stated: FrameFile) -> ScannedProgram:
