@@ -1,1 +1,1 @@
-"""Pages in the browser over the workflow: a measuring session, and a whole cell."""
+"""Pages in the browser for the workflow: a measuring session, and a whole cell."""

@@ -25,12 +25,12 @@ from pisigma.workflow.cell.cell import Cell
 from pisigma.workflow.measure import MeasuringSession
 from pisigma.workflow.settings.measuring import MeasureSettings
 
-if TYPE_CHECKING:  # a name in full, which type checkers at run time find without this import
+if TYPE_CHECKING:  # the full name, which type checkers at run time find without this import
     import viser
 
 
 class CellScene:
-    """The scene of a cell; every call replaces what was drawn before."""
+    """Scene of a cell; every call replaces earlier drawings."""
 
     def __init__(self, server: "viser.ViserServer") -> None:
         """Set up an empty scene.
@@ -64,7 +64,7 @@ class CellScene:
             try:
                 planned = MeasuringSession.read(newest_plan(cell.folder), MeasureSettings())
             except PisigmaError:
-                planned = None  # the tabs say what is wrong with it
+                planned = None  # the tabs state the fault of the cell
         arm = ArmInSurroundings.from_robot(cell.robot, cell.file.document.surroundings)
         if planned is not None and not is_movable:
             arm = planned.plan.arm
@@ -131,7 +131,7 @@ class CellScene:
         self._server.flush()
 
     def mark_lines(self, lines: list[int]) -> None:
-        """Mark the rows of some lines in red with their numbers, and look at the first one."""
+        """Mark the rows of some lines in red with their numbers, and move the camera to the first of these rows."""
         with self._lock, self._server.atomic():
             self._marked = lines
             if (place := self._draw_rows()) is not None:
@@ -140,7 +140,7 @@ class CellScene:
         self._server.flush()
 
     def _draw_rows(self) -> Float64[np.ndarray, " 3"] | None:
-        """Draw the rows with the magnification of the slider; return the position of the first one that is marked."""
+        """Draw the rows with the magnification of the slider; return the position of the first marked row."""
         if self._scene is None or self._rows is None:
             return None
         rows = replace(self._rows, alarmed=self._rows.alarmed | np.isin(self._rows.line, self._marked))

@@ -1,4 +1,4 @@
-"""Forms made from the settings of steps, and from those of `cell.yaml`."""
+"""Forms for the settings of steps, and for the settings in `cell.yaml`."""
 
 import hashlib
 import itertools
@@ -26,7 +26,7 @@ FIRST = {
     "recalibrate": (),
     "import": ("unit", "join"),
 }
-"""Settings that are shown at once; the others are behind "all settings"."""
+"""Settings that are shown at once; other settings are behind "all settings"."""
 NEW_CELL = {"sensor": "--sensor", "limit_mm": "--limit-mm"}
 """Settings of a new cell, with their options."""
 LEFT_OUT = ("map", "no_history")
@@ -39,14 +39,14 @@ class Field:
 
     Attributes:
         key: name of the field: the key of a setting in its section of `cell.yaml`, or in the whole file, with dots.
-        help: what it does, with unit.
+        help: effect of the setting, with unit.
         kind: "number", "flag", "choice", "list" or "text".
         choices: choices of a "choice".
         bounds: smallest and largest value that is accepted, such as ">= 0"; "" if there are none.
-        default: value without an entry: that of `cell.yaml`, else the default; "" if there is none.
+        default: value without an entry: the value in `cell.yaml`, otherwise the default; "" without a default.
         value: value that the form shows as entered.
         option: option of the command, or its start if a value follows without a space; "" without a command.
-        first: whether it is shown at once.
+        first: whether the field is shown at once.
     """
 
     key: str
@@ -75,7 +75,7 @@ def form_of(step: str, file: CellFile) -> list[Field]:
     stated, fields = file.stated_values(step), []
     for one in _settings(step):
         key, option = one.key, one.name
-        if one.option.is_key or one.default is False:  # no option switches off
+        if one.option.is_key or one.default is False:  # these settings have no option that switches them off
             option = f"--set {key}="
         default = _text(stated.get(key, one.default))
         fields.append(replace(_field(one), default=default, option=option, first=key in FIRST.get(step, ())))
@@ -106,7 +106,7 @@ def form_of_new_cell() -> list[Field]:
 
 
 def changed_cell(file: CellFile, form: Mapping[str, str]) -> str:
-    """Return the text of `cell.yaml` with the values of a form; fields that the form does not have are kept.
+    """Return the text of `cell.yaml` with the values of a form; fields that the form lacks do not change.
 
     Raises:
         PisigmaError: the file is written in a way in which a value cannot be changed alone.
@@ -117,19 +117,19 @@ def changed_cell(file: CellFile, form: Mapping[str, str]) -> str:
     changed = [(one, value) for one, value in entered if value != one.value]
     removed = [(one, value) for one, value in changed if not value]
     stated = [(one, value) for one, value in changed if value]
-    for one, value in [*stated, *reversed(removed)]:  # a removed item changes the numbers of later ones
+    for one, value in [*stated, *reversed(removed)]:  # a removed item changes the numbers of later items
         keys = [int(part) if part.isdigit() else part for part in one.key.split(".")]
         text = with_value(text, keys, _value(one.kind, value), str(file.path))
     return text
 
 
 def digest_of(text: str) -> str:
-    """Return the SHA-256 of a text, by which a change since it was shown is noticed."""
+    """Return the SHA-256 of a text, which shows whether the text has changed since it was displayed."""
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _section(section: type[Section], stated: Any, prefix: str) -> Iterator[Field]:
-    """Yield the fields of a section of `cell.yaml` and of the sections in it; lists of sections get an empty one."""
+    """Yield the fields of a section of `cell.yaml` and its sections; lists of sections get an empty section."""
     meanings = {key: text for one in reversed(section.__mro__) for key, text in attributes_of(one).items()}
     for name, info in section.model_fields.items():
         key, kind, bounds = f"{prefix}{info.alias or name}", info.annotation, list(info.metadata)
@@ -213,7 +213,7 @@ def _text(value: object) -> str:
 
 
 def _value(kind: str, text: str) -> Any:
-    """Return what a person entered as a plain value; a text that is not of the kind is refused by its setting."""
+    """Return the entry of a person as a plain value; the setting refuses a text that is not of the kind."""
     if kind == "list":
         return [_value("number", one.strip()) for one in text.split(",") if one.strip()] or None
     if kind == "flag":

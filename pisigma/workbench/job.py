@@ -1,4 +1,4 @@
-"""The running step: one at a time, with its progress, the person who started it, and a way to stop it."""
+"""Running step: one at a time, with its progress, the person who started it, and a way to stop it."""
 
 import datetime
 import sys
@@ -28,14 +28,14 @@ class Outcome:
     Attributes:
         text: the result for people; None if the step was refused.
         refusal: why the input was refused, or the result is not accepted.
-        field: field of the form that is at fault; "" if none is.
-        subject: what it is about, such as a session; "" if that is clear from its step.
-        curve: expected accuracy against the number of poses; () without one.
+        field: field of the form that causes the fault; "" if no field does.
+        subject: object of the step, such as a session; "" if the step implies it.
+        curve: expected accuracy by number of poses; () without a curve.
         stopped: whether a person stopped it.
         step: name of the step.
         command: command line that does the same.
         person: who started it.
-        ended: day and time at which it ended.
+        ended: day and time of the end of the step.
     """
 
     text: ResultText | None = None
@@ -62,7 +62,7 @@ class Job:
         person: who started it.
         command: command line that does the same.
         what: the current activity, with the time left.
-        stopped_by: who asked to stop it; "" if nobody did.
+        stopped_by: name of the person who asked to stop the step; "" if nobody did.
     """
 
     step: str
@@ -88,9 +88,9 @@ class Jobs:
     """The steps of a page.
 
     Attributes:
-        running: the step that runs; None if none does.
+        running: the running step; None if no step runs.
         outcomes: the last outcome of every step.
-        version: number of changes, by which pages notice them.
+        version: number of changes, by which pages detect changes.
         ended: number of steps that have ended.
     """
 

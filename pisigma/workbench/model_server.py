@@ -1,4 +1,4 @@
-"""`pisigma serve` of a cell as a process of the page, so that its answers do not wait for what the page computes."""
+"""`pisigma serve` of a cell as a process of the page, so that answers do not wait for computations of the page."""
 
 import json
 import socket
@@ -15,7 +15,7 @@ from pisigma.robot.description import Robot
 TIMEOUT = 2.0
 """Longest time to wait for an answer of the server [s]."""
 WARM_UP = 100
-"""Requests after the start, whose times are the first ones that are shown."""
+"""Number of requests after the start, whose times are the first displayed times."""
 
 
 class ModelServer:
@@ -62,7 +62,7 @@ class ModelServer:
         self._ask([{"pose": there["pose"]}] * WARM_UP if "pose" in there else [])
 
     def stop(self) -> None:
-        """Stop the server after it has answered all requests that it received."""
+        """Stop the server after it has answered all received requests."""
         with self._lock:
             if self._process is not None:
                 self._process.terminate()
@@ -76,7 +76,7 @@ class ModelServer:
         return self._ask([{"ask": "health"}])[0]
 
     def _ask(self, requests: list[dict[str, Any]]) -> list[dict[str, Any]]:
-        """Send requests and return their answers; empty ones if the server does not answer."""
+        """Send requests and return the answers, which are empty if the server does not answer."""
         try:
             with socket.create_connection(("127.0.0.1", self.ports["json_port"]), TIMEOUT) as stream:
                 answers = stream.makefile("r", encoding="utf-8")

@@ -71,7 +71,7 @@ def create(folder: Path, form: Form, files: list[Path]) -> Cell:
     if not robot:
         raise RobotError(expected="a robot of the catalogue, or a file", option="robot")
     if robot == form.get("robot"):
-        check_choice(RobotError, "robot", robot, catalogue())  # a page must not name paths
+        check_choice(RobotError, "robot", robot, catalogue())  # a page must not choose paths
     limit = form_number(form, "limit_mm") if form.get("limit_mm") else None
     return Cell.create(
         folder, robot, form.get("sensor") or "tracker", limit, form.get("base"), form.get("tip")
@@ -79,7 +79,7 @@ def create(folder: Path, form: Form, files: list[Path]) -> Cell:
 
 
 def write_cell(cell: Cell, form: Form, texts: dict[str, str]) -> None:
-    """Write `cell.yaml`, if it is valid and is still the file that the person saw.
+    """Write `cell.yaml`, if the new text is valid and the file has not changed since it was displayed.
 
     Args:
         cell: the cell.
@@ -156,12 +156,12 @@ def _in_cell(text: ResultText, cell: Cell) -> ResultText:
 
 
 def incoming_rows(files: list[Path], cell: Cell, form: Form) -> IncomingRows:
-    """Return uploaded files as they are read into the cell.
+    """Return uploaded files with the settings by which they are read into the cell.
 
     Args:
         files: uploaded files.
         cell: the cell, which states the settings of the import.
-        form: what a person changed: "column 0 3" is the meaning of the fourth column of the first file.
+        form: changes by a person: "column 0 3" is the meaning of the fourth column of the first file.
     """
     changed = changed_settings("import", form)
     if lines := form.get("new_frame_at", "").split():
@@ -229,7 +229,7 @@ def follow_file(
     show: Callable[[SessionState], None],
     progress: Progress,
 ) -> Outcome:
-    """Follow a growing file with the newest plan as `measure` does, until it ends or a person stops it."""
+    """Follow a growing file with the newest plan as `measure` does, until the plan ends or a person stops."""
     plan = newest_plan(cell.folder)
     session = MeasuringSession.read(plan, cell.file.settings_of_step("measure"))
     growing = growing_file(path, session.plan.arm.robot, session.plan.settings)
@@ -249,7 +249,7 @@ def _session_outcome(state: SessionState, subject: str) -> Outcome:
 
 
 def export(cell: Cell, form: Form, files: Mapping[str, Path]) -> Outcome:
-    """Write the model in use in a format, to the exports of the cell.
+    """Export the model in use in a format to the exports of the cell.
 
     Args:
         cell: the cell.
@@ -300,7 +300,7 @@ def side_by_side(diff: str) -> list[tuple[str, str, str]]:
 
 
 def report_cell(cell: Cell, form: Form, progress: Progress) -> Outcome:
-    """Write a report on the model in use, to the reports of the cell."""
+    """Write a report on the model in use to the reports of the cell."""
     out = output_path(cell.folder, REPORTS, ".html")
     found = report(cell.model_folder(), None, progress, cell.cameras, acceptance_of(cell))
     found.save(out)

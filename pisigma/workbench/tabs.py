@@ -104,7 +104,7 @@ class Tabs:
         )
 
     def page(self, folder: Path, cell: Cell | None) -> str:
-        """Render the frame of the page, without the content of a tab; without a cell there is only one tab."""
+        """Return the frame of the page, without the content of a tab; without a cell, there is only one tab."""
         robot, tabs = ("", {"status": "New cell"}) if cell is None else (cell.robot.name, TABS)
         template = self._environment.get_template("page.html.j2")
         return template.render(tabs=tabs, name=folder.resolve().name, robot=robot, folder=str(folder))
@@ -160,7 +160,7 @@ class Tabs:
         )
 
     def findings(self, incoming: IncomingRows, found: Sequence[Diagnostic], problem: str = "") -> str:
-        """Render what the check of uploaded rows found next to the rows, with what corrects it.
+        """Return HTML with the findings of the check of uploaded rows next to the rows, with repairs.
 
         Args:
             incoming: the files.
@@ -186,7 +186,7 @@ class Tabs:
 
 
 def repaired_fields(incoming: IncomingRows, repair: Repair) -> dict[str, str]:
-    """Return what a repair enters in the form of the proposal."""
+    """Return the values that a repair enters into the form of the proposal."""
     fields = {
         f"column {number} {one.index}": stated[mapping.key(one)]
         for stated in repair.settings.maps
@@ -206,7 +206,7 @@ def lines_in(text: str) -> list[int]:
 
 
 def _more(name: str, cell: Cell, status: CellStatus, texts: Mapping[str, str]) -> dict[str, Any]:
-    """Return the values that only one tab shows."""
+    """Return the values for the template that only one tab shows."""
     match name:
         case "status":
             return {"timeline": timeline(status), "kinds": get_args(EventKind)}
@@ -282,7 +282,7 @@ FOLDERS = {"plan": PLANS, "model": MODELS, "export": EXPORTS, "report": REPORTS}
 def download_of(cell: Cell, kind: str, names: tuple[str, ...]) -> Path:
     """Return a file of the cell that a page may download: a plan, an export, or a figure or the card of a model.
 
-    Names are compared with those of the files that exist, so that no other path can be named.
+    Names are compared with the names of existing files, so that no other path can be chosen.
 
     Args:
         cell: the cell.

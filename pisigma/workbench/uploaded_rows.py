@@ -1,4 +1,4 @@
-"""Requests for uploaded rows: how they are read, what the check finds, and which of them the scene marks."""
+"""Requests for uploaded rows: settings for reading, findings of the check, and rows that the scene marks."""
 
 import asyncio
 import contextlib
@@ -19,7 +19,7 @@ from pisigma.workflow.cell.cell import Cell
 from pisigma.workflow.cell.incoming_rows import IncomingRows
 
 GROWING = "growing"
-"""What a form names the growing file instead of the number of an upload."""
+"""Name of the growing file in a form, instead of the number of an upload."""
 
 
 class UploadedRows:
@@ -52,7 +52,7 @@ class UploadedRows:
         def propose() -> str:
             incoming = self._incoming(Cell.open(self.folder), form)
             text = self._tabs.proposal(incoming, form.get("files", ""))
-            with contextlib.suppress(PisigmaError):  # the check says what is wrong
+            with contextlib.suppress(PisigmaError):  # the check states the fault
                 rows = incoming.unchecked_rows
                 self._scene.show_rows(RowsSoFar.unjudged(rows.line, rows.q.numpy()))
             return text
@@ -76,7 +76,7 @@ class UploadedRows:
 
     @with_error_answers
     async def _show(self, request: web.Request) -> web.StreamResponse:
-        """Mark the rows that a sentence names in the scene: those of a session that it names, else those shown."""
+        """Mark the rows that a sentence names in the scene: rows of a named session, otherwise the displayed rows."""
         text = (await form_of(request)).get("text", "")
 
         def show() -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 from pisigma.files.errors import MeasurementError, make_printable
 
 MAX_FILES = 20
-"""Number of files that are kept; the oldest is removed first."""
+"""Largest number of stored files; the oldest file is removed first."""
 MAX_NAME = 60
 """Longest name [characters]; file systems accept 255 bytes, and a character has up to four."""
 
@@ -19,13 +19,13 @@ class Uploads:
     """Uploaded files until the server ends."""
 
     def __init__(self) -> None:
-        self._folder = tempfile.TemporaryDirectory(prefix="pisigma-")  # with mode 0700
+        self._folder = tempfile.TemporaryDirectory(prefix="pisigma-")  # the folder has mode 0700
         self._files: dict[str, Path] = {}
         self._lock = threading.Lock()
         self._numbers = map(str, itertools.count(1))  # several files may arrive at once
 
     def add(self, name: str, content: bytes) -> str:
-        """Store a file; return the number by which it is requested.
+        """Store an uploaded file; return the number by which it is requested.
 
         Args:
             name: name that the browser states; its folders are removed.
@@ -58,7 +58,7 @@ class Uploads:
         return [self._files[number] for number in numbers]
 
     def without_folder(self, text: str) -> str:
-        """Return a message that names uploaded files without the folder in which they are kept."""
+        """Return a message without the folder of uploaded files."""
         return re.sub(rf"{re.escape(self._folder.name)}/\d+/", "", text)
 
     def close(self) -> None:

@@ -42,13 +42,13 @@ STATIC = {
 """Type, package and folder of the files of the page."""
 NO_CELL = {"state": "no_cell", "reason": "the folder has no cell yet", "command": "pisigma new"}
 """Next step of a folder without a cell."""
-HELD = 30
-"""How often a request for the state is looked at again."""
+STATE_CHECKS = 30
+"""Number of times that a waiting request for the state is checked."""
 REPORT_POLICY = (
     "sandbox allow-scripts; default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; img-src data:; "
     "frame-ancestors 'self'"
 )
-"""A report is one file with its scripts inside, which cannot reach the page that shows it."""
+"""Content security policy for reports, whose scripts cannot reach the page that shows them."""
 MAX_COMMAND = 2000
 """Longest command line that is shown."""
 
@@ -71,7 +71,7 @@ class Workbench(UploadedRows):
         Args:
             folder: folder of the cell; if it does not exist or is empty, the page creates the cell.
             host: address to listen on; at 127.0.0.1 only this machine can open the page.
-            port: port to listen on; if it is taken, the next free one.
+            port: port to listen on; if it is in use, the next free port.
             growing: file to which an instrument writes rows; None for none.
 
         Raises:
@@ -161,10 +161,12 @@ class Workbench(UploadedRows):
 
     @with_error_answers
     async def _state(self, request: web.Request) -> web.StreamResponse:
-        for _ in range(HELD):  # while a step runs, a change is answered at once, and the progress after 0.3 s
+        for _ in range(
+            STATE_CHECKS
+        ):  # while a step runs, changes are answered at once, and progress after 0.3 s
             if self.jobs.running is None or request.query.get("version") != str(self.jobs.version):
                 break
-            await asyncio.sleep(0.3 / HELD)
+            await asyncio.sleep(0.3 / STATE_CHECKS)
         status, job = await asyncio.to_thread(self.status), self.jobs.running
         running = job and {
             "step": job.step,
@@ -227,7 +229,7 @@ class Workbench(UploadedRows):
                 field = problem.option or str(problem.column or "")
                 return Outcome(refusal=self._uploads.without_folder(str(problem)), field=field)
             finally:
-                with self._reading:  # a reading that began before the end of the step is out of date
+                with self._reading:  # values that were read before the end of the step are out of date
                     self._status = self._status[0], -math.inf
 
         self.jobs.start(name, person_of(request), form.pop("command", "")[:MAX_COMMAND], run)
@@ -310,7 +312,7 @@ class Workbench(UploadedRows):
         return Outcome()
 
     def try_pose(self, cell: Cell, form: Form, progress: Progress) -> Outcome:
-        """Compute the joint values of a pose, and show the arm there."""
+        """Compute the joint values of a pose, and show the arm in this configuration."""
         progress("computing joint values")
         found, solution = steps.try_pose(cell, form)
         if not found.refusal:
@@ -344,4 +346,4 @@ STEPS: dict[str, Callable[[Workbench, Cell, Form, Progress], Outcome]] = {
     "session": lambda _, *given: steps.set_aside(*given),
     "take_back": lambda _, *given: steps.take_back(*given),
 }
-"""Steps by the names of their commands."""
+"""Functions of steps by the names of their commands."""

@@ -24,7 +24,7 @@ HEADERS = {
     "Referrer-Policy": "no-referrer",
     "X-Content-Type-Options": "nosniff",
 }
-"""Headers of every response: nothing is loaded from elsewhere, stored, or shown inside a foreign page."""
+"""Headers of every response, which forbid loading from other servers, storing, and display inside foreign pages."""
 FORBIDDEN = "Open this page with the link that pisigma printed."
 
 
@@ -34,7 +34,7 @@ def _random_name() -> str:
 
 @dataclass(frozen=True)
 class Access:
-    """Secrets of one server. The link with the token sets a cookie; every other request needs the cookie.
+    """Secrets of one server: the link with the token sets a cookie, which every other request needs.
 
     A browser sends the cookies of a host to the servers at all ports of it, including those of other users. The cookie
     is therefore restricted to a folder with a random name, in which all pages are.
@@ -58,7 +58,7 @@ class Access:
         """Answer the link: set the cookie, and go on to the first page.
 
         A redirect would be a part of the navigation from the foreign page with the link, to which a strict cookie is
-        not sent; hence a page that is left at once.
+        not sent; hence a page that is left immediately.
         """
         if not secrets.compare_digest(
             request.match_info["token"].encode(errors="replace"), self.token.encode()

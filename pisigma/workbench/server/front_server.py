@@ -1,4 +1,4 @@
-"""The server of a page, in a thread: the only one that listens on a port."""
+"""Server of a page, in a thread; no other server of the page listens on a port."""
 
 import asyncio
 import contextlib
@@ -39,7 +39,7 @@ class FrontServer:
         Args:
             pages: functions that answer a method and a path in the folder of the pages, such as ("GET", "/").
             host: address to listen on; at 127.0.0.1 only this machine can open the pages.
-            port: port to listen on; if it is taken, the next free one.
+            port: port to listen on; if it is in use, the next free port.
             closing: called in the thread of the server at its end.
 
         Raises:
@@ -79,7 +79,7 @@ class FrontServer:
 
 
 async def _end_tasks() -> None:
-    """Cancel what is left of closed connections."""
+    """Cancel the remaining tasks of closed connections."""
     left = asyncio.all_tasks() - {asyncio.current_task()}
     for task in left:
         task.cancel()

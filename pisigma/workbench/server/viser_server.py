@@ -16,17 +16,17 @@ from aiohttp.typedefs import Handler
 
 from pisigma.files.errors import OutputError, Place
 
-if TYPE_CHECKING:  # a name in full, which type checkers at run time find without this import
+if TYPE_CHECKING:  # the full name, which type checkers at run time find without this import
     import viser
 
 MAX_MESSAGE = 50 * 2**20
-"""Largest message that viser accepts [bytes]."""
+"""Largest size of a message that viser accepts [bytes]."""
 MAX_PATH = 100
 """Longest path of a unix socket on all systems [bytes]."""
 SCENE_POLICY = (
     "default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:; frame-ancestors 'self'; base-uri 'none'"
 )
-"""viser's page is one file with its scripts, workers and compiled code inside; it loads nothing from elsewhere."""
+"""Content security policy for viser's page, a file that contains its scripts, workers and compiled code."""
 _starting = threading.Lock()
 
 
@@ -52,7 +52,7 @@ class ViserBackend:
             OutputError: the path of temporary files is too long for a socket.
         """
         self._client = _client()
-        self._folder = tempfile.TemporaryDirectory(prefix="pisigma-")  # with mode 0700
+        self._folder = tempfile.TemporaryDirectory(prefix="pisigma-")  # the folder has mode 0700
         path = Path(self._folder.name) / "viser"
         if len(os.fsencode(path)) > MAX_PATH:
             raise OutputError(
@@ -81,7 +81,7 @@ class ViserBackend:
         )
 
     async def _connect(self, request: web.Request) -> web.StreamResponse:
-        """Pass the messages of a websocket on in both directions until one side closes it."""
+        """Forward the messages of a websocket in both directions until one side closes it."""
         if self._session is None:
             self._session = aiohttp.ClientSession(connector=aiohttp.UnixConnector(str(self.path), limit=0))
         stated = request.headers.get("Sec-WebSocket-Protocol", "").split(",")
@@ -112,7 +112,7 @@ class ViserBackend:
 
 
 async def _pass_on(source: Any, target: Any) -> None:
-    """Send the messages of one websocket to another until it is closed."""
+    """Forward the messages of one websocket to another until the first is closed."""
     async for message in source:
         if message.type is aiohttp.WSMsgType.BINARY:
             await target.send_bytes(message.data)
@@ -134,7 +134,7 @@ def _started(path: Path, label: str) -> "viser.ViserServer":
     replaced while it starts.
 
     Raises:
-        RuntimeError: this version of viser starts in another way; nothing listens then.
+        RuntimeError: this version of viser starts in another way; in this case, no server listens.
     """
     import viser
     import websockets.asyncio.server as sockets

@@ -37,7 +37,7 @@ class AbstractBody(ABC):
     def draw(
         self, scene: "viser.SceneApi", name: str, q: Values, color: Color, opacity: float | None
     ) -> None:
-        """Draw the robot, replacing what was drawn under the name before.
+        """Draw the robot in a scene, and replace the earlier drawing of the same name.
 
         Args:
             scene: scene to draw in.
@@ -49,7 +49,7 @@ class AbstractBody(ABC):
 
 
 class CapsuleBody(AbstractBody):
-    """The robot as the capsules by which plans are checked for collision."""
+    """Robot that is drawn as the capsules by which plans are checked for collisions."""
 
     def __init__(self, capsules: Capsules) -> None:
         self._capsules = capsules
@@ -57,7 +57,7 @@ class CapsuleBody(AbstractBody):
     def draw(
         self, scene: "viser.SceneApi", name: str, q: Values, color: Color, opacity: float | None
     ) -> None:
-        """Draw one mesh of all capsules; see `AbstractBody.draw`."""
+        """Draw one mesh of all capsules of the robot; see `AbstractBody.draw`."""
         segments, radii = self._capsules.segments(torch.from_numpy(q)).numpy(), self._capsules.radius.tolist()
         links = join_surfaces(
             [capsule(start, end, radius) for (start, end), radius in zip(segments, radii, strict=True)]
@@ -112,7 +112,7 @@ class MeshBody(AbstractBody):
     def draw(
         self, scene: "viser.SceneApi", name: str, q: Values, color: Color, opacity: float | None
     ) -> None:
-        """Draw one mesh per link on the first call, and move the meshes afterwards; see `AbstractBody.draw`."""
+        """Draw one mesh per link in the first call, and move the meshes in later calls; see `AbstractBody.draw`."""
         values = dict(zip(self._joints, q.tolist(), strict=True))
         for link, T in self.frames(values).items():
             if link not in self.links:

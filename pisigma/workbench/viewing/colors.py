@@ -47,7 +47,7 @@ def error_colors(errors: Float64[np.ndarray, " rows"], top: float) -> UInt8[np.n
 
 
 def round_up(value: float) -> float:
-    """Round up to 1, 2 or 5 times a power of ten; 1 where the value is not positive."""
+    """Return a value rounded up to 1, 2 or 5 times a power of ten; 1 if the value is not positive."""
     if not value > 0:
         return 1.0
     power = 10.0 ** math.floor(math.log10(value))

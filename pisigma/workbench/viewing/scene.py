@@ -47,11 +47,11 @@ MAX_LABELS, MAX_ARROWS = 50, 1000
 """Wrong rows that are labelled with their line, and errors that are drawn as arrows; more are drawn as lines."""
 FLOOR, TRACKER_HEAD, CONE, BEAM, HANDLE = 5.0, 0.05, 0.2, 0.003, 0.3
 """Shares of the robot's reach: edge of the floor, radius of the tracker, length of the cone, width of the beam, size of
-the arrows by which objects are dragged."""
+the arrows for dragging objects."""
 
 
 class SessionScene:
-    """Scene of the robot and the rows; every call replaces what was drawn before.
+    """Scene of the robot and the rows; every call replaces earlier drawings.
 
     Attributes:
         handles: nodes of boxes and tracker by their keys in the surroundings.
@@ -126,9 +126,9 @@ class SessionScene:
         """Draw every row as a point in the colour of its error, with the error as an arrow.
 
         Args:
-            rows: rows; those that cannot be judged yet are drawn at the tool of the nominal robot.
+            rows: measured rows; rows that cannot be judged yet are drawn at the tool of the nominal robot.
             top: error at the end of the colour scale [m].
-            magnification: ratio of the lengths of the arrows to those of the errors.
+            magnification: ratio of the lengths of the arrows to the lengths of the errors.
 
         Returns:
             The positions at which they are drawn [m].
@@ -316,7 +316,7 @@ def draw_sight(
 
 
 def acceptance_cone(reflector: ReflectorSection, length: float) -> Surface:
-    """Make the acceptance cone of a reflector in the frame of the tool.
+    """Return the acceptance cone of a reflector in the frame of the tool.
 
     Args:
         reflector: reflector with axis and acceptance angle.

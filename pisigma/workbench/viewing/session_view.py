@@ -67,7 +67,7 @@ class SessionView:
             body: appearance of the robot; None for capsules.
             limit: limit of the 95 % quantile of the errors [m]; None for no limit.
             host: address to listen on; at 127.0.0.1 only this machine can open the page.
-            port: port to listen on; if it is taken, the next free one.
+            port: port to listen on; if it is in use, the next free port.
             sight: camera and board; None without a camera.
 
         Raises:
@@ -214,7 +214,7 @@ class SessionPanel:
 def _curves(
     points: Sequence[AccuracyPoint], limit: float | None
 ) -> tuple[Float64[np.ndarray, " points"], ...]:
-    """Return the columns of the curve [mm] over the number of poses; of several points for one number, the last."""
+    """Return the columns of the curve [mm] over the number of poses; of points with equal numbers, the last."""
     by_poses = {point.poses: point for point in points}
     line = math.nan if limit is None else limit
     rows = [

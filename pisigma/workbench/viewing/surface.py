@@ -27,14 +27,14 @@ class Surface:
 
 
 def join_surfaces(surfaces: list[Surface]) -> Surface:
-    """Join several surfaces to one."""
+    """Return one surface that consists of several surfaces."""
     starts = np.cumsum([0, *(len(surface.points) for surface in surfaces)])
     faces = [surface.faces + start for surface, start in zip(surfaces, starts, strict=False)]
     return Surface(np.concatenate([surface.points for surface in surfaces]), np.concatenate(faces))
 
 
 def revolve(radii: Float64[np.ndarray, " rings"], heights: Float64[np.ndarray, " rings"]) -> Surface:
-    """Make a surface of revolution about the z axis.
+    """Return a surface of revolution about the z axis.
 
     Args:
         radii: radii of the rings [m]; the surface is closed at radius 0.
@@ -51,7 +51,7 @@ def revolve(radii: Float64[np.ndarray, " rings"], heights: Float64[np.ndarray, "
 
 
 def capsule(start: Float64[np.ndarray, " 3"], end: Float64[np.ndarray, " 3"], radius: float) -> Surface:
-    """Make a cylinder between two points with a hemisphere at either end [m]."""
+    """Return a cylinder between two points with a hemisphere at either end [m]."""
     length = float(np.linalg.norm(end - start))
     angles = np.linspace(-np.pi / 2, np.pi / 2, 16)
     heights = radius * np.sin(angles) + np.where(angles > 0, length, 0.0)
@@ -59,7 +59,7 @@ def capsule(start: Float64[np.ndarray, " 3"], end: Float64[np.ndarray, " 3"], ra
 
 
 def rotation_to(direction: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "3 3"]:
-    """Return a rotation that maps the z axis to a direction; the identity where the direction is 0."""
+    """Return a rotation that maps the z axis to a direction; the identity if the direction is 0."""
     length = float(np.linalg.norm(direction))
     if length == 0:
         return np.eye(3)

@@ -276,9 +276,7 @@ def run_fleet(
 def _advance(folder: Path, prior: Path | None) -> tuple[str, dict[str, list[ParameterValue]]]:
     """Advance a cell; return the reason why it needs attention (or "") and the parameters of its models."""
     # importing torch takes seconds, and most calls have nothing to do
-    from pisigma.workflow.cell.cell import (
-        Cell,
-    )
+    from pisigma.workflow.cell.cell import Cell
 
     reason = ""
     try:
