@@ -10,12 +10,9 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float64
 
-from pisigma.robot.kernels.array_kinematics import cosine_sine
+from pisigma.robot.right_angles import ROUNDING, cosine_sine, snap_right_angle
 
 Frame = Float64[np.ndarray, "4 4"]
-
-ROUNDING = 2e-14
-"""Largest deviation of a length from 0 [m] and of an angle from a multiple of 90 deg [rad] that is a rounding error."""
 
 
 def rotation(axis: int, angle: float) -> Frame:
@@ -76,11 +73,3 @@ def inverse(T: Frame) -> Frame:
 def zero_if_rounding(value: float) -> float:
     """Return a length [m], or 0 if it is a rounding error."""
     return 0.0 if abs(value) <= ROUNDING else float(value)
-
-
-def snap_right_angle(value: float) -> float:
-    """Replace an angle [rad] that is a multiple of 90 deg up to a rounding error by that multiple, in (-pi, pi]."""
-    quarters = round(value / (math.pi / 2))
-    if abs(value - quarters * (math.pi / 2)) > ROUNDING:
-        return float(value)
-    return (2 if quarters == -2 else quarters) * (math.pi / 2)

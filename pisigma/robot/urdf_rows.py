@@ -14,16 +14,15 @@ import numpy as np
 from jaxtyping import Float64
 
 from pisigma.robot.coupling_section import CoupledJointSection, rows_and_coupling
+from pisigma.robot.right_angles import ROUNDING, snap_right_angle
 from pisigma.robot.robot_fields import RobotFields
 from pisigma.robot.row import Row
 from pisigma.robot.urdf_chain import Chain, ChainJoint
 from pisigma.robot.urdf_frames import (
-    ROUNDING,
     Frame,
     inverse,
     rotation,
     row_frame,
-    snap_right_angle,
     xyzrpy_of,
     zero_if_rounding,
 )

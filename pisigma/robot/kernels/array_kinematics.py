@@ -15,6 +15,7 @@ import numpy as np
 from pisigma.files.errors import ModelError
 from pisigma.robot.kernels.arrays import FIXED, FORWARD, PRISMATIC, REVOLUTE
 from pisigma.robot.kernels.layout import DESCRIPTION, DOF, ROWS, make_memory
+from pisigma.robot.right_angles import cosine_sine
 
 if TYPE_CHECKING:  # run-time type checkers find the full names without these imports
     import pisigma.robot.description
@@ -214,14 +215,6 @@ def xyzrpy_of(T: Any) -> tuple[float, ...]:
     if horizontal > 1e-12:
         return x, y, z, math.atan2(c, a), pitch, math.atan2(f, g)
     return x, y, z, math.atan2(-b, d), pitch, 0.0
-
-
-def cosine_sine(angle: float) -> tuple[float, float]:
-    """Return cosine and sine, exactly 0 and ±1 within 1e-15 rad of a multiple of 90 deg."""
-    quarter = angle / (math.pi / 2)
-    if abs(quarter - round(quarter)) < 1e-15 * max(1.0, abs(quarter)):
-        return ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))[round(quarter) % 4]
-    return math.cos(angle), math.sin(angle)
 
 
 def address_of(array: Any) -> int:
