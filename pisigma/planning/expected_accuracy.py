@@ -19,6 +19,8 @@ RANDOM_SELECTIONS = 5
 """Number of random selections of poses with which a plan is compared."""
 DRAWS = 100
 """Number of robots that are drawn from the posterior to compute quantiles."""
+DRAWS_AT_POSE = 1_000
+"""Robots that are drawn for the quantile at a single pose, which scatters by 2 % then."""
 MORE_IMAGES = 10
 """Number of additional images whose benefit is predicted."""
 EXACT_CORNERS, EXACT_ROBOT = 1e-4, Repeatability(1e-9, 1e-9)
@@ -97,9 +99,22 @@ def rms_of(D: Float64[Tensor, "tasks 3 directions"]) -> float:
 
 def p95_of(D: Float64[Tensor, "tasks 3 directions"], seed: int = 0) -> float:
     """Compute the 95 % quantile of the position errors over the task [m] from `DRAWS` robots of the posterior."""
+    return float(torch.quantile(_drawn_errors(D, DRAWS, seed).flatten(), 0.95))
+
+
+def p95_at(D: Float64[Tensor, "tasks 3 directions"], seed: int = 0) -> Float64[Tensor, " tasks"]:
+    """Compute the 95 % quantile of the position error at each pose [m] from `DRAWS_AT_POSE` robots of the posterior."""
+    return _drawn_errors(D, DRAWS_AT_POSE, seed).quantile(0.95, dim=1)
+
+
+def _drawn_errors(
+    D: Float64[Tensor, "tasks 3 directions"], draws: int, seed: int
+) -> Float64[Tensor, "tasks draws"]:
+    """Return the position errors of robots that are drawn from the posterior [m]."""
     generator = torch.Generator().manual_seed(seed)
-    numbers = torch.randn(D.shape[2], DRAWS, generator=generator, dtype=D.dtype)
-    return float(torch.quantile((D @ numbers).norm(dim=1).flatten(), 0.95))
+    numbers = torch.randn(D.shape[2], draws, generator=generator, dtype=D.dtype)
+    errors: Tensor = (D @ numbers).norm(dim=1)
+    return errors
 
 
 def remaining_errors(

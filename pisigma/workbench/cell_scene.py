@@ -5,14 +5,20 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 from jaxtyping import Float64
+from scipy.spatial.transform import Rotation
 
-from pisigma.files.errors import PisigmaError, RobotError
+from pisigma.files.errors import ModelError, PisigmaError, RobotError
+from pisigma.files.templates import template_environment
 from pisigma.lifetime.cell.layout import PLANS, newest_plan
+from pisigma.model.folder.model_folder import load_model
 from pisigma.planning.plan_inputs import sight_of
 from pisigma.planning.session.state import RowsSoFar, SessionState
 from pisigma.planning.surroundings.arm_in_surroundings import ArmInSurroundings
+from pisigma.robot.se3 import xyzrpy_from_transform
 from pisigma.workbench.viewing.body import AbstractBody, CapsuleBody, MeshBody
+from pisigma.workbench.viewing.colors import RAMP, round_up
 from pisigma.workbench.viewing.scene import SessionScene
 from pisigma.workbench.viewing.session_view import (
     FIELD,
@@ -23,6 +29,7 @@ from pisigma.workbench.viewing.session_view import (
 )
 from pisigma.workflow.cell.cell import Cell
 from pisigma.workflow.measure import MeasuringSession
+from pisigma.workflow.predicted_errors import PredictedErrors, predicted_errors
 from pisigma.workflow.settings.measuring import MeasureSettings
 
 if TYPE_CHECKING:  # the full name, which type checkers at run time find without this import
@@ -47,6 +54,16 @@ class CellScene:
         server.gui.configure_theme(show_logo=False, show_share_button=False)
         self._slider = server.gui.add_slider("errors magnified by", *MAGNIFICATIONS, initial_value=0)
         self._slider.on_update(self._magnify)
+        self._cell: Cell | None = None
+        self._predicted: tuple[str, PredictedErrors] | None = None
+        self._errors = server.gui.add_checkbox("predicted 95 % errors", False)
+        self._errors.on_update(lambda event: self.show_errors(self._cell))
+        self._legend = server.gui.add_html("", visible=False)
+        self._text: Any = (
+            template_environment("pisigma.workbench.viewing", {"mm": str})
+            .get_template("panel.html.j2")
+            .module
+        )
         server.scene.configure_default_lights(cast_shadow=False)
 
     def show_cell(self, cell: Cell, is_movable: bool = False) -> int:
@@ -54,7 +71,7 @@ class CellScene:
 
         Args:
             cell: the cell.
-            is_movable: whether boxes and tracker can be dragged.
+            is_movable: whether floor, boxes, tracker, and camera or board can be dragged.
 
         Returns:
             The number of calls so far.
@@ -76,6 +93,7 @@ class CellScene:
             view.fov = FIELD
             sight = None if camera is None else sight_of(camera)
             self._scene = SessionScene(self._server.scene, arm, _body(cell, arm), sight, is_movable)
+            self._cell = cell
             self._reach, self._rows = arm.robot.reach, None
             self._turn += 1
             self._before = self._places() if is_movable else None
@@ -84,7 +102,49 @@ class CellScene:
             else:
                 self._scene.show_robot(planned.state)
         self._server.flush()
+        self.show_errors(cell)
         return self._turn
+
+    def show_errors(self, cell: Cell | None) -> None:
+        """Show the errors that the model in use predicts, or the newest model, if a person switched them on.
+
+        Args:
+            cell: the cell; None before there is one.
+        """
+        self._legend.visible = bool(self._errors.value)
+        if self._errors.value and cell is not None:
+            self._legend.content = str(self._text.legend("", 0, RAMP, "The errors are being predicted."))
+            try:
+                found, note = self._predicted_errors(cell), ""
+            except PisigmaError as problem:
+                found, note = None, str(problem)
+        else:
+            found, note = None, ""
+        with self._lock, self._server.atomic():
+            top = 0.0
+            if found is not None:
+                top, note = (
+                    round_up(float(found[1].p95.max())),
+                    f"Model {found[0]}: 95 % of the position errors.",
+                )
+            self._legend.content = str(self._text.legend("predicted error", top, RAMP, note))
+            if self._scene is not None:
+                self._scene.show_cloud(None if found is None else found[1], top)
+        self._server.flush()
+
+    def _predicted_errors(self, cell: Cell) -> tuple[str, PredictedErrors] | None:
+        """Return the name of the model and its errors; None without a model.
+
+        Raises:
+            PisigmaError: the model predicts no errors, or cannot be read.
+        """
+        models, in_use = cell.history.models(), cell.history.in_use
+        if not models:
+            raise ModelError("there is no model yet", remedy="calibrate")
+        name = models[-1].name if in_use is None else in_use.name
+        if self._predicted is None or self._predicted[0] != name:
+            self._predicted = name, predicted_errors(load_model(cell.model_folder(name)))
+        return self._predicted
 
     def dragged_values(self) -> dict[str, Any]:
         """Return the keys of `cell.yaml` that people changed by dragging, since which call of `show_cell`."""
@@ -94,11 +154,23 @@ class CellScene:
             return {"turn": 0 if before is None else self._turn, "values": moved}
 
     def _places(self) -> dict[str, str]:
-        """Return the positions of all objects that can be dragged [mm], and the yaw angles of boxes [deg]."""
+        """Return the positions of all objects that can be dragged [mm], and the angles of those that can turn [deg]."""
         places: dict[str, str] = {}
         for name, node in ({} if self._scene is None else self._scene.handles).items():
-            key, at = f"surroundings.{name}", [f"{1e3 * one:.1f}".removesuffix(".0") for one in node.position]
-            if name == "tracker":
+            key, at = (
+                f"surroundings.{name}",
+                [f"{1e3 * one + 0.0:.1f}".removesuffix(".0") for one in node.position],
+            )
+            if name == "floor_mm":
+                places[key] = at[2]
+            elif name == "view.frame":
+                T = np.eye(4)
+                T[:3, :3] = Rotation.from_quat(node.wxyz, scalar_first=True).as_matrix()
+                angles = np.rad2deg(xyzrpy_from_transform(torch.from_numpy(T))[3:].numpy())
+                places |= {f"{key}.{axis}_mm": one for axis, one in zip("xyz", at, strict=True)}
+                for axis, angle in zip(("roll", "pitch", "yaw"), angles, strict=True):
+                    places[f"{key}.{axis}_deg"] = f"{180.0 - (180.0 - round(angle, 2)) % 360.0:.2f}"
+            elif name == "tracker":
                 places |= {f"{key}.{axis}_mm": one for axis, one in zip("xyz", at, strict=True)}
             else:
                 places[f"{key}.center_mm"] = ", ".join(at)

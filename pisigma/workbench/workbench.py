@@ -40,6 +40,8 @@ STATIC = {
     "copies.js": ("text/javascript", "pisigma.reporting", "page"),
 }
 """Type, package and folder of the files of the page."""
+MODEL_STEPS = ("calibrate", "verify", "recalibrate", "use")
+"""Steps that add a model or put one into use."""
 NO_CELL = {"state": "no_cell", "reason": "the folder has no cell yet", "command": "pisigma new"}
 """Next step of a folder without a cell."""
 STATE_CHECKS = 30
@@ -224,7 +226,10 @@ class Workbench(UploadedRows):
             try:
                 if name == "new":
                     return self._create(form)
-                return STEPS[name](self, Cell.open(self.folder), form, progress)
+                found = STEPS[name](self, Cell.open(self.folder), form, progress)
+                if name in MODEL_STEPS:
+                    self._scene.show_errors(Cell.open(self.folder))
+                return found
             except PisigmaError as problem:
                 field = problem.option or str(problem.column or "")
                 return Outcome(refusal=self._uploads.without_folder(str(problem)), field=field)

@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from testing.cell_rows import day, measured
+from testing.closeness import assert_close
 from testing.models import no_type_checker
 from testing.pages import visitor
 from testing.report import HOSTILE
@@ -21,6 +22,8 @@ pytest.importorskip("viser", reason="the extra view is not installed")
 from pisigma.cli.main import app
 from pisigma.files.errors import PlanningError, system_fault
 from pisigma.lifetime.cell.layout import CELL_FILE
+from pisigma.model.folder.model_folder import load_model
+from pisigma.validation.report.error_map import map_of_workspace
 from pisigma.workbench.job import BusyError, Jobs, Outcome
 from pisigma.workbench.steps import side_by_side
 from pisigma.workbench.tabs import MAX_LINES, TABS, lines_in
@@ -116,18 +119,35 @@ def test_what_was_dragged_is_written_and_can_be_undone(browser_with_link, bench,
     assert ended(browser_with_link, bench, "cell", seen=digest, **margin).refusal
     assert cell.file.path.read_text() == text
     fields |= {"surroundings.tracker.x_mm": "3000", "surroundings.tracker.y_mm": "-10"}
+    view = {
+        "near_mm": "300",
+        "far_mm": "700",
+        "frame.x_mm": "420",
+        "frame.z_mm": "50",
+        "frame.yaw_deg": "180",
+    }
+    fields |= {f"surroundings.view.{key}": value for key, value in view.items()}
     assert ended(browser_with_link, bench, "cell", seen=digest, **fields).refusal == ""
     turn = json.loads(browser_with_link.ask("/drag", "POST", '{"on": "true"}').body)["turn"]
     handles = bench._scene._scene.handles
     handles["boxes.0"].wxyz = (np.cos(np.pi / 8), 0, 0, np.sin(np.pi / 8))
     handles["tracker"].position = (3, -0.01, 0.8)
+    handles["floor_mm"].position = (0, 0, -0.5)
+    handles["view.frame"].position = (0.42, 0.1, 0.05)
+    handles["view.frame"].wxyz = (0, np.cos(np.pi / 12), np.sin(np.pi / 12), 0)
     found = state(browser_with_link)["dragged"]
     values = {"surroundings.boxes.0.yaw_deg": "45.00", "surroundings.tracker.z_mm": "800"}
+    values |= {"surroundings.view.frame.roll_deg": "30.00"}
+    values |= {"surroundings.floor_mm": "-500", "surroundings.view.frame.y_mm": "100"}
     assert found == {"turn": turn, "values": values}
     assert ended(browser_with_link, bench, "cell", seen=seen(browser_with_link), **values).refusal == ""
     written = Cell.open(cell.folder).file.document.surroundings
     assert (written.boxes[0].center_mm, written.boxes[0].yaw_deg) == ((700, 0, 50.5), 45)
-    assert (written.boxes[0].name, written.tracker.z_mm) == (HOSTILE, 800)
+    assert (written.boxes[0].name, written.tracker.z_mm, written.floor_mm) == (HOSTILE, 800, -500)
+    T = written.view.T_cell_frame.numpy()  # a rotation by 180 deg about an axis in the x-y plane
+    assert_close(T[:3, 3], np.array([0.42, 0.1, 0.05]), atol=1e-9)
+    assert_close(T[:3, 0], np.array([np.cos(np.pi / 6), np.sin(np.pi / 6), 0]), atol=1e-9)
+    assert_close(T[:3, 2], np.array([0.0, 0, -1]), atol=1e-9)
     assert HOSTILE not in browser_with_link.ask("/tab/cell").body.decode()
     for _ in range(2):
         last = seen(browser_with_link)
@@ -285,3 +305,12 @@ def test_results_are_those_of_the_commands(tmp_path):
                 for text in (verdict.accuracy, verdict.trust, *found.text.warnings):
                     assert " ".join(text.split()) in printed, step
                 assert bool(found.refusal) == (result.exit_code != 0), (step, found.refusal)
+            bench._scene._errors.value = True
+            bench._scene.show_errors(made)
+            name, shown = bench._scene._predicted
+            assert name in bench._scene._legend.content
+            model = load_model(made.model_folder(name))
+            # 95 % quantile over the standard deviation of the length: 1.61 for a round, 1.96 for a flat distribution
+            spread = next(one for one in map_of_workspace(model).layers if one.key == "predicted").values
+            ratio = 1e3 * shown.p95.numpy() / spread
+            assert 1.5 < ratio.min() < ratio.max() < 2.1

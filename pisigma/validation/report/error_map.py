@@ -100,13 +100,7 @@ def map_of_rows(model: CalibratedModel, rows: JudgedRows) -> ErrorMap:
 
 def map_of_workspace(model: CalibratedModel) -> ErrorMap:
     """Return a map of the workspace without measurements: stored joint values, and random ones in their ranges."""
-    q = model.starts
-    more = max(SAMPLES - len(q), 0) if len(q) else 0
-    if more:
-        low, high = q.amin(0), q.amax(0)
-        generator = torch.Generator().manual_seed(0)
-        uniform = torch.rand(more, q.shape[1], generator=generator, dtype=torch.float64)
-        q = torch.cat([q, low + uniform * (high - low)])
+    q, more = samples_of_workspace(model)
     frame, target = (next(iter(names), "") for names in (model.bases, model.tools))
     samples = Measurements(q=q, frame=(frame,) * len(q), target=(target,) * len(q), source=model.name)
     moved = model.forward(q)[:, :3, 3] - forward_kinematics(model.robot, q)[:, :3, 3]
@@ -115,6 +109,18 @@ def map_of_workspace(model: CalibratedModel) -> ErrorMap:
     )
     number = torch.zeros(len(q), dtype=torch.int64)
     return _map(model, samples, layers, number, (0, model.name, "", more))
+
+
+def samples_of_workspace(model: CalibratedModel) -> tuple[Float64[Tensor, "samples dof"], int]:
+    """Return joint values that the model keeps and random ones in their ranges [rad or m], and how many are random."""
+    q = model.starts
+    more = max(SAMPLES - len(q), 0) if len(q) else 0
+    if more:
+        low, high = q.amin(0), q.amax(0)
+        generator = torch.Generator().manual_seed(0)
+        uniform = torch.rand(more, q.shape[1], generator=generator, dtype=torch.float64)
+        q = torch.cat([q, low + uniform * (high - low)])
+    return q, more
 
 
 def _layer(key: Quantity, values: Float64[Tensor, " points"] | None, unit: str = "mm") -> Layer | None:

@@ -29,6 +29,7 @@ from pisigma.workbench.viewing.colors import (
     error_colors,
 )
 from pisigma.workbench.viewing.surface import Surface, revolve, rotation_to
+from pisigma.workflow.predicted_errors import PredictedErrors
 
 if TYPE_CHECKING:  # names in full, which type checkers at run time find without these imports
     import viser
@@ -43,6 +44,8 @@ SHEET, PRINT = (245, 245, 245), (20, 20, 20)
 """Colours of a board's sheet and corners."""
 CORNER_DOT = 0.25
 """Diameter of a corner's dot, as a share of the distance of two corners."""
+CLOUD_DOT = 0.6
+"""Diameter of a predicted error's dot, as a share of that of a row's."""
 MAX_LABELS, MAX_ARROWS = 50, 1000
 """Wrong rows that are labelled with their line, and errors that are drawn as arrows; more are drawn as lines."""
 FLOOR, TRACKER_HEAD, CONE, BEAM, HANDLE = 5.0, 0.05, 0.2, 0.003, 0.3
@@ -54,7 +57,7 @@ class SessionScene:
     """Scene of the robot and the rows; every call replaces earlier drawings.
 
     Attributes:
-        handles: nodes of boxes and tracker by their keys in the surroundings.
+        handles: nodes of floor, boxes, tracker and camera or board by their keys in the surroundings.
     """
 
     def __init__(
@@ -72,7 +75,7 @@ class SessionScene:
             arm: the robot in its surroundings.
             body: appearance of the robot.
             sight: camera and board; None without a camera.
-            is_movable: whether boxes and tracker can be dragged.
+            is_movable: whether floor, boxes, tracker, and camera or board can be dragged.
         """
         self._sight = sight
         self._scene, self._arm, self._robot, self._body = scene, arm, arm.robot, body
@@ -148,6 +151,18 @@ class SessionScene:
             self._label(f"/rows/alarm_{row}", f"line {rows.line[row]}", position[row])
         self._arrows(position, rows, colors, magnification)
         return position
+
+    def show_cloud(self, errors: PredictedErrors | None, top: float) -> None:
+        """Draw predicted errors as one cloud of points.
+
+        Args:
+            errors: the errors; None for none.
+            top: error at the end of the colour scale [m].
+        """
+        self._begin("/predicted")
+        if errors is not None:
+            colors = error_colors(errors.p95.numpy(), top)
+            self._dots("/predicted/errors", errors.position.numpy(), colors, CLOUD_DOT)
 
     def add_rows(self, q: Float64[np.ndarray, "rows dof"]) -> None:
         """Draw new rows in grey at the tool of the nominal robot, until all rows are drawn again.
@@ -237,37 +252,41 @@ def draw_board(scene: "viser.SceneApi", name: str, board: Board) -> None:
 def draw_surroundings(
     scene: "viser.SceneApi", surroundings: Surroundings, reach: float, is_movable: bool = False
 ) -> dict[str, "viser.SceneNodeHandle"]:
-    """Draw floor, boxes and tracker; return the nodes of boxes and tracker by their keys in the surroundings.
+    """Draw the surroundings; return the nodes that can be dragged by their keys in the surroundings.
 
     Args:
         scene: scene to draw in, in the robot's base frame.
         surroundings: surroundings to draw; without a floor the grid is at the height of the robot's base.
         reach: reach of the robot [m].
-        is_movable: whether boxes (with their yaw) and tracker can be dragged.
+        is_movable: whether floor (height), boxes (with their yaw), tracker, and camera or board can be dragged.
     """
-    edge, fixed = FLOOR * reach, (0.0, 0.0)
+    edge, fixed, free = FLOOR * reach, (0.0, 0.0), (-1000.0, 1000.0)
     height = 0.0 if surroundings.floor_mm is None else surroundings.floor_mm / 1e3
 
-    def node(name: str, position: Any, yaw: float | None = None) -> Any:
-        half = (yaw or 0.0) / 2
-        at: dict[str, Any] = {"position": position, "wxyz": (np.cos(half), 0.0, 0.0, np.sin(half))}
+    def node(
+        name: str, position: Any, wxyz: Any = (1.0, 0.0, 0.0, 0.0), turns: str = "", moves: str = "xyz"
+    ) -> Any:
+        at: dict[str, Any] = {"position": position, "wxyz": wxyz}
         if not is_movable:
             return scene.add_frame(name, show_axes=False, **at)
-        limits = (fixed, fixed, (-7.0, 7.0))
+        x, y, z = (free if axis in turns else fixed for axis in "xyz")
+        along_x, along_y, along_z = (free if axis in moves else fixed for axis in "xyz")
         return scene.add_transform_controls(
             name,
             HANDLE * reach,
-            disable_rotations=yaw is None,
-            rotation_limits=limits,
+            disable_rotations=not turns,
+            active_axes=("x" in moves, "y" in moves, "z" in moves),
+            translation_limits=(along_x, along_y, along_z),
+            rotation_limits=(x, y, z),
             depth_test=False,
             **at,
         )
 
-    scene.add_grid("/floor", edge, edge, cell_size=0.25, section_size=1.0, position=(0.0, 0.0, height))
-    handles = {}
+    handles = {"floor_mm": node("/floor", (0.0, 0.0, height), moves="z")}
+    scene.add_grid("/floor/grid", edge, edge, cell_size=0.25, section_size=1.0)
     for number, box in enumerate(surroundings.boxes):
         name, edges = f"/boxes/{number}", 2 * box.half_size.numpy()
-        handles[f"boxes.{number}"] = node(name, box.center.numpy(), np.deg2rad(box.yaw_deg))
+        handles[f"boxes.{number}"] = node(name, box.center.numpy(), _turned(np.deg2rad(box.yaw_deg)), "z")
         scene.add_box(f"{name}/box", FORBIDDEN, edges, opacity=0.35, cast_shadow=False)
         scene.add_label(f"{name}/label", box.name, position=(0, 0, edges[2] / 2), anchor="bottom-center")
     if surroundings.tracker is not None:
@@ -277,7 +296,18 @@ def draw_surroundings(
         if (stand := float(head[2] - height)) > 0:
             scene.add_cylinder("/tracker/stand", size / 3, stand, TRACKER, position=(0, 0, -stand / 2))
         scene.add_label("/tracker/label", "tracker", position=(0, 0, 1.2 * size), anchor="bottom-center")
+    if surroundings.view is not None and surroundings.view.T_cell_frame is not None:
+        T = surroundings.view.T_cell_frame.numpy()
+        handles["view.frame"] = node("/view", T[:3, 3], _quaternion(T), "xyz")
+        axes = AXES * reach / 2
+        scene.add_frame("/view/axes", axes_length=axes, axes_radius=axes / 20)
+        scene.add_label("/view/label", "board, or fixed camera", anchor="bottom-center")
     return handles
+
+
+def _turned(yaw: float) -> tuple[float, float, float, float]:
+    """Return a rotation about z [rad] as a quaternion, w first."""
+    return float(np.cos(yaw / 2)), 0.0, 0.0, float(np.sin(yaw / 2))
 
 
 def draw_sight(
