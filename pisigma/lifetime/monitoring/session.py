@@ -20,6 +20,7 @@ from pisigma.lifetime.recalibration.movement import HistoryMovement, Movement, m
 from pisigma.lifetime.recalibration.recalibration_problem import (
     FrameKey,
     RecalibrationProblem,
+    known_frames,
     movement_hypotheses,
     recalibration_problem,
 )
@@ -186,9 +187,7 @@ def _with_relocated(
     model: CalibratedModel, posterior: ModelPosterior, rows: Measurements, still: "_Solved"
 ) -> tuple["_Solved", dict[FrameKey, float]]:
     """Find which bases and tools were moved: the base, the tool, or both where neither alone explains the rows."""
-    geometry = posterior.geometry
-    bases = frozenset(("base", name) for name in rows.frame if name in geometry.bases)
-    tools = frozenset(("tool", name) for name in rows.target if name in geometry.tools)
+    bases, tools = known_frames(posterior, rows)
     tried: dict[frozenset[FrameKey], _Solved] = {frozenset(): still}
     for owners in (bases, tools, bases | tools):
         if not owners or (owners == bases | tools and any(one.has_usual_noise for one in tried.values())):

@@ -48,6 +48,15 @@ def frame_keys(rows: Measurements, kinds: Collection[str]) -> frozenset[FrameKey
     return frozenset((kind, name) for kind in kinds for name in names[kind])
 
 
+def known_frames(
+    posterior: ModelPosterior, rows: Measurements
+) -> tuple[frozenset[FrameKey], frozenset[FrameKey]]:
+    """Return the keys of the bases and of the tools of rows that a model has, which may have been moved since."""
+    known = {("base", name) for name in posterior.geometry.bases}
+    known |= {("tool", name) for name in posterior.geometry.tools}
+    return frame_keys(rows, ("base",)) & known, frame_keys(rows, ("tool",)) & known
+
+
 @dataclass(frozen=True, eq=False)
 class RecalibrationProblem:
     """New rows, the unknowns, and their prior.

@@ -7,9 +7,9 @@ from pisigma.calibration.geometric.initial_guess.initial_guess import randomly_c
 from pisigma.estimation.drift import LOG_PRIOR_PENALTY
 from pisigma.files.errors import IdentificationError
 from pisigma.lifetime.recalibration.adaptation import adapt
-from pisigma.lifetime.recalibration.recalibration_problem import FrameKey, recalibration_problem
+from pisigma.lifetime.recalibration.recalibration_problem import FrameKey, known_frames, recalibration_problem
 from pisigma.measurement.dataset import Measurements
-from pisigma.model.calibrated_model import CalibratedModel, Frames
+from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.model_posterior import ModelPosterior
 
 MAX_ROWS = 30
@@ -39,10 +39,7 @@ def relocated_frames(
     """
     if rows.rows > MAX_ROWS and rows.pair is None:
         rows = rows.select(randomly_chosen_rows(rows.rows, MAX_ROWS).sort().values)
-    bases, tools = (
-        frozenset((kind, name) for name in dict.fromkeys(names) if name in frames)
-        for kind, names, frames in _kinds(rows, posterior)
-    )
+    bases, tools = known_frames(posterior, rows)
 
     def evidence(relocated: Set[FrameKey]) -> float:
         problem = recalibration_problem(model, posterior, rows, relocated)
@@ -55,10 +52,3 @@ def relocated_frames(
     with suppress(IdentificationError):  # too few rows to determine these
         tried |= {owners: evidence(owners) for owners in (bases, tools, bases | tools) if owners}
     return max(tried, key=lambda owners: tried[owners])
-
-
-def _kinds(
-    rows: Measurements, posterior: ModelPosterior
-) -> tuple[tuple[str, tuple[str, ...], Frames], tuple[str, tuple[str, ...], Frames]]:
-    geometry = posterior.geometry
-    return ("base", rows.frame, geometry.bases), ("tool", rows.target, geometry.tools)

@@ -331,7 +331,7 @@ def _engine(settings: FleetSettings, items: int) -> Iterator[AbstractEngine]:
     if settings.engine == "processes" or not items:
         yield ProcessEngine(max(1, min(jobs, items)))
         return
-    from pisigma.files.engines.ray_cluster import RayEngine
+    from pisigma.files.engines.processes import RayEngine
 
     engine = RayEngine(settings.jobs, settings.address)
     try:

@@ -5,8 +5,7 @@ import os
 import pytest
 from testing.engine_work import environment, square
 
-from pisigma.files.engines.processes import ProcessEngine
-from pisigma.files.engines.ray_cluster import RayEngine
+from pisigma.files.engines.processes import ProcessEngine, RayEngine
 
 
 @pytest.fixture(scope="module")
