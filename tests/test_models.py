@@ -59,7 +59,7 @@ def test_a_model_comes_from_the_shipped_recipe(folder, repository):
 
 
 @each
-def test_energies_are_there_for_every_corrected_joint(folder):
+def test_every_corrected_joint_has_energies(folder):
     head, *rows = csv.reader((folder / "energy.csv").read_text().splitlines())
     joints = [joint["name"] for joint in load_model(folder).metrics["joints"]]
     assert head == ["epoch", *(f"energy_{joint}" for joint in joints)]

@@ -72,7 +72,7 @@ def imported(path: Path) -> frozenset[str]:
     return frozenset(found)
 
 
-def test_there_are_these_rooms_and_nothing_beside_them():
+def test_the_package_contains_only_the_listed_packages():
     tops = {path.relative_to(PACKAGE).parts[0].removesuffix(".py") for path in MODULES}
     assert tops == {"__init__", "__main__", *ROOMS}
 
@@ -118,7 +118,7 @@ def test_lightning_is_imported_in_training_only():
     assert users <= {"network"}
 
 
-def test_files_and_folders_stay_small():
+def test_files_and_folders_are_small():
     lines = {name_of(path): path.read_text(encoding="utf-8").count("\n") for path in MODULES}
     assert not {name for name, count in lines.items() if count > MAX_LINES}
     folders = Counter(name_of(path.parent) for path in MODULES)
@@ -185,7 +185,7 @@ def test_public_names_are_there_and_documented(name):
     assert name in dir(pisigma)
 
 
-def test_type_checkers_know_the_public_names():
+def test_type_checkers_find_the_public_names():
     stub = ast.parse((PACKAGE / "__init__.pyi").read_text(encoding="utf-8"))
     named = [alias.asname for node in stub.body if isinstance(node, ast.ImportFrom) for alias in node.names]
     assert sorted(map(str, named)) == pisigma.__all__
@@ -259,7 +259,7 @@ def wheel(repository, tmp_path_factory) -> Path:
     return found
 
 
-def test_the_wheel_holds_the_package_and_nothing_else(wheel):
+def test_the_wheel_contains_only_the_package(wheel):
     names = zipfile.ZipFile(wheel).namelist()
     assert {name.split("/")[0] for name in names} == {"pisigma", f"pisigma-{pisigma.__version__}.dist-info"}
     shipped = {name for name in names if name.startswith("pisigma/")}

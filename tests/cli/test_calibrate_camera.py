@@ -67,7 +67,7 @@ def test_from_pixels_of_corners_to_a_model(calibrated):
     assert_close(aligned_error(true, estimated), 0.0, atol=1e-4)
 
 
-def test_new_corners_judge_a_model_and_are_added_to_it(run, refuses, files, calibrated):
+def test_new_corners_evaluate_and_update_a_model(run, refuses, files, calibrated):
     (files / "new.csv").write_text("\n".join(corner_lines(camera_cell(20, 1).images)) + "\n")
     judged = run("evaluate", calibrated[0], files / "new.csv", *cameras(files), "--json")
     assert judged.exit_code == 0, judged.output
@@ -79,7 +79,7 @@ def test_new_corners_judge_a_model_and_are_added_to_it(run, refuses, files, cali
     refuses("verify", calibrated[0], files / "new.csv", error=MeasurementError, file="new.csv", line=1)
 
 
-def test_corners_say_whether_a_model_still_holds(run, files, calibrated):
+def test_corners_show_whether_a_model_still_holds(run, files, calibrated):
     """The zero of joint 3 has moved by 0.05 deg, 0.3 mm at the camera: less than the noise of the images' poses."""
     cell = camera_cell(20, 1)
     q = cell.images.q - torch.tensor([0.0, 0.0, np.deg2rad(0.05), 0.0, 0.0, 0.0])
@@ -108,7 +108,7 @@ def test_corners_say_whether_a_model_still_holds(run, files, calibrated):
     assert any("--camera" in sentence for sentence in result["says"])
 
 
-def test_corners_stand_beside_two_models_and_in_a_report(run, refuses, files, calibrated):
+def test_corners_are_compared_for_two_models_and_reported(run, refuses, files, calibrated):
     rows = files / "corners.csv"
     compared = run("compare", calibrated[0], "nominal", "--rows", rows, *cameras(files), "--json")
     assert compared.exit_code == 0, compared.output

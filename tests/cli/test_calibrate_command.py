@@ -111,7 +111,7 @@ def test_the_folder_is_whole_and_loads(calibrated, poses):
     assert_close(again[reached], T[reached], atol=1e-9)
 
 
-def test_the_card_says_everything(calibrated):
+def test_the_card_states_all_results(calibrated):
     folder, printed = calibrated
     card = (folder / "README.md").read_text()
     assert card.startswith("# arm\n\nGeometric calibration of robot kiro4 (")

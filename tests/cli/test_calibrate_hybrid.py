@@ -180,7 +180,7 @@ def test_the_geometric_model_is_there_still(run, refuses, data, calibrated, tmp_
     )
 
 
-def test_nothing_to_learn_is_said_and_the_geometry_stands(run, tmp_path):
+def test_nothing_to_learn_is_reported_and_the_geometry_is_kept(run, tmp_path):
     with no_type_checker():
         rows = simulate("kiro4", rows=60, noise=5e-5).measurements
     path = write(tmp_path / "rows.csv", rows)

@@ -75,7 +75,7 @@ def test_jigs_held_out_in_turn(run, touches, tmp_path):
     assert "distance" not in result.stdout
 
 
-def test_placements_that_are_not_there_are_refused_in_one_line(run, shared_data, tmp_path):
+def test_missing_placements_are_refused_in_one_line(run, shared_data, tmp_path):
     data = shared_data / "ur5" / "grid.csv"
     result = run(
         "calibrate", "ur5", data, "--out", tmp_path / "arm", "--model", "geometric", "--split", "placement"

@@ -85,7 +85,7 @@ def test_in_calibrated_and_out_again(run, urdf, tip, measured, tmp_path):
     assert torch.isfinite(T).all()
 
 
-def test_a_tool_that_is_not_named(refuses, urdf, measured, tmp_path):
+def test_a_tool_without_a_name(refuses, urdf, measured, tmp_path):
     said = refuses("calibrate", urdf, measured[0], "--out", tmp_path / "arm", error=RobotError)
     assert "camera, tool0" in said
     assert not (tmp_path / "arm").exists()

@@ -161,7 +161,7 @@ def test_status_shows_sessions_and_the_model_in_use(run, used):
     assert status["next"]["state"] == "up_to_date"  # held-out rows confirm the limit
 
 
-def test_an_option_wins_over_the_file_and_says_so(run, used):
+def test_an_option_overrides_the_file_with_a_message(run, used):
     cell, _ = used
     path = cell / "cell.yaml"
     text = path.read_text()
@@ -193,7 +193,7 @@ def test_an_option_wins_over_the_file_and_says_so(run, used):
         ("import", "rows.csv", "--out", "rows2.csv", "--cell", "{cell}"),
     ],
 )
-def test_what_a_cell_knows_is_not_stated_again_and_what_is_missing_is(run, cell, arguments):
+def test_only_missing_settings_of_a_cell_are_stated(run, cell, arguments):
     result = run(*(str(one).format(cell=cell) for one in arguments))
     assert result.exit_code == 2
     assert result.stdout == ""

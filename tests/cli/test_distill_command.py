@@ -53,7 +53,7 @@ def test_the_model_can_be_used(run, distilled):
     assert done.exit_code == 0, done.output
 
 
-def test_the_report_says_what_was_lost(distilled):
+def test_the_report_states_what_was_lost(distilled):
     report, out = distilled
     held_out = report["held_out"]
     assert held_out["full"]["max_mm"] < 1e-6

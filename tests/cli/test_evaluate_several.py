@@ -54,7 +54,7 @@ def several(run, folder):
     return json.loads(result.stdout)
 
 
-def test_models_stand_in_the_order_in_which_they_were_given(several, folder):
+def test_models_are_listed_in_the_given_order(several, folder):
     assert [model["name"] for model in several["models"]] == [
         "nominal",
         "geometric",
@@ -126,7 +126,7 @@ def test_equal_arguments_give_equal_figures_and_the_seed_gives_others(run, folde
     assert intervals("--set", "seed=1") != intervals()
 
 
-def test_a_single_model_stands_beside_nominal(run, folder):
+def test_a_single_model_is_compared_with_nominal(run, folder):
     printed = json.loads(run("evaluate", folder / "hybrid", folder / "trained.csv", "--json").stdout)
     assert printed["model"] == str(folder / "hybrid")
     assert printed["nominal"]["rms_mm"] == printed["models"][0]["rms_mm"] > printed["corrected"]["rms_mm"]
@@ -197,7 +197,7 @@ def test_refusals(refuses, run, folder):
     assert "measurements" in alone.stderr
 
 
-def test_models_of_one_name_are_told_apart(run, folder, tmp_path):
+def test_models_with_the_same_name_are_distinguished(run, folder, tmp_path):
     (tmp_path / "hybrid").symlink_to(folder / "geometric_only")
     (tmp_path / "other").mkdir()
     save_model(load_model(folder / "hybrid"), tmp_path / "other")

@@ -170,7 +170,7 @@ def test_offsets(run, geometric, tmp_path):
 @pytest.mark.parametrize(
     ("form", "suffix"), [("urdf", "urdf"), ("dh", "csv"), ("dh", "yaml"), ("offsets", "csv")]
 )
-def test_a_learned_correction_is_said_to_be_missing(run, models, tmp_path, form, suffix):
+def test_a_missing_learned_correction_is_stated(run, models, tmp_path, form, suffix):
     out = tmp_path / f"out.{suffix}"
     result = run("export", models / "kiro3", "--format", form, "--out", out)
     assert result.exit_code == 0

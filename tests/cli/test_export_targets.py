@@ -149,7 +149,7 @@ def test_a_table_of_a_robot_with_a_sliding_joint(run, models, poses, tmp_path):
     assert "line,status,branch,q1_deg,q2_deg,q3_mm,q4_deg,x_mm," in out.read_text()
 
 
-def test_a_branch_that_is_asked_for(run, models, poses, tmp_path):
+def test_the_requested_branch_is_used(run, models, poses, tmp_path):
     path, out = poses(good_poses("kiro4", 1)), tmp_path / "targets.csv"
     every = json.loads(
         run("ik", models / "kiro4", "--pose", *good_poses("kiro4", 1)[0], "--all-branches", "--json").stdout

@@ -33,7 +33,7 @@ def test_the_papers_protocol(run, repository, tmp_path, name):
     assert pisigma.load(tmp_path / "model").model.provenance.recipe == name
 
 
-def test_sets_are_told_apart_in_the_table(run, repository, tmp_path):
+def test_sets_are_distinguished_in_the_table(run, repository, tmp_path):
     recipe = repository / "training" / "rb5_redundancy.yaml"
     text = run("train", recipe, "--out", tmp_path / "model", "--verbose").stdout
     assert_screen(text, "redundancy and convergence", verbose=True)

@@ -24,7 +24,7 @@ def test_without_a_terminal_it_shows_the_table_and_ends_with_2(refuses, out):
 
 
 @pytest.mark.parametrize(("answer", "status"), [(True, 0), (False, 2)])
-def test_on_a_terminal_it_asks(run, out, monkeypatch, answer, status):
+def test_the_import_asks_on_a_terminal(run, out, monkeypatch, answer, status):
     monkeypatch.setattr("pisigma.cli.import_._is_asked", lambda: True)
     monkeypatch.setattr("typer.confirm", lambda question: answer)
     assert run("import", EXPORTS / "kuka.csv", "--out", out).exit_code == status

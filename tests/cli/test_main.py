@@ -158,7 +158,7 @@ def test_nobody_reads_what_is_printed():
     assert (done.returncode, done.stderr) == (141, "")
 
 
-def test_a_terminal_that_knows_few_letters():
+def test_a_terminal_with_a_small_character_set():
     done = subprocess.run(
         [sys.executable, "-c", START, "robots"],
         capture_output=True,

@@ -33,7 +33,7 @@ def test_json_has_the_figures_of_the_plan(folder):
     assert printed["weak"]
 
 
-def test_people_read_a_table_and_what_stays_uncertain(run, folder):
+def test_the_terminal_shows_a_table_and_the_remaining_uncertainty(run, folder):
     result = run("plan", "fanuc_r2000", *SMALL, "--limit-mm", "0.001", "--out", folder / "again.csv")
     assert result.exit_code == 0
     assert_screen(
@@ -100,5 +100,5 @@ def test_nothing_is_written_over_what_is_read(refuses, folder):
     )
 
 
-def test_models_that_do_not_say_how_uncertain_they_are_cannot_be_planned_for(refuses, models, tmp_path):
+def test_models_without_uncertainty_cannot_be_planned_for(refuses, models, tmp_path):
     refuses("plan", models / "kiro3", "--out", tmp_path / "poses.csv", error=PlanningError)

@@ -27,7 +27,7 @@ def arm(tmp_path_factory):
     return folder
 
 
-def test_a_report_is_written_and_its_verdict_said(run, arm, tmp_path):
+def test_a_report_is_written_and_its_verdict_printed(run, arm, tmp_path):
     result = run("report", arm / "arm", arm / "rows.csv", "--out", tmp_path / "page.html")
     assert result.exit_code == 0
     assert_screen(result.stdout, "50 rows")

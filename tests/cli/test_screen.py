@@ -106,7 +106,7 @@ def test_without_a_terminal_each_step_is_a_line_with_the_time_left(capsys, monke
     assert [line.split()[-3:-1] for line in lines] == [[str(left), "s"] for left in (40, 30, 20, 10)]
 
 
-def test_a_quick_command_says_nothing_of_its_progress(capsys, monkeypatch):
+def test_a_quick_command_prints_no_progress(capsys, monkeypatch):
     monkeypatch.setattr(progress, "QUIET_S", 60.0)
     with progress_of("evaluate") as tell:
         tell("models")

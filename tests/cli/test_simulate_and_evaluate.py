@@ -148,7 +148,7 @@ def test_joints_of_another_robot_are_refused(refuses, models, trained, held_out)
     )
 
 
-def test_joints_alone_are_refused(refuses, trained, held_out, tmp_path):
+def test_rows_with_joint_values_only_are_refused(refuses, trained, held_out, tmp_path):
     joints = without(held_out, tmp_path / "joints.csv", "qx", "qy", "qz", "qw", "x_mm", "y_mm", "z_mm")
     refuses(
         "evaluate",

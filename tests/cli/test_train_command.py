@@ -88,7 +88,7 @@ def test_recipes_at_fault(refuses, tmp_path, old, new, error, word):
     assert not (tmp_path / "model").exists()
 
 
-def test_data_where_none_is_wanted_and_none_where_it_is(refuses, trained, tmp_path):
+def test_unexpected_and_missing_data_are_refused(refuses, trained, tmp_path):
     folder, _, _ = trained
     unused = ("train", folder / "kiro3.yaml", "--data", "x.csv", "--out", tmp_path / "model")
     refuses(*unused, error=RecipeError, option="--data")

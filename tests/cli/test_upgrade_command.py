@@ -9,7 +9,7 @@ from pisigma.lifetime.cell.history import HISTORY, SCHEMA_VERSION, History
 from pisigma.model.folder.model_document import FORMAT
 
 
-def test_what_is_new_already_is_said(run, models):
+def test_a_folder_of_the_current_version_is_reported(run, models):
     result = run("upgrade", models / "kiro3", "--json")
     assert json.loads(result.stdout) == {
         "model": str(models / "kiro3"),

@@ -18,7 +18,7 @@ def test_a_file_is_replaced_completely(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_nothing_is_left_behind_if_the_rename_fails(tmp_path, monkeypatch):
+def test_no_files_remain_if_the_rename_fails(tmp_path, monkeypatch):
     def fail(*_):
         raise OSError(28, "No space left on device")
 
@@ -71,7 +71,7 @@ def test_a_pipe_is_not_replaced(tmp_path):
         write_atomically(tmp_path / "pipe.csv", "text")
 
 
-def test_a_linked_file_stays_linked_and_scratch_of_killed_processes_is_removed(tmp_path):
+def test_a_linked_file_remains_linked_and_files_of_killed_processes_are_removed(tmp_path):
     (tmp_path / "real.csv").write_text("old")
     (tmp_path / "link.csv").symlink_to(tmp_path / "real.csv")
     (tmp_path / ".real.csv.k2j_9xyz.part").write_text("half")

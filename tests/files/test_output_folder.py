@@ -30,7 +30,7 @@ def test_a_folder_and_its_parents_are_created(tmp_path):
     assert load_model(tmp_path / "a" / "b" / "model").robot.name == "kiro3"
 
 
-def test_a_model_is_replaced_and_nothing_is_left_behind(tmp_path):
+def test_a_model_is_replaced_without_leftover_files(tmp_path):
     write(tmp_path / "model")
     (tmp_path / "model" / "residuals.png").write_text("old")
     write(tmp_path / "model", "kiro4")
@@ -45,7 +45,7 @@ def test_an_empty_folder_is_used(tmp_path):
     assert load_model(tmp_path / "model").robot.name == "kiro3"
 
 
-def test_a_linked_folder_stays_linked(tmp_path):
+def test_a_linked_folder_remains_linked(tmp_path):
     (tmp_path / "real").mkdir()
     (tmp_path / "link").symlink_to(tmp_path / "real")
     write(tmp_path / "link")

@@ -57,7 +57,7 @@ def test_one_value_is_changed(keys, value, changed):
     assert with_value(found, stated, value, "cell.yaml") == found
 
 
-def test_what_cannot_be_changed_alone_is_refused():
+def test_aliased_values_cannot_be_changed_separately():
     text = "a: &same {b: 1}\nc: *same\n"
     with refused(PisigmaError, file="cell.yaml", column="a.b"):
         with_value(text, ["a", "b"], {"x": 2}, "cell.yaml")

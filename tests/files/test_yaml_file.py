@@ -49,7 +49,7 @@ def test_integers_are_decimal():
 
 
 @pytest.mark.parametrize("text", ["no", "2024-01-31", "1:30", "on", "'7'", "a b", "1_000"])
-def test_texts_stay_texts(text):
+def test_texts_remain_texts(text):
     assert read(f"name: {text}").name == text.strip("'")
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from testing.aged import model_before
+from testing.aged import original_model
 from testing.measured_plans import measured_plan
 from testing.models import no_type_checker
 
@@ -53,27 +53,27 @@ def _calibrate(rows: Measurements, folder: Path) -> Answer:
 
 
 def _recalibrate(rows: Measurements, folder: Path) -> Answer:
-    done = recalibrate(model_before(), rows)
+    done = recalibrate(original_model(), rows)
     return _of(done.trusted, [one.sentence for one in done.diagnostics])
 
 
 def _monitor(rows: Measurements, folder: Path) -> Answer:
-    done = monitor(model_before(), [rows])
+    done = monitor(original_model(), [rows])
     return _of(not done.untrusted, [one.sentence for one in done.untrusted])
 
 
 def _compare(rows: Measurements, folder: Path) -> Answer:
-    done = compare(model_before(), "nominal", rows)
+    done = compare(original_model(), "nominal", rows)
     return _of(not done.diagnostics, [one.sentence for one in done.diagnostics])
 
 
 def _verify(rows: Measurements, folder: Path) -> Answer:
-    done = verify(model_before(), rows)
+    done = verify(original_model(), rows)
     return _of(done.verdict in ("better", "undecided", "not_better"), done.sentence)
 
 
 def _evaluate(rows: Measurements, folder: Path) -> Answer:
-    done = evaluate(model_before(), rows)
+    done = evaluate(original_model(), rows)
     return _of(done.accepted, [one.sentence for one in done.diagnostics])
 
 
@@ -114,7 +114,7 @@ def model_folder(folder: Path) -> Path:
     path = folder / "model"
     if not path.exists():
         path.mkdir()
-        save_model(model_before(), path)
+        save_model(original_model(), path)
     return path
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from click.testing import CliRunner
 from gate.option_inputs import REPOSITORY, prepare
-from testing.aged import model_before, rows_later
+from testing.aged import original_model, rows_after_change
 from testing.models import no_type_checker
 from testing.simulated_arm import simulate
 from typer.main import get_command
@@ -88,14 +88,14 @@ def fleet(path: Path, small: Path) -> None:
 
 
 def later(seed: int, moved: tuple[float, ...] = (0.0,) * 6) -> Maker:
-    """Write rows of the RB5 of `model_before`."""
-    return lambda path, small: rows_later(30, seed, moved).write_csv(path, model_before().robot)
+    """Write rows of the RB5 of `original_model`."""
+    return lambda path, small: rows_after_change(30, seed, moved).write_csv(path, original_model().robot)
 
 
 def before(path: Path, small: Path) -> None:
     """Write the model of the RB5."""
     path.mkdir(parents=True)
-    save_model(model_before(), path)
+    save_model(original_model(), path)
 
 
 def renewed(path: Path, small: Path) -> None:

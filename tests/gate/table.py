@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
-from testing.aged import model_before, rows_later
+from testing.aged import original_model, rows_after_change
 from testing.simulated_arm import dh_errors
 
 from pisigma.measurement.dataset import Measurements
@@ -40,7 +40,7 @@ class Mistake:
 
 def filtered_rows(seed: int = 2) -> Measurements:
     """Return rows without a mistake, of the model's robot."""
-    return replace(rows_later(ROWS, seed), line=tuple(range(2, ROWS + 2)), source="rows.csv")
+    return replace(rows_after_change(ROWS, seed), line=tuple(range(2, ROWS + 2)), source="rows.csv")
 
 
 def joints(
@@ -98,7 +98,7 @@ def of_other_arm(dh: Callable[[np.ndarray], np.ndarray]) -> Change:
     """Replace positions by those of an arm with another geometry, in the model's frame and with its tool."""
 
     def change(rows: Measurements) -> Measurements:
-        model = model_before()
+        model = original_model()
         assert model.hybrid is not None
         arm = replace(model.hybrid, robot=model.hybrid.robot.with_geometry(dh=dh(model.hybrid.robot.dh)))
         return replace(rows, position=poses_of_rows(replace(model, hybrid=arm), rows)[:, :3, 3].clone())

@@ -7,7 +7,7 @@ import pytest
 from gate.agreement import disagreements
 from gate.commands import COMMANDS
 from gate.table import MISTAKES, MOVES, Mistake, filtered_rows
-from testing.aged import model_before
+from testing.aged import original_model
 
 from pisigma.validation.checks import check as row_check
 from pisigma.validation.gate import check_rows
@@ -26,26 +26,28 @@ EVERYWHERE = (
 
 @pytest.mark.parametrize("mistake", MISTAKES, ids=lambda one: one.name)
 def test_the_check_notices(mistake):
-    found = check_rows(mistake.change(filtered_rows()), model_before(), may_move=row_check.MOVES).implausible
+    found = check_rows(
+        mistake.change(filtered_rows()), original_model(), may_move=row_check.MOVES
+    ).implausible
     assert found
     assert "*" in mistake.kinds or found[0].kind in mistake.kinds, found[0].sentence
 
 
 @pytest.mark.parametrize("seed", [2, 3, 4])
-def test_right_rows_are_trusted(seed):
-    assert check_rows(filtered_rows(seed), model_before()).diagnostics == ()
+def test_valid_rows_are_trusted(seed):
+    assert check_rows(filtered_rows(seed), original_model()).diagnostics == ()
 
 
 @pytest.mark.parametrize("move", MOVES, ids=lambda one: one.name)
 def test_moves_of_any_size_are_not_mistakes(move):
     rows = move.change(filtered_rows())
-    assert check_rows(rows, model_before(), may_move=row_check.MOVES).trusted
-    assert not check_rows(rows, model_before()).trusted
+    assert check_rows(rows, original_model(), may_move=row_check.MOVES).trusted
+    assert not check_rows(rows, original_model()).trusted
 
 
 def test_wrong_rows_are_named():
     (mistake,) = (one for one in MISTAKES if one.name == "tracker moved by 2 mm half-way")
-    (found,) = check_rows(mistake.change(filtered_rows()), model_before()).implausible
+    (found,) = check_rows(mistake.change(filtered_rows()), original_model()).implausible
     assert found.rows == tuple(f"rows.csv, line {line}" for line in range(10, 18))
 
 

@@ -16,7 +16,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import numpy as np
 from hostile.kills import contents, start
-from testing.aged import model_before, rows_later
+from testing.aged import original_model, rows_after_change
 
 from pisigma.lifetime.cell.layout import history_of_model
 from pisigma.model.folder.model_folder import load_model, save_model
@@ -43,13 +43,13 @@ class Chain:
         """Write the first model."""
         self.folder, self.links = folder, 1
         (folder / "link-0").mkdir()
-        save_model(model_before(), folder / "link-0")
+        save_model(original_model(), folder / "link-0")
         self._before, self._files = contents(folder), _files(folder)
 
     def start(self, number: int, monitor: bool) -> subprocess.Popen[bytes]:
         """Start to monitor the last model, or to recalibrate it, with new rows."""
         rows = self.folder / f"2026-01-{number % 28 + 1:02d}.csv"
-        rows_later(10, number + 1000).write_csv(rows, model_before().robot)
+        rows_after_change(10, number + 1000).write_csv(rows, original_model().robot)
         self._before, self._sessions = contents(self.folder), self.sessions()
         self._files = _files(self.folder)
         last = f"link-{self.links - 1}"

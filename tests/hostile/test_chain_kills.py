@@ -3,7 +3,7 @@
 from hostile.chain_kills import Chain
 
 
-def test_a_recalibration_that_is_killed_leaves_a_whole_model_or_none(tmp_path):
+def test_a_killed_recalibration_leaves_a_complete_model_or_none(tmp_path):
     chain = Chain(tmp_path)
     process = chain.start(0, monitor=False)
     chain.wait_for_writing(process)

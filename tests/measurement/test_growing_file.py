@@ -105,7 +105,7 @@ def test_a_replaced_file_gives_only_its_new_rows(file, tmp_path):
     assert growth.rows.line == (2,)
 
 
-def test_a_bad_row_is_reported_once_and_does_not_stop_the_others(file):
+def test_an_invalid_row_is_reported_once_and_does_not_affect_the_others(file):
     growing = GrowingFile(file, ROBOT)
     file.write_text(HEADER + "1,1,2,3,4,5,,,\n")
     (bad,) = growing.read().left_out

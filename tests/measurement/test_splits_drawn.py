@@ -43,7 +43,7 @@ def test_more_rows_than_there_are_are_refused(rows: int) -> None:
         draw_rows(repeats(60, 1), rows, 0)
 
 
-def test_the_held_out_rows_of_a_fold_stay() -> None:
+def test_the_held_out_rows_of_a_fold_are_kept() -> None:
     data = repeats(50, 1)
     folds = k_folds(data, 5, 0)
     fewer = with_fewer_training_rows(data, folds, 11, 0)

@@ -27,7 +27,7 @@ def test_without_network_it_is_the_robot():
     assert_close(model.correction(model.forward(q), q), 0.0)
 
 
-def test_nan_stays_in_its_row():
+def test_nan_remains_in_its_row():
     model = hand_made_model("kiro4")
     q = joints_around("kiro4", 3)
     whole = model.forward(q)
@@ -46,7 +46,7 @@ def test_a_correction_with_a_slope_above_one_yields_nan():
     assert torch.equal(rows.any(-1), rows.all(-1))
 
 
-def test_wrapped_values_stay_inside_the_limits_and_on_the_pose():
+def test_wrapped_values_are_inside_the_limits_and_reach_the_pose():
     robot = hand_made_model("kiro3").robot  # theta_4 has limits of ±360 deg, d_3 is prismatic
     q = torch.tensor([3.0, 1.0, -0.2, 0.5], dtype=torch.float64)
     near = torch.tensor([-3.0, 40.0, 9.0, -7.0], dtype=torch.float64)

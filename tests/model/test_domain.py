@@ -36,7 +36,7 @@ def test_repeats_do_not_shrink_the_domain(generator):
         assert_close(domain.radius, 0.2 * MARGIN, atol=1e-4)
 
 
-def test_one_row_makes_a_domain(generator):
+def test_one_row_defines_a_domain(generator):
     row = torch.tensor([[0.3, -0.2]], dtype=torch.float64)
     for rows in (row, row.repeat(5, 1)):
         domain = Domain.from_rows(rows, generator)

@@ -42,7 +42,7 @@ def measure(robot: Robot, q: torch.Tensor, error: torch.Tensor) -> Measurements:
     return Measurements(q=q, position=T[:, :3, 3].clone(), rotation=T[:, :3, :3].clone(), source="made up")
 
 
-def test_targets_stay_small_across_a_full_turn(generator):
+def test_targets_are_small_across_a_full_turn(generator):
     robot = Robot.load("ur10")
     q = random_joints(generator, 100)
     q = q[singularity_measure(robot, q) > 0.05]

@@ -85,7 +85,7 @@ def _named(text: str, what: str) -> set[int]:
 
 
 @pytest.mark.parametrize("key", TABLES)
-def test_every_table_and_figure_of_the_papers_is_there_or_it_is_said_why_not(training, page, key):
+def test_every_table_and_figure_of_the_papers_is_shown_or_its_absence_explained(training, page, key):
     paper, sections = read_published(training).paper(key), _sections(page)
     for items, count in ((paper.tables, TABLES[key]), (paper.figures, PICTURES[key])):
         assert [item.number for item in items] == list(range(1, count + 1))

@@ -110,14 +110,14 @@ def test_depths_are_stated_once():
         ViewSection.model_validate({"near_mm": 700, "far_mm": 300})
 
 
-def test_a_camera_needs_to_know_where_the_board_is(settings: PlanSettings):
+def test_a_plan_with_a_camera_needs_the_position_of_the_board(settings: PlanSettings):
     with refused(PlanningError, option="--surroundings"):
         views_of(settings, ArmInSurroundings.from_robot(Robot.load("ur5")))
     with refused(PlanningError, option="sensor", value="camera"):
         PlanSettings(sensor="camera")
 
 
-def test_points_far_outside_do_not_count_as_seen(tmp_path: Path, settings: PlanSettings):
+def test_points_far_outside_are_not_visible(tmp_path: Path, settings: PlanSettings):
     """A strong distortion folds back outside the image, so that points outside project into it."""
     assert settings.camera is not None
     arm = arm_before_board()

@@ -27,7 +27,7 @@ def test_candidates_are_allowed_and_the_same_at_every_draw():
     assert "turned away" in candidates.sentence
 
 
-def test_the_reflector_stays_in_the_workspace():
+def test_the_reflector_remains_in_the_workspace():
     workspace = torch.tensor([[0.5, -2.0, 0.2], [2.5, 1.0, 2.5]], dtype=torch.float64)
     candidates = draw_candidates(ARM, 6, 0, workspace)
     position = forward_kinematics(ARM.robot, candidates.q)[:, :3, 3]

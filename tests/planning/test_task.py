@@ -66,7 +66,7 @@ def test_joint_values_of_a_task_outside_the_limits_are_refused(
     assert stated in str(caught.value)
 
 
-def test_without_a_task_the_whole_workspace_counts():
+def test_without_a_task_the_whole_workspace_is_used():
     q = torch.arange(4000.0, dtype=torch.float64).reshape(1000, 4)
     some = task_poses(ArmInSurroundings.from_robot(Robot.load("kiro3")), PlanSettings(), q)
     assert len(some) == TASK_POSES

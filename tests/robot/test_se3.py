@@ -87,7 +87,7 @@ def test_gradients_of_rotation_and_rotation_vector_are_inverse(angle):
     assert_close(derivative, torch.eye(3), atol=1e-8)
 
 
-def test_pose_error_moves_actual_onto_wanted(generator):
+def test_pose_error_moves_the_actual_to_the_desired_pose(generator):
     wanted, actual = random_transforms(generator, 50), random_transforms(generator, 50)
     error = se3.pose_error(wanted, actual)
     R = se3.rotation_from_vector(error[:, 3:]) @ actual[:, :3, :3]

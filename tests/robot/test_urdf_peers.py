@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from testing.aged import model_before
+from testing.aged import original_model
 from testing.closeness import assert_close
 from testing.outside_arm import ARMS, SIMULATOR
 
@@ -115,7 +115,7 @@ def test_peers_compute_the_same_poses_and_jacobians(peer, repository, request):
 @pytest.mark.parametrize("in_drawing", [False, True])
 def test_a_model_in_pinocchio(in_drawing, tmp_path):
     pinocchio = pytest.importorskip("pinocchio", reason="pinocchio is not installed (pip install pin)")
-    model, names = model_before(), (BASE_LINK, TOOL_LINK)
+    model, names = original_model(), (BASE_LINK, TOOL_LINK)
     if in_drawing:
         drawing = tmp_path / "arm.urdf"
         drawing.write_text(robot_to_urdf(model.robot))

@@ -62,7 +62,7 @@ def test_spread_rotates_the_home_orientation_as_documented():
     check_transforms(T, "grid", tolerance=1e-14)
 
 
-def test_polar_random_stays_inside_and_fills():
+def test_polar_random_poses_fill_their_region():
     T = PolarRandom(
         kind="polar_random", count=2000, seed=1, r_mm=(200, 560), phi_deg=(8.18, 81.8), z_mm=300
     ).transforms()
@@ -74,7 +74,7 @@ def test_polar_random_stays_inside_and_fills():
     assert_close(T[:, 2, 3], 0.3)
 
 
-def test_cube_random_stays_inside_and_fills():
+def test_cube_random_poses_fill_their_region():
     T = CubeRandom(
         kind="cube_random", count=2000, seed=1, orientation={"spread_deg": 10}, **KIRO4_CUBE
     ).transforms()

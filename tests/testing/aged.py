@@ -16,14 +16,14 @@ NAME = "rb5"
 
 
 @functools.cache
-def model_before() -> CalibratedModel:
+def original_model() -> CalibratedModel:
     """Return the hybrid calibration of the arm."""
     under_test = hybrid_of(NAME)
     with no_type_checker():
         return model_of_hybrid(NAME, under_test.true.nominal, under_test.result, under_test.measurements)
 
 
-def rows_later(
+def rows_after_change(
     rows: int,
     seed: int,
     moved: tuple[float, ...] = (0.0,) * 6,

@@ -4,7 +4,7 @@ import functools
 import math
 
 import torch
-from testing.aged import NAME, rows_later
+from testing.aged import NAME, rows_after_change
 from testing.hybrid import hybrid_of
 from testing.models import no_type_checker
 
@@ -23,9 +23,9 @@ CARRIED = (0.3, -0.2, 0.1, 0.4, 0.02, -0.03)
 def model_of(
     seed: int, moved: tuple[float, ...] = (0.0,) * 6, base: tuple[float, ...] = (0.0,) * 6
 ) -> CalibratedModel:
-    """Return a hybrid calibration with 80 rows; for the arguments see `testing.aged.rows_later`."""
+    """Return a hybrid calibration with 80 rows; for the arguments see `testing.aged.rows_after_change`."""
     nominal = hybrid_of(NAME).true.nominal
-    rows = rows_later(80, seed, moved, base)
+    rows = rows_after_change(80, seed, moved, base)
     calibrator = HybridCalibrator(
         GeometricCalibrator(nominal), features=("gravity", "series"), harmonics=(4, 8), products=False
     )

@@ -208,12 +208,12 @@ def read_fanuc(text: str) -> Program:
             program.poses.append(values)
             program.config.add(str(where.children[0]).strip("'"))
             program.frame, program.tool = (
-                _told(program.remarks, f"{kind} 1 has to be") for kind in ("UFRAME", "UTOOL")
+                _stated_values(program.remarks, f"{kind} 1 has to be") for kind in ("UFRAME", "UTOOL")
             )
     return program
 
 
-def _told(remarks: list[str], title: str) -> list[float]:
+def _stated_values(remarks: list[str], title: str) -> list[float]:
     """Return X, Y, Z, W, P, R of the three remarks after a title."""
     begin = remarks.index(title) + 1
     words = " ".join(remarks[begin : begin + 3]).replace(",", "").split()

@@ -44,12 +44,12 @@ def hybrid_under_test(frames: bool = False) -> tuple[HybridArmUnderTest, Calibra
     with no_type_checker():
         summary = summarise(arm.result).with_figures(rows=200)
         if not frames:
-            summary = summary.with_figures(cross_validation=judged_on(arm, measured(arm, 60, 5)).figures())
+            summary = summary.with_figures(cross_validation=evaluated_on(arm, measured(arm, 60, 5)).figures())
         model = model_of_hybrid("arm", arm.true.nominal, arm.result, arm.measurements)
     return arm, replace(model, metrics=summary.to_json())
 
 
-def judged_on(arm: HybridArmUnderTest, rows: Measurements) -> CalibrationValidation:
+def evaluated_on(arm: HybridArmUnderTest, rows: Measurements) -> CalibrationValidation:
     """Evaluate the calibration of an arm on rows."""
     calibrator = HybridCalibrator(GeometricCalibrator(arm.true.nominal))
     return judge(calibrator, arm.result, arm.measurements, rows)
@@ -68,7 +68,7 @@ def geometric_under_test() -> tuple[HybridArmUnderTest, CalibratedModel]:
 def folder_with_held_out(arm: HybridArmUnderTest, model: CalibratedModel, folder: Path) -> CalibratedModel:
     """Write a model folder with errors of "held-out" rows: those of the calibration, enlarged by a tenth."""
     with no_type_checker():
-        found = judged_on(arm, arm.measurements)
+        found = evaluated_on(arm, arm.measurements)
         for errors in found.models.values():
             errors.position.mul_(1.1)
         held_out = HeldOutRows.from_validation(found, arm.measurements)

@@ -39,10 +39,10 @@ class Language:
     pose: Callable[[Frame], str]
     text: str
     kept: tuple[str, ...]
-    """What has to stand in the new program too."""
+    """Text that the new program must also contain."""
 
 
-def six(T: Frame) -> str:
+def xyzabc_text(T: Frame) -> str:
     return labelled(millimetres_and_euler(T).tolist(), "XYZABC")
 
 
@@ -86,7 +86,7 @@ end
     ),
     Language(
         ".src",
-        lambda T: "{X 1, Y 2}"[:0] + f"{{{six(T)}}}",
+        lambda T: "{X 1, Y 2}"[:0] + f"{{{xyzabc_text(T)}}}",
         """&ACCESS RVP
 DEF cell()
 ; LIN {{X 1,Y 2,Z 3,A 4,B 5,C 6}}
@@ -162,7 +162,7 @@ tools: {{"UTOOL 2": {{{tool}}}}}
 """
 
 
-def wanted_poses(robot: Robot) -> torch.Tensor:
+def desired_poses(robot: Robot) -> torch.Tensor:
     """Return three poses of the tool in the frame within the domain, and one that is too far."""
     bare = robot.with_geometry(base=np.zeros(6), tool=np.zeros(6))
     T = invert(FRAME) @ forward_kinematics(bare, joints_around("ur10", 3, seed=2, spread=0.2)) @ TOOL
@@ -173,14 +173,14 @@ def wanted_poses(robot: Robot) -> torch.Tensor:
 
 def program(language: Language, arm: Path, tmp_path: Path) -> ExportRequest:
     """Write the program and the frames it does not state as files, and return the request to rewrite it."""
-    T = wanted_poses(load_model(arm).robot)
+    T = desired_poses(load_model(arm).robot)
     written = {
         f"P{i}": (position(i + 1) if language.suffix == ".ls" else language.pose)(T[i]) for i in range(3)
     }
     far = (position(4) if language.suffix == ".ls" else language.pose)(T[3])
     place = place_of if language.suffix == ".mod" else language.pose
     text = language.text.format(
-        **written, far=far, tool=place(TOOL), frame=place(FRAME), p0=six(T[0]), p2=six(T[2])
+        **written, far=far, tool=place(TOOL), frame=place(FRAME), p0=xyzabc_text(T[0]), p2=xyzabc_text(T[2])
     )
     path = tmp_path / f"cell{language.suffix}"
     path.write_text(text, newline="")
@@ -201,7 +201,7 @@ def scanned(path: Path, frames: Path | None) -> ScannedProgram:
     return SCANNERS[path.suffix](path.read_text(), FrameFile.read(frames))
 
 
-def really(arm: Path, commanded: torch.Tensor, wanted: torch.Tensor) -> torch.Tensor:
+def attained_poses(arm: Path, commanded: torch.Tensor, wanted: torch.Tensor) -> torch.Tensor:
     """Return the poses that the real tool reaches with a controller that uses the nominal robot."""
     model = load_model(arm)
     base, tool = (

@@ -23,7 +23,7 @@ POSES, JUDGED_FROM = 30, 8
 """In the plan; rows from which on base and tool can be worked out."""
 
 
-def arm_beside_tracker(robot: Robot | None = None) -> ArmInSurroundings:
+def arm_with_tracker(robot: Robot | None = None) -> ArmInSurroundings:
     """Return a robot (default: a UR10) in a cell with all kinds of surroundings."""
     cabinet = Box(name="control <cabinet>", center_mm=(-900, 900, 380), size_mm=(500, 600, 800), yaw_deg=20)
     tracker = TrackerSection(x_mm=2200, y_mm=-1200, z_mm=1100)

@@ -20,7 +20,7 @@ def found(rows: Measurements, robot: Robot = ROBOT) -> list[tuple[str, str]]:
     return [(one.kind, one.cause) for one in check_rows(rows, robot).implausible]
 
 
-def test_right_rows_and_very_few_have_no_fault():
+def test_valid_and_very_few_rows_have_no_fault():
     assert found(PLAN.rows(5)) == found(PLAN.rows(24)) == []
     few = PLAN.rows(3)
     assert found(replace(few, position=few.position * 1000)) == []

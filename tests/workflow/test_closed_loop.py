@@ -1,4 +1,4 @@
-"""A false SCARA that MuJoCo drives reaches wanted poses after its cell was planned, measured and calibrated."""
+"""A SCARA with errors reaches commanded poses in MuJoCo after its cell was planned, measured and calibrated."""
 
 import importlib
 import sys
@@ -19,7 +19,7 @@ def closed_loop(repository, monkeypatch):
 
 
 @pytest.mark.usefixtures("without_type_checker")
-def test_wanted_poses_are_reached_in_mujoco(closed_loop, tmp_path):
+def test_commanded_poses_are_reached_in_mujoco(closed_loop, tmp_path):
     plan = closed_loop.plan_of("scara", poses=30, candidates=500)
     closed = closed_loop.close_loop("scara", "measured", 0, tmp_path, plan, count=100)
     assert closed.reached == 100

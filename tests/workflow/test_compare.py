@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from testing.aged import rows_later
+from testing.aged import rows_after_change
 from testing.closeness import assert_close
 from testing.compared import COLLISION, joints_of, model_of
 from testing.models import no_type_checker
@@ -24,7 +24,7 @@ def compared(tmp_path_factory):
     Measurements(q=joints_of(model, 5), position=model.forward(joints_of(model, 5))[:, :3, 3]).write_csv(
         program, model.robot
     )
-    return compare(model, model_of(61, COLLISION), rows_later(20, 70, COLLISION), program)
+    return compare(model, model_of(61, COLLISION), rows_after_change(20, 70, COLLISION), program)
 
 
 def test_the_model_of_the_robot_as_it_is_predicts_its_rows_better(compared):
@@ -61,7 +61,7 @@ def test_models_of_the_same_name_and_rows_get_different_names_and_a_warning():
 def test_rows_that_one_of_the_models_was_made_from_are_warned_of(compared):
     assert compared.warnings == ()
     models = [model_of(50), model_of(61, COLLISION)]
-    some = rows_later(80, 61, COLLISION).select(torch.arange(8))
+    some = rows_after_change(80, 61, COLLISION).select(torch.arange(8))
     (warning,) = compare(*models, some).warnings
     assert warning.startswith("rows_61 ")
 

@@ -32,7 +32,7 @@ def test_a_plan_holds_the_controllers_values_within_its_limits(tmp_path: Path) -
     assert_close(again.waypoints[0], q[:1], atol=1e-7)
 
 
-def test_the_operator_is_told_what_the_controller_shows() -> None:
+def test_the_message_states_what_the_controller_shows() -> None:
     robot = coupled_robot()
     values = torch.tensor([0.1, 0.2, 0.3, 0.4, 0.5, 0.6]).double()
     q = robot.to_dh(values)

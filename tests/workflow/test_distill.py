@@ -176,7 +176,7 @@ def test_joint_values_lie_between_the_rows(rows):
     assert rows == 1 or float(drawn.std(0).min()) > 0.1 * float(q.std(0).min())
 
 
-def test_between_goes_the_short_way_round():
+def test_between_takes_the_shorter_direction():
     robot = Robot.load("ur10")
     q = torch.full((2, 6), 3.1, dtype=torch.float64)
     q[1] = -3.1

@@ -29,7 +29,7 @@ MODEL = ModelFigures(
 )
 
 
-def test_a_model_that_meets_its_limits_misses_none():
+def test_a_model_within_its_limits_misses_no_limit():
     assert Limits().missed_by(MODEL) == []
     assert Limits(0.5, 1.0, 2.0, 0.1).missed_by(MODEL) == []
 

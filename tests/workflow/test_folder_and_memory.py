@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import pytest
-from testing.aged import model_before, rows_later
+from testing.aged import original_model, rows_after_change
 from testing.same_model import differences
 
 from pisigma.model.inverse.written_model import write_model
@@ -20,30 +20,32 @@ COLLISION = (0.0, 0.0, 0.00436, 0.0, 0.0, 0.0)
 def folder(tmp_path_factory):
     path = tmp_path_factory.mktemp("models") / "rb5"
     path.mkdir()
-    write_model(model_before(), path)
+    write_model(original_model(), path)
     return path
 
 
 def test_plans_are_the_same(folder):
     settings = PlanSettings(count=4, check=1, candidates=100)
-    one, other = (plan(source, settings) for source in (model_before(), folder))
+    one, other = (plan(source, settings) for source in (original_model(), folder))
     assert differences(one.stored.q, other.stored.q) == []
     assert differences(one.curve, other.curve) == []
 
 
 def test_recalibrations_are_the_same(folder):
-    one, other = (recalibrate(source, rows_later(10, 2, COLLISION)) for source in (model_before(), folder))
+    one, other = (
+        recalibrate(source, rows_after_change(10, 2, COLLISION)) for source in (original_model(), folder)
+    )
     assert differences(replace(one.model, metrics={}), replace(other.model, metrics={})) == []
     assert differences(one.moved, other.moved) == []
 
 
 def test_sessions_and_their_history_are_the_same(folder):
-    sessions = [rows_later(10, 2, COLLISION)]
-    one, other = (monitor(source, sessions) for source in (model_before(), folder))
+    sessions = [rows_after_change(10, 2, COLLISION)]
+    one, other = (monitor(source, sessions) for source in (original_model(), folder))
     assert differences(one.records, other.records) == []
     assert differences(one.charts, other.charts) == []
 
 
 def test_comparisons_are_the_same(folder):
-    one, other = (compare("nominal", source).to_json() for source in (model_before(), folder))
+    one, other = (compare("nominal", source).to_json() for source in (original_model(), folder))
     assert differences({**one, "seconds": 0, "models": []}, {**other, "seconds": 0, "models": []}) == []

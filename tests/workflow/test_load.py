@@ -47,7 +47,7 @@ def test_a_path_that_was_begun_is_answered_by_one_model(cell, monkeypatch):
     assert ik.name == SECOND
 
 
-def test_a_damaged_model_is_named_by_the_warnings_of_the_one_before(cell):
+def test_a_damaged_model_is_named_in_warnings_of_the_previous_model(cell):
     ik = pisigma.load(cell.folder)
     path = cell.folder / "models" / SECOND / "model.yaml"
     path.write_text("damaged")

@@ -102,7 +102,7 @@ def test_settings_out_of_range_are_refused(option, value):
         MeasureSettings(**{option: value})
 
 
-def test_a_wrong_unit_is_reported_once_and_advised_to_correct():
+def test_a_wrong_unit_is_reported_once_with_advice():
     session, rows = MeasuringSession(PLAN.stored), PLAN.rows(5)
     rows = replace(rows, position=rows.position * 1000)
     session.add(rows.select(torch.arange(4)))

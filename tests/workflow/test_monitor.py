@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from testing.aged import model_before, rows_later
+from testing.aged import original_model, rows_after_change
 from testing.closeness import assert_close
 from testing.hybrid import hybrid_of
 from testing.refusals import refused
@@ -26,8 +26,8 @@ def dated(rows, *dates):
 
 
 def test_rows_of_several_days_are_several_sessions():
-    rows = dated(rows_later(12, 30), "2026-02-01", "2026-01-01")
-    monitoring = monitor(model_before(), [rows, dated(rows_later(6, 31), "2026-03-01")])
+    rows = dated(rows_after_change(12, 30), "2026-02-01", "2026-01-01")
+    monitoring = monitor(original_model(), [rows, dated(rows_after_change(6, 31), "2026-03-01")])
     assert [one.date for one in monitoring.sessions] == ["2026-01-01", "2026-02-01", "2026-03-01"]
     assert [one.session.rows for one in monitoring.sessions] == [6, 6, 6]
     assert not monitoring.needs_action
@@ -35,7 +35,9 @@ def test_rows_of_several_days_are_several_sessions():
 
 
 def test_an_instrument_that_was_moved_raises_no_alarm():
-    monitoring = monitor(model_before(), [rows_later(12, 3, base=(1e-3, -2e-3, 5e-4, 2e-3, 0.0, 0.0))])
+    monitoring = monitor(
+        original_model(), [rows_after_change(12, 3, base=(1e-3, -2e-3, 5e-4, 2e-3, 0.0, 0.0))]
+    )
     assert [one.what for one in monitoring.sessions[0].session.moved] == ["base", "base"]
     assert monitoring.sentences == ()
     assert not monitoring.needs_action
@@ -43,7 +45,9 @@ def test_an_instrument_that_was_moved_raises_no_alarm():
 
 def test_a_collision_calls_for_action():
     settings = MonitorSettings(dates=("2026-01-01", "2026-02-01"), limit_mm=0.5)
-    monitoring = monitor(model_before(), [rows_later(10, 30), rows_later(10, 31, COLLISION)], settings)
+    monitoring = monitor(
+        original_model(), [rows_after_change(10, 30), rows_after_change(10, 31, COLLISION)], settings
+    )
     report = monitoring.to_json()
     assert report["action"]
     assert [one["verdict"] for one in report["sessions"]] == ["unchanged", "moved"]
@@ -55,7 +59,9 @@ def test_a_collision_calls_for_action():
     assert report["forecast"]["passed"]
     assert any("pisigma recalibrate" in line for line in report["says"])
     settings = MonitorSettings(dates=("2026-03-01", "2026-02-01"))
-    repaired = monitor(model_before(), [rows_later(10, 30), rows_later(10, 31, COLLISION)], settings)
+    repaired = monitor(
+        original_model(), [rows_after_change(10, 30), rows_after_change(10, 31, COLLISION)], settings
+    )
     assert repaired.needs_action
     assert repaired.advised_session is None
     assert not any("pisigma recalibrate" in line for line in repaired.sentences)
@@ -76,21 +82,21 @@ def test_settings_out_of_range_are_refused(settings, error, option, value):
 
 def test_every_file_needs_a_date_if_dates_are_given():
     with refused(MeasurementError, option="dates", value=1):
-        monitor(model_before(), [rows_later(6, 1)] * 2, MonitorSettings(dates=("2026-01-01",)))
+        monitor(original_model(), [rows_after_change(6, 1)] * 2, MonitorSettings(dates=("2026-01-01",)))
 
 
 def test_rows_that_are_not_trusted_are_in_no_chart_and_not_remembered(tmp_path):
-    rows = rows_later(10, 30)
+    rows = rows_after_change(10, 30)
     metres = replace(rows, position=rows.position * 1e-3)
     (folder := tmp_path / "model").mkdir()
-    save_model(model_before(), folder)
+    save_model(original_model(), folder)
     monitoring = monitor(folder, [rows, metres])
     assert (len(monitoring.sessions), len(monitoring.records)) == (1, 1)
     (untrusted,) = monitoring.untrusted
     assert [one.kind for one in untrusted.diagnostics] == ["setup_fault"]
     assert monitoring.needs_action
     assert len(monitor(folder, [metres]).records) == 1
-    alone = monitor(model_before(), [metres])
+    alone = monitor(original_model(), [metres])
     assert (alone.records, alone.charts, alone.trends) == ((), (), ())
     alone.save_page(tmp_path / "page.html")
     (left_out,) = alone.untrusted
@@ -98,9 +104,9 @@ def test_rows_that_are_not_trusted_are_in_no_chart_and_not_remembered(tmp_path):
 
 
 def test_the_same_rows_again_are_not_a_new_session(tmp_path):
-    rows = rows_later(10, 30)
+    rows = rows_after_change(10, 30)
     (folder := tmp_path / "model").mkdir()
-    save_model(model_before(), folder)
+    save_model(original_model(), folder)
     again = replace(
         rows.select(torch.arange(9, -1, -1)), position=(rows.position.flip(0) * 1e5).round() / 1e5
     )
@@ -112,13 +118,13 @@ def test_the_same_rows_again_are_not_a_new_session(tmp_path):
     corrected = monitor(folder, [rows], MonitorSettings(dates=("2026-01-05",)))
     assert [one.date for one in corrected.records] == ["2026-01-05"]
     assert len(corrected.warnings) == 1
-    mixed = monitor(model_before(), [rows, join([rows_later(8, 31), again])])
+    mixed = monitor(original_model(), [rows, join([rows_after_change(8, 31), again])])
     assert sorted(one.session.rows for one in mixed.sessions) == [8, 10]
 
 
 def test_rows_of_the_calibration_are_not_a_session():
     own = hybrid_of("rb5").measurements
     with refused(MeasurementError, expected="new rows"):
-        monitor(model_before(), [own])
-    mixed = monitor(model_before(), [join([own.select(torch.arange(3)), rows_later(10, 30)])])
+        monitor(original_model(), [own])
+    mixed = monitor(original_model(), [join([own.select(torch.arange(3)), rows_after_change(10, 30)])])
     assert [one.session.rows for one in mixed.sessions] == [10]

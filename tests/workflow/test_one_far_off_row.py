@@ -4,7 +4,7 @@ import dataclasses
 import math
 
 import pytest
-from testing.aged import model_before, rows_later
+from testing.aged import original_model, rows_after_change
 from testing.models import no_type_checker
 
 from pisigma.measurement.dataset import Measurements
@@ -25,10 +25,10 @@ def with_one_far_off(rows: Measurements) -> Measurements:
 
 @pytest.mark.parametrize("base", [(0.0,) * 6, (0.4, 0.2, 0.0, 0.0, 0.0, 0.3)], ids=["there", "moved"])
 def test_monitor_uses_the_other_rows(base):
-    rows = rows_later(24, 3, base=base)
+    rows = rows_after_change(24, 3, base=base)
     with no_type_checker():
-        done = monitor(model_before(), [with_one_far_off(rows)])
-        alone = monitor(model_before(), [rows])
+        done = monitor(original_model(), [with_one_far_off(rows)])
+        alone = monitor(original_model(), [rows])
     assert done.untrusted == ()
     (session,), (right,) = (one.sessions for one in (done, alone))
     assert session.session.rows == 23
@@ -38,9 +38,9 @@ def test_monitor_uses_the_other_rows(base):
 
 
 def test_report_uses_the_other_rows(tmp_path):
-    save_model(model_before(), tmp_path)
+    save_model(original_model(), tmp_path)
     with no_type_checker():
-        done = report(tmp_path, with_one_far_off(rows_later(24, 3)))
+        done = report(tmp_path, with_one_far_off(rows_after_change(24, 3)))
     assert done.diagnostics == ()
     assert done.content.rows.measurements.rows == 23
     assert float(done.content.rows.after.position.max()) < 2e-3
@@ -49,6 +49,6 @@ def test_report_uses_the_other_rows(tmp_path):
 
 def test_recalibrate_uses_the_other_rows():
     with no_type_checker():
-        done = recalibrate(model_before(), with_one_far_off(rows_later(24, 3)))
+        done = recalibrate(original_model(), with_one_far_off(rows_after_change(24, 3)))
     assert done.trusted
     assert [one.row for one in done.summary.outliers] == [WRONG]

@@ -77,7 +77,7 @@ def test_rows_of_every_sensor_are_evaluated_and_wrong_ones_are_refused(kind: str
 
 
 @pytest.mark.parametrize("kind", ["sockets", "wires"])
-def test_a_moved_zero_is_named_and_is_a_move_where_one_may_be(kind: str) -> None:
+def test_a_moved_zero_is_named_and_is_a_movement_if_possible(kind: str) -> None:
     data = of_kind(kind)
     moved = replace(data, q=data.q + torch.tensor([0, 0, 0.03, 0, 0, 0], dtype=torch.float64))
     found = check_rows(moved, model())

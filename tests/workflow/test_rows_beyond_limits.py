@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from testing.aged import model_before, rows_later
+from testing.aged import original_model, rows_after_change
 from testing.identified import geometric_model
 from testing.models import no_type_checker
 
@@ -72,7 +72,7 @@ def test_the_warning_names_joint_and_row(command, narrow):
 
 
 def test_monitor_and_recalibrate_warn_and_recalibrate_widens(tmp_path):
-    model, rows = model_before(), rows_later(20, 7)
+    model, rows = original_model(), rows_after_change(20, 7)
     model, widest = narrow_model(model), float(rows.q[:, 2].abs().max())
     assert model.robot.limits[2, 1] < widest
     with no_type_checker():
@@ -86,11 +86,11 @@ def test_monitor_and_recalibrate_warn_and_recalibrate_widens(tmp_path):
 
 
 def test_a_fleet_prior_warns_and_widens(tmp_path):
-    arm = narrow_model(model_before()).robot
+    arm = narrow_model(original_model()).robot
     (tmp_path / "arm.yaml").write_text(robot_to_yaml(arm))
     lines = ["id,robot,data"]
     for number in range(5):
-        rows = rows_later(40, number)
+        rows = rows_after_change(40, number)
         rows.write_csv(tmp_path / f"r{number}.csv", arm)
         lines.append(f"r{number},arm.yaml,r{number}.csv")
     (tmp_path / "fleet.csv").write_text("\n".join(lines) + "\n")

@@ -49,7 +49,7 @@ def test_the_recipes_of_geometric_calibration_are_there():
 
 
 @pytest.mark.parametrize("name", GEOMETRIC)
-def test_a_geometric_recipe_parses_and_says_what_it_is(name):
+def test_a_geometric_recipe_parses_and_states_its_kind(name):
     recipe = read_recipe(FOLDER / f"{name}.yaml")
     assert isinstance(recipe, GeometricRecipe)
     assert recipe.name == name
@@ -65,7 +65,7 @@ def test_the_recipes_of_inverse_calibration_are_there():
 
 
 @pytest.mark.parametrize("name", INVERSE)
-def test_it_parses_and_says_what_it_is(name):
+def test_the_recipe_parses_and_states_its_kind(name):
     recipe = read(name)
     assert recipe.name == name
     assert recipe.description
@@ -75,7 +75,7 @@ def test_it_parses_and_says_what_it_is(name):
 
 
 @pytest.mark.parametrize("name", ["kiro3_paper", "kiro4_paper"])
-def test_the_papers_network_does_what_the_paper_says(name):
+def test_the_papers_network_agrees_with_the_paper(name):
     recipe = read(name)
     assert (recipe.fit.method, recipe.fit.epochs) == ("gradient_descent", 3000)
     assert {group.orders for group in recipe.network} == {(3,)}

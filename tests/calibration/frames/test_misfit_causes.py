@@ -43,7 +43,7 @@ def test_cause_is_named(kind):
     assert 0.3 < first.share <= 1.0
 
 
-def test_nothing_is_named_where_nothing_is_wrong():
+def test_no_fault_is_named_for_valid_rows():
     causes = causes_of("nothing", 2)
     assert not any(one.named for one in causes)
     assert all(one.log_bayes_factor < CLEAR for one in causes)

@@ -174,7 +174,7 @@ def test_repeats_of_a_pose_do_not_count_as_new_poses() -> None:
 
 
 @pytest.mark.parametrize(("shared", "own"), [(3e-4, 1e-5), (0.0, 3e-4)])
-def test_standard_errors_know_what_targets_on_one_tool_share(shared: float, own: float) -> None:
+def test_standard_errors_include_the_common_error_of_targets_on_one_tool(shared: float, own: float) -> None:
     """Three targets whose errors are the same tell as much as one, three with errors of their own three times as much.
 
     Args:
@@ -201,7 +201,7 @@ def test_standard_errors_know_what_targets_on_one_tool_share(shared: float, own:
     )  # of 6 variances of 12 draws each; 3.7 for shared errors taken for three targets' own
 
 
-def test_what_the_data_do_not_determine_stays_nominal_and_is_reported() -> None:
+def test_undetermined_parameters_remain_nominal_and_are_reported() -> None:
     on_axis = np.array([1e-4, 2e-4, 0.1, 0.0, 0.0, 0.0])
     arm = simulate("ur10", rows=200, noise=5e-5, tool=on_axis)
     result = GeometricCalibrator(arm.nominal).fit(arm.measurements)
@@ -233,7 +233,7 @@ def test_joint_offsets_alone() -> None:
     assert result.parameter("a_2").remark == "fixed"
 
 
-def test_a_list_of_parameters_and_a_known_base() -> None:
+def test_a_list_of_parameters_with_a_fixed_base() -> None:
     arm = simulate("ur10", rows=30, length=0, angle=0)
     dh = arm.nominal.dh.copy()
     dh[1, 2] += 1e-3

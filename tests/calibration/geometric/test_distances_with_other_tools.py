@@ -72,7 +72,7 @@ def test_neither_a_far_frame_nor_a_long_tool_has_to_be_drawn(anchors: int, off: 
 
 
 @pytest.mark.parametrize("anchors", [1, 2, 3])
-def test_anchors_at_stated_places_say_where_the_frame_is(anchors: int) -> None:
+def test_anchors_at_stated_positions_determine_the_frame(anchors: int) -> None:
     T = transform_from_xyzrpy(torch.tensor([2.5, -1.2, 0.4, 2.3, 0.1, -0.05], dtype=torch.float64))
     data = seen_from(T, anchors)
     tip = forward_kinematics(true_robot().geometric_robot, data.q)[:, :3, 3]

@@ -97,7 +97,7 @@ def test_errors_of_an_anchor_that_was_calibrated() -> None:
     )
 
 
-def test_the_place_of_a_row_counts_where_the_anchor_was_not_calibrated() -> None:
+def test_the_position_of_a_row_is_used_if_the_anchor_was_not_calibrated() -> None:
     data = wire_data(known=True)
     assert data.distance is not None
     assert_close(errors(replace(data, distance=data.distance - ZERO)), torch.zeros(80), atol=1e-12)
@@ -132,7 +132,7 @@ def test_rows_without_a_distance_have_no_error() -> None:
     assert bool(torch.isfinite(found["position"][30:]).all())
 
 
-def test_a_calibration_judges_wires_that_it_did_not_see() -> None:
+def test_a_calibration_evaluates_held_out_wires() -> None:
     data = wire_data(count=200)
     train, test = data.select(torch.arange(150)), data.select(torch.arange(150, 200))
     result = GeometricCalibrator(true_robot().nominal).fit(train)

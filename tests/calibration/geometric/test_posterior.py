@@ -18,7 +18,7 @@ def result(request: pytest.FixtureRequest) -> CalibrationResult:
     return GeometricCalibrator(true_robot().nominal).fit(rows)
 
 
-def test_all_parameters_are_there_with_all_correlations(result: CalibrationResult) -> None:
+def test_all_parameters_and_correlations_are_listed(result: CalibrationResult) -> None:
     posterior = result.posterior
     assert posterior.names == tuple(parameter.name for parameter in result.parameters)
     assert_close(
@@ -54,7 +54,7 @@ def test_sensors_unknowns_are_among_them(result: CalibrationResult) -> None:
     assert float(cross.abs().max()) > 0  # they are known together, not one by one
 
 
-def test_a_name_that_is_none_is_refused(result: CalibrationResult) -> None:
+def test_an_unknown_name_is_refused(result: CalibrationResult) -> None:
     with refused(IdentificationError, value="a_22"):
         result.posterior.select(["a_22"])
 

@@ -98,7 +98,7 @@ def test_usual_errors_get_no_warning(seed: int) -> None:
     assert not unusual(GeometricCalibrator(arm.nominal).fit(arm.measurements))
 
 
-def test_large_errors_are_told_apart_by_kind() -> None:
+def test_kinds_of_large_errors_are_distinguished() -> None:
     assert calibrated(15e-3, 3e-4) == ["angle"]
     assert calibrated(5e-4, 12e-3) == ["length"]
 

@@ -37,7 +37,7 @@ def test_touches_along_one_axis_do_not_tell_the_frame() -> None:
     assert [one.subject for one in result.warning_details if one.kind == "touched_frame"] == ["back"]
 
 
-def test_a_start_of_a_frame_that_is_not_there_is_refused() -> None:
+def test_a_missing_start_of_a_frame_is_refused() -> None:
     with refused(IdentificationError, option="frames", value="lefd"):
         calibrator(frames={"lefd": (0.0,) * 6}).fit(touch_data())
     with refused(IdentificationError, option="frames", value=(0.0, 0.0, 0.0)):
@@ -52,7 +52,7 @@ def test_touches_that_fit_nowhere_ask_for_a_start() -> None:
         calibrator().fit(wild)
 
 
-def test_sockets_alone_have_no_scale() -> None:
+def test_sockets_do_not_determine_the_scale() -> None:
     result = calibrator().fit(socket_data())
     assert kinds_of_warnings(result) >= {"scale_of_sockets"}
     assert result.status.is_minimum

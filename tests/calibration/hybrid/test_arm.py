@@ -98,7 +98,7 @@ def test_one_joint_beyond_its_measured_values_is_enough_but_rounding_is_not() ->
     assert found.contains(q).tolist() == [False, True, False]
 
 
-def test_the_correction_holds_where_joints_were_measured_and_beyond() -> None:
+def test_the_correction_applies_inside_and_outside_the_measured_joint_values() -> None:
     robot = Robot.load("ur5")
     geometry = robot.with_geometry(dh=robot.dh + 1e-3)
     correction = JointCorrection(robot, (FourierSeries(robot, 2),)).requires_grad_(False)

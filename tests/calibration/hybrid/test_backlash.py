@@ -136,7 +136,7 @@ def model() -> CalibratedModel:
         return model_of_hybrid("play", ROBOT, fitted(ARC_MINUTE, True), measured(ARC_MINUTE, 60, 0, NOISE))
 
 
-def test_inverse_kinematics_knows_the_side():
+def test_inverse_kinematics_uses_the_stated_side():
     true, q = true_robot(ARC_MINUTE), 0.7 + 0.3 * measured(ARC_MINUTE, 200, 9, 0.0).q[:20]
     approach = torch.from_numpy(np.random.default_rng(3).choice([-1.0, 1.0], (20, 6)))
     with no_type_checker():

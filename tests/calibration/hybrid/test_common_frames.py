@@ -30,7 +30,7 @@ def test_a_motion_is_found_again(turn, generator):
     assert_close(fit_rigid_motion(points, onto), T, atol=1e-12)
 
 
-def test_a_mirrored_cloud_gives_a_rotation_still(generator):
+def test_a_mirrored_point_cloud_still_yields_a_rotation(generator):
     points = torch.randn(30, 3, generator=generator, dtype=torch.float64)
     T = fit_rigid_motion(points, points * torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64))
     assert_close(torch.linalg.det(T[:3, :3]), 1.0, atol=1e-12)
@@ -49,7 +49,7 @@ def distances(rows: int) -> tuple[TrueRobot, Measurements]:
     return true, Measurements(q=q, distance=distance, anchor=names)
 
 
-def test_frames_that_no_distance_tells_are_those_of_the_geometric_calibration():
+def test_frames_that_no_distance_determines_are_those_of_the_geometric_calibration():
     _, data = distances(360)
     calibrator = HybridCalibrator(GeometricCalibrator(Robot.load("rb5")), harmonics=(4,), products=False)
     result = calibrator.fit(data)

@@ -112,7 +112,7 @@ def test_prior_has_a_size_for_every_class_and_every_group_of_weights(arm: Linear
     assert prior.group[design.weights_of(2)].view(4, 6).tolist() == [[6, 7, 8] * 2] * 4
 
 
-def test_weights_of_a_sliding_joint_count_in_radians_times_the_reach(arm: LinearisedArm) -> None:
+def test_weights_of_a_prismatic_joint_are_scaled_by_the_reach(arm: LinearisedArm) -> None:
     robot = arm.rows.problem.space.robot
     design = Design(arm.rows.problem, (FourierSeries(robot, 1),))
     base = design.prior((1.0,) * 4).base[design.weights_of(0)].view(4, 2)

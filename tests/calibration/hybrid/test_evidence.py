@@ -132,7 +132,7 @@ def test_log_evidence_of_linearised_rows_is_stationary() -> None:
     assert_close(np.array(slopes), 0.0, atol=1e-2)
 
 
-def test_more_updates_never_make_a_settled_search_worse() -> None:
+def test_more_updates_never_worsen_a_converged_search() -> None:
     X, y = problem(rows=60)
     fit = DenseRegression.between(X, y)
     few, many = (fit.maximise_evidence(prior(), NOISE, count, 0.0) for count in (10, 400))
@@ -165,7 +165,7 @@ def test_groups_without_effect_go_to_the_floor_and_the_others_do_not() -> None:
     assert_close(found.noise[0], float(y.sub(X @ found.x).norm()) / math.sqrt(200 - 5), rtol=1e-3)
 
 
-def test_sizes_of_classes_of_geometric_parameters_stand() -> None:
+def test_sizes_of_classes_of_geometric_parameters_are_kept() -> None:
     """The geometric calibration has found them; those of the weights move."""
     X, y = problem()
     found = DenseRegression.between(X, y).maximise_evidence(prior(classes=2), NOISE).prior.sizes
@@ -173,7 +173,7 @@ def test_sizes_of_classes_of_geometric_parameters_stand() -> None:
     assert float((found[2] / prior().sizes[2]).log().abs()) > 1e-3
 
 
-def test_sizes_of_which_nothing_is_told_stand() -> None:
+def test_sizes_that_no_data_determine_are_kept() -> None:
     X, y = problem()
     X = [columns * (GROUP != 1) for columns in X]
     found = DenseRegression.between(X, y).maximise_evidence(prior(), NOISE, 30, 0.0)
@@ -181,7 +181,7 @@ def test_sizes_of_which_nothing_is_told_stand() -> None:
     assert_close(found.x[GROUP == 1], torch.zeros(3))
 
 
-def test_noise_that_is_given_falls_below_it_never_and_of_what_is_certain_not_at_all() -> None:
+def test_estimated_noise_never_falls_below_the_stated_noise() -> None:
     X, y = problem()
     scaled = [part / sigma for part, sigma in zip(X, NOISE, strict=True)]
     small = [0.3 * target / sigma for target, sigma in zip(y, NOISE, strict=True)]

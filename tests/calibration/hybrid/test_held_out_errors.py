@@ -43,7 +43,7 @@ def test_several_groups_can_be_held_out_together(form: str) -> None:
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_sizes_and_noise_can_be_estimated_anew_for_every_fold(form: str) -> None:
+def test_sizes_and_noise_can_be_estimated_for_every_fold(form: str) -> None:
     case = poses()
     folds = case.rows.folds(3, 1000)
     fit: AbstractDesignRegression = FORMS[form].from_rows(case.design, case.rows)
@@ -56,7 +56,7 @@ def test_sizes_and_noise_can_be_estimated_anew_for_every_fold(form: str) -> None
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_the_noise_of_a_sensor_stands_of_which_a_fold_takes_all_values(form: str) -> None:
+def test_the_noise_of_a_sensor_is_kept_if_a_fold_holds_out_all_its_values(form: str) -> None:
     """All distances are from one anchor; without them nothing says how noisy they are."""
     case = CASES["all kinds"]()
     number = [values.name for values in case.rows.values].index("distance")
@@ -98,7 +98,7 @@ def residuals(count: int, seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
     return Z, torch.eye(count).double() + 0.1 * A @ A.t(), torch.randn(count, generator=generator).double()
 
 
-def test_what_only_held_out_values_determine_counts_as_fitted_to_them() -> None:
+def test_parameters_determined_only_by_held_out_values_are_treated_as_fitted() -> None:
     """By least squares; errors are scaled to what as many values would show that nothing is fitted to."""
     Z, S, y = residuals(8)
     inverse = torch.linalg.inv(S)
@@ -113,7 +113,7 @@ def test_what_only_held_out_values_determine_counts_as_fitted_to_them() -> None:
     assert_close(found.spread, spread, rtol=1e-9)
 
 
-def test_values_that_say_no_more_than_one_err_by_more_than_their_share() -> None:
+def test_downweighted_values_have_larger_errors_than_their_weight() -> None:
     """Counted as a third, a value has three times the variance of noise that its weight says."""
     _, S, y = residuals(6, 1)
     sensor = torch.tensor([0, 0, 0, 1, 1, 1])

@@ -115,7 +115,7 @@ def test_the_arm_and_the_predicted_poses_are_those_of_the_fit() -> None:
 
 
 @pytest.mark.parametrize("seed", [0, 4])
-def test_30_positions_are_not_made_worse(seed: int) -> None:
+def test_thirty_positions_do_not_increase_the_error(seed: int) -> None:
     simulated, result = fitted(seed, rows=30)
     assert rms(result, simulated.test) < 1.02 * rms(result.geometric, simulated.test)
 
@@ -156,7 +156,7 @@ def test_product_units_are_kept_where_joints_act_on_each_other() -> None:
     assert any(name.endswith("products") for name in names)
 
 
-def test_product_units_are_not_kept_where_there_is_nothing_for_them() -> None:
+def test_product_units_without_an_effect_are_dropped() -> None:
     simulated = simulated_tracker(0)
     result = calibrator(simulated.robot, harmonics=(8,), products=True).fit(simulated.train)
     assert result.learned is not None
@@ -179,7 +179,7 @@ def test_repeats_of_a_few_poses_do_not_fool_it() -> None:
     assert rms(result, simulated.test) <= 1.02 * rms(result.geometric, simulated.test)
 
 
-def test_wrong_rows_do_not_count() -> None:
+def test_wrong_rows_do_not_affect_the_fit() -> None:
     simulated, good = fitted()
     generator = torch.Generator().manual_seed(0)
     assert simulated.train.position is not None
@@ -259,7 +259,7 @@ def test_harmonics_do_not_matter_without_a_series() -> None:
     assert calibrator(Robot.load("rb5"), features=("gravity",), harmonics=()).harmonics == ()
 
 
-def test_touches_alone_are_enough() -> None:
+def test_touches_are_sufficient_without_other_sensors() -> None:
     """Along all three axes at every pose, in one jig frame."""
     simulated = simulated_tracker(0)
     q = simulated.train.q
@@ -288,7 +288,7 @@ def test_touches_alone_are_enough() -> None:
     assert set(result.learned.noise) == {"touch"}
 
 
-def test_sockets_alone_with_nothing_but_geometry_are_the_geometric_calibration() -> None:
+def test_sockets_with_geometry_only_are_the_geometric_calibration() -> None:
     known = {("plate/0", "plate/1"): 0.05}
     nominal, data = true_robot().nominal, socket_data()
     noise = torch.randn(data.q.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)

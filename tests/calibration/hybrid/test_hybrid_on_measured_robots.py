@@ -48,7 +48,7 @@ def test_ur5_with_100_poses(shared_data: Path) -> None:
         assert rms(result, test) < 0.085e-3
 
 
-def test_fanuc_with_20_poses_is_not_made_worse(shared_data: Path) -> None:
+def test_twenty_poses_of_the_fanuc_do_not_increase_the_error(shared_data: Path) -> None:
     """24 poses, each measured 30 times; RMS over six folds of them."""
     data = Measurements.read_csv(shared_data / "fanuc_r2000" / "positions.csv")
     poses = torch.unique(data.q, dim=0, return_inverse=True)[1]

@@ -134,7 +134,7 @@ def test_values_that_are_not_finite_are_refused() -> None:
         broken.solve(poses().prior, poses().noise)
 
 
-def test_first_sizes_say_nearly_what_the_whole_fit_gains() -> None:
+def test_initial_sizes_nearly_reach_the_gain_of_the_whole_fit() -> None:
     """With the other sizes and the noise held it is a lower bound, and the sizes are those found so."""
     robot = Robot.load("rb5")
     q = random_joints(robot, 120, 0)

@@ -33,7 +33,7 @@ def sums_of(design: Design, values: SensorValues) -> NormalEquations:
     return NormalEquations.from_rows(design, Rows(design.problem, (values,), group))
 
 
-def test_rows_that_do_not_count_are_left_out_and_the_others_weighted() -> None:
+def test_excluded_rows_are_left_out_and_the_others_weighted() -> None:
     values = values_of(5)
     found = values.apply_weights(torch.tensor([1.0, 0.0, 0.25, 0.0, 4.0], dtype=torch.float64))
     assert found.row.tolist() == [0, 2, 4]
@@ -92,7 +92,7 @@ def test_other_sights_of_a_pose_are_no_repeats() -> None:
     assert_close(few.descent, many.descent, atol=1e-10)
 
 
-def test_rows_without_repeats_are_left_alone() -> None:
+def test_rows_without_repeats_are_accepted() -> None:
     values = values_of(6)
     assert values.merge_repeats(torch.arange(6)) is values
     none = values.select(torch.zeros(6, dtype=torch.bool))
@@ -137,7 +137,7 @@ def test_identical_targets_come_to_the_regression_of_one() -> None:
     assert_close(many.updated_noise(found)[0], single.updated_noise(expected)[0], rtol=1e-10)
 
 
-def test_targets_that_err_each_for_themselves_count_in_full() -> None:
+def test_targets_with_independent_errors_have_full_weight() -> None:
     values = values_of(3_000)
     values = replace(values, residual=values.residual / values.root[:, None])
     independent = values.downweight_correlated(torch.arange(1_000).repeat_interleave(3))
@@ -148,7 +148,7 @@ def test_targets_that_err_each_for_themselves_count_in_full() -> None:
     assert opposite.downweight_correlated(torch.arange(8).repeat_interleave(2)).repetition == 1.0
 
 
-def test_what_is_certain_and_pairs_and_configurations_of_one_target_count_in_full() -> None:
+def test_exact_values_pairs_and_single_targets_have_full_weight() -> None:
     copies, configuration = alike(3), torch.arange(8).repeat_interleave(3)
     certain = replace(copies, certain=True)
     assert certain.downweight_correlated(configuration) is certain

@@ -52,7 +52,7 @@ def test_folds_are_the_same_every_time_and_hold_every_group_once(arm: Linearised
     assert [fold.tolist() for fold in folds] != [list(range(k, 40, 4)) for k in range(4)]
 
 
-def test_not_more_groups_than_wanted_and_not_more_folds_than_groups_are_held_out(arm: LinearisedArm) -> None:
+def test_numbers_of_groups_and_folds_are_limited(arm: LinearisedArm) -> None:
     some = arm.rows.folds(4, 12)
     assert [len(fold) for fold in some] == [3] * 4
     assert len(set(torch.cat(some).tolist())) == 12

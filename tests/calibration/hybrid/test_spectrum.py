@@ -67,7 +67,7 @@ def test_lines_below_the_first_order_are_left_to_the_series() -> None:
 
 
 @pytest.mark.parametrize("grid", [360, 1_000])
-def test_joint_values_on_a_grid_say_nothing_of_orders_beyond_half_of_it(grid: int) -> None:
+def test_joint_values_on_a_grid_do_not_determine_orders_above_half_of_it(grid: int) -> None:
     """There order k and `grid - k` are the same at all values; the slower of the two is right."""
     step = 2 * math.pi / grid
     q = (random_joints(ROBOT, 300, 2) / step).round() * step

@@ -85,7 +85,7 @@ def test_widening_makes_held_out_errors_as_large_as_predicted() -> None:
     assert_close((error.square() / (1 + factor * (spread.square() - 1))).mean(), 1.0, atol=1e-9)
 
 
-def test_errors_as_small_as_predicted_widen_nothing_and_there_is_a_limit() -> None:
+def test_errors_as_predicted_do_not_widen_intervals_and_widening_is_limited() -> None:
     spread = 1 + normal(500, seed=0).abs()
     assert held_out_scale(missed(0.9 * normal(500, seed=1), spread)) == 1.0
     hopeless = held_out_scale(missed(100 + spread, torch.ones_like(spread)))
@@ -175,7 +175,7 @@ def test_deviation_is_that_of_drawn_calibrations(arm: LinearisedArm) -> None:
     assert_close(got.norm(dim=1), drawn.norm(dim=1), rtol=0.05)
 
 
-def test_more_rows_make_it_surer_and_the_widening_is_one_or_more() -> None:
+def test_more_rows_reduce_the_widening_which_is_at_least_one() -> None:
     robot = Robot.load("rb5")
     deviations = []
     for rows in (60, 240):
@@ -187,7 +187,7 @@ def test_more_rows_make_it_surer_and_the_widening_is_one_or_more() -> None:
     assert 0.3 < deviations[1] / deviations[0] < 0.75
 
 
-def test_of_many_groups_sizes_and_noise_are_those_of_all_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sizes_and_noise_of_many_groups_are_those_of_all_rows(monkeypatch: pytest.MonkeyPatch) -> None:
     robot = Robot.load("rb5")
     own = linearised(robot, tracker_data(robot, random_joints(robot, 80, 2), noise=3e-5))
     folds = uncertainty(own)[0].prior_scale

@@ -26,7 +26,7 @@ def test_posterior_is_that_of_the_dense_problem_and_of_normal_equations(name: st
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_of_a_smaller_design_it_is_as_if_made_from_that(name: str) -> None:
+def test_a_smaller_design_equals_one_built_directly(name: str) -> None:
     """Of fewer features, and of a series with fewer harmonics."""
     case = CASES[name]()
     small = Design(case.rows.problem, case.smaller)
@@ -85,7 +85,7 @@ def test_values_that_are_not_finite_are_refused() -> None:
         found.solve(case.prior, case.noise)
 
 
-def test_noise_that_is_small_beside_the_values_is_left_to_normal_equations() -> None:
+def test_noise_that_is_small_compared_with_the_values_uses_normal_equations() -> None:
     """Traces of P cancel there; what comes back is that of the normal equations to the last bit."""
     case = few_values()
     noise = tuple(1e-4 * sigma for sigma in case.noise)

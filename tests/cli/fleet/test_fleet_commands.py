@@ -3,7 +3,7 @@
 import json
 
 import pytest
-from testing.aged import model_before, rows_later
+from testing.aged import original_model, rows_after_change
 from testing.models import REPOSITORY
 from testing.screens import assert_screen
 
@@ -18,7 +18,7 @@ def plant(tmp_path_factory, run):
     folder = tmp_path_factory.mktemp("plant")
     for name in ("cell1", "cell2"):
         (folder / "in" / name).mkdir(parents=True)
-    rows_later(30, 1).write_csv(folder / "in" / "cell1" / "2026-10-01.csv", model_before().robot)
+    rows_after_change(30, 1).write_csv(folder / "in" / "cell1" / "2026-10-01.csv", original_model().robot)
     (folder / "in" / "cell2" / "2026-10-02.csv").write_text("<b>\n1\n", encoding="utf-8")
     made = run("new", "rb5", "--from", folder / "in", "--out", folder / "cells", "--json")
     assert made.exit_code == 0, made.output
@@ -28,7 +28,7 @@ def plant(tmp_path_factory, run):
     return folder, json.loads(made.stdout), run("fleet", "run", folder / "cells", "--jobs", "1", "--json")
 
 
-def test_a_cell_is_made_of_every_robot(plant):
+def test_a_cell_is_created_for_every_robot(plant):
     folder, made, _ = plant
     assert made["cells"] == [str(folder / "cells" / name) for name in ("cell1", "cell2")]
     assert (made["created"], made["sessions"], made["refused"]) == (2, 2, [])
@@ -72,7 +72,7 @@ def test_what_is_not_a_fleet_is_refused(refuses, tmp_path):
         refuses(*arguments, error=error, **fields)
 
 
-def test_a_cell_is_made_of_a_model_folder(run, tmp_path):
+def test_a_cell_is_created_from_a_model_folder(run, tmp_path):
     made = run("new", "--from", REPOSITORY / "models" / "kiro4", "--out", tmp_path / "cell", "--json")
     assert made.exit_code == 0, made.output
     assert json.loads(made.stdout)["model"] == "kiro4"

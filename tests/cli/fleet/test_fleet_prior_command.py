@@ -47,7 +47,7 @@ def test_what_the_robots_have_in_common_is_printed_and_kept(prior):
     assert "`pisigma fleet prior cells " in card
 
 
-def test_a_calibration_of_ten_poses_begins_with_it(prior, run):
+def test_a_calibration_of_ten_poses_starts_from_the_prior(prior, run):
     folder, _ = prior
     done = run(
         "calibrate", "rb5", folder / "few.csv", "--prior", folder / "prior", "--out", folder / "m", "--json"

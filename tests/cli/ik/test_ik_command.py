@@ -223,7 +223,7 @@ def test_rows_that_are_no_poses_do_not_stop_the_others(
         assert empty == (set(row) - {"line", "status"} if line in BAD_ROWS else set())
 
 
-def test_only_the_first_failures_are_told_one_by_one(run, models, tmp_path):
+def test_only_the_first_failures_are_listed_separately(run, models, tmp_path):
     path, out = tmp_path / "poses.csv", tmp_path / "joints.csv"
     path.write_text("\n".join([",".join(COLUMNS), *["x,0,0,0,0,0"] * 25]) + "\n")
     result = run("ik", models / "kiro4", "--poses", path, "--out", out, "--json")
@@ -276,7 +276,7 @@ def test_the_file_of_poses_is_not_overwritten(refuses, models, tmp_path):
     assert same.read_text() == before
 
 
-def test_accuracy_where_asked_for(run, models, tmp_path):
+def test_accuracy_is_computed_if_requested(run, models, tmp_path):
     write_poses(tmp_path / "poses.csv", [home_pose("kiro3")])
     out = tmp_path / "joints.csv"
     run("ik", models / "kiro3", "--poses", tmp_path / "poses.csv", "--out", out, "--accuracy")

@@ -3,7 +3,7 @@
 import json
 
 import pytest
-from testing.aged import rows_later
+from testing.aged import rows_after_change
 from testing.compared import COLLISION, model_of
 from testing.screens import assert_screen
 
@@ -18,7 +18,7 @@ def folder(tmp_path_factory):
     for name, model in (("before", model_of(50)), ("after", model_of(61, COLLISION))):
         (folder / name).mkdir()
         save_model(model, folder / name)
-    rows_later(20, 70).write_csv(folder / "rows.csv", model_of(50).robot)
+    rows_after_change(20, 70).write_csv(folder / "rows.csv", model_of(50).robot)
     poses = "x_mm,y_mm,z_mm,roll_deg,pitch_deg,yaw_deg\n400,100,400,0,180,0\n450,120,400,10,180,0\n"
     (folder / "poses.csv").write_text(poses)
     return folder

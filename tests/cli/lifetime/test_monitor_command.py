@@ -6,7 +6,7 @@ import sqlite3
 from contextlib import closing
 
 import pytest
-from testing.aged import model_before, rows_later
+from testing.aged import original_model, rows_after_change
 from testing.screens import assert_screen
 
 from pisigma.files.errors import OutputError
@@ -18,10 +18,10 @@ def folder(tmp_path_factory):
     """A folder with a model and files of sessions, of which the last came after a collision."""
     folder = tmp_path_factory.mktemp("monitor")
     (folder / "model").mkdir()
-    save_model(model_before(), folder / "model")
+    save_model(original_model(), folder / "model")
     for month in (1, 2, 3):
         moved = (0.0, 0.0, math.radians(0.25) * (month == 3), 0.0, 0.0, 0.0)
-        rows_later(8, month, moved).write_csv(folder / f"2026-0{month}-01.csv", model_before().robot)
+        rows_after_change(8, month, moved).write_csv(folder / f"2026-0{month}-01.csv", original_model().robot)
     return folder
 
 
@@ -37,7 +37,7 @@ def test_each_call_adds_a_session(run, folder):
     assert (folder / "model.history.sqlite").is_file()
 
 
-def test_a_collision_is_said_and_ends_with_3(run, folder):
+def test_a_collision_is_reported_with_exit_status_3(run, folder):
     page = folder / "page.html"
     done = run(
         *("monitor", folder / "model", folder / "2026-03-01.csv", folder / "2026-01-01.csv"),

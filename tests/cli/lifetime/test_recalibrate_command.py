@@ -5,7 +5,7 @@ import shlex
 
 import pytest
 from gate.table import moved, positions
-from testing.aged import model_before, rows_later
+from testing.aged import original_model, rows_after_change
 from testing.refusals import assert_fields, problem_of
 from testing.screens import assert_screen
 
@@ -19,8 +19,10 @@ def folder(tmp_path_factory):
     """A folder with a model and a file of new rows."""
     folder = tmp_path_factory.mktemp("recalibrate")
     (folder / "model").mkdir()
-    save_model(model_before(), folder / "model")
-    rows_later(10, 2, (0.0, 0.0, 0.00436, 0.0, 0.0, 0.0)).write_csv(folder / "rows.csv", model_before().robot)
+    save_model(original_model(), folder / "model")
+    rows_after_change(10, 2, (0.0, 0.0, 0.00436, 0.0, 0.0, 0.0)).write_csv(
+        folder / "rows.csv", original_model().robot
+    )
     return folder
 
 
@@ -48,7 +50,7 @@ def test_a_dry_run_writes_nothing(run, folder):
 def other_rows(folder):
     """Files of rows with what is wrong, or moved, in them."""
     for name, change in {"tracker": moved((6.0, 0.0, 0.0)), "inches": positions(1 / 25.4)}.items():
-        change(rows_later(10, 2)).write_csv(folder / f"{name}.csv", model_before().robot)
+        change(rows_after_change(10, 2)).write_csv(folder / f"{name}.csv", original_model().robot)
     return folder
 
 
@@ -70,14 +72,14 @@ def test_a_dry_run_ends_as_the_run(run, other_rows, tmp_path, monkeypatch, rows,
     assert (tmp_path / "new").exists() == (status == 0)
 
 
-def test_what_stands_elsewhere_is_written_into_commands():
+def test_moved_parts_are_written_into_commands():
     stated = {None: [], (): ["--moved", ""], ("base", "tool"): ["--moved", "base,tool"]}
     for moved_parts, words in stated.items():
         line = RecalibrationSettings(moved_parts).command("model", "rows.csv")
         assert shlex.split(line) == ["pisigma", "recalibrate", "model", "rows.csv", *words, "--out", "DIR"]
 
 
-def test_either_a_folder_or_a_dry_run_is_wanted(run, folder):
+def test_either_a_folder_or_a_dry_run_is_required(run, folder):
     done = run("recalibrate", folder / "model", folder / "rows.csv")
     assert done.exit_code == 2
     assert "--dry-run" in done.stderr

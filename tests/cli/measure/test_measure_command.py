@@ -24,7 +24,7 @@ def folder(tmp_path_factory) -> Path:
     return folder
 
 
-def test_once_judges_the_rows_that_are_there(run, folder):
+def test_the_option_once_evaluates_the_existing_rows(run, folder):
     before = (folder / "poses.csv").read_bytes()
     result = run(
         "measure", folder / "poses.csv", "--rows", folder / "rows.csv", "--once", "--limit-mm", "0.001"
@@ -98,7 +98,7 @@ def test_what_cannot_be_used_is_one_sentence(refuses, folder, monkeypatch, argum
     assert arguments[0] in message or fields
 
 
-def test_programs_of_the_poses_that_are_left(run, refuses, tmp_path):
+def test_programs_contain_the_remaining_poses(run, refuses, tmp_path):
     plan = measured_plan("ur5", poses=9)
     plan.stored.write(tmp_path / "poses.csv")
     (tmp_path / "rows.csv").write_text(

@@ -5,7 +5,7 @@ import sys
 import pytest
 from testing.models import no_type_checker
 from testing.pages import visitor
-from testing.sessions import arm_beside_tracker, session_state
+from testing.sessions import arm_with_tracker, session_state
 
 from pisigma.cli.measure.command import PageOptions, serve_session_page
 from pisigma.files.errors import RobotError, missing_extra
@@ -14,14 +14,14 @@ OPTIONS = PageOptions("127.0.0.1", 8080, None)
 
 
 def test_without_the_option_nothing_is_served(capsys):
-    with serve_session_page(arm_beside_tracker(), None, None) as show:
-        show(session_state(arm_beside_tracker(), 3))
+    with serve_session_page(arm_with_tracker(), None, None) as show:
+        show(session_state(arm_with_tracker(), 3))
     assert capsys.readouterr() == ("", "")
 
 
-def test_the_address_is_said_beside_the_results(capsys):
+def test_the_address_is_printed_with_the_results(capsys):
     pytest.importorskip("viser", reason="the extra view is not installed")
-    arm = arm_beside_tracker()
+    arm = arm_with_tracker()
     with no_type_checker(), serve_session_page(arm, 0.15, OPTIONS) as show:
         out, err = capsys.readouterr()
         assert out == ""
@@ -32,7 +32,7 @@ def test_the_address_is_said_beside_the_results(capsys):
 
 def test_the_extra_is_named_where_it_is_missing(monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
-    with pytest.raises(ImportError) as raised, serve_session_page(arm_beside_tracker(), None, OPTIONS):
+    with pytest.raises(ImportError) as raised, serve_session_page(arm_with_tracker(), None, OPTIONS):
         pass
     assert 'pip install "pisigma[view]"' in str(missing_extra(raised.value))
 
@@ -41,6 +41,6 @@ def test_meshes_that_cannot_be_shown_are_refused(tmp_path):
     options = PageOptions("127.0.0.1", 8080, tmp_path / "absent.urdf")
     with (
         pytest.raises(RobotError, match=r"absent\.urdf"),
-        serve_session_page(arm_beside_tracker(), None, options),
+        serve_session_page(arm_with_tracker(), None, options),
     ):
         pass

@@ -12,7 +12,7 @@ from pisigma.files.errors import ModelError, OutputError
 POSE = [800.0, 200.0, 600.0, 10.0, -80.0, 170.0]
 
 
-def test_it_says_its_ports_answers_and_ends_with_sigterm(repository):
+def test_the_server_prints_its_ports_answers_and_ends_at_sigterm(repository):
     command = [sys.executable, "-m", "pisigma", "serve", "--models", str(repository / "models")]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         ports = json.loads(process.stdout.readline())

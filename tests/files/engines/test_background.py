@@ -43,7 +43,7 @@ def test_what_it_prints_is_not_taken_for_an_answer(process):
     assert process.compute(partial(print, "printed by the test")) is None
 
 
-def test_it_ends_at_once():
+def test_the_process_ends_at_once():
     process, ended = BackgroundProcess(), []
 
     def wait():

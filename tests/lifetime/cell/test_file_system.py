@@ -34,7 +34,7 @@ MACOS = """/dev/disk3s1s1 on / (apfs, sealed, local, read-only, journaled)
         ("/home/me", "ext4"),
     ],
 )
-def test_the_last_and_deepest_mount_counts(path, kind):
+def test_the_last_and_deepest_mount_is_used(path, kind):
     assert file_system_type(path, linux_mounts(MOUNTINFO)) == kind
 
 

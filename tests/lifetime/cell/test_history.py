@@ -43,7 +43,7 @@ def history(tmp_path):
     return History(tmp_path / HISTORY)
 
 
-def test_nothing_is_known_and_no_file_is_made_before_the_first_entry(history):
+def test_a_history_without_entries_is_empty_and_has_no_file(history):
     assert (history.sessions(), history.events(), history.models(), history.checks()) == ((), (), (), ())
     assert history.in_use is None
     assert not history.path.exists()
@@ -78,7 +78,7 @@ def test_sessions_are_in_the_order_of_their_days_and_replaced_by_name(history):
     assert history.sessions()[1].set_aside == "wrong tool"
 
 
-def test_the_last_use_counts_and_the_earlier_ones_stay(history):
+def test_the_last_use_applies_and_the_earlier_ones_are_kept(history):
     history.add(MODEL, replace(MODEL, name="b"), USE, replace(USE, model="b"))
     assert history.in_use.name == "b"
     history.add(replace(USE, model=""))
@@ -110,7 +110,7 @@ def test_an_older_history_gets_the_tables_and_columns_that_it_lacks(history):
     assert [one.undo for one in history.uses()] == [False, True]
 
 
-def test_a_model_that_is_not_there_is_refused_with_the_nearest_name(history):
+def test_a_missing_model_is_refused_with_the_nearest_name(history):
     history.add(MODEL)
     with refused(ModelError, option="model", value="A"):
         history.model("A")
@@ -134,7 +134,7 @@ def test_a_newer_schema_is_refused(history):
         history.sessions()
 
 
-def test_a_file_of_another_kind_is_refused_and_stays(history):
+def test_a_file_of_another_kind_is_refused_and_kept(history):
     history.path.write_text("no database at all, but longer than a header of SQLite")
     with refused(OutputError, file=HISTORY):
         history.add(SESSION)
@@ -290,7 +290,7 @@ def _tables(path):
         return {name for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
 
 
-def test_an_upgrade_is_made_as_a_whole_or_not_at_all(older):
+def test_an_upgrade_is_complete_or_absent(older):
     history, beside = History(older / HISTORY), older / "models" / "2026-11-26.history.sqlite"
     content, before = beside.read_bytes(), history.path.read_bytes()
     beside.write_bytes(b"damaged" * 1_000)

@@ -273,7 +273,7 @@ def test_a_limit_that_no_rows_have_confirmed_is_verified():
     assert next_step(replace(facts, limit_mm=None)).state == "up_to_date"
 
 
-def test_a_model_that_fits_the_joint_zeros_is_used_and_else_one_is_made():
+def test_a_model_that_fits_the_joint_zeros_is_used_or_else_calibrated():
     facts = replace(MONITORED, controller=OFFSETS)
     fitting = model("b", "2026-01-10,2026-03-10", day="2026-03-10", parent="a")
     step = next_step(replace(facts, models=(MODEL, fitting)))

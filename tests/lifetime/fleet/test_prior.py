@@ -31,7 +31,7 @@ def rms(errors):
     return float(errors["position"].square().sum(1).mean().sqrt())
 
 
-def test_an_inconsistent_robot_is_named_and_does_not_count(prior):
+def test_an_inconsistent_robot_is_named_and_excluded(prior):
     assert prior.odd == (ROBOTS - 1,)
     summary = summarise_prior(prior, [f"r{k}" for k in range(ROBOTS)])
     assert (summary.robots, summary.odd) == (ROBOTS - 1, ("r7",))

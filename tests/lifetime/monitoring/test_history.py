@@ -61,7 +61,7 @@ def test_the_history_of_a_model_in_a_cell_is_that_of_the_cell(tmp_path):
 
 
 @pytest.mark.parametrize("content", [b"no history", b"SQLite format 3\x00 and then nothing"])
-def test_other_files_are_refused_and_left_alone(tmp_path, content):
+def test_other_files_are_refused_and_not_changed(tmp_path, content):
     path = tmp_path / "model.history.sqlite"
     path.write_bytes(content)
     with refused(OutputError, file="model.history.sqlite"):

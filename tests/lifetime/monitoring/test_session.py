@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from testing.aged import model_before, rows_later
+from testing.aged import original_model, rows_after_change
 from testing.closeness import assert_close
 
 from pisigma.lifetime.monitoring.session import judge_session
@@ -20,14 +20,14 @@ def moved_joint(joint, degrees=0.05):
 
 
 def judged(rows, stated=None):
-    model = model_before()
+    model = original_model()
     return judge_session(model, ModelPosterior.from_model(model), rows, stated)
 
 
 @pytest.mark.parametrize("joint", [1, 2, 3, 4, 5])
 def test_the_joint_that_moved_is_named_from_five_poses(joint):
     degrees = 0.05 if joint < 4 else 0.5  # nearer to the reflector
-    session, zeros = judged(rows_later(5, 20 + joint, moved_joint(joint, degrees)))
+    session, zeros = judged(rows_after_change(5, 20 + joint, moved_joint(joint, degrees)))
     assert session.verdict == "moved"
     assert [one.what for one in session.moved] == [f"joint {joint}"]
     low, high = session.moved[0].interval
@@ -38,22 +38,22 @@ def test_the_joint_that_moved_is_named_from_five_poses(joint):
 
 
 def test_false_alarms_are_rare():
-    sessions = [judged(rows_later(5, 100 + seed))[0] for seed in range(10)]
+    sessions = [judged(rows_after_change(5, 100 + seed))[0] for seed in range(10)]
     assert [one.verdict for one in sessions] == ["unchanged"] * 10
     assert not any(one.recalibrate for one in sessions)
 
 
 def test_a_recalibration_is_recommended_after_a_collision():
-    session, _ = judged(rows_later(10, 3, moved_joint(3, 0.25)))
+    session, _ = judged(rows_after_change(10, 3, moved_joint(3, 0.25)))
     assert session.recalibrate
     assert session.rms_after < 0.2 * session.rms
     assert_close(session.gain, session.rms - session.rms_after, rtol=1e-12)
-    assert not judged(rows_later(10, 3))[0].recalibrate
+    assert not judged(rows_after_change(10, 3))[0].recalibrate
 
 
 @pytest.mark.parametrize("joint", [0, 3])
 def test_a_wrong_row_is_not_mistaken_for_a_movement(joint):
-    rows = rows_later(10, 3, moved_joint(joint, 0.25))
+    rows = rows_after_change(10, 3, moved_joint(joint, 0.25))
     wrong = rows.position.clone()
     wrong[4, 1] += 0.005
     session, _ = judged(replace(rows, position=wrong))
@@ -64,13 +64,13 @@ def test_a_wrong_row_is_not_mistaken_for_a_movement(joint):
 
 def test_two_joints_that_moved_are_both_named():
     both = tuple(a + b for a, b in zip(moved_joint(2, 0.2), moved_joint(5, -0.3), strict=True))
-    session, _ = judged(rows_later(12, 4, both))
+    session, _ = judged(rows_after_change(12, 4, both))
     assert {one.what for one in session.moved} == {"joint 2", "joint 5"}
 
 
 @pytest.mark.parametrize("joint", [0, 3])
 def test_a_moved_instrument_is_distinguished_from_a_joint(joint):
-    session, _ = judged(rows_later(12, 5, moved_joint(joint, 0.1), ELSEWHERE))
+    session, _ = judged(rows_after_change(12, 5, moved_joint(joint, 0.1), ELSEWHERE))
     expected = ["joint 3"] if joint else []
     assert [one.what for one in session.moved] == [*expected, "base", "base"]
     assert session.recalibrate == bool(joint)
@@ -81,19 +81,19 @@ def test_a_moved_instrument_is_distinguished_from_a_joint(joint):
 
 
 def test_a_small_motion_of_the_base_is_not_mistaken_for_a_joint():
-    session, _ = judged(rows_later(10, 6, base=(3e-4, -2e-4, 4e-4, 0.0, 0.0, 0.0)))
+    session, _ = judged(rows_after_change(10, 6, base=(3e-4, -2e-4, 4e-4, 0.0, 0.0, 0.0)))
     assert {one.what for one in session.moved} == {"base"}
     assert not session.recalibrate
 
 
 def test_moved_frames_can_be_stated():
-    session, _ = judged(rows_later(12, 5), frozenset({("base", "")}))
+    session, _ = judged(rows_after_change(12, 5), frozenset({("base", "")}))
     assert session.standing == ("base",)
     assert all(one.what == "base" for one in session.moved)
 
 
 def test_scores_are_as_large_as_expected_where_nothing_changes():
-    zeros = [judged(rows_later(10, 200 + seed))[1] for seed in range(12)]
+    zeros = [judged(rows_after_change(10, 200 + seed))[1] for seed in range(12)]
     scores = torch.stack(
         [one.shift / (one.influence @ one.influence.mT + one.own).diagonal().sqrt() for one in zeros]
     )
@@ -101,7 +101,7 @@ def test_scores_are_as_large_as_expected_where_nothing_changes():
 
 
 def test_only_the_part_of_a_tool_that_moved_is_named():
-    session, _ = judged(rows_later(10, 3))
+    session, _ = judged(rows_after_change(10, 3))
     origin = Movement("tool", 30.0, 0.01, "mm", 0.999)
     still = Movement("tool", 0.0, 0.0001, "deg", 0.999)
     both = replace(session, moved=(origin, still))

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from testing.aged import model_before, rows_later
+from testing.aged import original_model, rows_after_change
 from testing.closeness import assert_close
 from testing.linearised import with_directions
 from testing.models import hand_made_model
@@ -46,10 +46,10 @@ def with_turned_joint_3(adaptation: Adaptation) -> Adaptation:
 
 
 def test_a_collision_is_found_and_repaired():
-    model = model_before()
-    before = rms_of(model, rows_later(300, 50, noise=0.0))
-    adaptation = adapted(model, rows_later(10, 2, COLLISION))
-    after = rms(adaptation.errors_of(rows_later(300, 50, COLLISION, noise=0.0))["position"])
+    model = original_model()
+    before = rms_of(model, rows_after_change(300, 50, noise=0.0))
+    adaptation = adapted(model, rows_after_change(10, 2, COLLISION))
+    after = rms(adaptation.errors_of(rows_after_change(300, 50, COLLISION, noise=0.0))["position"])
     assert after < 1.15 * before
     moved = significant_movements(adaptation)
     assert [one.what for one in moved] == ["joint 3"]
@@ -61,31 +61,31 @@ def test_a_collision_is_found_and_repaired():
 
 
 def test_an_unchanged_robot_has_no_movements():
-    adaptation = adapted(model_before(), rows_later(10, 2))
+    adaptation = adapted(original_model(), rows_after_change(10, 2))
     assert significant_movements(adaptation) == ()
 
 
 @pytest.mark.parametrize("moved", [(0.0,) * 6, COLLISION])
 def test_a_moved_instrument_is_found(moved):
-    model, rows = model_before(), rows_later(12, 2, moved, SHIFTED)
+    model, rows = original_model(), rows_after_change(12, 2, moved, SHIFTED)
     posterior = ModelPosterior.from_model(model)
     assert relocated_frames(model, posterior, rows) == {("base", "")}
-    assert not relocated_frames(model, posterior, rows_later(12, 2, moved))
+    assert not relocated_frames(model, posterior, rows_after_change(12, 2, moved))
     adaptation = adapted(model, rows, {("base", "")})
-    errors = adaptation.errors_of(rows_later(300, 50, moved, SHIFTED, noise=0.0))["position"]
-    assert rms(errors) < 1.5 * rms_of(model, rows_later(300, 50, noise=0.0))
+    errors = adaptation.errors_of(rows_after_change(300, 50, moved, SHIFTED, noise=0.0))["position"]
+    assert rms(errors) < 1.5 * rms_of(model, rows_after_change(300, 50, noise=0.0))
     whats = [one.what for one in significant_movements(adaptation)]
     assert whats == [*(["joint 3"] if any(moved) else []), "base", "base"]
 
 
 def test_adapting_row_by_row_agrees_with_all_rows_at_once():
-    model = chain = model_before()
-    everything = rows_later(30, 11)
+    model = chain = original_model()
+    everything = rows_after_change(30, 11)
     for k in range(3):
         part = everything.select(torch.arange(10 * k, 10 * k + 10))
         chain = recalibrated_model(chain, adapted(chain, part), part)
     at_once = recalibrated_model(model, adapted(model, everything), everything)
-    test = rows_later(300, 50, noise=0.0)
+    test = rows_after_change(300, 50, noise=0.0)
     assert_close(rms_of(chain, test), rms_of(at_once, test), rtol=0.05)
     assert rms_of(chain, test) < rms_of(model, test)
     deviations = [one.uncertainty.deviation(test).norm(dim=1).mean() for one in (chain, at_once, model)]

@@ -78,7 +78,7 @@ def test_nothing_is_found_where_nothing_moved(models, of_model, of_rows):
 
 
 @pytest.mark.parametrize("of_model", KINDS)
-def test_checks_of_rows_know_the_noise_whatever_states_it(models, of_model):
+def test_checks_of_rows_use_the_stated_noise_of_any_source(models, of_model):
     with no_type_checker():
         usual = [
             RowsUnderModel.from_rows(

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from testing.aged import model_before, rows_later
+from testing.aged import original_model, rows_after_change
 from testing.closeness import assert_close
 
 from pisigma.calibration.hybrid.calibrator import HybridCalibrator
@@ -61,7 +61,7 @@ def test_without_held_out_rows_the_recalibrated_model_is_kept():
 
 @pytest.mark.parametrize("count", [5, 10])
 def test_held_out_rows_decide(count):
-    model, rows = model_before(), rows_later(count, 2, (0.0, 0.0, math.radians(0.25), 0.0, 0.0, 0.0))
+    model, rows = original_model(), rows_after_change(count, 2, (0.0, 0.0, math.radians(0.25), 0.0, 0.0, 0.0))
     posterior = ModelPosterior.from_model(model)
     problem = recalibration_problem(model, posterior, rows, frozenset())
     whole = adapt(problem)

@@ -4,7 +4,7 @@ import math
 import re
 
 import pytest
-from testing.aged import model_before, rows_later
+from testing.aged import original_model, rows_after_change
 from testing.models import hand_made_model
 
 from pisigma.lifetime.recalibration.motion import judged_motion
@@ -17,7 +17,7 @@ COLLISION = (0.0, 0.0, math.radians(0.25), 0.0, 0.0, 0.0)
 
 
 def test_a_moved_joint_is_named_with_the_command_to_run():
-    verification = verify(model_before(), rows_later(10, 3, COLLISION))
+    verification = verify(original_model(), rows_after_change(10, 3, COLLISION))
     assert verification.verdict == "moved"
     assert not verification.accepted
     assert verification.sentence.startswith("Joint 3 has moved by 0.2")
@@ -32,8 +32,8 @@ def test_a_moved_joint_is_named_with_the_command_to_run():
 @pytest.mark.parametrize("collision", [False, True])
 def test_six_rows_in_another_frame_are_enough(collision):
     """The base is fitted, so that it is not said to have moved."""
-    rows = rows_later(6, 11, COLLISION if collision else (0.0,) * 6, ELSEWHERE)
-    verification = verify(model_before(), rows, VerificationSettings(fit_frame=True))
+    rows = rows_after_change(6, 11, COLLISION if collision else (0.0,) * 6, ELSEWHERE)
+    verification = verify(original_model(), rows, VerificationSettings(fit_frame=True))
     assert verification.verdict == ("moved" if collision else "better")
     assert [one.what for one in verification.motion.moved] == ["joint 3"] * collision
     assert ("--moved base" in verification.recalibration) == collision
@@ -42,10 +42,10 @@ def test_six_rows_in_another_frame_are_enough(collision):
 
 
 def test_a_small_motion_of_the_base_is_a_warning():
-    verification = verify(model_before(), rows_later(10, 6, base=(2e-4, -1e-4, 2e-4, 0.0, 0.0, 0.0)))
+    verification = verify(original_model(), rows_after_change(10, 6, base=(2e-4, -1e-4, 2e-4, 0.0, 0.0, 0.0)))
     assert verification.verdict == "better"
     assert {one.what for one in verification.motion.moved} == {"base"}
 
 
 def test_a_model_without_a_posterior_gives_no_session():
-    assert judged_motion(hand_made_model("kiro3"), rows_later(6, 1)) is None
+    assert judged_motion(hand_made_model("kiro3"), rows_after_change(6, 1)) is None

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from testing.aged import model_before, rows_later
+from testing.aged import original_model, rows_after_change
 from testing.closeness import assert_close
 
 from pisigma.lifetime.recalibration.adaptation import adapt
@@ -19,7 +19,7 @@ ELSEWHERE = (0.3, -0.2, 0.1, 0.5, 0.2, -0.3)
 
 
 def recalibrated(rows, relocated=frozenset(), arm=True):
-    model = model_before()
+    model = original_model()
     posterior = ModelPosterior.from_model(model)
     problem = recalibration_problem(model, posterior, rows, relocated)
     adaptation = adapt(problem if arm else problem.with_fixed_arm())
@@ -31,7 +31,10 @@ def frame(values) -> torch.Tensor:
 
 
 def test_the_model_is_the_same_after_writing_and_reading(tmp_path):
-    rows, test = rows_later(10, 2, (0.0, 0.0, math.radians(0.25), 0.0, 0.0, 0.0)), rows_later(20, 50)
+    rows, test = (
+        rows_after_change(10, 2, (0.0, 0.0, math.radians(0.25), 0.0, 0.0, 0.0)),
+        rows_after_change(20, 50),
+    )
     model, adaptation = recalibrated(rows)
     save_model(model, tmp_path)
     loaded = load_model(tmp_path)
@@ -42,14 +45,14 @@ def test_the_model_is_the_same_after_writing_and_reading(tmp_path):
     assert loaded.uncertainty.noise == model.uncertainty.noise
     again = ModelPosterior.from_model(loaded)
     assert_close(again.weights, ModelPosterior.from_model(model).weights, atol=1e-12)
-    at = adaptation.arm.geometry.robot.dh - model_before().hybrid.robot.dh
-    assert_close(loaded.calibrated.dh - model_before().calibrated.dh, at, atol=1e-12)
+    at = adaptation.arm.geometry.robot.dh - original_model().hybrid.robot.dh
+    assert_close(loaded.calibrated.dh - original_model().calibrated.dh, at, atol=1e-12)
 
 
 def test_moved_frames_move_the_geometric_calibration_as_well():
-    rows = rows_later(12, 2, base=ELSEWHERE)
+    rows = rows_after_change(12, 2, base=ELSEWHERE)
     model, _ = recalibrated(rows, {("base", "")}, arm=False)
-    before = model_before()
+    before = original_model()
     moved = [
         frame(new[""]) @ invert(frame(old[""]))
         for new, old in ((model.bases, before.bases), (model.hybrid_bases, before.hybrid_bases))
@@ -68,7 +71,7 @@ def test_moved_frames_move_the_geometric_calibration_as_well():
 
 @pytest.mark.parametrize("name", ["hall", ""])
 def test_a_new_frame_is_added_to_the_old_ones(name):
-    rows = rows_later(12, 2)
+    rows = rows_after_change(12, 2)
     two = type(rows)(q=rows.q, position=rows.position, frame=(name,) * 6 + ("wall",) * 6)
     model, _ = recalibrated(two)
     assert list(model.bases) == list(dict.fromkeys(["", name, "wall"]))

@@ -1,7 +1,7 @@
 """Unknowns of a recalibration: those of the model and of the rows, in the order of the sensors."""
 
 import torch
-from testing.aged import model_before, rows_later
+from testing.aged import original_model, rows_after_change
 from testing.closeness import assert_close
 
 from pisigma.calibration.geometric.problem.parameters import ParameterSpace
@@ -28,7 +28,7 @@ def test_owners_are_in_the_order_of_the_rows():
 
 
 def test_the_prior_is_the_posterior_of_the_model():
-    model, rows = model_before(), rows_later(10, 2)
+    model, rows = original_model(), rows_after_change(10, 2)
     posterior = ModelPosterior.from_model(model)
     problem = recalibration_problem(model, posterior, rows, frozenset())
     parameters = len(posterior.space.parameters)

@@ -155,7 +155,7 @@ def test_faults_are_refused(tmp_path: Path, case: str):
     assert all(str(name) in caught.value.remedy for name in names)
 
 
-def test_a_pair_is_left_out_whole(tmp_path: Path):
+def test_both_rows_of_a_pair_are_left_out(tmp_path: Path):
     text = f"{WIRE}\n1,3,,,,,bar,,\n2,3,,,,,bar,,0\n3,5,,,,,rod,,\n4,5,,,,,rod,,\n"
     data = read(tmp_path, text, "leave_out")
     assert data.pair == ("rod", "rod")

@@ -124,7 +124,7 @@ def test_chunks_contain_every_row_once_and_in_order(tmp_path, rows):
     assert shares[-1] == 1
 
 
-def test_chunks_state_what_is_wrong_with_a_row(tmp_path):
+def test_chunks_state_the_fault_of_a_row(tmp_path):
     path = tmp_path / "poses.csv"
     path.write_bytes("\n".join([QUATERNION, *ROWS, "0,0,0,0,0,0,ü", ""]).encode("latin-1"))
     (chunk,) = read_pose_chunks(path)

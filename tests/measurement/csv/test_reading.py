@@ -39,7 +39,7 @@ def test_units_come_from_the_column_names(write):
     assert_close(measurements.temperature, [21.0])
 
 
-def test_si_units_stay_as_they_are(write):
+def test_si_units_remain_unchanged(write):
     measurements = Measurements.read_csv(write("q1_rad,q2_m,x_m,y_m,z_m\n1.5,0.25,1,2,3\n"))
     assert_close(measurements.q, [[1.5, 0.25]])
     assert_close(measurements.position, [[1.0, 2.0, 3.0]])

@@ -202,7 +202,7 @@ def test_refuses_a_missing_folder(tmp_path: Path):
         make().write_csv(tmp_path / "nowhere" / "data.csv")
 
 
-def test_a_link_stays_a_link_and_rights_are_ordinary(tmp_path: Path):
+def test_a_link_remains_a_link_with_default_permissions(tmp_path: Path):
     (tmp_path / "plain").write_text("")
     (tmp_path / "link.csv").symlink_to(tmp_path / "data.csv")
     make().write_csv(tmp_path / "link.csv")

@@ -49,5 +49,5 @@ def test_a_row_of_another_width_is_refused(tmp_path: Path):
         read(tmp_path, "j1,j2,x,y\n1,2,3\n4,5,6\n")
 
 
-def test_a_row_that_a_spreadsheet_could_not_calculate_stays(tmp_path: Path):
+def test_a_row_that_a_spreadsheet_could_not_calculate_is_kept(tmp_path: Path):
     assert read(tmp_path, "a,b,c\n1,2,3\n#N/A,5,6\n").lines == (2, 3)

@@ -213,7 +213,7 @@ def test_files_hold_the_columns_of_registered_sensors(tmp_path: Path) -> None:
     assert some.content_hash() != back.select(torch.tensor([6, 0])).content_hash()
 
 
-def test_a_calibration_uses_them_and_judges_held_out_rows() -> None:
+def test_a_calibration_uses_the_rows_and_evaluates_held_out_rows() -> None:
     robot, data = measured(60)
     test = torch.arange(data.rows) % 4 == 0
     result = pisigma.GeometricCalibrator(robot).fit(data.select(~test))
@@ -305,7 +305,7 @@ def test_a_gauge_that_was_not_calibrated_is_refused() -> None:
     assert "row 41" in str(caught.value)
 
 
-def test_the_workflow_judges_them_by_cross_validation() -> None:
+def test_the_workflow_evaluates_the_rows_by_cross_validation() -> None:
     robot, data = measured(40)
     calibration = pisigma.calibrate(robot, data, pisigma.CalibrationSettings(model="geometric", folds=2))
     figures = calibration.to_json()["cross_validation"]

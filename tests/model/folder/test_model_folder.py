@@ -91,7 +91,7 @@ def test_no_pickle_is_read_or_written(folder):
     refuses(folder, "model.safetensors", expected="a safetensors file")
 
 
-def test_windows_line_endings_do_not_count_as_edits(folder):
+def test_windows_line_endings_are_not_edits(folder):
     path = folder / "model.yaml"
     path.write_bytes(path.read_bytes().replace(b"\n", b"\r\n"))
     assert load_model(folder).name == "hand_made_kiro3"

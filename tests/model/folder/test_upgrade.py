@@ -165,7 +165,7 @@ def test_figures_of_other_kinds_change_their_form(tmp_path):
     assert load_model(tmp_path / "net").metrics == {"joints": [{"name": "theta_1"}]}
 
 
-def test_a_folder_that_does_not_load_stays_as_it_was(tmp_path):
+def test_a_folder_that_cannot_be_loaded_remains_unchanged(tmp_path):
     files = write_old(hand_made_model("kiro3"), tmp_path / "arm")
     (tmp_path / "arm" / "model.safetensors").write_bytes(files["model.safetensors"][:-8])
     with refused(ModelError, file="model.safetensors"):

@@ -249,7 +249,7 @@ def test_limits_are_those_of_the_corrected_joints(name, side):
     assert_close(every.q[index], free.q, atol=1e-10)
 
 
-def test_singular_pose_whose_nominal_joints_are_outside_the_limits_stays_singular():
+def test_singular_pose_with_nominal_joints_outside_the_limits_remains_singular():
     model = hand_made_model("kiro3")
     T = forward_kinematics(model.robot, torch.tensor([0.3, 0.0, -0.1, 0.0], dtype=torch.float64))
     free = CorrectedIK(model)(T)

@@ -49,7 +49,7 @@ def everywhere(arm, rows: int = 300) -> torch.Tensor:
     return joints_in(arm.true.nominal, rows, seed=7)
 
 
-def test_the_set_ups_are_what_their_names_say():
+def test_the_set_ups_agree_with_their_names():
     assert model_of("additive")[1].hybrid.correction.orders == ()
     assert set(model_of("products")[1].hybrid.correction.orders) == {2}
     assert [f.name for f in model_of("joints")[1].hybrid.correction.features] == ["joints"]
@@ -102,7 +102,7 @@ def test_rows_without_a_name_use_the_only_frame():
     assert_close(poses_of_rows(model, rows), model.forward(rows.q), atol=1e-12)
 
 
-def test_the_accuracy_of_nothing_is_nan():
+def test_the_accuracy_without_rows_is_nan():
     arm, model = model_of("additive")
     q = everywhere(arm, 3)
     q[1, 2] = torch.nan

@@ -107,7 +107,7 @@ def test_near_prefers_a_branch_inside_the_limits():
 
 
 @pytest.mark.parametrize("name", ["ur5", "panda"])
-def test_joints_without_limits_stay_near(name):
+def test_joints_without_limits_are_solved_near(name):
     """A continuous joint of a URDF file has infinite limits; the Kinova Gen3 has four of them."""
     robot = Robot.load(name)
     for joint in (0, 2):

@@ -62,7 +62,7 @@ def lines(plan: StoredPlan) -> list[str]:
     return text
 
 
-def test_an_image_counts_when_the_next_one_begins(plan: StoredPlan, lines: list[str], tmp_path: Path):
+def test_an_image_is_complete_when_the_next_one_starts(plan: StoredPlan, lines: list[str], tmp_path: Path):
     file = growing_file(tmp_path / "corners.csv", plan.arm.robot, plan.settings)
     assert "does not exist" in file.read().waiting
     (tmp_path / "corners.csv").write_text("\n".join(lines[: 1 + CORNERS]) + "\n")

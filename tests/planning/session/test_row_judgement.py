@@ -47,7 +47,7 @@ def test_a_swapped_point_among_the_first_rows_is_found():
     assert counting(rows, 5) == [0, 2, 3, 4, 5]
 
 
-def test_a_row_that_was_called_wrong_can_count_again():
+def test_a_row_that_was_called_wrong_can_be_used_again():
     rows = PLAN.rows(15)
     mask = (torch.arange(15) < 14) & (torch.arange(15) != 4)
     assert judge_rows(ROBOT, rows, NOISE, mask).counts.all()

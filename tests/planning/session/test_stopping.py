@@ -40,7 +40,7 @@ def test_the_last_pose_ends_the_session():
     assert stopping_advice(None, 0.005, [], [], 0).action == "stop"
 
 
-def test_without_an_accuracy_measuring_goes_on():
+def test_without_an_accuracy_measuring_continues():
     said = stopping_advice(0.15, 0.005, [], [], 12)
     assert said.action == "measure"
     assert "12 poses" in said.sentence

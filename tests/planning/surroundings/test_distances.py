@@ -41,7 +41,7 @@ def test_a_segment_is_as_far_from_a_box_as_its_nearest_point():
     assert bool((box_distance(segments, half) <= torch.stack(outside) + 1e-9).all())
 
 
-def test_a_segment_is_nearest_to_a_box_where_the_slope_of_its_distance_is_none():
+def test_a_segment_is_nearest_to_a_box_where_the_slope_of_the_distance_is_zero():
     half = torch.tensor([1.0, 1.0, 1.0], dtype=torch.float64)
     cases = [
         ([[-3, 0, 1.5], [3, 0, 1.5]], 0.5),  # along a face

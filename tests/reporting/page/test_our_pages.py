@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from matplotlib.figure import Figure
-from testing.aged import model_before, rows_later
+from testing.aged import original_model, rows_after_change
 from testing.cell_models import cell_of_two_models
 from testing.compared import after_collision
 from testing.models import no_type_checker
@@ -37,11 +37,11 @@ def pages(tmp_path_factory):
         content = report_content(folder_with_held_out(arm, model, folder / "arm"), folder / "arm")
         (folder / "report.html").write_text(render_page(content, draw_figures(content)), encoding="utf-8")
         sessions = [
-            replace(rows_later(count, 30 + count), date=(day,) * count) for day, count in DAYS.items()
+            replace(rows_after_change(count, 30 + count), date=(day,) * count) for day, count in DAYS.items()
         ]
         metres = replace(sessions[1], position=sessions[1].position * 1e-3)
-        monitor(model_before(), [*sessions, metres]).save_page(folder / "monitoring.html")
-        compare(model_before(), after_collision()).save_page(folder / "comparison.html")
+        monitor(original_model(), [*sessions, metres]).save_page(folder / "monitoring.html")
+        compare(original_model(), after_collision()).save_page(folder / "comparison.html")
         cell_of_two_models(folder / "cells" / "a")
         Cell.create(folder / "cells" / "new", "ur5")
         (folder / "cells" / "broken").mkdir()

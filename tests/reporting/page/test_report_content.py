@@ -71,7 +71,7 @@ def test_rows_of_the_calibration_are_recognised_by_their_hash(hybrid, tmp_path):
     assert content.accuracies[0].models == CalibrationSummary.read(model).cross_validation.models
 
 
-def test_training_rows_alone_do_not_count_as_held_out(hybrid, tmp_path):
+def test_training_rows_are_not_held_out_rows(hybrid, tmp_path):
     arm, model = hybrid
     bare = replace(model, metrics={})
     content = report_content(bare, tmp_path, arm.measurements)
@@ -174,7 +174,7 @@ def test_a_geometric_model_has_no_curves_and_no_noise(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["kiro3", "ur10"])
-def test_a_network_alone_is_reported(name, tmp_path):
+def test_a_model_of_a_network_only_is_reported(name, tmp_path):
     model = hand_made_model(name)
     alone = report_content(model, tmp_path)
     assert alone.accuracies == ()
@@ -297,7 +297,7 @@ def test_the_summary_is_json(hybrid, tmp_path):
     )
 
 
-def test_a_distilled_model_is_judged_by_its_parent(tmp_path):
+def test_a_distilled_model_is_compared_with_its_parent(tmp_path):
     figures = [
         {f"{name}_mm": size * k for k, name in enumerate(("mean", "rms", "p95", "max"), 1)}
         for size in (1, 0.01)

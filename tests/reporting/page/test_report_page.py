@@ -112,7 +112,7 @@ def test_json_cannot_end_its_element():
     assert json.loads(text) == value
 
 
-def test_the_map_holds_what_the_content_says(hostile_page):
+def test_the_map_contains_the_stated_content(hostile_page):
     content, text = hostile_page
     data = json.loads(Page(text).scripts[1])
     unpack = lambda packed: np.frombuffer(base64.b64decode(packed), "<f4")  # noqa: E731

@@ -55,7 +55,7 @@ def test_backlash_is_found_with_its_joints_and_size_and_is_no_lag_and_no_second_
 
 
 @pytest.mark.parametrize("name", ["kr10", "scara", "rail"])
-def test_rows_without_backlash_or_in_another_order_than_measured_are_left_alone(name):
+def test_rows_without_backlash_or_in_another_order_are_accepted(name):
     robot, rows, _ = with_backlash(name, 4)
     shuffled = rows.select(torch.randperm(rows.rows, generator=torch.Generator().manual_seed(1)))
     shuffled = replace(shuffled, line=tuple(range(2, 2 + rows.rows)))
@@ -99,7 +99,7 @@ def test_the_predicted_accuracy_contains_the_play_if_no_side_is_stated():
     )
 
 
-def test_a_calibration_learns_the_backlash_and_says_so():
+def test_a_calibration_learns_the_backlash_and_reports_it():
     robot, rows, joints = with_backlash("scara", 3)
     made = calibrate(robot, rows, CalibrationSettings(features=("backlash",), folds=0))
     (found,) = (one for one in made.summary.diagnostics if one.kind == "backlash")

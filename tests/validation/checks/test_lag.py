@@ -33,7 +33,7 @@ def test_a_lag_is_found_with_its_size(name, before):
 
 @pytest.mark.parametrize("name", ARMS)
 @pytest.mark.parametrize("seed", range(5, 8))
-def test_rows_without_a_lag_are_left_alone(name, seed):
+def test_rows_without_a_lag_are_accepted(name, seed):
     arm = OutsideArm(name, seed, 60, seed)
     assert list(check_lag(checked(GeometricCalibrator(arm.robot), arm.measured()))) == []
 

@@ -22,7 +22,7 @@ def test_positions_that_are_unrelated_to_the_only_joint_that_moves(generator, jo
     assert ("residual", "implausible") in kinds
 
 
-def test_orientations_are_judged_as_positions_are(generator):
+def test_orientations_are_evaluated_like_positions(generator):
     q = torch.rand(40, 6, generator=generator, dtype=torch.float64)
     robot = Robot.load("ur10")
     T = forward_kinematics(robot, q)

@@ -41,7 +41,7 @@ def test_rounded_joint_values_are_named_with_their_step_and_error(name, degrees)
 
 @pytest.mark.parametrize("name", ARMS)
 @pytest.mark.parametrize("degrees", [1.0, 0.1, 0.01])
-def test_poses_at_round_values_and_fine_steps_are_left_alone(name, degrees):
+def test_poses_at_round_values_and_fine_steps_are_accepted(name, degrees):
     arm = OutsideArm(name, 5)
     if degrees > 0.05:  # sent to round values
         arm.q = rounded(arm, degrees)

@@ -127,7 +127,7 @@ def test_a_small_motion_is_a_warning() -> None:
     ("seed", "rows", "wrong"),
     [(0, 15, 0.0), (1, 15, 0.1), (2, 15, 0.1), (3, 15, 0.0), (0, 60, 0.1), (1, 60, 0.0), (2, 60, 0.0)],
 )
-def test_healthy_rows_in_any_order_are_left_alone(seed: int, rows: int, wrong: float) -> None:
+def test_valid_rows_in_any_order_are_accepted(seed: int, rows: int, wrong: float) -> None:
     simulated = simulate("ur5", seed=seed, rows=rows, noise=5e-5, wrong=wrong)
     assert found(simulated.nominal, simulated.measurements) == []
     in_order = simulated.measurements.select(simulated.measurements.q[:, seed].argsort())
@@ -135,7 +135,7 @@ def test_healthy_rows_in_any_order_are_left_alone(seed: int, rows: int, wrong: f
 
 
 @pytest.mark.parametrize(("seed", "rows"), [(2, 20), (7, 20), (10, 20), (3, 24), (6, 24), (7, 24)])
-def test_few_rows_of_an_arm_with_gears_are_left_alone(seed: int, rows: int) -> None:
+def test_few_rows_of_an_arm_with_gears_are_accepted(seed: int, rows: int) -> None:
     """What motions and parameters could follow to the noise, as they are nearly as many as the values."""
     simulated = simulate("ur5", seed=seed, rows=rows)
     drawn, q = np.random.default_rng(seed), simulated.measurements.q

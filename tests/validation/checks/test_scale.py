@@ -47,7 +47,7 @@ def test_a_thousandth_is_recognised_where_links_are_long_for_their_errors(shared
     assert (diagnostic.kind, diagnostic.severity) == ("scale", "warning")
 
 
-def test_figures_say_how_far_true_positions_are_off(shared_data):
+def test_figures_state_the_error_of_true_positions(shared_data):
     rows = Measurements.read_csv(shared_data / "ur5/grid.csv")
     rows = rows.select(torch.arange(0, rows.rows, 15))
     figures = [

@@ -54,7 +54,7 @@ def test_intervals_are_those_of_resamples_drawn_by_hand(groups: int):
     assert_close(found.difference[:, 0], 0.0)
 
 
-def test_the_seed_decides_and_nothing_else(monkeypatch):
+def test_only_the_seed_determines_the_result(monkeypatch):
     errors, group = grouped(1, 9)
     state = np.random.get_state()[1].copy()  # noqa: NPY002
     first, again, other = (
@@ -80,7 +80,7 @@ def test_repeats_of_a_configuration_make_no_interval_narrower():
     assert np.diff(as_rows[0, 0]) < np.diff(once[0, 0]) / 4
 
 
-def test_an_interval_holds_the_truth_as_often_as_it_says():
+def test_an_interval_covers_the_true_value_as_often_as_stated():
     """60 sets of 60 configurations with 2 rows each; 95 % of the intervals shall hold the true mean and RMS."""
     rng = np.random.default_rng(0)
     truth = np.array([2.0, np.sqrt(6.0)])  # of a gamma distribution of shape 2

@@ -37,7 +37,7 @@ def test_few_poses_are_at_most_a_little_worse_than_the_nominal_arm(shared_data):
 
 
 @pytest.mark.parametrize("hybrid", [False, True])
-def test_an_arm_without_errors_stays_nominal(hybrid):
+def test_an_arm_without_errors_remains_nominal(hybrid):
     arm = simulate("ur10", rows=7, noise=1e-3, turn_noise=1e-3, length=1e-6, angle=1e-6)
     calibrator = GeometricCalibrator(arm.nominal)
     result = fit_if_better(HybridCalibrator(calibrator) if hybrid else calibrator, arm.measurements, nothing)

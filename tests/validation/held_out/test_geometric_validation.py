@@ -89,7 +89,7 @@ def test_an_error_of_a_held_out_socket_is_the_distance_to_where_its_rows_meet() 
         assert_close(errors[own].mean(0), torch.zeros(3, dtype=torch.float64), atol=1e-12)
 
 
-def test_every_stated_distance_is_judged_by_a_calibration_without_it() -> None:
+def test_every_stated_distance_is_predicted_by_a_calibration_without_it() -> None:
     data = socket_data()
     wrong = KNOWN | {("low/0", "low/1"): 0.051}
     found = validate(exact(socket_distances=wrong), data, k_folds(data, 3, 0))
@@ -102,7 +102,7 @@ def test_every_stated_distance_is_judged_by_a_calibration_without_it() -> None:
     assert 1e-3 < max(others) < 1.0  # their calibrations had the wrong one
 
 
-def test_distances_are_held_out_once_and_never_all_of_them() -> None:
+def test_distances_are_held_out_once_but_never_all_together() -> None:
     data = socket_data()
     whole = held_out_distances(KNOWN, data, k_folds(data, None, 0, "placement"))
     assert sorted(len(one) for one in whole) == [1, 1, 1]

@@ -86,7 +86,7 @@ def test_columns_bear_their_units(measured):
     assert head[-3:] == ["residual_x_mm", "residual_y_mm", "residual_z_mm"]
 
 
-def test_without_a_section_there_are_none(tmp_path):
+def test_a_folder_without_held_out_rows_has_none(tmp_path):
     assert read_held_out(tmp_path, hand_made_model("kiro3")) is None
 
 

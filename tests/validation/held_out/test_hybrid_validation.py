@@ -38,7 +38,7 @@ def found(arm):
     return validate(small(arm.true.nominal), arm.measurements, parts, steps.append), parts, steps
 
 
-def test_all_three_are_judged_on_the_same_rows(found):
+def test_all_three_models_are_evaluated_on_the_same_rows(found):
     validation, _, steps = found
     assert list(validation.models) == ["nominal", "geometric", "hybrid"]
     figures = validation.figures()
@@ -61,7 +61,7 @@ def test_geometric_figures_are_those_of_the_geometric_calibrator_alone(arm, foun
         assert_close(alone.models[name].position, validation.models[name].position, atol=1e-15)
 
 
-def test_every_fold_knows_its_training_rows_only(arm, found):
+def test_every_fold_uses_only_its_training_rows(arm, found):
     validation, parts, _ = found
     train, test = parts[1]
     again = small(arm.true.nominal).fit(arm.measurements.select(train))
@@ -99,7 +99,7 @@ def test_coverage_of_errors_drawn_as_predicted(generator):
     assert PredictedSpread.all_nan(5).in_file_units() == {}
 
 
-def test_stated_noise_counts_row_by_row_and_rows_without_are_exact(arm):
+def test_stated_noise_applies_per_row_and_rows_without_it_are_exact(arm):
     stated = torch.full((ROWS,), NOISE, dtype=torch.float64)
     rows = replace(arm.measurements, sigma_position=stated)
     result = small(arm.true.nominal).fit(rows)
@@ -155,7 +155,7 @@ def test_a_frame_that_was_held_out_is_fitted_under_both_arms(arm):
     assert list(result.geometric.bases) == ["left"]
 
 
-def test_sockets_are_judged_as_a_geometric_calibration_judges_them():
+def test_sockets_are_evaluated_like_those_of_a_geometric_calibration():
     data = socket_data()
     known = {(f"{plate}/0", f"{plate}/1"): 0.05 for plate in ("plate", "low", "high")}
     parts = k_folds(data, None, 0, "placement")

@@ -175,7 +175,7 @@ def test_inside_and_outside_of_a_network():
     assert inside_domain(replace(model, domain=None), rows) is None
 
 
-def test_rows_that_one_does_not_predict_count_for_none():
+def test_rows_that_one_model_does_not_predict_are_excluded_for_all():
     model, steep = hand_made_model("kiro3"), hand_made_model("kiro3")
     steep.network.networks[0].output_scale.fill_(3.0)
     q = joints_around("kiro3", 80, spread=1.0)
@@ -190,7 +190,7 @@ def test_rows_that_one_does_not_predict_count_for_none():
     assert_close(good.position.statistics["mean"], 1e3 * float(errors[predicted].mean()), atol=1e-12)
 
 
-def test_nothing_to_compare_is_said(arm):
+def test_rows_without_comparable_values_are_refused(arm):
     _, model = arm
     q = joints_around("ur10", 3)
     with pytest.raises(IdentificationError):

@@ -24,7 +24,7 @@ def test_signed_rank_does_not_depend_on_the_direction():
     assert signed_rank(values).z < 0
 
 
-def test_no_difference_is_no_difference():
+def test_equal_models_do_not_differ():
     found = signed_rank(np.zeros(4))
     assert (found.statistic, found.z, found.p, found.pairs) == (0.0, 0.0, 1.0, 0)
 

@@ -121,7 +121,7 @@ def test_a_bias_shows_in_the_mean_along_an_axis():
     assert found == pytest.approx({"rms": math.sqrt(11 / 3), "mean": -1.0, "p95": 2.8, "max": 3.0}, rel=1e-15)
 
 
-def test_rows_without_positions_are_told_what_is_missing():
+def test_the_missing_columns_of_rows_without_positions_are_named():
     q = joints_around("kiro4", 2)
     T = forward_kinematics(hand_made_model("kiro4").robot, q)
     with refused(MeasurementError, expected="positions", value="socket"):

@@ -61,7 +61,7 @@ def test_angles_by_hand():
     assert_close(angular_distance_repeatability(first, second), [spread, 0.0, 0.0], atol=EXACT)
 
 
-def test_one_repeat_says_nothing_of_repeatability():
+def test_one_repeat_does_not_determine_repeatability():
     for function in (distance_repeatability, angular_distance_repeatability):
         with refused(MeasurementError, option="attained", value=1):
             function(FIRST[:1], SECOND[:1])

@@ -115,7 +115,7 @@ def test_a_command_without_direction_is_refused():
         path_tangents(COMMAND[[0, 1, 0]])
 
 
-def test_one_path_says_nothing_of_repeatability():
+def test_one_path_does_not_determine_repeatability():
     for function in (path_repeatability, path_orientation_repeatability):
         with refused(MeasurementError, option="attained", value=1):
             function(COMMAND[None])

@@ -59,7 +59,7 @@ def test_orientation_by_hand():
     assert_close(orientation_repeatability(angles), [0.06, 0.0, 0.9], atol=EXACT)
 
 
-def test_a_full_turn_makes_no_difference():
+def test_a_full_turn_has_no_effect():
     angles = tensor([[math.pi - 0.01] * 3, [-math.pi + 0.03] * 3])
     assert_close(orientation_accuracy(angles, tensor([math.pi] * 3)), [0.01] * 3, atol=EXACT)
     assert_close(orientation_repeatability(angles), [3 * math.sqrt(2 * 0.02**2)] * 3, atol=EXACT)
@@ -119,7 +119,7 @@ def test_angles_of_rotations_are_about_the_axes_of_the_frame():
     assert_close(orientation_accuracy(found, torch.zeros(3).double()), turns.mean(0), atol=1e-12)
 
 
-def test_one_repeat_says_nothing_of_repeatability():
+def test_one_repeat_does_not_determine_repeatability():
     for function in (position_repeatability, orientation_repeatability):
         with refused(MeasurementError, option="attained", value=1):
             function(COMMAND[None])

@@ -51,7 +51,7 @@ def test_rows_of_usual_errors_and_many_wrong_ones_are_all_judged(arm, model):
 
 
 @pytest.mark.parametrize(("shift", "turn"), [(0.0, 2.83), (0.05, 0.0)])
-def test_of_few_rows_one_is_named_where_nothing_is_fitted_to_them(arm, model, shift, turn):
+def test_one_of_few_rows_is_named_if_nothing_is_fitted(arm, model, shift, turn):
     rows = spoilt(arm.measurements, shift, turn).select(torch.arange(2, 10))
     found = without_wrong_rows([model], rows)
     assert found.numbers == (WRONG - 2,)

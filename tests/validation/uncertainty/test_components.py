@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from testing.aged import model_before, rows_later
+from testing.aged import original_model, rows_after_change
 from testing.cell_rows import ROBOT
 from testing.closeness import assert_close
 from testing.models import no_type_checker
@@ -53,7 +53,7 @@ def test_an_instrument_without_uncertainty_or_factor_is_not_guessed(stated):
 )
 def test_thermal_expansion_is_that_of_the_reach(temperatures, kelvin):
     """Sessions a and b made the model, so that the calibration was at their mean."""
-    model = model_before()
+    model = original_model()
     found = thermal_component(model, temperatures, ("a", "b"), 1.2e-5)
     assert (found.evaluation, found.degrees_of_freedom) == ("B", math.inf)
     assert_close(found.standard_uncertainty, 1.2e-5 * model.robot.reach * kelvin / math.sqrt(3), atol=1e-15)
@@ -64,7 +64,7 @@ def test_thermal_expansion_is_that_of_the_reach(temperatures, kelvin):
     [({"a": 20.0, "b": None}, 1.2e-5), ({"a": 20.0}, None), ({"b": 20.0}, 1.2e-5), ({}, 1.2e-5)],
 )
 def test_thermal_expansion_is_not_guessed(temperatures, expansion):
-    assert isinstance(thermal_component(model_before(), temperatures, ("a",), expansion), str)
+    assert isinstance(thermal_component(original_model(), temperatures, ("a",), expansion), str)
 
 
 def test_the_repeatability_of_the_maker_is_that_of_its_axes():
@@ -76,17 +76,17 @@ def test_the_repeatability_of_the_maker_is_that_of_its_axes():
 
 
 def test_the_parameters_are_those_of_the_posterior():
-    rows = rows_later(12, 3)
-    found = parameter_component(model_before(), rows, "session a")
-    deviation = deviation_of_rows(model_before(), rows)
+    rows = rows_after_change(12, 3)
+    found = parameter_component(original_model(), rows, "session a")
+    deviation = deviation_of_rows(original_model(), rows)
     assert_close(found.standard_uncertainty, float(deviation.square().mean().sqrt()))
     assert found.degrees_of_freedom is None or found.degrees_of_freedom > 1
-    assert isinstance(parameter_component(model_before(), None, ""), str)
+    assert isinstance(parameter_component(original_model(), None, ""), str)
 
 
 def test_missing_components_are_named_and_do_not_contribute():
     found = uncertainty_budget(
-        model_before(), rows_later(12, 3), "a", Instrument(), {"a": None}, ("a",), None
+        original_model(), rows_after_change(12, 3), "a", Instrument(), {"a": None}, ("a",), None
     )
     assert [one.evaluation for one in found.components] == ["A", "A"]
     assert [line.partition(":")[0] for line in found.missing] == ["instrument", "thermal expansion"]

@@ -23,7 +23,7 @@ class Scene:
         self.drawn[name] = points
 
 
-def test_the_sheet_holds_every_corner() -> None:
+def test_the_sheet_contains_every_corner() -> None:
     scene = Scene()
     draw_board(scene, "/sensor", BOARD)
     assert_close(scene.drawn["/sensor/corners"], BOARD.corners, atol=0.0)

@@ -9,7 +9,7 @@ import pytest
 from testing.closeness import assert_close
 from testing.models import no_type_checker
 from testing.report import HOSTILE
-from testing.sessions import arm_beside_tracker, session_state
+from testing.sessions import arm_with_tracker, session_state
 
 from pisigma.planning.session.state import Advice, Alarm
 
@@ -21,7 +21,7 @@ from pisigma.workbench.viewing.session_view import SessionView, first_view, top_
 @pytest.fixture(scope="module")
 def view():
     """A page that is served while a module is tested; viser's annotations are not checked."""
-    with no_type_checker(), SessionView(arm_beside_tracker(), limit=1.5e-4, port=0) as view:
+    with no_type_checker(), SessionView(arm_with_tracker(), limit=1.5e-4, port=0) as view:
         yield view
 
 
@@ -57,7 +57,7 @@ def text_with(page, rows):
 
 
 def test_rows_appear_as_they_come(browser, view):
-    arm = arm_beside_tracker()
+    arm = arm_with_tracker()
     view.show_state(session_state(arm, 5))
     with opened(browser, view) as page:
         first = text_with(page, 5)
@@ -85,19 +85,19 @@ def test_rows_appear_as_they_come(browser, view):
 
 
 def test_nothing_is_printed_to_stdout(capfd):
-    with no_type_checker(), SessionView(arm_beside_tracker(), port=0) as view:
+    with no_type_checker(), SessionView(arm_with_tracker(), port=0) as view:
         assert view.url.startswith("http://127.0.0.1:")
     assert capfd.readouterr().out == ""
 
 
-def test_the_colour_scale_covers_the_rows_that_count():
-    state = session_state(arm_beside_tracker(), 20, wrong=19)
+def test_the_colour_scale_covers_the_used_rows():
+    state = session_state(arm_with_tracker(), 20, wrong=19)
     assert_close(top_of_scale(state.rows), 5e-4, rtol=1e-12)
-    assert_close(top_of_scale(session_state(arm_beside_tracker(), 3).rows), 1e-3)
+    assert_close(top_of_scale(session_state(arm_with_tracker(), 3).rows), 1e-3)
 
 
-def test_the_first_view_holds_robot_and_tracker():
-    arm = arm_beside_tracker()
+def test_the_first_view_contains_robot_and_tracker():
+    arm = arm_with_tracker()
     position, middle = first_view(arm)
     tracker = arm.surroundings.tracker.position.numpy()
     for point in (tracker, 0 * tracker):

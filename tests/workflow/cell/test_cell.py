@@ -63,7 +63,7 @@ def test_the_model_is_that_of_the_rows_without_a_cell_to_the_bit(year):
     )
 
 
-def test_the_first_model_goes_into_use_when_it_is_verified(year):
+def test_the_first_model_is_put_into_use_when_it_is_verified(year):
     cell, _, (_, entry), (verification, verified) = year
     assert verification.verdict == "better"
     assert (verified, cell.history.in_use) == (entry, entry)
@@ -113,7 +113,7 @@ def test_a_plan_for_a_model_has_few_and_other_poses_and_is_measured_next(year):
 
 
 @pytest.mark.parametrize("again", ["same", "file"])
-def test_rows_that_are_known_are_refused(year, again, tmp_path):
+def test_rows_that_the_cell_contains_are_refused(year, again, tmp_path):
     cell, *_ = year
     rows = measured(12, 2)
     if again == "file":
@@ -211,7 +211,7 @@ def test_sessions_before_and_after_an_event_of_the_instrument_are_in_two_frames(
         cell.calibrate()
 
 
-def test_a_plan_is_measured_whole_or_the_other_poses_are_asked_for(tmp_path):
+def test_the_missing_poses_of_a_plan_are_requested(tmp_path):
     cell = Cell.create(tmp_path / "cell", "ur10")
     cell.plan(count=40, check=0, candidates=100)
     cell.take_in(measured(20, 1), day=day(2))
@@ -244,7 +244,7 @@ def test_a_session_is_set_aside_with_a_reason(tmp_path):
     assert (cell.folder / "sessions" / "2026-01-10.csv").exists()
 
 
-def test_a_folder_that_holds_something_is_not_made_a_cell(tmp_path):
+def test_a_folder_with_files_does_not_become_a_cell(tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
     with refused(OutputError, file=tmp_path):
         Cell.create(tmp_path, "ur10")

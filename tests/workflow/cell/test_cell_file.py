@@ -49,7 +49,7 @@ def test_values_have_the_units_and_forms_of_the_command_line(tmp_path):
     assert settings.gravity == (0, 0, -1)
 
 
-def test_what_is_stated_once_counts_for_every_step_and_a_step_may_state_another(tmp_path):
+def test_a_common_setting_applies_to_all_steps_unless_a_step_overrides_it(tmp_path):
     file = cell_file(tmp_path, "robot: ur10\nlimit_mm: 0.3\nplan:\n  limit_mm: 0.5\n")
     assert file.settings_of_step("plan").limit_mm == 0.5
     assert file.settings_of_step("measure").limit_mm == 0.3

@@ -58,7 +58,7 @@ def test_every_command_of_the_table_is_called():
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_every_command_asks_the_table_before_it_does_anything(command, cell, used, tmp_path, monkeypatch):
+def test_every_command_checks_the_table_first(command, cell, used, tmp_path, monkeypatch):
     set_controller(cell, used.folder.parent / "dh.csv", day(0))
     monkeypatch.setattr(
         controller, "RULES", dict.fromkeys(RULES, ("allow",) * 3) | {command: ("refuse",) * 3}

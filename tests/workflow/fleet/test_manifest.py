@@ -3,7 +3,7 @@
 import hashlib
 
 import pytest
-from testing.aged import model_before, rows_later
+from testing.aged import original_model, rows_after_change
 from testing.refusals import assert_fields, refused
 
 from pisigma.files.errors import FleetError, MeasurementError, ModelError
@@ -150,18 +150,18 @@ def test_an_empty_folder_is_refused(tmp_path):
 def model(tmp_path_factory):
     folder = tmp_path_factory.mktemp("models") / "welder"
     folder.mkdir()
-    save_model(model_before(), folder)
+    save_model(original_model(), folder)
     return folder
 
 
-def test_the_model_of_a_folder_goes_into_use(tmp_path, model):
+def test_the_model_of_a_folder_is_put_into_use(tmp_path, model):
     cell_from_model(model, ANY).write(tmp_path / "cell")
     cell = Cell.open(tmp_path / "cell")
     assert cell.history.in_use.name == "welder"
     assert cell.history.in_use.sha256 == hashlib.sha256((model / "model.yaml").read_bytes()).hexdigest()
-    assert cell.robot.dh == pytest.approx(model_before().robot.dh)
+    assert cell.robot.dh == pytest.approx(original_model().robot.dh)
     assert (cell.status().step.state, cell.history.in_use.made_of) == ("no_plan", ())
-    rows_later(10, 11).write_csv(tmp_path / "new.csv", cell.robot)
+    rows_after_change(10, 11).write_csv(tmp_path / "new.csv", cell.robot)
     cell.take_in(tmp_path / "new.csv")
     assert cell.status().step.state == "session_not_judged"
 

@@ -5,7 +5,7 @@ import shutil
 import sys
 
 import pytest
-from testing.aged import model_before, rows_later
+from testing.aged import original_model, rows_after_change
 from testing.models import no_type_checker
 from testing.refusals import refused
 
@@ -42,7 +42,7 @@ def in_this_process(monkeypatch):
 def plant(tmp_path):
     """Three cells, of which the file of one is bad."""
     for number in range(2):
-        rows_later(20, number).write_csv(tmp_path / f"{number}.csv", model_before().robot)
+        rows_after_change(20, number).write_csv(tmp_path / f"{number}.csv", original_model().robot)
     (tmp_path / "bad.csv").write_text("q1_deg\nx\n", encoding="utf-8")
     (tmp_path / "fleet.csv").write_text(
         "id,data,date,options\n"
@@ -60,7 +60,7 @@ def table_of(run):
     return [(row["cell"], row["command"], row["verdict"]) for row in rows], rows
 
 
-def test_a_bad_file_is_named_and_does_not_stop_the_others(plant):
+def test_an_invalid_file_is_named_and_does_not_affect_the_others(plant):
     run = run_fleet(plant, ONE_JOB)
     assert (run.cells, run.done, run.unchanged) == (3, 2, 0)
     ((cell, reason),) = run.refused
@@ -86,7 +86,7 @@ def test_a_later_call_continues(plant):
     assert again.results.read_bytes() == content
     first.results.unlink()  # parameters are then read from the models
     assert run_fleet(plant, ONE_JOB).results.read_bytes() == content
-    rows_later(31, 5).write_csv(plant / "r2" / "sessions" / "2026-10-01.csv", model_before().robot)
+    rows_after_change(31, 5).write_csv(plant / "r2" / "sessions" / "2026-10-01.csv", original_model().robot)
     last = run_fleet(plant, ONE_JOB)
     assert (last.unchanged, last.done, last.refused) == (2, 3, ())
 

@@ -18,7 +18,7 @@ HYBRID = "repeats: 5\n"
 
 
 @pytest.mark.parametrize("name", ["ur5_hybrid", "ur10_hybrid", RB5])
-def test_shipped_recipes_parse_and_say_what_they_are(repository, name):
+def test_shipped_recipes_parse_and_state_their_kind(repository, name):
     recipe = read_recipe(repository / "training" / f"{name}.yaml")
     assert isinstance(recipe, HybridRecipe)
     assert recipe.name == name

@@ -136,7 +136,7 @@ def test_every_dependency_holds(name: str) -> None:
         assert_close(J @ change, 0.0, atol=1e-5 * np.linalg.norm(J[:, names.index(removed)]))
 
 
-def test_dependencies_are_said_in_words_and_the_preferred_are_kept() -> None:
+def test_dependencies_are_described_and_preferred_parameters_kept() -> None:
     seen, sizes = condensed(Robot.load("rb5"), 0, rows=40, poses=False, arm_only=True)
     redundancy = find_redundancy(seen, sizes)
     assert (

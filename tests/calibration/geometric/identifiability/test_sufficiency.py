@@ -15,7 +15,7 @@ from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
 
 
-def test_too_few_rows_say_how_many_more() -> None:
+def test_too_few_rows_state_how_many_more_are_needed() -> None:
     arm = simulate("ur10", rows=8)
     with refused(IdentificationError, value=24) as caught:
         GeometricCalibrator(arm.nominal).fit(arm.measurements)
@@ -35,7 +35,7 @@ def test_an_empty_name_is_refused() -> None:
         GeometricCalibrator(Robot.load("ur10"), free=("a_2", ""))
 
 
-def test_few_rows_do_not_make_few_parameters() -> None:
+def test_few_rows_do_not_reduce_the_number_of_parameters() -> None:
     """The rank of three positions is at most nine, but many more parameters have to be estimated."""
     arm = simulate("ur10", rows=3)
     with refused(IdentificationError, expected="more than 39 values", value=9) as caught:

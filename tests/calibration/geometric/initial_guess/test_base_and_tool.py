@@ -106,7 +106,7 @@ def test_missing_values_are_left_out() -> None:
 
 
 @pytest.mark.parametrize("poses", [True, False])
-def test_a_fixed_base_or_tool_stays(poses: bool) -> None:
+def test_a_fixed_base_or_tool_remains_unchanged(poses: bool) -> None:
     arm = simulate("ur10", rows=30, length=0, angle=0, turn_noise=0.0 if poses else None)
     known = 6 if poses else 3
     with_base = arm.nominal.with_geometry(base=arm.true.base)
@@ -197,7 +197,7 @@ def test_a_base_that_only_outliers_show_has_no_standard_error(seed: int) -> None
     assert result.parameter("base_F_x").free
 
 
-def test_a_base_that_no_row_ever_told_is_not_laid_to_outliers() -> None:
+def test_a_base_that_no_row_determines_does_not_cause_outliers() -> None:
     arm = simulate("ur10", rows=60, noise=5e-5)
     result = GeometricCalibrator(arm.nominal, prior=None, elimination="none", loss=SquaredLoss()).fit(
         arm.measurements

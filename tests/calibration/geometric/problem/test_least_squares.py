@@ -97,7 +97,7 @@ def test_a_remaining_residual_ends_by_convergence() -> None:
     assert_close(solution.linearisation.point, torch.ones(2), atol=1e-3)
 
 
-def test_the_iteration_limit_is_said() -> None:
+def test_the_iteration_limit_is_reported() -> None:
     solution = levenberg_marquardt(Curve(10.0), START, maximum_iterations=1)
     assert solution.status is SolutionStatus.ITERATION_LIMIT
     assert not solution.status.is_minimum

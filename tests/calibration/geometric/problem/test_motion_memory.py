@@ -18,7 +18,7 @@ def _problem() -> tuple[CalibrationProblem, torch.Tensor]:
     return setup.problem, setup.start
 
 
-def test_another_point_is_looked_at_anew() -> None:
+def test_another_point_is_evaluated_again() -> None:
     problem, start = _problem()
     active, rows = torch.arange(len(start)), problem.chunks()[0]
     before = problem.motion(start, rows, active)

@@ -12,11 +12,11 @@ from testing.rewritten_programs import (
     LANGUAGES,
     TOLERANCE_MM,
     TOOL,
+    attained_poses,
+    desired_poses,
     place_of,
     position,
-    really,
     scanned,
-    wanted_poses,
 )
 
 from pisigma.deployment.export.export_format import ExportRequest
@@ -71,7 +71,7 @@ PROGRAMS = {
 
 def _poses(arm, points=POINTS):
     """Of one orientation, in the frame."""
-    first = wanted_poses(load_model(arm).robot)[0]
+    first = desired_poses(load_model(arm).robot)[0]
     T = first.repeat(3, 1, 1)
     T[:, :3, 3] += points
     return T
@@ -99,7 +99,7 @@ def _reasons(exported):
 
 
 @pytest.mark.parametrize("suffix", PROGRAMS)
-def test_the_real_tool_stays_on_the_arc(suffix, arm, tmp_path):
+def test_the_real_tool_remains_on_the_arc(suffix, arm, tmp_path):
     """A controller moves on arcs through the commanded poses, and the real tool on the intended arc."""
     T = _poses(arm)
     request = _request(suffix, PROGRAMS[suffix].text, T, arm, tmp_path)
@@ -113,12 +113,12 @@ def test_the_real_tool_stays_on_the_arc(suffix, arm, tmp_path):
         ends = (target.pose.T[None, :3, 3] for target in (move.start, move.via, move.end))
         commanded = move.start.pose.T.repeat(9, 1, 1)
         commanded[:, :3, 3] = CircularArcs.through_points(*ends).sample(8)[0]
-        real = really(arm, commanded, commanded)[:, :3, 3] - meant.centre
+        real = attained_poses(arm, commanded, commanded)[:, :3, 3] - meant.centre
         height = (real * meant.axis).sum(-1)
         off = torch.hypot(height, (real - height[:, None] * meant.axis).norm(dim=-1) - meant.radius.norm())
         worst = max(worst, float(off.max()) * 1e3)
     assert worst < 1.5 * TOLERANCE_MM
-    last = really(arm, moves[-1].end.pose.T[None], T[2:])
+    last = attained_poses(arm, moves[-1].end.pose.T[None], T[2:])
     assert_close(last[0, :3, 3], T[2, :3, 3], atol=1e-8)
 
 

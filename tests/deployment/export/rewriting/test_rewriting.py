@@ -14,11 +14,11 @@ from testing.rewritten_programs import (
     LANGUAGES,
     TOLERANCE_MM,
     TOOL,
+    attained_poses,
+    desired_poses,
     program,
-    really,
     scanned,
-    six,
-    wanted_poses,
+    xyzabc_text,
 )
 
 from pisigma.deployment.export.export_format import Exported, ExportRequest
@@ -34,7 +34,7 @@ from pisigma.model.folder.model_folder import load_model
 def test_the_real_tool_reaches_the_programmed_poses(language, arm, tmp_path):
     request = program(language, arm, tmp_path)
     exported = export_model("targets", request)
-    wanted = wanted_poses(load_model(arm).robot)
+    wanted = desired_poses(load_model(arm).robot)
     before, after = scanned(request.program, request.frames), scanned(request.out, request.frames)
     names = [round(float(t.pose.T[0, 3]), 6) for t in before.targets]
     kept = 2 if language.suffix == ".ls" else 3  # P[3] is used with an offset too
@@ -49,7 +49,7 @@ def test_the_real_tool_reaches_the_programmed_poses(language, arm, tmp_path):
             commanded[nearest] = target.pose.T
     for index in set(order) - {3}:
         assert float((commanded[index] - wanted[index])[:3, 3].norm()) > 1e-4
-        real = really(arm, commanded[index][None], wanted[index][None])
+        real = attained_poses(arm, commanded[index][None], wanted[index][None])
         assert_close(real[0, :3, 3], wanted[index, :3, 3], atol=1e-8)
         assert_close(real[0, :3, :3], wanted[index, :3, :3], atol=1e-7)
     assert_close(commanded[3], wanted[3], atol=1e-8)  # it keeps its line
@@ -63,13 +63,13 @@ def test_the_real_tool_reaches_the_programmed_poses(language, arm, tmp_path):
 
 
 @pytest.mark.parametrize("language", LANGUAGES, ids=lambda language: language.suffix)
-def test_straight_moves_stay_straight(language, arm, tmp_path):
+def test_straight_moves_remain_straight(language, arm, tmp_path):
     """Between waypoints a controller moves on the line between commanded poses, and the real tool nearly so."""
     request = program(language, arm, tmp_path)
     exported = export_model("targets", request)
     after = scanned(request.out, request.frames)
     moves = [move for move in after.moves if move.start is not None]
-    wanted = wanted_poses(load_model(arm).robot)
+    wanted = desired_poses(load_model(arm).robot)
     assert exported.facts["way_points"] >= 1
     ends = [float((move.end.pose.T - wanted[1])[:3, 3].norm()) < 4e-3 for move in moves]
     moves = moves[: ends.index(True) + 1]
@@ -80,7 +80,7 @@ def test_straight_moves_stay_straight(language, arm, tmp_path):
         T = move.start.pose.T + share * (move.end.pose.T - move.start.pose.T)
         u, _, v = torch.linalg.svd(T[:, :3, :3])
         T[:, :3, :3] = u @ v
-        real = really(arm, T, T)[:, :3, 3] - wanted[0, :3, 3]
+        real = attained_poses(arm, T, T)[:, :3, 3] - wanted[0, :3, 3]
         off = real - (real @ line / (line @ line))[:, None] * line
         worst = max(worst, float(off.norm(dim=-1).max()) * 1e3)
     assert worst < 1.5 * TOLERANCE_MM
@@ -200,16 +200,16 @@ ENDDAT
 
 def test_points_of_inline_forms(arm, tmp_path):
     """Their frames are numbers; points with a fixed tool or without frames are left unchanged."""
-    T = wanted_poses(load_model(arm).robot)
+    T = desired_poses(load_model(arm).robot)
     program_file, out = tmp_path / "cell.dat", tmp_path / "new.dat"
-    program_file.write_text(DATA.format(**{f"P{i}": six(T[i]) for i in range(3)}))
+    program_file.write_text(DATA.format(**{f"P{i}": xyzabc_text(T[i]) for i in range(3)}))
     columns = ("x_mm", "y_mm", "z_mm", "roll_deg", "pitch_deg", "yaw_deg")
     frame, tool = (dict(zip(columns, millimetres_and_euler(F).tolist(), strict=True)) for F in (FRAME, TOOL))
     frames = tmp_path / "frames.yaml"
     frames.write_text(json.dumps({"frames": {"BASE_DATA[3]": frame}, "tools": {"TOOL_DATA[4]": tool}}))
     exported = export_model("targets", ExportRequest(arm, out, program=program_file, frames=frames))
     (target,) = scanned(out, frames).targets
-    real = really(arm, target.pose.T[None], T[:1])
+    real = attained_poses(arm, target.pose.T[None], T[:1])
     assert_close(real[0, :3, 3], T[0, :3, 3], atol=1e-8)
     assert [entry["line"] for entry in exported.facts["left_alone"]] == [4, 6]
     assert out.read_text().splitlines()[2:] == program_file.read_text().splitlines()[2:]
