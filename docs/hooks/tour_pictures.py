@@ -36,12 +36,12 @@ return [...document.querySelectorAll("body *")]
   .filter(one => !one.closest(left) && one.offsetWidth > 0 && one.scrollWidth > one.clientWidth + 1)
   .filter(one => getComputedStyle(one).overflowX !== "visible")
   .map(one => `${one.tagName} ${one.className} ${one.textContent.trim().slice(0, 60)}`);"""
-"""Elements whose text is cut off, in the browser's words; tables scroll."""
+"""JavaScript that lists the elements whose text is cut off, except tables, which scroll."""
 AXE = 'axe.run({exclude: ["#scene"]}, {iframes: false, resultTypes: ["violations"]})'
 
 
 def opened(browser: Browser, url: str, width: int, scheme: Any, faults: list[str]) -> Page:
-    """Open the page in a new window; what goes wrong on it is added to `faults`."""
+    """Open the page in a new window; errors on it are added to `faults`."""
     size: Any = {"width": width, "height": SIZES[width]}
     page = browser.new_context(viewport=size, color_scheme=scheme).new_page()
     page.set_default_timeout(180_000)
@@ -100,7 +100,7 @@ def work(page: Page, rows: list[Path]) -> None:
 
 
 def take(page: Page, name: str, axe: str) -> list[str]:
-    """Take the picture of the present tab, and return what is wrong with it."""
+    """Take the picture of the present tab, and return its faults."""
     page.wait_for_timeout(1_500)
     image = Image.open(io.BytesIO(page.screenshot())).convert("RGB")
     image.save(FOLDER / f"{name}.webp", quality=QUALITY, method=6)
@@ -114,7 +114,7 @@ def take(page: Page, name: str, axe: str) -> list[str]:
 
 
 def main() -> int:
-    """Take all pictures; return 1 if something is wrong with one of them."""
+    """Take all pictures; return 1 if one of them has a fault."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path)
     stated = parser.parse_args()

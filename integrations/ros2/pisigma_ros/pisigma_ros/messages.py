@@ -53,7 +53,7 @@ def near_of(joint_state, joints):
 
 
 def solution(stamped, near, arm, solve):
-    """Ask for the joint values of a geometry_msgs/PoseStamped.
+    """Request the joint values of a geometry_msgs/PoseStamped.
 
     Args:
         stamped: desired pose of the tool in the base frame.
@@ -78,7 +78,7 @@ def solution(stamped, near, arm, solve):
 
 
 def _refusal(wanted, arm):
-    """Return the error code for what a moveit_msgs/PositionIKRequest asks for in addition to a pose; "" for nothing."""
+    """Return the error code for unsupported parts of a moveit_msgs/PositionIKRequest; "" if there are none."""
     if wanted.ik_link_name not in ("", arm.tip_link) or wanted.pose_stamped_vector:
         return "INVALID_LINK_NAME"
     if wanted.avoid_collisions:

@@ -24,9 +24,9 @@ except ImportError:  # without MoveIt there is no service of its type
     GetPositionIK = None
 
 REQUESTS = QoSProfile(depth=100)
-"""Reliable, so that no request is lost; the depth is that of a short burst."""
+"""Reliable quality of service, so that no request is lost; the depth is sufficient for a short burst."""
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-"""As robot_state_publisher publishes robot_description."""
+"""Quality of service with which robot_state_publisher publishes robot_description."""
 PARAMETERS = {
     "host": ("127.0.0.1", "Host of the server."),
     "port": (5006, "Port of the server for binary frames."),
@@ -136,14 +136,14 @@ class CorrectedIk(LifecycleNode):
             self._made.append((self.destroy_service, service))
 
     def on_activate(self, state):
-        """Begin to answer."""
+        """Start to answer requests."""
         self._is_active = True
         result = super().on_activate(state)
         self._report()
         return result
 
     def on_deactivate(self, state):
-        """Stop answering."""
+        """Stop answering requests."""
         self._is_active, self._shown = False, None
         return super().on_deactivate(state)
 
@@ -203,7 +203,7 @@ class CorrectedIk(LifecycleNode):
             self.get_logger().warning(f"A request was refused: {name}", throttle_duration_sec=1.0)
 
     def _report(self):
-        """Publish diagnostics, and the robot_description if it is another one."""
+        """Publish diagnostics, and the robot_description if it has changed."""
         server = self._server
         if self._is_active and server.urdf and server.urdf != self._shown:
             self._description.publish(String(data=server.urdf))

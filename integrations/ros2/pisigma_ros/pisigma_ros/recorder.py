@@ -33,7 +33,7 @@ PARAMETERS = {
 MIN_SAMPLES = 3
 """Minimum number of messages of each topic within a window."""
 MIN_MOTION = 10.0
-"""The arm is at another pose if a joint differs by this multiple of `still_joints`."""
+"""Multiple of `still_joints` by which a joint must differ for the arm to be at another pose."""
 
 
 class Samples:
@@ -50,7 +50,7 @@ class Samples:
             self._values.popleft()
 
     def mean(self, largest, checked):
-        """Return the means over the window; None if there are too few messages or one of the first values moves.
+        """Return the means over the window; None if there are too few messages, or if one of the first values moves.
 
         Args:
             largest: Largest range of a value that counts as standstill.
@@ -109,7 +109,7 @@ class Recorder(Node):
         self._tracker.add([p.x, p.y, p.z, *(sign * value for value in (q.x, q.y, q.z, q.w))])
 
     def _measured(self):
-        """Return joint values and reading of an arm that does not move, and why there are none."""
+        """Return joint values and reading of an arm at rest, or the reason why there are none."""
         q = self._arm.mean(self._value("still_joints"), len(self.joints))
         if q is None:
             return None, None, "joint_states are missing or change: wait until the arm does not move"

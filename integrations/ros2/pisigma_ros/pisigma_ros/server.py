@@ -6,13 +6,13 @@ from xml.etree import ElementTree
 from pisigma_ros.pisigma_client import FrameClient, JsonClient
 
 URDF_TIMEOUT = 60.0
-"""[s] Longest wait for the first URDF of a model, which the server has to make."""
+"""Maximum time to wait for the first URDF of a model, which the server has to create [s]."""
 FRAMES, TIPS = ("calibrated_frame", "base_link"), ("calibrated_tool", "tool0")
-"""Links of a calibrated URDF that are the frame of the model's poses and its tool; the first one that it has."""
+"""Candidate links of a calibrated URDF for the frame of the poses and for the tool; the first existing one is used."""
 
 
 class Server:
-    """Corrected joint values of a server, and what it says about a model.
+    """Corrected joint values from a server, and its information about a model.
 
     Attributes:
         problem: Why the server did not answer last; empty if it did.
@@ -22,7 +22,7 @@ class Server:
     """
 
     def __init__(self, host, port, json_port, token=None, model=0, timeout=0.5):
-        """Connect, and ask for the model and its URDF; an OSError or RuntimeError says that this is not possible."""
+        """Connect, and request the model and its URDF; raise OSError or RuntimeError if this is not possible."""
         self._address, self._json_address = (
             (port, host, token, timeout),
             (json_port, host, token, URDF_TIMEOUT),
@@ -45,7 +45,7 @@ class Server:
             raise
 
     def follow(self, period):
-        """Ask for the model every `period` seconds in a background thread."""
+        """Request the model every `period` seconds in a background thread."""
         threading.Thread(target=self._follow, args=(period,), daemon=True).start()
 
     def close(self):
