@@ -1,4 +1,4 @@
-"""`pisigma calibrate` with the hybrid, its default, and `train` with recipes of it."""
+"""`pisigma calibrate` with the hybrid (the default), and `train` with recipes for hybrids."""
 
 import json
 from dataclasses import replace

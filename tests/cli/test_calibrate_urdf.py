@@ -21,7 +21,7 @@ from pisigma.robot.writing import robot_to_urdf
 
 @pytest.fixture(scope="module")
 def urdf(tmp_path_factory):
-    """A UR5 as URDF with a camera beside the tool, so that the tool has to be named."""
+    """A UR5 as URDF with a camera in addition to the tool, so that the tool has to be named."""
     path = tmp_path_factory.mktemp("urdf") / "arm.urdf"
     root = etree.fromstring(robot_to_urdf(Robot.load("ur5"), ()).encode())
     elbow = root.findall("joint[@type='revolute']")[2].find("child").get("link")

@@ -35,7 +35,7 @@ def good_poses(name: str, rows: int = 3) -> list[tuple[float, ...]]:
 
 @pytest.fixture
 def poses(tmp_path):
-    """Write a file of poses; line 2 is a comment, so the first pose stands in line 3."""
+    """Write a file of poses; line 2 is a comment, so the first pose is in line 3."""
 
     def write(rows):
         path = tmp_path / "poses.csv"

@@ -66,7 +66,7 @@ def arm(tmp_path):
 
 
 def test_a_feature_is_tried_by_calibrate(run, example, arm, tmp_path):
-    """By default beside the others, and alone where the option names it."""
+    """The feature is tried with the others by default, and alone if the option names it."""
     options = ("--folds", 0, "--json", "--plugin", example("add-a-feature"))
     printed = json.loads(
         run("calibrate", "kiro4", tmp_path / "rows.csv", "--out", tmp_path / "a", *options).stdout
@@ -135,7 +135,7 @@ def test_a_closed_form_solves(run, example, tmp_path):
 
 
 def test_an_installed_package_is_loaded_by_every_command(run, example, tmp_path, monkeypatch):
-    """A package that is installed has a folder with its entry points beside it."""
+    """An installed package has a folder with its entry points next to it."""
     example("add-an-export").rename(tmp_path / "limits_of_joints.py")
     folder = tmp_path / "limits_of_joints-1.0.dist-info"
     folder.mkdir()

@@ -104,7 +104,7 @@ class KilledCell:
 
 
 def main() -> None:
-    """Run each command once, kill commands in turn at any time, and run each to its end at last."""
+    """Run each command once, kill the commands one after the other at random times, and finally run each to its end."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--count", type=int, default=200)
     parser.add_argument("--seed", type=int, default=0)

@@ -21,7 +21,7 @@ ROUNDING_MM = 1e-9
 
 @pytest.fixture
 def again(repository):
-    """A recipe run again, as the script does, and what is stored of it."""
+    """A recipe that is run again as by the script, and its stored result."""
 
     def run(name: str) -> tuple[dict, dict]:
         folder = repository / "training"

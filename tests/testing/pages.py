@@ -45,7 +45,7 @@ def visitor(link: str) -> Visitor:
 
 
 def ask(address: str, path: str, method="GET", body=None, **headers: str) -> Answer:
-    """Send one request; the path is sent as it is."""
+    """Send one request with an unmodified path."""
     connection = http.client.HTTPConnection(address, timeout=20)
     try:
         connection.request(method, path, body, {name: value for name, value in headers.items() if value})

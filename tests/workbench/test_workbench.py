@@ -287,7 +287,7 @@ def test_no_step_starts_once_the_server_ends():
 
 
 def test_results_are_those_of_the_commands(tmp_path):
-    """The page on a cell and the commands on a copy of it: the same figures, and attention at the same time."""
+    """The page of a cell and the commands on a copy of the cell show the same figures and states."""
     with no_type_checker():
         made = Cell.create(tmp_path / "page", "ur10", limit_mm=0.5)
         made.take_in(measured(40, 0), day=day(20))

@@ -1,4 +1,4 @@
-"""Where nothing tells where a frame stands, the hybrid arm stands where the geometric one does."""
+"""If no data determine the position of a frame, the hybrid arm is at the position of the geometric one."""
 
 from dataclasses import replace
 

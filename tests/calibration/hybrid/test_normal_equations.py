@@ -106,7 +106,7 @@ def test_sums_without_some_groups_are_those_of_the_others(name: str) -> None:
 
 
 def with_sums(normal: Tensor, descent: Tensor) -> NormalEquations:
-    """Of one sensor, beside any rows."""
+    """Return normal equations of one sensor with the given sums instead of those of rows."""
     whole = NormalEquations.from_rows(poses().design, poses().rows)
     return replace(
         whole, normal=normal[None], descent=descent[None], square=(1.0,), sensors=whole.sensors[:1]

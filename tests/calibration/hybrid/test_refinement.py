@@ -1,4 +1,4 @@
-"""The chosen model on all rows: linearised anew until it settles, and written as a network."""
+"""The chosen model on all rows: linearised again until convergence, and written as a network."""
 
 from dataclasses import replace
 

@@ -21,7 +21,7 @@ CAMERA_YAML = f"width: {CAMERA.width}\nheight: {CAMERA.height}\nfx: 500\nfy: 500
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with four images, the third a piece of a board and the fourth blurred, and the files beside them."""
+    """A folder with other files and four images; the third shows a part of a board, and the fourth is blurred."""
     folder = tmp_path_factory.mktemp("images")
     (folder / "images").mkdir()
     for number, (R, t) in enumerate(VIEWS):

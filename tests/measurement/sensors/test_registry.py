@@ -175,7 +175,7 @@ def true_arm() -> tuple[pisigma.Robot, pisigma.Robot]:
 
 
 def measured(rows: int, noise: float = 1e-6) -> tuple[pisigma.Robot, pisigma.Measurements]:
-    """Positions with tilts beside them, and heights above two gauges."""
+    """Positions with tilts, and heights above two gauges."""
     drawn, true = true_arm()
     rng = np.random.default_rng(1)
     q = torch.from_numpy(rng.uniform(-2, 2, (rows, drawn.dof)))

@@ -231,7 +231,7 @@ def test_far_from_the_rows_is_outside_the_domain(ik, name):
 @pytest.mark.parametrize("name", ROBOTS)
 @pytest.mark.parametrize("side", [-1, 1])
 def test_limits_are_those_of_the_corrected_joints(name, side):
-    """With a limit between nominal and corrected value, the corrected one counts, as it is commanded."""
+    """If a limit is between the nominal and the corrected value, the commanded (corrected) value is checked."""
     model = hand_made_model(name)
     T = poses_around(name)
     free = CorrectedIK(model)(T)

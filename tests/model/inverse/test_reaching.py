@@ -1,4 +1,4 @@
-"""What it is all for: the simulated true robot comes nearer to the wanted pose with corrected joints."""
+"""The purpose of pisigma: with corrected joint values the simulated true robot comes closer to the desired pose."""
 
 import pytest
 from testing.closeness import assert_close

@@ -69,7 +69,7 @@ def test_a_tolerance_that_is_not_a_number_is_rejected():
     ],
 )
 def test_errors_and_their_derivatives_agree(tolerance, pivot):
-    """All errors near the wanted pose; twists and positions far from it too."""
+    """All errors near the desired pose; twists and positions also far from it."""
     axes, robot, step = TaskAxes(tuple(map(float, tolerance))), Robot.load("ur10"), 1e-6
     assert axes.pivot == pivot
     q = joints_around("ur10", 6, spread=0.6)

@@ -1,4 +1,4 @@
-"""A calibration of all rows beside those of its folds, here and in processes."""
+"""A calibration of all rows together with those of its folds, in this process and in several processes."""
 
 import torch
 from testing.simulated_arm import simulate

@@ -22,7 +22,7 @@ ROWS = 60
 
 
 def two_setups(first: int, wrong: float = 0.0) -> tuple[Robot, Measurements]:
-    """A robot, and measurements of it as if they came from a file."""
+    """A robot and its measurements as read from a file."""
     arm = simulate("ur5", rows=ROWS, noise=5e-5, wrong=wrong)
     assert arm.measurements.position is not None
     position = arm.measurements.position.clone()

@@ -1,4 +1,4 @@
-"""Changes that neither wear nor a collision makes are told from those that they make, by class of robots."""
+"""Changes that neither wear nor a collision can cause are distinguished from others, by class of robots."""
 
 import math
 from dataclasses import replace

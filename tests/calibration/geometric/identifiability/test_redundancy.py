@@ -96,7 +96,7 @@ def test_rank_with_base_and_tool_is_4r_2p_3(name: str, rank: int, poses: bool) -
 def test_no_more_is_independent_than_axes_targets_and_frames_have(
     name: str, poses: bool, frames: int, targets: int
 ) -> None:
-    """Where no axes are parallel or meet, all of it is."""
+    """If no axes are parallel or intersect, this maximum is attained."""
     robot, rng = Robot.load(name), np.random.default_rng(frames + 10 * targets)
     robot = robot.with_geometry(robot.dh + 0.1 * rng.standard_normal(robot.dh.shape), BASE, TOOL)
     q = torch.from_numpy(rng.uniform(*robot.limits.T, (40 * frames * targets, robot.dof)))
