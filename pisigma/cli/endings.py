@@ -80,7 +80,7 @@ def report_problems(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def exit_with_problem(problem: BaseException, as_json: bool = False) -> None:
-    """Print what is wrong, and end the command with an exit status.
+    """Print the error, and end the command with an exit status.
 
     The status is 2 if the user's input is invalid, 3 if a model does not meet its limits, 130 after an interruption,
     141 if the reader of the output has gone, and 1 for everything else.
@@ -113,7 +113,7 @@ def exit_with_problem(problem: BaseException, as_json: bool = False) -> None:
 
 
 def exit_with_error(sentence: str, status: int = REFUSED) -> NoReturn:
-    """Print what is wrong on stderr, in one line that is wrapped on a terminal, and end with an exit status."""
+    """Print the error on stderr, in one line that is wrapped on a terminal, and end with an exit status."""
     line = f"pisigma: {make_printable(' '.join(sentence.split()))}"
     if sys.stderr.isatty():
         width = shutil.get_terminal_size().columns

@@ -74,7 +74,7 @@ class FitResiduals:
         is_stated: bool,
         causes: Mapping[str, Float64[Tensor, "values _columns"]],
     ) -> "FitResiduals":
-        """Project out what was fitted.
+        """Return the residuals with the fitted unknowns projected out.
 
         Args:
             y: residuals in units of the stated noise.
@@ -91,7 +91,7 @@ class FitResiduals:
         return FitResiduals(N @ y, A @ A.t(), N[:, exact], is_stated, columns)
 
     def compare(self) -> tuple[Cause, ...]:
-        """Compare all causes, and name the clearest one and those that are clear in addition; the clearest first."""
+        """Return all causes, where `named` marks the clear causes; named causes come first, then by Bayes factor."""
         alone = self._compared()
         named, here = set[str](), self
         while len(named) < MAX_CAUSES:

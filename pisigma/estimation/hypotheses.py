@@ -52,7 +52,7 @@ class Explanation:
     Attributes:
         motions: motions that certainly happened, most probable first.
         candidates: all hypotheses, most probable first, if something moved but it is not clear what; otherwise empty.
-        unchanged: probability that nothing moved.
+        unchanged: probability that no part moved.
         noise_factor: most probable factor on the usual noise.
         log_evidence: log evidence of the rows given the motions, averaged over all other hypotheses, minus the prior
             penalties of the motions and of wrong rows.

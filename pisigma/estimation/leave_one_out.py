@@ -14,7 +14,7 @@ LEVEL = 1e-3
 
 @dataclass(frozen=True)
 class RowTest:
-    """The row with the least probable error under the fit to the others.
+    """The row with the least probable error under the fit to all other rows.
 
     Attributes:
         row: number of the row.
@@ -26,7 +26,7 @@ class RowTest:
 
     @property
     def is_wrong(self) -> bool:
-        """Whether the others contradict it."""
+        """Whether the other rows contradict the row."""
         return self.probability < LEVEL
 
 

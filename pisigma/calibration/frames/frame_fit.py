@@ -33,12 +33,12 @@ INVOLVED = 0.05
 
 @dataclass(frozen=True)
 class WrongRow:
-    """A row that the others contradict, and that was left out.
+    """A row that was left out, because the other rows contradict it.
 
     Attributes:
         row: number in the measurements, from 0.
         place: file and line.
-        distance: length of its error under the fit to the others [m]; NaN if it has no length.
+        distance: length of the error of the row under the fit to all other rows [m]; NaN if no length was measured.
         angle: angle of the same [rad]; NaN if it has none.
         probability: probability of an error of this size, or larger, of any row without a wrong one.
     """
@@ -218,7 +218,7 @@ def fit_frames(
 
 
 def _wrong_row(fit: FrameFit, number: int, tested: RowTest) -> WrongRow:
-    """Return a row that was left out, with its error under the fit to the others."""
+    """Return a row that was left out, with its error under the fit to all other rows."""
     row = fit.rows.select(torch.tensor([number]))
     errors = fit.solved.result().errors_of(row)
     size = {"m": math.nan, "rad": math.nan}

@@ -271,7 +271,7 @@ def _outliers(solved: SolvedCalibration, refined: RefinedFit) -> tuple[Outlier, 
 
 
 def _kept_sentence(serving: FinalCorrection) -> str:
-    """Return a sentence about the correction that was kept and the resulting prediction of held-out rows."""
+    """Return a sentence about the chosen correction and the resulting prediction of held-out rows."""
     best = serving.choice.best
     return (
         f"A joint correction was kept ({best.name}): held-out rows are predicted with {serving.held_out:.2f} times the "

@@ -50,10 +50,10 @@ class HybridResult:
 
     Attributes:
         geometric: the calibration without a correction.
-        learned: the correction; None if no correction was kept, so that the geometric calibration is the result.
+        learned: the correction; None without a correction, so that the geometric calibration is the result.
         uncertainty: uncertainty of predicted positions.
         trials: the trials of features, in order.
-        verdict: a sentence that states what was kept and why.
+        verdict: sentence on the chosen features, with the reason.
     """
 
     geometric: CalibrationResult
@@ -100,7 +100,7 @@ class HybridResult:
         It is the standard deviation of the posterior, within the measured joint ranges and outside.
 
         Raises:
-            IdentificationError: nothing was measured in metres.
+            IdentificationError: no value was measured in metres.
         """
         return self.uncertainty.deviation(
             measurements, None if self.learned is None else self.learned.correction

@@ -113,7 +113,7 @@ class FeatureChoice:
     Attributes:
         rows: rows used for the selection.
         geometry: fit without features.
-        best: fit with the features that were kept.
+        best: fit with the chosen features.
         trials: the trials, in order.
         regression: regression of the rows on the best design, if available.
     """

@@ -43,7 +43,7 @@ class FailedRow:
     Attributes:
         line: line in the file of poses.
         status: `bad_row`, or the name of a `Status` in lower case.
-        reason: what is wrong and what to do.
+        reason: the fault and its remedy.
     """
 
     line: int
@@ -108,7 +108,7 @@ def write_joint_file(
 
     A row contains the line of the pose, status, branch, corrected and nominal joint values, the residuals of the
     calibrated model, the domain measure and, with `accuracy`, the predicted standard deviation of the tool's position.
-    Unknown values are empty. A row that is not a pose gets the status `bad_row` and does not stop the others.
+    Unknown values are empty. A row that is not a pose gets the status `bad_row` and does not stop the command.
 
     Args:
         solver: the corrected inverse kinematics.

@@ -38,7 +38,7 @@ def step_lines(step: SessionStep) -> Iterator[str]:
 
 
 def _row_lines(state: SessionState, lines: Sequence[int]) -> Iterator[str]:
-    """Return lines about the distance of new rows from the predictions of the others; one line if they are many."""
+    """Return lines about the distance of new rows from their predictions; one line if there are many rows."""
     rows = [state.rows.line.index(line) for line in lines]
     if len(lines) <= MAX_ALIKE:
         yield from (f"line {line}: {row_text(state, row)}" for line, row in zip(lines, rows, strict=True))
@@ -56,7 +56,7 @@ def _row_lines(state: SessionState, lines: Sequence[int]) -> Iterator[str]:
 
 
 def row_text(state: SessionState, row: int) -> str:
-    """Return a text with the distance of a row from the prediction of the others."""
+    """Return a text with the distance of a row from its prediction by the other rows."""
     error = float((state.rows.error[row] ** 2).sum() ** 0.5)
     kind = " (check)" if state.rows.check[row] else ""
     if error != error:

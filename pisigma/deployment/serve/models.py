@@ -54,7 +54,7 @@ class ServedModel:
 
     @property
     def name(self) -> str:
-        """Name of the model in requests: that of its folder."""
+        """Name of the model in requests, which is the name of its folder."""
         return self.folder.name
 
     @cached_property
@@ -79,7 +79,7 @@ class ServedModel:
 
     @cached_property
     def joints_key(self) -> str:
-        """Return the key of joint values in messages: `q_deg` if all joints are revolute, else `q` [deg or mm]."""
+        """Return the key of joint values in messages: `q_deg` if all joints are revolute, otherwise `q` [deg or mm]."""
         return "q_deg" if self.ik.revolute.all() else "q"
 
     @cached_property

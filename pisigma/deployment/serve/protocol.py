@@ -72,10 +72,10 @@ def pose_entries(pose: Any, name: str) -> tuple[float, ...]:
 
 
 def read_numbers(request: dict[str, Any], key: str, count: int) -> list[float]:
-    """Read a list of finite numbers.
+    """Return a list of `count` finite numbers from the key of a request.
 
     Raises:
-        RequestError: the value is anything else.
+        RequestError: the value is not a list of this length, or contains another value.
     """
     values = request[key]
     if not isinstance(values, list) or len(values) != count:

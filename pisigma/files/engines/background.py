@@ -60,7 +60,7 @@ class BackgroundProcess:
         return value  # type: ignore[no-any-return]
 
     def close(self) -> None:
-        """End the process at once; what it computes is lost."""
+        """End the process at once, and discard its computation."""
         self._process.kill()
         self._process.wait()
         with self._lock, contextlib.suppress(OSError):
@@ -93,7 +93,7 @@ class BackgroundProcess:
 
 
 def serve() -> None:
-    """Compute what the process at the other end of stdin and stdout asks for, until it ends."""
+    """Compute the requests of the process at the other end of stdin and stdout, until that process ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the other process handles interruptions
     requests, answers = sys.stdin.buffer, os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # what functions print must not get among the answers

@@ -161,7 +161,7 @@ class MonitoredSession:
         rows: number of rows.
         temperature_c: mean temperature [deg C]; None if the rows do not state it.
         verdict: "unchanged", "moved" or "unclear".
-        unchanged: probability that nothing moved.
+        unchanged: probability that no part moved.
         rms_mm: RMS position error under the model [mm].
         rms_after_mm: RMS position error expected after a recalibration [mm].
         session: the whole result as JSON; lengths in m, angles in rad.

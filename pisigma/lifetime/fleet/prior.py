@@ -45,7 +45,7 @@ class FleetPrior:
         model: mean robot, with the uncertainty of another robot of the fleet.
         population: mean and covariance of the errors between robots.
         names: names of the geometric parameters.
-        odd: indices of robots that are inconsistent with the others and therefore were not used.
+        odd: indices of robots that were not used, because they are inconsistent with the other robots.
     """
 
     model: CalibratedModel

@@ -45,7 +45,7 @@ class FleetPriorSummary(AbstractSummary):
 
     Attributes:
         robots: number of robots that were used.
-        odd: ids of robots that are inconsistent with the others and therefore were not used.
+        odd: ids of robots that were not used, because they are inconsistent with the other robots.
         refused: reasons by id of robots whose files cannot be read.
         remarks: remarks on the rows of the robots that were used, one sentence each.
         rows: number of rows of all robots.

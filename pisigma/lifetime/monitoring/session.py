@@ -71,7 +71,7 @@ class Session:
 
     Attributes:
         rows: number of rows.
-        unchanged: probability that nothing moved.
+        unchanged: probability that no part moved.
         moved: movements; movements of the arm come first.
         candidates: names and probabilities of possible movements where these are ambiguous; otherwise empty.
         rms: RMS position error under the model, with the current base and tool [m].

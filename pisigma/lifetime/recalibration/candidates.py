@@ -44,7 +44,7 @@ OUTLIER_FACTOR = 5.0
 
 @dataclass(frozen=True)
 class CandidateChoice:
-    """Cross-validated errors of the candidates, and the candidate that is kept.
+    """Cross-validated errors of the candidates, and the chosen candidate.
 
     Attributes:
         kept: "recalibrated", unless another candidate is better by more than 5 %, and significantly.
@@ -74,7 +74,7 @@ class CandidateChoice:
 
     @property
     def sentence(self) -> str:
-        """Sentence about the candidate that is kept, with the errors of all candidates."""
+        """Return a sentence about the chosen candidate, with the errors of all candidates."""
         if not self.rows:
             return f"{self.names[self.kept]} is kept: there are too few rows for a cross-validation."
         sizes = {name: size * 1e3 for name, size in self.rms.items() if size is not None}
@@ -132,7 +132,7 @@ def choose_candidate(
 
 
 def _decided(errors: Mapping[Kept, Float64[Tensor, " rows"]]) -> CandidateChoice:
-    """Return the choice of the candidate to keep, from the errors of held-out rows [m]."""
+    """Return the chosen candidate, given the errors of held-out rows [m]."""
     smallest = torch.stack(list(errors.values())).amin(0)
     judged = torch.isfinite(smallest)
     counted = (
@@ -174,7 +174,7 @@ def _clearly_better(errors: Float64[Tensor, " rows"], than: Float64[Tensor, " ro
 
 
 def _predictable(rows: Measurements, test: Tensor, training: Measurements) -> Tensor:
-    """Return which test rows have a frame, a target and an anchor that the training rows have as well."""
+    """Return which test rows have a frame, a target and an anchor that also occur in training rows."""
     frames = set(training.frame)
     framed = torch.tensor([rows.frame[row] in frames for row in test.tolist()])
     try:

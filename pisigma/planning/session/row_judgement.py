@@ -344,7 +344,7 @@ def _contradicted(
     errors: LeaveOneOutErrors,
     few: bool,
 ) -> tuple[RowModel, LeaveOneOutErrors] | None:
-    """Return the judgement without the row that the others contradict; None if there is no such row.
+    """Return the judgement without the row that the other rows contradict; None if there is no such row.
 
     A wrong row among few moves base and tool so far that it can be found only by leaving out every row once.
     """
