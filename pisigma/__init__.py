@@ -18,6 +18,8 @@ _NAMES = {
     "model.inverse.solution": "Solution",
     "deployment.export.urdf": "to_pinocchio",
     "joint_correction.registry": "register_feature",
+    "deployment.lerobot.correction": "LeRobotCorrection",
+    "deployment.lerobot.dataset": "correct_lerobot_dataset",
     "robot.kernels.array_kinematics": "forward_kinematics joint_jacobian",
     "robot.kinematics.status": "Status",
     "network.pi_sigma": "PiSigma",

@@ -3,6 +3,8 @@ from pisigma.calibration.geometric.result import CalibrationResult as Calibratio
 from pisigma.calibration.hybrid.calibrator import HybridCalibrator as HybridCalibrator
 from pisigma.calibration.hybrid.result import HybridResult as HybridResult
 from pisigma.deployment.export.urdf import to_pinocchio as to_pinocchio
+from pisigma.deployment.lerobot.correction import LeRobotCorrection as LeRobotCorrection
+from pisigma.deployment.lerobot.dataset import correct_lerobot_dataset as correct_lerobot_dataset
 from pisigma.files.errors import PisigmaError as PisigmaError
 from pisigma.joint_correction.registry import register_feature as register_feature
 from pisigma.measurement.dataset import Measurements as Measurements

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from pisigma.workflow.cell.incoming_rows import IncomingRows
     from pisigma.workflow.import_rows import ImportProposal
 
-Files = Annotated[list[Path], typer.Argument(help="Exports (tables as text, in any encoding).")]
+Files = Annotated[list[Path], typer.Argument(help="Exports (tables as text), or a LeRobot data set.")]
 Yes = Annotated[bool, typer.Option("--yes", "-y", help="Accept the proposed mapping without asking.")]
 SaveMap = Annotated[Path | None, typer.Option(help="Write the mapping to this file, for --map.")]
 
@@ -45,6 +45,7 @@ def import_(
     confirmation. Without a terminal, exits with status 2 unless --yes or a complete --map is given.
     """
     from pisigma.files.output_file import check_output
+    from pisigma.measurement.foreign.lerobot_dataset import is_lerobot_dataset
     from pisigma.workflow import import_rows as workflow
     from pisigma.workflow.cell.cell import Cell
     from pisigma.workflow.cell.incoming_rows import IncomingRows
@@ -56,6 +57,8 @@ def import_(
     if save_map is not None:
         check_output(save_map, (".yaml", ".yml"), "a mapping", [*files, *([] if out is None else [out])])
     chosen = settings.build() if cell is None else settings_at(cell, "import", settings)
+    if out is not None and is_lerobot_dataset(files[0]):
+        return _write_joint_log(files, chosen, out, as_json)
     if cell is not None:
         incoming = IncomingRows(tuple(files), Cell.open(cell), chosen)
         if not incoming.is_ready:
@@ -74,6 +77,21 @@ def import_(
         print_json({"file": str(out)} | rows.to_json())
         return
     print_lines([*rows.sentences, f"{rows.rows} measurements written to {out}."])
+
+
+def _write_joint_log(files: list[Path], settings: ImportSettings, out: Path, as_json: bool) -> None:
+    """Write the joint values of a LeRobot data set."""
+    from pisigma.measurement.foreign.lerobot_log import read_joint_log
+
+    if len(files) > 1:
+        raise typer.BadParameter("expected one LeRobot data set without other files", param_hint="'files'")
+    log = read_joint_log(files[0], settings.lerobot_units, settings.lerobot_calibration)
+    log.save(out)
+    if as_json:
+        print_json({"file": str(out)} | log.to_json())
+        return
+    columns = ", ".join(f"{motor} as q{number}_deg" for number, motor in enumerate(log.motors, start=1))
+    print_lines([f"{len(log.rows)} rows of joint values written to {out}: {columns}."])
 
 
 def _take_in(incoming: "IncomingRows", date: str, accept_implausible: bool, as_json: bool) -> None:

@@ -299,6 +299,9 @@ EVERYWHERE: Mapping[str, Maker] = {
     "both.csv": with_plumb,
     "calibration.conf": exported(MY_UR5, "ur-calibration"),
     "arm.urdf": six_joints,
+    "lerobot_data": copy("lerobot_data"),
+    "follower.json": copy("follower.json"),
+    "models/so101": copy("so101"),
 }
 """How to create the files that pages name, except those below."""
 OF_RB5 = {

@@ -11,6 +11,7 @@ from testing.board_images import CAMERA as SMALL_CAMERA
 from testing.board_images import cv2, draw_board, view
 from testing.camera_cell import BOARD, CAMERA, camera_cell, corner_lines
 from testing.identified import hybrid_model
+from testing.lerobot_arm import DATA_SETS, SO101, so101_model
 from testing.models import hand_made_model, joints_around, no_type_checker
 from testing.simulated_arm import simulate
 from testing.urdf import UrdfJoint, urdf_text
@@ -19,6 +20,7 @@ from pisigma.joint_correction.conditions import ConditionFeatures
 from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.measurement.camera.board import Board
 from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.foreign.lerobot_motors import motors_text
 from pisigma.model.folder.model_folder import save_model
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
@@ -41,7 +43,9 @@ def prepare(folder: Path) -> None:
 
 
 def copy_files(folder: Path) -> None:
-    """Copy exports of instruments, and recipes."""
+    """Copy exports of instruments, a data set and a calibration file of LeRobot, and recipes."""
+    shutil.copytree(DATA_SETS / "v3.0", folder / "lerobot_data")
+    (folder / "follower.json").write_text(motors_text(SO101))
     shutil.copytree(REPOSITORY / "tests" / "measurement" / "foreign" / "exports", folder / "exports")
     shorter = {"poses: {count: 50,": "poses: {count: 4,", "rows: [30, 50, 100, 300]": "rows: [16]"}
     for recipe in ("kiro3", "rb5_redundancy", "ur5_camera", "ur5_hybrid"):
@@ -174,7 +178,7 @@ def _images(folder: Path) -> None:
 
 
 def _models(folder: Path) -> None:
-    """Write models of a UR10 with effects of payload and temperature, and of a SCARA robot."""
+    """Write models of a UR10 with effects of payload and temperature, of a SCARA robot and of an SO-101."""
     robot = Robot.load("ur10")
     learned = ConditionFeatures(
         robot, ("payload_kg", "temperature_c"), (2.0, 22.0), (1.5, 3.0), ((0.0, 5.0), (15.0, 30.0))
@@ -182,6 +186,7 @@ def _models(folder: Path) -> None:
     for name, model in (
         ("loaded", hybrid_model("ur10", [FourierSeries(robot, 2), learned])),
         ("scara", hand_made_model("kiro3")),
+        ("so101", so101_model()),
         ("arm10", hand_made_model("ur10")),
     ):
         (folder / name).mkdir()

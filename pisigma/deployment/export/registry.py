@@ -36,6 +36,10 @@ BUILT_IN = {
         "home offsets of Epson in encoder counts",
     ),
     "fanuc-mastering": ("pisigma.deployment.export.controllers.counts:FANUC", "mastering counts of FANUC"),
+    "lerobot": (
+        "pisigma.deployment.lerobot.calibration_file",
+        "calibration JSON of LeRobot with corrected zeros, from --like",
+    ),
     "onnx": ("pisigma.deployment.export.onnx_model", "the network alone"),
     "library": ("pisigma.deployment.export.library.c_library", "a shared library for C with a header"),
 }

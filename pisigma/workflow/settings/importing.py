@@ -11,6 +11,7 @@ from pisigma.files.setting import Option
 if TYPE_CHECKING:
     from pisigma.measurement.foreign.dialect import Decimal
     from pisigma.measurement.foreign.joining import JoinBy
+    from pisigma.measurement.foreign.lerobot_motors import LeRobotUnits
 
 _SIGNS = {"point": ".", "comma": ","}
 
@@ -48,9 +49,11 @@ class ImportSettings:
             the files are concatenated.
         within: maximum difference between joined time stamps [s].
         new_frame_at: first line measured after the instrument was moved. From there, rows are in a new frame.
+        lerobot_units: units of the joint values of a LeRobot data set, degrees or normalized (-100 to 100).
+        lerobot_calibration: calibration file of LeRobot with which normalized values were recorded.
 
     Raises:
-        MeasurementError: `join` is not a valid choice.
+        MeasurementError: `join` or `lerobot_units` is not a valid choice.
     """
 
     maps: Annotated[Sequence[Mapping[str, str]], Option("--map", kind=str, read=parse_maps)] = ()
@@ -62,10 +65,16 @@ class ImportSettings:
     join: Annotated["JoinBy | None", Option(kind=str)] = None
     within: Annotated[float, Option(kind=str, read=parse_seconds, default="0.2s")] = 0.2
     new_frame_at: Annotated[tuple[int, ...], Option(metavar="LINE", is_key=True)] = ()
+    lerobot_units: Annotated["LeRobotUnits | None", Option(kind=str, is_key=True)] = None
+    lerobot_calibration: Annotated[str | None, Option(is_key=True)] = None
 
     def __post_init__(self) -> None:
-        """Check `join`."""
+        """Check the choices."""
         from pisigma.measurement.foreign.joining import JoinBy
 
         if self.join is not None:
             check_choice(MeasurementError, "join", self.join, get_args(JoinBy))
+        if self.lerobot_units is not None:
+            from pisigma.measurement.foreign.lerobot_motors import LeRobotUnits
+
+            check_choice(MeasurementError, "lerobot_units", self.lerobot_units, get_args(LeRobotUnits))

@@ -1,0 +1,112 @@
+"""Corrected zeros of joints in LeRobot's calibration file."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from pisigma.deployment.export.export_format import Exported, ExportFormat, ExportRequest, model_facts
+from pisigma.deployment.export.geometry import offset_remarks
+from pisigma.deployment.export.joint_offsets import fit_joint_offsets, offset_sentences
+from pisigma.files.errors import OutputError, Place
+from pisigma.measurement.foreign.lerobot_motors import TICKS, Motor, motors_text, read_motors
+
+README = "README.md"
+NOT_EXPRESSED = (
+    "LeRobot's file has one zero per motor, in the middle of range_min and range_max: lengths of links, angles between "
+    "axes, backlash and gravity cannot be expressed in it.",
+    "Zeros are rounded to half a tick (0.04 deg). One end of a range is moved inwards by twice the offset, so that the "
+    "motor stays within the range that was recorded; homing_offset is unchanged.",
+    "The directions of the joints (drive_mode) are unchanged: LeRobot ignores drive_mode for degrees.",
+    "The file holds for use_degrees=true. Values of -100 to 100 have another scale with another range: correct the "
+    "frames of such policies and data sets with pisigma.LeRobotCorrection instead.",
+    "Use either this file or corrected frames, not both: the correction would be applied twice.",
+)
+
+
+def with_offset(motor: Motor, ticks: float, at: Place) -> Motor:
+    """Return a motor whose position 0 deg is moved so that its degrees increase by an offset.
+
+    Args:
+        motor: the motor.
+        ticks: increase of its values [ticks].
+        at: place of the motor, for messages.
+
+    Raises:
+        OutputError: the range would become empty.
+    """
+    cut = round(2 * ticks)
+    moved = replace(motor, range_min=motor.range_min + max(-cut, 0), range_max=motor.range_max - max(cut, 0))
+    if moved.range_min >= moved.range_max:
+        raise OutputError(
+            expected=f"an offset below half of the range of {motor.range_max - motor.range_min} ticks",
+            value=ticks,
+            at=at,
+            remedy="calibrate the motors with LeRobot again, with the arm in the middle of its ranges",
+        )
+    return moved
+
+
+def with_offsets(motors: Mapping[str, Motor], offsets: Mapping[str, float], file: Path) -> dict[str, Motor]:
+    """Return all motors, those of joints with other zeros.
+
+    Args:
+        motors: motors of the arm.
+        offsets: offset of every joint [rad], by the name of its motor.
+        file: file of the motors, for messages.
+
+    Raises:
+        OutputError: a joint has no motor, or see `with_offset`.
+    """
+    if missing := sorted(set(offsets) - set(motors)):
+        raise OutputError(
+            expected=f"motors named {', '.join(offsets)}, as the joints of the robot",
+            value=", ".join(motors),
+            at=Place(file),
+            option="--like",
+            remedy=f"give the calibration file of this arm, or rename joint {missing[0]} of the robot",
+        )
+    return {
+        name: with_offset(motor, offsets[name] / (2 * np.pi) * TICKS, Place(file, column=name))
+        if name in offsets
+        else motor
+        for name, motor in motors.items()
+    }
+
+
+def _write(request: ExportRequest) -> Exported:
+    assert request.like is not None  # see `_check`
+    motors = read_motors(request.like)
+    model = request.load()
+    fitted = fit_joint_offsets(model)
+    offsets = dict(zip([axis.name for axis in fitted.robot.axes], fitted.values.tolist(), strict=True))
+    text = motors_text(with_offsets(motors, offsets, request.like))
+    sentences = (*offset_remarks(model), *offset_sentences(fitted), *NOT_EXPRESSED)
+    title = f"# LeRobot calibration of model {model.name} (robot {model.robot.name})"
+    facts = model_facts(model) | fitted.departures()
+    facts["offsets_deg"] = {name: float(np.rad2deg(value)) for name, value in offsets.items()}
+    readme = "\n\n".join((title, *sentences)) + "\n"
+    content = {request.like.name: text.encode(), README: readme.encode()}
+    return Exported(content, facts, sentences)
+
+
+def _check(request: ExportRequest) -> None:
+    if request.like is None or request.like.suffix.lower() != ".json":
+        raise OutputError(
+            expected="LeRobot's present calibration file (.json)",
+            value=None if request.like is None else str(request.like),
+            option="--like",
+            remedy="give the file in ~/.cache/huggingface/lerobot/calibration",
+        )
+
+
+FORMAT = ExportFormat(
+    "lerobot",
+    "LeRobot's calibration file with corrected zeros",
+    (),
+    _write,
+    frozenset(("like", "payload_kg", "temperature_c")),
+    _check,
+    contains="joint_zeros",
+)

@@ -1,0 +1,223 @@
+"""Correct the joint values of LeRobot's observations and actions, of a policy or a data set."""
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+
+from pisigma.deployment.export.joint_offsets import JointOffsets, fit_joint_offsets
+from pisigma.files.errors import MeasurementError
+from pisigma.files.model_files import DESCRIPTION, WEIGHTS, content_hash, read_model_file
+from pisigma.measurement.foreign.lerobot_dataset import joint_motors, motor_of
+from pisigma.measurement.foreign.lerobot_motors import LeRobotUnits, Motor, radians_per_unit, read_motors
+from pisigma.model.folder.model_folder import load_model
+from pisigma.robot.description import Robot
+
+if TYPE_CHECKING:
+    from pisigma.model.calibrated_model import CalibratedModel
+
+CHUNK = 10_000
+"""Frames whose poses are computed at a time."""
+
+
+@dataclass(frozen=True, eq=False)
+class LeRobotCorrection:
+    """Correction of frames of joint values in LeRobot's units.
+
+    The real arm commanded to q is where the nominal arm is at q + offset. The offsets are those of
+    `fit_joint_offsets`: errors of lengths and angles between the axes cannot be expressed in joint values, and
+    remain; `poses` contains them. Values that are not joints of the robot, such as the gripper's, are not changed.
+
+    Attributes:
+        model: calibrated model.
+        units: units of the values.
+        names: names of the values of a frame, in their order.
+        joints: for every joint of the robot, the index of its value in a frame.
+        scale: rotation [rad] per unit of the value, for every joint.
+        offset: offset of every value of a frame [its unit], 0 for values that are not joints.
+        lost: the joint offsets with what they leave out.
+        prefix: start of the names of this arm, such as "left_".
+        version: name, SHA-256 and offsets of the model, as written to the metadata of data sets.
+    """
+
+    model: "CalibratedModel"
+    units: LeRobotUnits
+    names: tuple[str, ...]
+    joints: tuple[int, ...]
+    scale: Float64[np.ndarray, " axes"]
+    offset: Float64[np.ndarray, " values"]
+    lost: JointOffsets
+    prefix: str
+    version: dict[str, Any]
+
+    @staticmethod
+    def load(
+        model: str | os.PathLike[str],
+        names: Sequence[str],
+        units: LeRobotUnits,
+        calibration: str | os.PathLike[str] | None = None,
+        prefix: str = "",
+    ) -> "LeRobotCorrection":
+        """Load a model folder for frames with these values.
+
+        Args:
+            model: model folder, whose robot has LeRobot's names of joints.
+            names: names of the values of a frame, such as "shoulder_pan.pos" or "shoulder_pan".
+            units: "degrees" (LeRobot's `use_degrees=true`) or "normalized" (-100 to 100); they cannot be
+                distinguished by the values.
+            calibration: LeRobot's calibration file of this arm, needed for normalized values.
+            prefix: start of the names of this arm, such as "left_" of a pair.
+
+        Raises:
+            ModelError: the folder is not a model.
+            MeasurementError: the values are not those of the robot's joints, or their scale is not known.
+        """
+        calibrated = load_model(model)
+        robot = calibrated.robot
+        joints = joints_of_values(robot, names, prefix)
+        motors = None if calibration is None else read_motors(calibration)
+        scale = np.array([radians_per_unit(units, axis.name, motors) for axis in robot.axes])
+        lost = fit_joint_offsets(calibrated)
+        offset = np.zeros(len(names))
+        offset[list(joints)] = lost.values / scale
+        return LeRobotCorrection(
+            calibrated,
+            units,
+            tuple(names),
+            joints,
+            scale,
+            offset,
+            lost,
+            prefix,
+            _version(Path(model), robot, units, lost, motors),
+        )
+
+    def true_values(self, frames: Any) -> Any:
+        """Compute the joint values at which the nominal arm is where the real arm was.
+
+        Args:
+            frames: joint values as recorded or commanded: an array or tensor `(*batch, values)`, or a dictionary by
+                name, such as an observation, whose other entries are kept.
+
+        Returns:
+            The same type, shape, dtype, device and order.
+
+        Raises:
+            MeasurementError: the last axis does not have one value per name, or a name is missing.
+        """
+        return self._moved(frames, self.offset)
+
+    def commands(self, frames: Any) -> Any:
+        """Compute the joint values to command for true ones; the inverse of `true_values`.
+
+        LeRobot limits normalized values to -100 to 100 when it sends them, so that an arm stops there.
+        """
+        return self._moved(frames, -self.offset)
+
+    def joint_values(self, frames: Any) -> Float64[np.ndarray, "*batch axes"]:
+        """Convert frames `(*batch, values)` to the robot's joint values [rad]."""
+        array = self._checked(np.asarray(frames, dtype=np.float64))
+        values: np.ndarray = array[..., list(self.joints)] * self.scale
+        return values
+
+    def poses(self, frames: Any) -> Float64[np.ndarray, "*batch 4 4"]:
+        """Compute the poses T_base_tool [m] that the whole model predicts for recorded frames `(*batch, values)`."""
+        q = self.joint_values(frames)
+        flat = torch.from_numpy(q.reshape(-1, q.shape[-1]))
+        T = (
+            torch.cat([self.model.forward(some) for some in torch.split(flat, CHUNK)])
+            if len(flat)
+            else flat[:, :0]
+        )
+        return T.numpy().reshape(*q.shape[:-1], 4, 4)
+
+    def _moved(self, frames: Any, offset: Float64[np.ndarray, " values"]) -> Any:
+        if isinstance(frames, Mapping):
+            return self._moved_by_name(frames, offset)
+        if isinstance(frames, torch.Tensor):
+            moved = self._checked(frames).double() + torch.from_numpy(offset).to(frames.device)
+            return moved.to(frames.dtype)
+        array = self._checked(np.asarray(frames))
+        return (array + offset).astype(array.dtype)
+
+    def _moved_by_name(
+        self, frame: Mapping[str, Any], offset: Float64[np.ndarray, " values"]
+    ) -> dict[str, Any]:
+        """Return a dictionary with the values moved, all entries in their order."""
+        if missing := [self.names[index] for index in self.joints if self.names[index] not in frame]:
+            raise MeasurementError(
+                expected=f"the values {', '.join(self.names[index] for index in self.joints)}",
+                value=", ".join(frame),
+                remedy=f"add {missing[0]}",
+            )
+        by_name = dict(zip(self.names, offset.tolist(), strict=True))
+        return {
+            name: type(value)(value + by_name[name]) if by_name.get(name) else value
+            for name, value in frame.items()
+        }
+
+    def _checked(self, frames: Any) -> Any:
+        """Return frames of numbers with one value per name.
+
+        Raises:
+            MeasurementError: they have another number of values, or are integers.
+        """
+        if not frames.ndim or frames.shape[-1] != len(self.names):
+            raise MeasurementError(
+                expected=f"frames of {len(self.names)} values ({', '.join(self.names)})",
+                value=str(tuple(frames.shape)),
+                option="frames",
+            )
+        if not (
+            frames.dtype.is_floating_point if isinstance(frames, torch.Tensor) else frames.dtype.kind == "f"
+        ):
+            raise MeasurementError(
+                expected="floating-point values",
+                value=str(frames.dtype),
+                option="frames",
+                remedy="convert them",
+            )
+        return frames
+
+
+def joints_of_values(robot: Robot, names: Sequence[str], prefix: str) -> tuple[int, ...]:
+    """Return the index of the value of every axis of the robot's controller.
+
+    Raises:
+        MeasurementError: the motors are not the joints of the robot, or a joint is prismatic.
+    """
+    axes = [axis.name for axis in robot.axes]
+    motors = joint_motors(names, prefix)
+    if sorted(motors) != sorted(axes) or any(axis.type != "revolute" for axis in robot.axes):
+        raise MeasurementError(
+            expected=f"one value for each of the revolute joints {', '.join(axes)} of robot '{robot.name}'",
+            value=", ".join(names),
+            option="names",
+            remedy="give the joints of the robot the names of LeRobot's motors, or state the prefix of the arm",
+        )
+    return tuple([motor_of(name, prefix) for name in names].index(axis) for axis in axes)
+
+
+def _version(
+    folder: Path, robot: Robot, units: LeRobotUnits, lost: JointOffsets, motors: Mapping[str, Motor] | None
+) -> dict[str, Any]:
+    """Return what identifies the model and the correction, for metadata."""
+    sha256 = content_hash(read_model_file(folder, DESCRIPTION), read_model_file(folder, WEIGHTS))
+    degrees = np.rad2deg(lost.values).tolist()
+    return {
+        "pisigma": version("pisigma"),
+        "model": folder.name,
+        "sha256": sha256,
+        "robot": robot.name,
+        "units": units,
+        "offsets_deg": dict(zip([axis.name for axis in robot.axes], degrees, strict=True)),
+        "unobservable": list(lost.unobservable),
+        **lost.departures(),
+        **({} if motors is None else {"ranges": {n: [m.range_min, m.range_max] for n, m in motors.items()}}),
+    }

@@ -1,0 +1,174 @@
+"""Correct the joint values of a whole LeRobot data set."""
+
+import json
+import os
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float
+
+from pisigma.deployment.lerobot.correction import LeRobotCorrection
+from pisigma.files.conflicts import check_conflicts
+from pisigma.files.errors import MeasurementError, OutputError, Place
+from pisigma.files.input_file import read_text
+from pisigma.files.scratch import FOLDER, scratch_beside
+from pisigma.measurement.foreign.lerobot_dataset import LeRobotDataset
+from pisigma.measurement.foreign.lerobot_motors import LeRobotUnits
+
+if TYPE_CHECKING:
+    import pyarrow
+
+RECORD = Path("meta", "pisigma.json")
+"""File of a corrected data set with the version of the model."""
+STATISTICS = ("mean", "min", "max", "q01", "q10", "q50", "q90", "q99")
+"""Statistics of a feature that move with its values; the standard deviation and the count do not."""
+
+
+@dataclass(frozen=True, eq=False)
+class CorrectedDataset:
+    """Result of `correct_lerobot_dataset`.
+
+    Attributes:
+        folder: the new data set.
+        frames: number of its frames.
+        corrections: the correction of every feature that was changed, by its name.
+    """
+
+    folder: Path
+    frames: int
+    corrections: dict[str, LeRobotCorrection]
+
+
+def correct_lerobot_dataset(
+    dataset: str | os.PathLike[str],
+    model: str | os.PathLike[str],
+    out: str | os.PathLike[str],
+    units: LeRobotUnits,
+    calibration: str | os.PathLike[str] | None = None,
+    prefix: str = "",
+) -> CorrectedDataset:
+    """Write a copy of a data set with true joint values in `observation.state` and `action`.
+
+    Frames keep their shape, type and order; statistics of these features move with them. All other files are copied
+    unchanged. `meta/pisigma.json` has the version of the model.
+
+    Args:
+        dataset: folder of a data set of layout v2.1 or v3.0.
+        model: model folder of the arm; see `LeRobotCorrection.load`.
+        out: folder to write; it must not exist.
+        units: units of the joint values.
+        calibration: LeRobot's calibration file, needed for normalized values.
+        prefix: start of the names of this arm.
+
+    Raises:
+        MeasurementError: the data set cannot be read, was corrected already, or its values are not those of the robot.
+        ModelError: the folder is not a model.
+        OutputError: the new folder exists or cannot be written.
+        ImportError: pyarrow is not installed.
+    """
+    source, target = LeRobotDataset.open(dataset), Path(os.path.realpath(out))
+    if (source.folder / RECORD).exists():
+        raise MeasurementError(
+            "the data set was corrected already",
+            at=Place(source.folder / RECORD),
+            remedy="correct the original data set",
+        )
+    check_conflicts(out, (source.folder, Path(model)))
+    if target.exists():
+        raise OutputError("the output exists", at=Place(out), option="out", remedy="choose another folder")
+    corrections = {
+        key: LeRobotCorrection.load(model, names, units, calibration, prefix)
+        for key, names in source.names.items()
+    }
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with scratch_beside(target, FOLDER) as scratch:
+        frames = _write_copy(source, corrections, scratch)
+        version = {key: one.version for key, one in corrections.items()}
+        (scratch / RECORD).write_text(json.dumps(version, indent=4))
+        scratch.chmod(0o755)
+        scratch.rename(target)
+    return CorrectedDataset(target, frames, corrections)
+
+
+def _write_copy(source: LeRobotDataset, corrections: dict[str, LeRobotCorrection], folder: Path) -> int:
+    """Write all files of a data set to a folder; return the number of frames."""
+    from pyarrow import parquet
+
+    changed = [file.relative_to(source.folder) for file in source.files]
+    changed += [Path("meta", name) for name in ("stats.json", "episodes_stats.jsonl")]
+    changed += [file.relative_to(source.folder) for file in _episode_files(source)]
+
+    def unchanged(where: str, names: list[str]) -> set[str]:
+        return {name for name in names if Path(where, name).relative_to(source.folder) in changed}
+
+    shutil.copytree(source.folder, folder, dirs_exist_ok=True, ignore=unchanged)
+    frames = 0
+    for file, table in source.tables():
+        for key, correction in corrections.items():
+            values = correction.true_values(source.frames(table, key, file))
+            table = _with_column(table, key, values.reshape(-1))
+        parquet.write_table(table, folder / file.relative_to(source.folder))
+        frames += len(table)
+    for file in _episode_files(source):
+        table = _with_statistics(parquet.read_table(file), corrections)
+        parquet.write_table(table, folder / file.relative_to(source.folder))
+    _write_json_statistics(source.folder, corrections, folder)
+    return frames
+
+
+def _episode_files(source: LeRobotDataset) -> list[Path]:
+    """Return the files of v3.0 with the statistics of every episode."""
+    return sorted((source.folder / "meta" / "episodes").glob("chunk-*/*.parquet"))
+
+
+def _with_column(table: "pyarrow.Table", name: str, flat: Float[np.ndarray, " numbers"]) -> "pyarrow.Table":
+    """Return a table with other numbers in a column of lists, of the same type and lengths."""
+    import pyarrow
+
+    index, field = table.column_names.index(name), table.schema.field(name)
+    old = table.column(name).combine_chunks()
+    numbers = pyarrow.array(flat, field.type.value_type)
+    if pyarrow.types.is_fixed_size_list(field.type):
+        new = pyarrow.FixedSizeListArray.from_arrays(numbers, type=field.type)
+    else:
+        new = type(old).from_arrays(old.offsets, numbers, type=field.type)
+    return table.set_column(index, field, new)
+
+
+def _with_statistics(table: "pyarrow.Table", corrections: dict[str, LeRobotCorrection]) -> "pyarrow.Table":
+    """Move the statistics of the corrected features in a table of episodes."""
+    for key, correction in corrections.items():
+        for name in (f"stats/{key}/{kind}" for kind in STATISTICS):
+            if name in table.column_names:
+                flat = table.column(name).combine_chunks().flatten().to_numpy(zero_copy_only=False)
+                table = _with_column(
+                    table, name, (flat.reshape(len(table), -1) + correction.offset).reshape(-1)
+                )
+    return table
+
+
+def _write_json_statistics(source: Path, corrections: dict[str, LeRobotCorrection], folder: Path) -> None:
+    """Move the statistics in `stats.json` (of all frames) and `episodes_stats.jsonl` (of every episode, v2.1)."""
+    whole, episodes = Path("meta", "stats.json"), Path("meta", "episodes_stats.jsonl")
+    if (source / whole).exists():
+        document = json.loads(read_text(source / whole, MeasurementError, "JSON"))
+        _move(document, corrections)
+        (folder / whole).write_text(json.dumps(document, indent=4))
+    if (source / episodes).exists():
+        lines = [
+            json.loads(line) for line in read_text(source / episodes, MeasurementError, "JSON").splitlines()
+        ]
+        for line in lines:
+            _move(line["stats"], corrections)
+        (folder / episodes).write_text("".join(json.dumps(line) + "\n" for line in lines))
+
+
+def _move(statistics: dict[str, Any], corrections: dict[str, LeRobotCorrection]) -> None:
+    """Move statistics by feature in place."""
+    for key, correction in corrections.items():
+        entry = statistics.get(key, {})
+        for kind in set(STATISTICS) & set(entry):
+            entry[kind] = (np.array(entry[kind]) + correction.offset).tolist()

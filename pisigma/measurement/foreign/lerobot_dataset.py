@@ -1,0 +1,146 @@
+"""Joint values in LeRobot data sets (v2.1 and v3.0): Parquet files under `data/`, described by `meta/info.json`."""
+
+import json
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float
+
+from pisigma.files.errors import MeasurementError, Place
+from pisigma.files.input_file import read_text
+
+if TYPE_CHECKING:
+    import pyarrow
+
+INFO = Path("meta", "info.json")
+VERSIONS = ("v2.1", "v3.0")
+STATE, ACTION = "observation.state", "action"
+GRIPPER = "gripper"
+"""Name of the motor that LeRobot counts as a joint, although it does not move the tool."""
+
+
+def is_lerobot_dataset(path: str | os.PathLike[str]) -> bool:
+    """Return whether a folder has the description of a LeRobot data set."""
+    return (Path(path) / INFO).is_file()
+
+
+@dataclass(frozen=True, eq=False)
+class LeRobotDataset:
+    """A data set on disk, whose frames are not read yet.
+
+    Attributes:
+        folder: its folder.
+        version: layout, one of `VERSIONS`.
+        fps: frames per second.
+        names: names of the values of every feature of joint values (`STATE`, `ACTION`), in their order.
+        files: Parquet files of the frames, in the order of the episodes.
+    """
+
+    folder: Path
+    version: str
+    fps: float
+    names: dict[str, tuple[str, ...]]
+    files: tuple[Path, ...]
+
+    @staticmethod
+    def open(folder: str | os.PathLike[str]) -> "LeRobotDataset":
+        """Read the description of a data set.
+
+        Raises:
+            MeasurementError: it is missing, has another layout, or does not name its joint values.
+        """
+        at = Place(Path(folder) / INFO)
+        try:
+            info = json.loads(read_text(Path(folder) / INFO, MeasurementError, "JSON"))
+            version, fps, features = info["codebase_version"], float(info["fps"]), dict(info["features"])
+        except (ValueError, KeyError, TypeError) as problem:
+            if isinstance(problem, MeasurementError):
+                raise
+            raise MeasurementError(
+                expected="codebase_version, fps and features of a LeRobot data set", value=str(problem), at=at
+            ) from None
+        if version not in VERSIONS:
+            raise MeasurementError(
+                expected=f"a data set of layout {' or '.join(VERSIONS)}",
+                value=version,
+                at=at,
+                remedy="convert it with LeRobot",
+            )
+        names = {key: _value_names(features[key], key, at) for key in (STATE, ACTION) if key in features}
+        files = tuple(sorted((Path(folder) / "data").glob("chunk-*/*.parquet")))
+        if not names or not files:
+            missing = f"the feature {STATE} or {ACTION}" if files else "Parquet files under data/"
+            raise MeasurementError(expected=missing, at=at)
+        return LeRobotDataset(Path(folder), version, fps, names, files)
+
+    def tables(self) -> "Iterator[tuple[Path, pyarrow.Table]]":
+        """Read file after file.
+
+        Raises:
+            MeasurementError: a file cannot be read.
+            ImportError: pyarrow is not installed.
+        """
+        from pyarrow import ArrowException, parquet
+
+        for file in self.files:
+            try:
+                yield file, parquet.read_table(file)
+            except (ArrowException, OSError) as problem:
+                raise MeasurementError(f"it cannot be read ({problem})", at=Place(file)) from None
+
+    def frames(self, table: "pyarrow.Table", key: str, file: Path) -> Float[np.ndarray, "frames values"]:
+        """Return the values of a feature in a table of `tables`, (frames, values).
+
+        Raises:
+            MeasurementError: the column is missing, or a frame has another number of values.
+        """
+        at, count = Place(file, column=key), len(self.names[key])
+        if key not in table.column_names:
+            raise MeasurementError(expected=f"a column {key}", at=at)
+        values = table.column(key).combine_chunks()
+        flat = values.flatten().to_numpy(zero_copy_only=False)
+        if values.null_count or len(flat) != count * len(table):
+            raise MeasurementError(expected=f"{count} values in every frame", at=at)
+        frames: np.ndarray = flat.reshape(len(table), count)
+        return frames
+
+
+def _value_names(feature: Any, key: str, at: Place) -> tuple[str, ...]:
+    """Return the names of the values of a feature, which may be in a list or in a dictionary with one list."""
+    names = feature.get("names") if isinstance(feature, dict) else None
+    if isinstance(names, dict) and len(names) == 1:
+        names = next(iter(names.values()))
+    if not isinstance(names, list) or not names or not all(isinstance(name, str) for name in names):
+        raise MeasurementError(
+            expected=f"names of the values of {key}", value=str(names), at=at, remedy="add them to the file"
+        )
+    return tuple(names)
+
+
+def motor_of(name: str, prefix: str = "") -> str | None:
+    """Return the motor whose position a value is, such as "elbow_flex" of "left_elbow_flex.pos"; None for others.
+
+    Args:
+        name: name of the value in a data set, or key of an observation.
+        prefix: start of the names of this arm, such as "left_" of a pair.
+    """
+    bare = name.removeprefix("main_")  # of data sets recorded before LeRobot 0.2
+    return bare.removeprefix(prefix).removesuffix(".pos") if bare.startswith(prefix) else None
+
+
+def joint_motors(names: Sequence[str], prefix: str = "") -> list[str]:
+    """Return the motors of an arm in the order of the values, without the gripper.
+
+    Raises:
+        MeasurementError: a motor appears twice.
+    """
+    motors = [motor for name in names if (motor := motor_of(name, prefix)) not in (None, GRIPPER)]
+    if len(set(motors)) < len(motors):
+        raise MeasurementError(
+            "a motor appears twice", value=", ".join(names), remedy="give the prefix of one arm"
+        )
+    return [motor for motor in motors if motor is not None]

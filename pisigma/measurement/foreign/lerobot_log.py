@@ -1,0 +1,93 @@
+"""Joint values of a LeRobot data set as a log, to which images or touched points belong."""
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from pisigma.files.errors import MeasurementError
+from pisigma.files.output_file import check_output, write_atomically
+from pisigma.measurement.foreign.lerobot_dataset import (
+    STATE,
+    LeRobotDataset,
+    joint_motors,
+    motor_of,
+)
+from pisigma.measurement.foreign.lerobot_motors import LeRobotUnits, radians_per_unit, read_motors
+
+
+@dataclass(frozen=True)
+class JointLog:
+    """Joint values of a data set, one row per frame.
+
+    Attributes:
+        motors: motors of the columns q1, q2, ..., in their order.
+        header: names of the columns: `image`, `time` and the joint values.
+        rows: their texts.
+        source: the data set.
+    """
+
+    motors: tuple[str, ...]
+    header: tuple[str, ...]
+    rows: list[list[str]]
+    source: str
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write a CSV file that `pisigma detect --joints` takes.
+
+        Raises:
+            OutputError: it cannot be written.
+        """
+        check_output(Path(path), (".csv",), "a file of joint values", [self.source])
+        write_atomically(Path(path), "".join(",".join(row) + "\n" for row in (self.header, *self.rows)))
+
+    def to_json(self) -> dict[str, object]:
+        """Return the number of rows and the columns."""
+        columns = {f"q{number}_deg": motor for number, motor in enumerate(self.motors, start=1)}
+        return {"rows": len(self.rows), "columns": columns}
+
+
+def read_joint_log(
+    dataset: str | os.PathLike[str],
+    units: LeRobotUnits | None,
+    calibration: str | os.PathLike[str] | None = None,
+) -> JointLog:
+    """Read the observed joint values of all frames, without the gripper.
+
+    Columns are the motors in their order in the data set. `image` is `episode-000003-frame-000120`, the name of the
+    image of that frame, and `time` [s] counts from the start of its episode.
+
+    Args:
+        dataset: folder of the data set.
+        units: units of its values; None if they are not stated.
+        calibration: LeRobot's calibration file, needed for normalized values.
+
+    Raises:
+        MeasurementError: the data set cannot be read, or the units of its values are not stated.
+        ImportError: pyarrow is not installed.
+    """
+    if units is None:
+        raise MeasurementError(
+            "values of LeRobot are degrees or -100 to 100 over the range of a motor, which the values do not show",
+            option="lerobot_units",
+            expected="degrees or normalized",
+            remedy="state --set lerobot_units=degrees if it was recorded with use_degrees=true, else normalized",
+        )
+    source = LeRobotDataset.open(dataset)
+    if STATE not in source.names:
+        raise MeasurementError(expected=f"the feature {STATE}", value=", ".join(source.names), option="files")
+    names = source.names[STATE]
+    motors = tuple(joint_motors(names))
+    known = None if calibration is None else read_motors(calibration)
+    scale = np.rad2deg([radians_per_unit(units, motor, known) for motor in motors])
+    columns = [[motor_of(name) for name in names].index(motor) for motor in motors]
+    rows = []
+    for file, table in source.tables():
+        values = source.frames(table, STATE, file)[:, columns].astype(np.float64) * scale
+        keys = (table.column(name).to_pylist() for name in ("episode_index", "frame_index", "timestamp"))
+        for episode, frame, seconds, joints in zip(*keys, values.tolist(), strict=True):
+            image = f"episode-{episode:06d}-frame-{frame:06d}"
+            rows.append([image, f"{seconds:.6f}", *(f"{value:.6f}" for value in joints)])
+    header = ("image", "time", *(f"q{number}_deg" for number in range(1, len(motors) + 1)))
+    return JointLog(motors, header, rows, str(dataset))

@@ -1,0 +1,41 @@
+"""Joint values of LeRobot data sets as a file for `pisigma detect --joints`."""
+
+import numpy as np
+import pytest
+from pyarrow import parquet
+from testing.closeness import assert_close
+from testing.lerobot_arm import DATA_SETS, MOTORS, RANGES, SO101
+from testing.refusals import refused
+
+from pisigma.files.errors import MeasurementError
+from pisigma.measurement.foreign.joining import join_joints
+from pisigma.measurement.foreign.lerobot_log import read_joint_log
+from pisigma.measurement.foreign.lerobot_motors import motors_text
+
+
+def recorded(layout):
+    files = sorted((DATA_SETS / layout).glob("data/chunk-*/*.parquet"))
+    return np.concatenate([parquet.read_table(f).column("observation.state").to_pylist() for f in files])
+
+
+@pytest.mark.parametrize("layout", ["v2.1", "v3.0"])
+def test_the_joints_of_every_frame_are_found_by_the_name_of_its_image(layout, tmp_path):
+    log = read_joint_log(DATA_SETS / layout, "degrees")
+    assert log.motors == MOTORS[:5]
+    log.save(tmp_path / "joints.csv")
+    images = [f"episode-{episode:06d}-frame-{frame:06d}" for episode in range(2) for frame in range(6)]
+    joined = join_joints(images, tmp_path / "joints.csv", within=0.2)
+    values = np.array([joined.cells[image] for image in images], dtype=float)
+    assert_close(values, recorded(layout)[:, :5] * 4095 / 4096, atol=1e-6)
+
+
+def test_normalized_values_need_the_calibration_file(tmp_path):
+    low, high = np.array(RANGES[:5]).T
+    (tmp_path / "arm.json").write_text(motors_text(SO101))
+    log = read_joint_log(DATA_SETS / "v3.0", "normalized", tmp_path / "arm.json")
+    expected = recorded("v3.0")[:, :5] / 200 * (high - low) * 360 / 4096
+    assert_close(np.array([row[2:] for row in log.rows], dtype=float), expected, atol=1e-6)
+    with refused(MeasurementError, option="calibration", value="shoulder_pan"):
+        read_joint_log(DATA_SETS / "v3.0", "normalized")
+    with refused(MeasurementError, option="lerobot_units"):
+        read_joint_log(DATA_SETS / "v3.0", None)
