@@ -96,11 +96,13 @@ class Driven:
     Attributes:
         position: true positions of the reflector in the world [m], shape (poses, 3).
         encoders: joint values [rad or m] that the encoders read, shape (poses, joints).
+        torque: what the drives exert on the joints [Nm or N], shape (poses, joints): `qfrc_actuator`.
         unsettled: largest joint speed when a pose was measured [rad/s or m/s].
     """
 
     position: np.ndarray
     encoders: np.ndarray
+    torque: np.ndarray
     unsettled: float
 
 
@@ -135,6 +137,7 @@ class PerturbedArm:
         self.model = spec.compile()
         self.spec = spec
         self.data = mujoco.MjData(self.model)
+        self._drives = [self.model.joint(name).dofadr[0] for name in self.joints]
         self._encoders = [self.model.joint(name).qposadr[0] for name in self.joints]
         joints = [self.model.joint(k) for k in range(self.model.njnt)]
         self._gears = [joint.qposadr[0] for joint in joints if joint.name.endswith(GEAR)]
@@ -150,7 +153,7 @@ class PerturbedArm:
         """
         if not np.abs(commands).max() < MAX_COMMAND:
             raise ValueError(f"a joint value of {np.abs(commands).max():g} was commanded")
-        positions, encoders, unsettled = [], [], 0.0
+        positions, encoders, torques, unsettled = [], [], [], 0.0
         mujoco.mj_resetData(self.model, self.data)
         self.data.qpos[self._encoders] = commands[0]
         self.data.ctrl[:] = commands[0]
@@ -162,7 +165,8 @@ class PerturbedArm:
             unsettled = max(unsettled, float(np.abs(self.data.qvel).max()))
             positions.append(self.data.site("reflector").xpos.copy())
             encoders.append(self.data.qpos[self._encoders].copy())
-        return Driven(np.array(positions), np.array(encoders), unsettled)
+            torques.append(self.data.qfrc_actuator[self._drives].copy())
+        return Driven(np.array(positions), np.array(encoders), np.array(torques), unsettled)
 
     def _move_to(self, command: np.ndarray) -> None:
         before = self.data.ctrl.copy()

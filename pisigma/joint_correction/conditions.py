@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from typing import Annotated, Literal
 
+import numpy as np
 import torch
 from jaxtyping import Float, Float64
 from pydantic import Field
@@ -12,6 +13,7 @@ from pisigma.joint_correction.feature import AbstractFeature, FeatureOptions, Fe
 from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.joint_correction.gravity_torques import Direction, GravityTorques
 from pisigma.joint_correction.joint_correction import JointCorrection
+from pisigma.joint_correction.joint_torques import JointTorques
 from pisigma.joint_correction.shared_features import ScaledJoints
 from pisigma.measurement.conditions import JointState
 from pisigma.robot.description import Robot
@@ -176,13 +178,64 @@ def at_conditions(
         falling = GravityTorques(robot, learned.gravity)
         torques = _weights_of(kept, falling, lambda other: other.describe() == falling.describe())
         torques[:, -4:] += weight[:, 3 * count :] * scaled[learned.names.index("payload_kg")]
-    made = JointCorrection(robot, [feature for feature, _ in kept], correction.orders)
+    return _with_features(correction, kept), shift
+
+
+def with_modelled_torques(correction: JointCorrection) -> JointCorrection:
+    """Reduce a correction to one without `JointTorques`, which is the same where no torques are stated."""
+    kept, torques = _without_torques(correction)
+    if torques is not None:
+        feature, values = torques
+        falling = GravityTorques(correction.robot, feature.gravity)
+        weights = _weights_of(kept, falling, lambda other: other.describe() == falling.describe())
+        weights += feature.gravity_weights(values)
+    return correction if torques is None else _with_features(correction, kept)
+
+
+def at_torques(
+    correction: JointCorrection, torques: Float64[np.ndarray, " dof"]
+) -> tuple[JointCorrection, Float64[Tensor, " dof"]]:
+    """Reduce a correction with `JointTorques` at fixed torques [Nm or N] to one without.
+
+    Returns:
+        The correction, and the remaining offset of every joint [rad or m].
+    """
+    kept, learned = _without_torques(correction)
+    assert learned is not None
+    feature, values = learned
+    return _with_features(correction, kept), feature.deflections(values, torques)
+
+
+def learned_torques(correction: JointCorrection) -> JointTorques | None:
+    """Return the `JointTorques` of a correction; None if it has none."""
+    return next((own for own in correction.features if isinstance(own, JointTorques)), None)
+
+
+_Kept = list[tuple[AbstractFeature, Tensor]]
+"""Features with their weights."""
+
+
+def _without_torques(correction: JointCorrection) -> tuple[_Kept, tuple[JointTorques, Tensor] | None]:
+    """Return copies of all weights, those of `JointTorques` apart."""
+    kept: _Kept = []
+    learned = None
+    for feature, values in zip(correction.features, correction.linear, strict=True):
+        if isinstance(feature, JointTorques):
+            learned = feature, values.detach()
+        else:
+            kept.append((feature, values.detach().clone()))
+    return kept, learned
+
+
+def _with_features(correction: JointCorrection, kept: _Kept) -> JointCorrection:
+    """Return a correction with other features, and the same product units."""
+    made = JointCorrection(correction.robot, [feature for feature, _ in kept], correction.orders)
     made.load_state_dict(
         {f"linear.{k}": values for k, (_, values) in enumerate(kept)}
         | {key: correction.state_dict()[key] for key in ("weight", "bias", "fixed")}
     )
     made.requires_grad_(False)
-    return made, shift
+    return made
 
 
 def _weights_of(

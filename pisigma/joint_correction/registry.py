@@ -10,6 +10,7 @@ from pisigma.joint_correction.feature import AbstractFeature, FeatureSection
 from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.joint_correction.gear_lines import GearLines
 from pisigma.joint_correction.gravity_torques import GravityTorques
+from pisigma.joint_correction.joint_torques import JointTorques
 from pisigma.joint_correction.shared_features import NominalPose, ScaledJoints, SinesCosines
 from pisigma.robot.description import Robot
 from pisigma.robot.kernels.forms import register_compiled
@@ -82,6 +83,7 @@ def feature_from(robot: Robot, section: FeatureSection) -> AbstractFeature:
 for _feature in (
     FourierSeries,
     GravityTorques,
+    JointTorques,
     ConditionFeatures,
     Backlash,
     CoupledSeries,

@@ -18,6 +18,9 @@ APPROACH = "approach"
 """Key of `JointState.stated`: `(*batch, dof)`, +1 if the joint's value increased before it stopped, -1 if it decreased;
 0 or NaN if not given."""
 
+TORQUE = "torque"
+"""Key of `JointState.stated`: `(*batch, dof)`, measured torques of the drives [Nm; N for prismatic joints]; NaN if not
+given."""
 MIN_MOTION = 1e-3
 """[rad or m] Smaller motions of a joint need not take up the play of its gear."""
 
@@ -42,6 +45,7 @@ class JointState:
             "payload_kg": measurements.payload,
             "temperature_c": measurements.temperature,
             APPROACH: measurements.approach,
+            TORQUE: measurements.torque,
         }
         return JointState(
             measurements.q, {name: values for name, values in columns.items() if values is not None}

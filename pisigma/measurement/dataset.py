@@ -54,8 +54,8 @@ class Measurements:
             one zero offset.
         anchor_place: per row, position of the anchor in the row's frame [m]; NaN if it is to be identified.
         pair: per row, the pair to which it belongs; a pair has exactly two rows, in one frame.
-        approach: per row and joint, direction in which the joint moved to its value: +1 if the value increased, -1 if
-            it decreased, NaN if not given.
+        approach: per row and joint, +1 if the joint value increased before it stopped, -1 if it decreased, NaN unknown.
+        torque: per row and joint, torque of the drive towards larger joint values [Nm or N]; NaN if not given.
         date: per row, the day of the measurement (ISO 8601, such as "2026-11-22"); "" if not given.
         image: per row, the name of the image from which it was measured; "" if there is no image.
         readings: readings of registered sensors (see `pisigma.measurement.sensors.register_sensor`), by column: one
@@ -88,6 +88,7 @@ class Measurements:
     anchor_place: Float64[Tensor, "rows 3"] | None = None
     pair: tuple[str, ...] | None = None
     approach: Float64[Tensor, "rows dof"] | None = None
+    torque: Float64[Tensor, "rows dof"] | None = None
     date: tuple[str, ...] | None = None
     image: tuple[str, ...] | None = None
     readings: Mapping[str, Tensor | tuple[str, ...]] = field(default_factory=dict)

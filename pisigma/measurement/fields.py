@@ -26,6 +26,7 @@ NUMBERS: dict[str, tuple[int, ...]] = {
     "distance": (),
     "anchor_place": (3,),
     "approach": (-1,),
+    "torque": (-1,),
 }
 """Shape of one row of every numeric field; -1 stands for the number of joints."""
 TEXTS = ("target", "frame", "split", "socket", "touch_axis", "anchor", "pair", "date", "image")

@@ -15,6 +15,10 @@ from pisigma.robot.row import Row
 _MAX_NAMED = 5
 """Largest number of rows that a warning lists."""
 
+MAX_TORQUE = 1e3
+"""[Nm/m^4] Largest torque over the fourth power of the reach, as masses grow with its cube: 75 for the UR5 (150 Nm), 60
+for the FANUC R-2000iC."""
+
 
 @dataclass(frozen=True, eq=False)
 class JointRange:
@@ -75,8 +79,24 @@ def limit_warnings(robot: Robot, rows: Measurements) -> tuple[str, ...]:
 
 
 def row_warnings(robot: Robot, rows: Measurements) -> tuple[str, ...]:
-    """Return warnings about duplicate rows, and about every joint whose limits rows exceed."""
-    return (*copy_warnings(rows.left_out), *limit_warnings(robot, rows))
+    """Return warnings about duplicate rows, joint values beyond the limits, and torques that no robot has."""
+    return (*copy_warnings(rows.left_out), *limit_warnings(robot, rows), *_torque_warnings(robot, rows))
+
+
+def _torque_warnings(robot: Robot, rows: Measurements) -> tuple[str, ...]:
+    """Warn of torques that are too large for an arm of this size, as those in Nmm or mNm are."""
+    if rows.torque is None:
+        return ()
+    turning = np.flatnonzero(robot.revolute)
+    largest = np.nan_to_num(np.abs(rows.torque.cpu().numpy()[:, turning])).max(0, initial=0.0)
+    limit = MAX_TORQUE * robot.reach**4
+    if not len(turning) or largest.max() <= limit:
+        return ()
+    joint = int(turning[largest.argmax()])
+    return (
+        f"Column tau_{joint + 1} contains {largest.max():.3g} Nm, but robots of this reach have less "
+        f"than {limit:.2g} Nm: expected Nm, got probably mNm or Nmm; convert the columns tau_1, tau_2, ...",
+    )
 
 
 def with_limits_of_rows(robot: Robot, rows: Measurements) -> Robot:

@@ -25,7 +25,7 @@ PAYLOADS = (0.0, 2500.0)
 TEMPERATURES = (-50.0, 150.0)
 """Range of temperatures [deg C] in which robots work; it excludes room temperatures in kelvins (293)."""
 
-_MAY_BE_PARTIAL = ("anchor_place", "approach")  # rows may have only some of the values
+_MAY_BE_PARTIAL = ("anchor_place", "approach", "torque")  # rows may have only some of the values
 _ROTATION_TOLERANCE = 1e-6
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from pisigma.files.errors import ModelError
+from pisigma.joint_correction.conditions import with_modelled_torques
 from pisigma.joint_correction.feature import angle_per_joint_value, scaled_joints
 from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.model.calibrated_model import CalibratedModel
@@ -128,7 +129,7 @@ def _correction(model: CalibratedModel) -> tuple[arrays.Correction, tuple[str, .
     robot = model.robot if hybrid is None else hybrid.correction.robot
     zero = scaled_joints(robot, torch.from_numpy(np.zeros(dof))).numpy()
     half = 1 / (scaled_joints(robot, torch.from_numpy(np.ones(dof))).numpy() - zero)
-    correction = JointCorrection(robot, ()) if hybrid is None else hybrid.correction
+    correction = JointCorrection(robot, ()) if hybrid is None else with_modelled_torques(hybrid.correction)
     numbers: dict[str, np.ndarray] = {}
     for feature, weight in zip(correction.features, correction.linear, strict=True):
         if feature.compiled is not None and feature.name not in numbers:

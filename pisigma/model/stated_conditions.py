@@ -4,12 +4,19 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
 import torch
 from jaxtyping import Float64
 from torch import Tensor
 
 from pisigma.files.errors import ModelError
-from pisigma.joint_correction.conditions import ConditionFeatures, at_conditions, learned_conditions
+from pisigma.joint_correction.conditions import (
+    ConditionFeatures,
+    at_conditions,
+    at_torques,
+    learned_conditions,
+    learned_torques,
+)
 from pisigma.measurement.conditions import conditions_of
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.rules import TEMPERATURES
@@ -72,6 +79,32 @@ def under_stated_conditions(
     return replace(model, hybrid=under, conditions={**usual, **stated}, measured_conditions=measured)
 
 
+def under_stated_torques(model: CalibratedModel, torques_nm: Sequence[float]) -> CalibratedModel:
+    """Return the model with the constant deflections of the joints by stated torques.
+
+    Args:
+        model: hybrid model, calibrated on rows with joint torques.
+        torques_nm: torques of all drives at the pose [Nm; N for prismatic joints], see `JointTorques`.
+
+    Raises:
+        ModelError: the model did not learn the effect of torques, or a torque is missing or not finite.
+    """
+    arm = model.hybrid
+    if arm is None or learned_torques(arm.correction) is None:
+        raise ModelError(
+            f"model '{model.name}' did not learn the effect of joint torques",
+            option="torques_nm",
+            remedy="calibrate with rows that state them (columns tau_1, tau_2, ...)",
+        )
+    values = np.asarray(torques_nm, dtype=np.float64)
+    if values.shape != (model.robot.dof,) or not np.isfinite(values).all():
+        raise ModelError(
+            expected=f"{model.robot.dof} finite torques, one per joint", value=torques_nm, option="torques_nm"
+        )
+    correction, shift = at_torques(arm.correction, values)
+    return replace(model, hybrid=replace(arm, robot=_shifted(arm.robot, shift), correction=correction))
+
+
 def condition_warnings(model: CalibratedModel, rows: Measurements | None = None) -> tuple[str, ...]:
     """Return a warning for every condition outside the range of the calibration.
 
@@ -79,6 +112,7 @@ def condition_warnings(model: CalibratedModel, rows: Measurements | None = None)
         model: model of any kind; only a hybrid learns the effect of conditions.
         rows: rows whose conditions are checked; None for the conditions at which the model is evaluated.
     """
+    sentences = _torque_warning(model, rows)
     if rows is None:
         stated = [
             (name, *ends, torch.tensor([model.conditions[name]], dtype=torch.float64))
@@ -87,13 +121,34 @@ def condition_warnings(model: CalibratedModel, rows: Measurements | None = None)
     else:
         learned = _learned(model)
         if learned is None:
-            return ()
+            return sentences
         columns = conditions_of(rows, learned.names).unbind(1)
         stated = [
             (name, low, high, values)
             for name, (low, high), values in zip(learned.names, learned.measured, columns, strict=True)
         ]
-    return tuple(sentence for one in stated for sentence in _warning(*one, model.name, rows is None))
+    beyond = (sentence for one in stated for sentence in _warning(*one, model.name, rows is None))
+    return (*sentences, *beyond)
+
+
+def _torque_warning(model: CalibratedModel, rows: Measurements | None) -> tuple[str, ...]:
+    """Return the warning that modelled torques are used; none if the model needs none or all rows state them."""
+    learned = None if model.hybrid is None else learned_torques(model.hybrid.correction)
+    if learned is None:
+        return ()
+    which = "no joint torques are stated"
+    if rows is not None:
+        needed = torch.tensor([scale > 0 for scale in learned.scale])
+        missing = rows.rows
+        if rows.torque is not None:
+            missing = int(rows.torque[:, needed].isnan().any(1).sum())
+        if not missing:
+            return ()
+        which = f"{missing} of {rows.rows} rows do not state all joint torques (columns tau_1, ...)"
+    return (
+        f"{which}, but {model.name} was calibrated with measured ones: gravity torques modelled from the joint values "
+        "are used, with the mean load of the calibration. The predicted accuracy includes their deviation.",
+    )
 
 
 def _warning(

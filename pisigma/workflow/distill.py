@@ -16,7 +16,7 @@ from torch import Tensor
 from pisigma.files.errors import IdentificationError, ModelError
 from pisigma.files.model_files import model_hash
 from pisigma.files.progress import Progress
-from pisigma.joint_correction.conditions import learned_conditions
+from pisigma.joint_correction.conditions import learned_conditions, learned_torques
 from pisigma.model.calibrated_model import CalibratedModel, Provenance
 from pisigma.model.domain import Domain
 from pisigma.model.folder.model_folder import load_model
@@ -266,6 +266,10 @@ def _limitations(
         names = " and ".join(conditions.names)
         sentences.append(
             f"Conditions: {names} are assumed to be at their means over the measurements of the parent."
+        )
+    if parent.hybrid is not None and learned_torques(parent.hybrid.correction) is not None:
+        sentences.append(
+            "Torques: gravity torques modelled from the joint values are assumed, not measured ones."
         )
     return (
         *sentences,

@@ -86,7 +86,15 @@ class HybridCalibrator:
     """
 
     robot: Robot | GeometricCalibrator
-    features: tuple[str, ...] = ("gravity", "conditions", "backlash", "coupling", "lines", "series")
+    features: tuple[str, ...] = (
+        "gravity",
+        "torques",
+        "conditions",
+        "backlash",
+        "coupling",
+        "lines",
+        "series",
+    )
     harmonics: tuple[int, ...] = (8, 24, 56, 110, 160)
     products: bool = True
     gravity: tuple[float, float, float] | None = None

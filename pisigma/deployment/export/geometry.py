@@ -136,7 +136,7 @@ def condition_remarks(model: CalibratedModel) -> tuple[str, ...]:
     usual = {} if learned is None else dict(zip(learned.names, learned.mean, strict=True))
     stated = [f"{name} {value:g}" for name, value in model.conditions.items()]
     stated += [f"{name} {mean:.4g} (mean of the calibration)" for name, mean in usual.items()]
-    return (f"For {' and '.join(stated)}.", *condition_warnings(model)) if stated else ()
+    return (*((f"For {' and '.join(stated)}.",) if stated else ()), *condition_warnings(model))
 
 
 def offset_remarks(model: CalibratedModel) -> tuple[str, ...]:

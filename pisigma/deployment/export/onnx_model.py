@@ -12,7 +12,7 @@ from pisigma.deployment.export.export_format import Exported, ExportFormat, Expo
 from pisigma.deployment.export.geometry import HYBRID
 from pisigma.files.errors import ModelError
 from pisigma.files.model_files import model_hash
-from pisigma.joint_correction.conditions import learned_conditions
+from pisigma.joint_correction.conditions import learned_conditions, with_modelled_torques
 from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.joint_correction.onnx_chain import add_roll_pitch_yaw
 from pisigma.joint_correction.onnx_graph import OnnxGraph, import_onnx
@@ -98,6 +98,7 @@ def add_joint_correction(graph: OnnxGraph, correction: JointCorrection, q: str) 
     Raises:
         ModelError: it uses features without an ONNX form.
     """
+    correction = with_modelled_torques(correction)
     robot, terms = correction.robot, []
     for feature, weight in zip(correction.features, correction.linear, strict=True):
         if feature.usually_zero:

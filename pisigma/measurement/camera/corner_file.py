@@ -29,7 +29,7 @@ SAME_JOINTS = 1e-9
 """Largest difference between the joint values in the rows of one image [rad or m]."""
 RESOLUTION_IMAGES = 8
 """Smallest number of images of which some must show corners outside the upper left quarter of the field of view."""
-CONDITIONS = ("split", "payload", "temperature", "approach", "date")
+CONDITIONS = ("split", "payload", "temperature", "approach", "torque", "date")
 """Fields that rows of corners may have in addition to joint values and pixels."""
 IMAGE_COLUMNS = (*CORNERS, "sigma_px", "camera", "board")
 """Columns that only rows of corners have."""

@@ -28,7 +28,9 @@ PLAN_COLUMNS = ("order", "candidate")
 """Columns of a plan; measurement files may contain them, but they are ignored."""
 
 _JOINT = re.compile(r"q([1-9][0-9]{0,2})_(deg|rad|mm|m)")
-_APPROACH = re.compile(r"approach([1-9][0-9]{0,2})")
+PER_JOINT = {"approach": "approach", "torque": "tau_"}
+"""Fields with a value per joint, and what the names of their columns start with; the number of the joint follows."""
+_PER_JOINT = re.compile(rf"({'|'.join(PER_JOINT.values())})([1-9][0-9]{{0,2}})")
 
 
 @dataclass(frozen=True)
@@ -57,10 +59,12 @@ class Column:
         return int(match[1]) if match else 0
 
     @property
-    def approach(self) -> int:
-        """Number, from 1, of the joint whose direction of approach the column contains; 0 for other columns."""
-        match = _APPROACH.fullmatch(self.name)
-        return int(match[1]) if match else 0
+    def joint_field(self) -> tuple[str, int]:
+        """Field of `PER_JOINT` and number of the joint, from 1, whose value it contains; 0 for other columns."""
+        match = _PER_JOINT.fullmatch(self.name)
+        if match is None:
+            return "", 0
+        return next(name for name, start in PER_JOINT.items() if start == match[1]), int(match[2])
 
 
 @dataclass(frozen=True)
@@ -106,16 +110,21 @@ def number_fields(dof: int = 0) -> tuple[FileField, ...]:
     """Return the numeric fields after the joint values, in the order of a file; rotations may also be read as `RPY`.
 
     Args:
-        dof: number of joints; with 0 the directions of approach are not included.
+        dof: number of joints; with 0 the fields of `PER_JOINT` are not included.
     """
-    approach = FileField("approach", tuple(f"approach{number}" for number in range(1, dof + 1)), ("",))
+    numbers = range(1, dof + 1)
+    per_joint = (
+        FileField(name, tuple(f"{start}{number}" for number in numbers), ("",))
+        for name, start in PER_JOINT.items()
+        if dof
+    )
     added = (
         FileField(column.name, (column.name,), column.units)
         for readings in READINGS.values()
         for column in readings.columns
         if not column.is_text
     )
-    return (*_FIELDS, *([approach] if dof else []), *added)
+    return (*_FIELDS, *per_joint, *added)
 
 
 def find_column(name: str) -> Column | None:
@@ -124,7 +133,7 @@ def find_column(name: str) -> Column | None:
     if match:
         unit = next(unit for unit in (*REVOLUTE_UNITS, *PRISMATIC_UNITS) if unit == match[2])
         return Column(name, f"q{match[1]}", unit)
-    return Column(name, name, "") if _APPROACH.fullmatch(name) else _columns().get(name)
+    return Column(name, name, "") if _PER_JOINT.fullmatch(name) else _columns().get(name)
 
 
 def _columns() -> dict[str, Column]:
@@ -147,7 +156,7 @@ def column_choices(name: str) -> str:
     meant = name.lower()
     if re.fullmatch(r"q[1-9][0-9]?", meant):  # degrees, because most joints are revolute
         meant += "_deg"
-    return nearest_choice(meant, (*joints, *_columns(), f"approach{joint}"))
+    return nearest_choice(meant, (*joints, *_columns(), *(f"{start}{joint}" for start in PER_JOINT.values())))
 
 
 def quoted_names(columns: Iterable[Column]) -> str:

@@ -57,9 +57,9 @@ class Layout:
         return tuple(f"q{number}" for number in range(1, self.dof + 1))
 
     @property
-    def approaches(self) -> tuple[str, ...]:
-        """Quantities approach1, approach2, ... that the file contains."""
-        return tuple(column.quantity for column in self.columns if column.approach)
+    def per_joint(self) -> tuple[Column, ...]:
+        """Columns of the fields of `PER_JOINT`."""
+        return tuple(column for column in self.columns if column.joint_field[1])
 
     def column(self, quantity: str) -> Column:
         """Return the column of a quantity."""
@@ -100,7 +100,7 @@ def read_header(table: Table, robot: Robot | None) -> Layout:
     dof = _check_joints(place, columns)
     if robot is not None:
         _check_robot(place, [columns[index[f"q{number}"]] for number in range(1, dof + 1)], robot)
-    _check_approaches(place, columns, dof)
+    _check_joint_fields(place, columns, dof)
     _check_position(place, columns)
     _check_lengths(place, columns)
     _check_readings(place, columns)
@@ -206,13 +206,13 @@ def _check_robot(place: Place, joints: list[Column], robot: Robot) -> None:
             )
 
 
-def _check_approaches(place: Place, columns: tuple[Column, ...], dof: int) -> None:
-    """Check that directions of approach are those of joints in the file."""
+def _check_joint_fields(place: Place, columns: tuple[Column, ...], dof: int) -> None:
+    """Check that directions of approach and torques are those of joints in the file."""
     for column in columns:
-        if column.approach > dof:
+        if column.joint_field[1] > dof:
             raise MeasurementError(
                 expected=f"a joint from 1 to {dof}",
-                value=column.approach,
+                value=column.joint_field[1],
                 at=replace(place, column=column.name),
                 remedy="correct its number, or remove the column",
             )

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.files.errors import MeasurementError, check_choice, nearest_choice
+from pisigma.files.errors import MeasurementError, Place, check_choice, nearest_choice
 from pisigma.measurement.csv.columns import (
     CORNERS,
     PRISMATIC_UNITS,
@@ -49,9 +49,9 @@ def read_fields(
 
     Optional are `roll_deg,pitch_deg,yaw_deg` (RotZ(roll) · RotY(pitch) · RotX(yaw)) or `qx,qy,qz,qw`, `target`,
     `frame`, `sigma_mm` (standard deviation of the row's length), `sigma_deg`, `set`, `payload_kg`, `temperature_c`,
-    and `approach1` and so
-    on: +1 where that joint's value increased before it stopped, -1 where it decreased. Registered sensors add
-        further columns. Cells of quantities that were not measured are empty.
+    `approach1` and so on (+1 where that joint's value increased before it stopped, -1 where it decreased), and `tau_1`
+    and so on (torque of that joint's drive in Nm, or its force in N). Registered sensors add further columns. Cells of
+    quantities that were not measured are empty.
 
     Args:
         path: the file.
@@ -109,6 +109,13 @@ def _sound_rows(table: Table, layout: Layout, robot: Robot | None) -> MeasuredFi
     }
     if robot is not None and robot.coupling is not None:
         numbers["q"] = robot.to_dh(numbers["q"])
+        if "torque" in numbers:
+            raise MeasurementError(
+                expected=f"no torques for robot '{robot.name}', whose joints are coupled",
+                value="tau_1, ...",
+                at=Place(table.source),
+                remedy="remove these columns: torques of its axes are not those of its joints",
+            )
         if "approach" in numbers:
             numbers["approach"] = robot.coupling.approach_to_dh(numbers["approach"])
     left_out = tuple(
@@ -152,10 +159,10 @@ def _fields(table: Table, layout: Layout, rows: CheckedRows) -> MeasuredFields:
     if layout.orientation:
         to_rotation = rotation_from_quaternion if layout.orientation == QUATERNION else rotation_from_rpy
         fields["rotation"] = to_rotation(numbers(*layout.orientation))
-    if layout.approaches:
-        fields["approach"] = torch.full_like(fields["q"], torch.nan)
-        for quantity in layout.approaches:
-            fields["approach"][:, layout.column(quantity).approach - 1] = numbers(quantity)[:, 0]
+    for column in layout.per_joint:
+        name, number = column.joint_field
+        values = fields.setdefault(name, torch.full_like(fields["q"], torch.nan))
+        values[:, number - 1] = numbers(column.quantity)[:, 0]
     names = (*TEXTS, *reading_texts())
     texts = {name: rows.texts(layout.index[name]) for name in names if name in layout.index}
     return MeasuredFields(fields, texts, table.lines, table.source)

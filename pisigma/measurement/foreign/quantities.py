@@ -103,7 +103,9 @@ def fits_unit(quantity: str, unit: str) -> bool:
 def is_measured(name: str) -> bool:
     """Return whether a column of measurement files contains measurements, not names, conditions or deviations."""
     column = find_column(name)
-    return column is not None and not (column.joint or column.approach or column.quantity in _NOT_MEASURED)
+    return column is not None and not (
+        column.joint or column.joint_field[1] or column.quantity in _NOT_MEASURED
+    )
 
 
 def unit_kind(quantity: str) -> UnitKind | None:

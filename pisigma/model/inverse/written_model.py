@@ -82,6 +82,7 @@ def _probe(model: CalibratedModel) -> Measurements:
         approach=2.0 * torch.randint(0, 2, rows.q.shape, generator=generator).double() - 1.0,
         payload=torch.linspace(0.0, 5.0, PROBES, dtype=torch.float64),
         temperature=torch.linspace(15.0, 30.0, PROBES, dtype=torch.float64),
+        torque=20.0 * torch.rand(rows.q.shape, generator=generator, dtype=torch.float64) - 10.0,
     )
 
 

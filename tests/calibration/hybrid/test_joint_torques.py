@@ -1,0 +1,138 @@
+"""Joint torques: learned as compliances where rows state them, and replaced by modelled ones where they do not."""
+
+import dataclasses
+import functools
+
+import numpy as np
+import pytest
+import torch
+from testing.closeness import assert_close
+from testing.refusals import refused
+
+from pisigma.calibration.hybrid.calibrator import HybridCalibrator
+from pisigma.calibration.hybrid.result import HybridResult
+from pisigma.deployment.export.onnx_model import export_onnx
+from pisigma.files.errors import MeasurementError, ModelError
+from pisigma.joint_correction.gravity_torques import GravityTorques
+from pisigma.measurement.conditions import JointState
+from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.joint_range import row_warnings
+from pisigma.model.accuracy import deviation_of_rows
+from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.model.folder.model_folder import load_model, save_model
+from pisigma.model.geometric_model import model_of_hybrid
+from pisigma.model.inverse.corrected_ik import CorrectedIK
+from pisigma.model.stated_conditions import condition_warnings, under_stated_torques
+from pisigma.robot import Robot
+from pisigma.robot.kinematics.forward import forward_kinematics
+
+ROBOT = Robot.load("ur5")
+COMPLIANCE = np.array([0.0, 2e-5, 2e-5, 5e-5, 5e-5, 5e-5])
+"""[rad/Nm]"""
+NOISE = 2e-5
+
+
+@functools.cache
+def measured(rows: int, seed: int, noise: float = NOISE) -> Measurements:
+    """Positions of an arm with elastic joints and a payload that differs from row to row and is not stated."""
+    rng = np.random.default_rng(seed)
+    q = torch.from_numpy(rng.uniform(-2.5, 2.5, (rows, 6)))
+    columns = GravityTorques(ROBOT).columns(JointState(q))
+    arm = np.zeros((6, 24))
+    arm[:, 4:24:4] = ROBOT.reach * 9.81 * np.array([8.0, 2.0, 1.0, 1.0, 0.5])  # masses of the links [kg]
+    load = rng.uniform(0, 5, rows)[:, None] * ROBOT.reach * 9.81
+    tau = -(
+        (columns.numpy() * arm).sum(-1) + columns.numpy()[..., 20] * load
+    )  # the drives hold against gravity
+    T = forward_kinematics(ROBOT, q - torch.from_numpy(COMPLIANCE * tau))
+    position = T[:, :3, 3] + torch.from_numpy(rng.normal(0, noise, (rows, 3)))
+    return Measurements(q, position, torque=torch.from_numpy(tau))
+
+
+@functools.cache
+def calibrated() -> HybridResult:
+    return HybridCalibrator(ROBOT, features=("gravity", "torques"), products=False).fit(measured(60, 1))
+
+
+@functools.cache
+def model() -> CalibratedModel:
+    return model_of_hybrid("ur5", ROBOT, calibrated(), measured(60, 1))
+
+
+def rms(result: HybridResult, rows: Measurements) -> float:
+    return float(result.errors_of(rows)["position"].square().sum(1).mean().sqrt())
+
+
+def test_the_compliances_are_found_and_predict_an_unknown_payload():
+    result, test = calibrated(), measured(100, 2, 0.0)
+    (learned,) = (one for one in result.learned.correction.features if one.name == "torques")
+    weight = result.learned.correction.linear[result.learned.correction.features.index(learned)]
+    found = -weight.detach().numpy()[:, 0] / np.array(learned.scale).clip(1e-9)
+    assert_close(found[1:4], COMPLIANCE[1:4], rtol=0.2)
+    without = HybridCalibrator(ROBOT, features=("gravity",), products=False).fit(measured(60, 1))
+    assert rms(result, test) < 0.5 * rms(without, test)
+    assert condition_warnings(model(), test) == ()
+
+
+def test_rows_without_torques_are_predicted_with_the_mean_load_and_a_larger_deviation():
+    test = measured(100, 2, 0.0)
+    unstated = dataclasses.replace(test, torque=None)
+    stated_error, error = rms(calibrated(), test), rms(calibrated(), unstated)
+    assert error > 2 * stated_error
+    predicted = float(deviation_of_rows(model(), unstated).square().sum(1).mean().sqrt())
+    assert 0.6 < predicted / error < 1.6
+    assert len(condition_warnings(model(), unstated)) == len(condition_warnings(model())) == 1
+
+
+def test_kernels_and_onnx_use_the_modelled_torques():
+    ik, q = CorrectedIK(model()), measured(20, 3).q.numpy()
+    assert ik.compiled is not None
+    assert_close(ik.forward(q), model().forward(torch.from_numpy(q)), atol=1e-12)
+    assert ik.warnings == condition_warnings(model())
+    runtime = pytest.importorskip("onnxruntime")
+    session = runtime.InferenceSession(export_onnx(model()), providers=["CPUExecutionProvider"])
+    (delta,) = session.run(["correction"], {"q": q})
+    assert_close(delta, model().hybrid.correction(torch.from_numpy(q)).detach(), atol=1e-12)
+
+
+def test_stated_torques_replace_the_modelled_ones():
+    rows = measured(5, 4)
+    for k in range(rows.rows):
+        ik = CorrectedIK(under_stated_torques(model(), rows.torque[k].tolist()))
+        expected = calibrated().predicted_poses(rows.select(torch.tensor([k])))[0, :3, 3]
+        assert_close(ik.forward(rows.q[k].numpy())[:3, 3], expected, atol=1e-9)
+        assert ik.warnings == ()
+
+
+def test_a_folder_keeps_the_feature(tmp_path):
+    save_model(model(), tmp_path)
+    loaded = load_model(tmp_path)
+    rows = measured(20, 3)
+    assert_close(deviation_of_rows(loaded, rows), deviation_of_rows(model(), rows), atol=1e-12)
+
+
+def test_a_file_keeps_the_torques_and_names_other_units(tmp_path):
+    rows = measured(20, 3)
+    rows.write_csv(tmp_path / "rows.csv", ROBOT)
+    read = Measurements.read_csv(tmp_path / "rows.csv", ROBOT)
+    assert_close(read.torque, rows.torque, rtol=1e-9)
+    assert row_warnings(ROBOT, read) == ()
+    assert len(row_warnings(ROBOT, dataclasses.replace(read, torque=1e3 * read.torque))) == 1
+
+
+def test_invalid_torques_are_refused(tmp_path):
+    with refused(ModelError, option="torques_nm"):
+        under_stated_torques(model(), [1.0, 2.0])
+    geometric = dataclasses.replace(model(), hybrid=None)
+    with refused(ModelError, option="torques_nm"):
+        under_stated_torques(geometric, [0.0] * 6)
+    file = tmp_path / "rows.csv"
+    file.write_text("q1_deg,q2_deg,x_mm,y_mm,z_mm,tau_3\n0,0,1,2,3,4\n", encoding="utf-8")
+    with refused(MeasurementError, value=3):
+        Measurements.read_csv(file)
+
+
+def test_without_torques_nothing_is_tried():
+    rows = dataclasses.replace(measured(60, 1), torque=torch.full((60, 6), torch.nan).double())
+    result = HybridCalibrator(ROBOT, features=("torques",), products=False).fit(rows)
+    assert result.learned is None
