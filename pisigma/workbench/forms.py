@@ -15,6 +15,7 @@ from pisigma.files.errors import PlanningError
 from pisigma.files.setting import Setting, attributes_of, flat_settings
 from pisigma.files.yaml_edit import with_value
 from pisigma.files.yaml_file import Section, plain_content
+from pisigma.lifetime.cell.layout import CELL_FILE
 from pisigma.robot.row import MAX_MAGNITUDE
 from pisigma.workflow.cell.cell_file import CAMERA_KEYS, STATED_ABOVE, STEPS, CellDocument, CellFile
 
@@ -111,7 +112,7 @@ def changed_cell(file: CellFile, form: Mapping[str, str]) -> str:
     Raises:
         PisigmaError: the file is written in a way in which a value cannot be changed alone.
     """
-    text = file.path.read_text(encoding="utf-8")
+    text = text_of(file.path.parent)
     fields = itertools.chain.from_iterable(form_of_cell(file).values())
     entered = [(one, form.get(one.key, one.value).strip()) for one in fields]
     changed = [(one, value) for one, value in entered if value != one.value]
@@ -121,6 +122,11 @@ def changed_cell(file: CellFile, form: Mapping[str, str]) -> str:
         keys = [int(part) if part.isdigit() else part for part in one.key.split(".")]
         text = with_value(text, keys, _value(one.kind, value), str(file.path))
     return text
+
+
+def text_of(folder: Path) -> str:
+    """Return the text of the `cell.yaml` in a folder, even where it is not UTF-8."""
+    return (folder / CELL_FILE).read_text(encoding="utf-8", errors="replace")
 
 
 def digest_of(text: str) -> str:

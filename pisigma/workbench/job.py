@@ -4,7 +4,7 @@ import datetime
 import sys
 import threading
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -28,6 +28,7 @@ class Outcome:
     Attributes:
         text: the result for people; None if the step was refused.
         refusal: why the input was refused, or the result is not accepted.
+        rows: rows at fault (file and line), by the sentences of the findings that name them.
         field: field of the form that causes the fault; "" if no field does.
         subject: object of the step, such as a session; "" if the step implies it.
         curve: expected accuracy by number of poses; () without a curve.
@@ -40,6 +41,7 @@ class Outcome:
 
     text: ResultText | None = None
     refusal: str = ""
+    rows: Mapping[str, str] = field(default_factory=dict)
     field: str = ""
     subject: str = ""
     curve: tuple[Any, ...] = ()

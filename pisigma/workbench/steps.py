@@ -3,7 +3,7 @@
 import contextlib
 import itertools
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ from pisigma.files.errors import (
     check_choice,
 )
 from pisigma.files.progress import Progress
-from pisigma.lifetime.cell.layout import EXPORTS, REPORTS, newest_plan
+from pisigma.lifetime.cell.layout import CELL_FILE, EXPORTS, REPORTS, newest_plan
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.growing_file import GrowingFile
 from pisigma.model.inverse.solution import Solution
@@ -32,7 +32,8 @@ from pisigma.reporting.result_text import ResultText, sentences, table_block
 from pisigma.reporting.solution_text import FAILURES, solution_text, statuses_of
 from pisigma.reporting.verdict import Verdict, count_text, uncapitalised
 from pisigma.robot.robot_file import catalogue
-from pisigma.workbench.forms import changed_cell, changed_settings, digest_of
+from pisigma.validation.held_out.diagnostic import Diagnostic
+from pisigma.workbench.forms import changed_cell, changed_settings, digest_of, text_of
 from pisigma.workbench.job import Outcome, StoppedError
 from pisigma.workbench.tabs import CHARTS, download_of
 from pisigma.workflow.calibrate import Calibration
@@ -78,11 +79,11 @@ def create(folder: Path, form: Form, files: list[Path]) -> Cell:
     )
 
 
-def write_cell(cell: Cell, form: Form, texts: dict[str, str]) -> None:
-    """Write `cell.yaml`, if the new text is valid and the file has not changed since it was displayed.
+def write_cell(folder: Path, form: Form, texts: dict[str, str]) -> None:
+    """Write `cell.yaml`, if the new one is valid and the old one is still the file that the person saw.
 
     Args:
-        cell: the cell.
+        folder: folder of the cell, whose file need not be valid.
         form: "seen", the digest of the file that the person saw, with its new "text" or the values of its form; or
             "undo", the digest of the file whose last change is undone.
         texts: the text before every change, by the digest of the text after it.
@@ -90,16 +91,16 @@ def write_cell(cell: Cell, form: Form, texts: dict[str, str]) -> None:
     Raises:
         PlanningError: the file has been changed meanwhile, or is not valid.
     """
-    before = cell.file.path.read_text(encoding="utf-8")
+    before = text_of(folder)
     digest, undo, entered = digest_of(before), form.get("undo"), form.get("text")
     if digest not in (form.get("seen"), undo) or (undo and undo not in texts):
         raise PlanningError(
             "the file has been changed since it was shown here",
-            at=Place(cell.file.path),
+            at=Place(folder / CELL_FILE),
             remedy="copy what you entered, discard your changes, and repeat them",
         )
-    text = texts[undo] if undo else changed_cell(cell.file, form) if entered is None else entered
-    CellFile.write(cell.folder, text)
+    text = texts[undo] if undo else changed_cell(CellFile.read(folder), form) if entered is None else entered
+    CellFile.write(folder, text)
     if undo:
         del texts[undo]
     elif text != before:
@@ -120,7 +121,11 @@ def calibrate(cell: Cell, form: Form, progress: Progress) -> Outcome:
     also = [] if entry is None else [sentences("the cell", [f"Model '{entry.name}': {entry.remark}."])]
     assert isinstance(found, Calibration)  # there is no prior
     text = calibration_text(found.summary, folder, found.seconds, also)
-    return Outcome(_in_cell(text, cell), NOT_STORED if entry is None else "")
+    return Outcome(
+        _in_cell(text, cell),
+        NOT_STORED if entry is None else "",
+        rows=rows_at_fault(found.summary.diagnostics),
+    )
 
 
 def verify(cell: Cell, form: Form, progress: Progress) -> Outcome:
@@ -130,7 +135,13 @@ def verify(cell: Cell, form: Form, progress: Progress) -> Outcome:
     in_use = cell.history.in_use
     used = [f"Model '{entry.name}' is in use."] if in_use is not None and in_use.name == entry.name else []
     text = replace(verification_text(found, WIDTH), closing=tuple(used))
-    return Outcome(_in_cell(text, cell), "" if found.accepted else found.sentence)
+    refusal = "" if found.accepted else found.sentence
+    return Outcome(_in_cell(text, cell), refusal, rows=rows_at_fault(found.diagnostics))
+
+
+def rows_at_fault(findings: Sequence[Diagnostic]) -> dict[str, str]:
+    """Return the rows at fault by the sentences of findings."""
+    return {one.sentence: "; ".join(one.rows) for one in findings if one.rows}
 
 
 def monitor(cell: Cell, form: Form, progress: Progress) -> Outcome:

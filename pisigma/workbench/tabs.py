@@ -13,7 +13,7 @@ from pisigma.deployment.export.targets import POSE_COLUMNS
 from pisigma.files.errors import ModelError, check_choice
 from pisigma.files.templates import template_environment
 from pisigma.lifetime.cell.events import EventKind
-from pisigma.lifetime.cell.layout import CELL_FILE, EXPORTS, MODELS, PLANS, REPORTS
+from pisigma.lifetime.cell.layout import EXPORTS, MODELS, PLANS, REPORTS
 from pisigma.lifetime.cell.status import CellStatus
 from pisigma.measurement.csv.columns import POSITION
 from pisigma.planning.plan_file import joint_columns, yaml_of
@@ -21,7 +21,14 @@ from pisigma.reporting.rendering import code
 from pisigma.reporting.result_text import merge_alike_warnings
 from pisigma.robot.robot_file import catalogue
 from pisigma.validation.held_out.diagnostic import Diagnostic
-from pisigma.workbench.forms import digest_of, form_of, form_of_cell, form_of_command, form_of_new_cell
+from pisigma.workbench.forms import (
+    digest_of,
+    form_of,
+    form_of_cell,
+    form_of_command,
+    form_of_new_cell,
+    text_of,
+)
 from pisigma.workbench.job import Jobs
 from pisigma.workbench.model_server import ModelServer
 from pisigma.workflow.cell.cell import Cell
@@ -103,9 +110,16 @@ class Tabs:
             },
         )
 
-    def page(self, folder: Path, cell: Cell | None) -> str:
-        """Return the frame of the page, without the content of a tab; without a cell, there is only one tab."""
+    def page(self, folder: Path, cell: Cell | None, is_broken: bool = False) -> str:
+        """Return the frame of the page, without the content of a tab; without a cell, there is only one tab.
+
+        Args:
+            folder: folder of the cell.
+            cell: the cell; None before there is one, and if its `cell.yaml` cannot be used.
+            is_broken: whether its `cell.yaml` cannot be used.
+        """
         robot, tabs = ("", {"status": "New cell"}) if cell is None else (cell.robot.name, TABS)
+        tabs = {"cell": "Repair"} if is_broken else tabs
         template = self._environment.get_template("page.html.j2")
         return template.render(tabs=tabs, name=folder.resolve().name, robot=robot, folder=str(folder))
 
@@ -117,6 +131,13 @@ class Tabs:
             robots=catalogue(),
             settings=form_of_new_cell(),
             outcomes=self._jobs.outcomes,
+        )
+
+    def repair(self, folder: Path, fault: str) -> str:
+        """Render the text of a `cell.yaml` that cannot be used, with what is wrong with it."""
+        text = text_of(folder)
+        return self._environment.get_template("repair.html.j2").render(
+            fault=fault, text=text, seen=digest_of(text), outcomes=self._jobs.outcomes
         )
 
     def tab(self, name: str, cell: Cell, status: CellStatus, texts: Mapping[str, str]) -> str:
@@ -211,7 +232,7 @@ def _more(name: str, cell: Cell, status: CellStatus, texts: Mapping[str, str]) -
         case "status":
             return {"timeline": timeline(status), "kinds": get_args(EventKind)}
         case "cell":
-            text = (cell.folder / CELL_FILE).read_text(encoding="utf-8")
+            text = text_of(cell.folder)
             seen = digest_of(text)
             return {"text": text, "seen": seen, "settings": form_of_cell(cell.file), "undo": seen in texts}
         case "plan":

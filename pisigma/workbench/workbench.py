@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Mapping
 from importlib import resources
 from pathlib import Path
+from typing import Any
 from urllib.parse import quote
 
 import numpy as np
@@ -16,6 +17,7 @@ from aiohttp.typedefs import Handler
 
 from pisigma.files.errors import PisigmaError, PlanningError
 from pisigma.files.progress import Progress
+from pisigma.lifetime.cell.layout import CELL_FILE
 from pisigma.lifetime.cell.status import CellStatus
 from pisigma.measurement.dataset import Measurements
 from pisigma.planning.session.state import SessionState
@@ -30,6 +32,7 @@ from pisigma.workbench.tabs import TABS, Tabs, download_of
 from pisigma.workbench.uploaded_rows import UploadedRows
 from pisigma.workbench.uploads import Uploads
 from pisigma.workflow.cell.cell import Cell
+from pisigma.workflow.cell.cell_file import CellFile
 
 Form = Mapping[str, str]
 STATUS_AGE = 5.0
@@ -46,6 +49,8 @@ NO_CELL = {"state": "no_cell", "reason": "the folder has no cell yet", "command"
 """Next step of a folder without a cell."""
 STATE_CHECKS = 30
 """Number of times that a waiting request for the state is checked."""
+BROKEN = "broken_cell"
+"""State of a cell whose `cell.yaml` cannot be used."""
 REPORT_POLICY = (
     "sandbox allow-scripts; default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; img-src data:; "
     "frame-ancestors 'self'"
@@ -82,8 +87,10 @@ class Workbench(UploadedRows):
             PlanningError: the folder is not a cell, and not empty.
         """
         self.folder, self._has_cell, self.growing = folder, False, growing
-        cell = self._cell()
-        self._status = None if cell is None else cell.status(), time.monotonic()
+        cell = self._cell() if self._fault() is None else None
+        self._status: tuple[CellStatus | None, float] = None, -math.inf
+        if cell is not None:
+            self._status = cell.status(), time.monotonic()
         self._reading, self._texts = threading.Lock(), dict[str, str]()
         self.jobs, self._uploads = Jobs(), Uploads()
         self._tabs = Tabs(self.jobs, ModelServer(folder), growing)
@@ -144,7 +151,11 @@ class Workbench(UploadedRows):
 
     @with_error_answers
     async def _page(self, request: web.Request) -> web.StreamResponse:
-        text = await asyncio.to_thread(lambda: self._tabs.page(self.folder, self._cell()))
+        def page() -> str:
+            fault = self._fault()
+            return self._tabs.page(self.folder, self._cell() if fault is None else None, fault is not None)
+
+        text = await asyncio.to_thread(page)
         return web.Response(text=text, content_type="text/html")
 
     @with_error_answers
@@ -152,6 +163,8 @@ class Workbench(UploadedRows):
         name = request.match_info["name"]
 
         def tab() -> str:
+            if (fault := self._fault()) is not None:
+                return self._tabs.repair(self.folder, fault)
             if (cell := self._cell()) is None or (status := self.status()) is None:
                 return self._tabs.new_cell(self.folder)
             return self._tabs.tab(name, cell, status, self._texts)
@@ -169,7 +182,7 @@ class Workbench(UploadedRows):
             if self.jobs.running is None or request.query.get("version") != str(self.jobs.version):
                 break
             await asyncio.sleep(0.3 / STATE_CHECKS)
-        status, job = await asyncio.to_thread(self.status), self.jobs.running
+        following, job = await asyncio.to_thread(self._next), self.jobs.running
         running = job and {
             "step": job.step,
             "person": job.person,
@@ -181,7 +194,7 @@ class Workbench(UploadedRows):
             "version": self.jobs.version,
             "ended": self.jobs.ended,
             "running": running,
-            "next": NO_CELL if status is None else status.step.to_json(),
+            "next": following,
             "dragged": self._scene.dragged_values(),
         }
         return web.json_response(said)
@@ -219,13 +232,15 @@ class Workbench(UploadedRows):
     @with_error_answers
     async def _step(self, request: web.Request) -> web.StreamResponse:
         name, form = request.match_info["name"], await form_of(request)
-        if name not in (*STEPS, "new"):
+        if name not in (*STEPS, "new", "cell"):
             raise web.HTTPNotFound
 
         def run(progress: Progress) -> Outcome:
             try:
                 if name == "new":
                     return self._create(form)
+                if name == "cell":
+                    return self._write_cell(form)
                 found = STEPS[name](self, Cell.open(self.folder), form, progress)
                 if name in MODEL_STEPS:
                     self._scene.show_errors(Cell.open(self.folder))
@@ -239,6 +254,22 @@ class Workbench(UploadedRows):
 
         self.jobs.start(name, person_of(request), form.pop("command", "")[:MAX_COMMAND], run)
         return web.json_response({"started": name})
+
+    def _next(self) -> dict[str, Any]:
+        """Return what to do next as plain values."""
+        if (fault := self._fault()) is not None:
+            return {"state": BROKEN, "reason": fault.rstrip("."), "command": ""}
+        status = self.status()
+        return NO_CELL if status is None else status.step.to_json()
+
+    def _fault(self) -> str | None:
+        """Return why `cell.yaml` cannot be used; None if it can, or if there is none."""
+        if (self.folder / CELL_FILE).is_file():
+            try:
+                CellFile.read(self.folder)
+            except PisigmaError as problem:
+                return str(problem)
+        return None
 
     def _cell(self) -> Cell | None:
         """Return the cell; None if the folder does not exist or is empty, and had no cell so far."""
@@ -324,10 +355,10 @@ class Workbench(UploadedRows):
             self._scene.show_pose(np.asarray(solution.q[0]))
         return found
 
-    def write_cell(self, cell: Cell, form: Form, progress: Progress) -> Outcome:
-        """Write `cell.yaml`, and show the cell."""
-        steps.write_cell(cell, form, self._texts)
-        self._scene.show_cell(Cell.open(cell.folder))
+    def _write_cell(self, form: Form) -> Outcome:
+        """Write `cell.yaml`, which need not have been valid, and show the cell."""
+        steps.write_cell(self.folder, form, self._texts)
+        self._scene.show_cell(Cell.open(self.folder))
         return Outcome()
 
 
@@ -342,7 +373,6 @@ STEPS: dict[str, Callable[[Workbench, Cell, Form, Progress], Outcome]] = {
     "recalibrate": lambda _, *given: steps.recalibrate(*given),
     "export": Workbench.export,
     "ik": Workbench.try_pose,
-    "cell": Workbench.write_cell,
     "serve": Workbench.serve,
     "report": lambda _, *given: steps.report_cell(*given),
     "event": lambda _, *given: steps.record_event(*given),

@@ -23,9 +23,12 @@ from pisigma.cli.main import app
 from pisigma.files.errors import PlanningError, system_fault
 from pisigma.lifetime.cell.layout import CELL_FILE
 from pisigma.model.folder.model_folder import load_model
+from pisigma.reporting.result_text import ResultText
+from pisigma.reporting.verdict import Verdict
+from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.report.error_map import map_of_workspace
 from pisigma.workbench.job import BusyError, Jobs, Outcome
-from pisigma.workbench.steps import side_by_side
+from pisigma.workbench.steps import rows_at_fault, side_by_side
 from pisigma.workbench.tabs import MAX_LINES, TABS, lines_in
 from pisigma.workbench.workbench import STEPS, Workbench
 from pisigma.workflow.cell.cell import Cell
@@ -205,13 +208,45 @@ def test_a_cell_file_that_breaks_during_a_step_is_named_as_the_fault(
     monkeypatch.setitem(STEPS, "plan", lambda *_: path.write_text("{") and Outcome())
     try:
         assert ended(browser_with_link, bench, "plan").refusal == ""
-        assert browser_with_link.ask("/state").status == 422
+        assert state(browser_with_link)["next"]["state"] == "broken_cell"
+        assert CELL_FILE in browser_with_link.ask("/tab/status").body.decode()
         found = ended(browser_with_link, bench, "verify")
         assert CELL_FILE in found.refusal
         assert "defect" not in found.refusal
     finally:
         path.write_text(before)
     assert browser_with_link.ask("/state").status == 200
+
+
+def test_a_broken_cell_file_is_repaired_on_the_page(tmp_path):
+    made = Cell.create(tmp_path / "broken", "ur10")
+    path = made.folder / CELL_FILE
+    right, wrong = path.read_text(), f"robot: ur10\nplan: [1\n{HOSTILE}"
+    path.write_bytes(wrong.encode() + b"\xff")
+    with no_type_checker(), Workbench(made.folder, port=0) as bench:
+        browser = visitor(bench.url)
+        assert browser.ask().body.decode().count('role="tab"') == 1
+        text = browser.ask("/tab/cell").body.decode()
+        assert f"{CELL_FILE}, line " in text
+        assert HOSTILE not in text
+        assert ended(browser, bench, "cell", text=f"{wrong}\n", seen=seen(browser)).refusal
+        assert path.read_bytes() == wrong.encode() + b"\xff"
+        assert ended(browser, bench, "cell", text=right, seen="").refusal
+        assert ended(browser, bench, "cell", text=right, seen=seen(browser)).refusal == ""
+        assert path.read_text() == right
+        assert state(browser)["next"] == made.status().step.to_json()
+        assert "Undo" in browser.ask("/tab/cell").body.decode()
+
+
+def test_warnings_point_at_their_rows_by_fields(browser_with_link, bench, cell, monkeypatch):
+    one = Diagnostic(
+        kind="mixed_rows", severity="warning", sentence="rows differ", rows=("a.csv, line 3", "a.csv, line 4")
+    )
+    text = ResultText(Verdict("exact", "yes", "none"), (one.sentence,))
+    monkeypatch.setitem(STEPS, "calibrate", lambda *_: Outcome(text, rows=rows_at_fault([one])))
+    ended(browser_with_link, bench, "calibrate")
+    assert 'data-show="a.csv, line 3; a.csv, line 4"' in browser_with_link.ask("/tab/calibrate").body.decode()
+    bench.jobs.outcomes.pop("calibrate")
 
 
 def test_changes_of_a_program_are_shown_side_by_side():

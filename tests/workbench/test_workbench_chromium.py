@@ -53,6 +53,10 @@ def set_in_form(page, cell: Cell) -> None:
         press(page, "cell")
         assert bool(page.query_selector("[name='plan.candidates'][aria-invalid]")) is is_refused
         assert bool(page.query_selector("label:has([name='plan.candidates']) .fault")) is is_refused
+    page.fill("[name='plan.candidates']", "200")
+    page.reload()
+    assert page.wait_for_selector("[name='plan.candidates']").input_value() == "200"
+    page.click("summary >> text=/^calibrate$/")
     show(page, "plan")
     show(page, "cell")
     do(page, "cell", **{f"{section}.{key}": value for section, key, value in SETTINGS})

@@ -26,12 +26,38 @@ let proposal = null, dragging = 0;
 
 const keyOf = form => `${form.dataset.step} ${form.dataset.name || form.dataset.command}`;
 
-function keep(parts, forms) {  // a form that the server sends unchanged stays as it is; else what was typed is copied
+const storeOf = name => `${document.body.dataset.folder} ${name}`;
+
+function store() {  // what was typed in a tab survives a reload
+  const found = {};
+  for (const form of content.querySelectorAll("form:not([data-fixed])")) {
+    const edited = [...form.elements].filter(one => one.name && one.type !== "file" && isEdited(one));
+    if (form.elements.seen && edited.length) edited.push(form.elements.seen);
+    if (edited.length) found[keyOf(form)] = edited.map(one => [one.name, one.type === "checkbox" ? one.checked : one.value]);
+  }
+  sessionStorage.setItem(storeOf(tab), JSON.stringify(found));
+}
+
+function openAround(field) {
+  for (let one = field.closest("details"); one; one = one.parentElement.closest("details")) one.open = true;
+}
+
+function fill(form, fields) {
+  for (const [name, value] of fields) {
+    const one = form.elements[name];
+    if (one && !one.hidden) openAround(one);
+    if (one?.type === "checkbox") one.checked = value;
+    else if (one && (!one.options || [...one.options].some(choice => choice.value === value))) one.value = value;
+  }
+}
+
+function keep(parts, forms, typed) {  // a form that the server sends unchanged stays as it is; else what was typed is copied
   for (const form of parts.querySelectorAll("form")) {
     const key = keyOf(form), before = forms[key], served = form.outerHTML;
     if (before?.served === served) form.replaceWith(before.form);
     else {
       if (before) copy(before.form, form);
+      else if (typed[key]) fill(form, typed[key]);
       forms[key] = { form, served };
     }
   }
@@ -55,7 +81,7 @@ async function show(name) {
     if (form.dataset.once !== undefined) delete left.forms[keyOf(form)];
     if (one.dataset.step === "import") proposal = null;
   }
-  keep(parts, left.forms);
+  keep(parts, left.forms, JSON.parse(sessionStorage.getItem(storeOf(name)) || "{}"));
   if (proposal) parts.querySelector("#proposal")?.append(proposal);
   content.replaceChildren(...parts.childNodes);
   content.querySelectorAll("details").forEach(one => { one.open ||= left.open.includes(nameOf(one)); });
@@ -73,6 +99,7 @@ async function show(name) {
   content.querySelectorAll(".outcome[data-field]").forEach(one => { if (refusals[one.dataset.step] === one.outerHTML) mark(one, refused === one.outerHTML); });
   content.querySelectorAll("form").forEach(say);
   lock();
+  store();
 }
 
 let place = null;  // what has the focus in a tab
@@ -152,7 +179,7 @@ function fault(form, problem) {
 function point(form, name) {  // show which field is at fault
   const field = form.elements[name] || form.elements[name.replace(/^(--set )?(--)?/, "").replaceAll("-", "_")];
   if (!field?.closest) return null;
-  for (let one = field.closest("details"); one; one = one.parentElement.closest("details")) one.open = true;
+  openAround(field);
   field.setAttribute("aria-invalid", true);
   return field;
 }
@@ -222,13 +249,15 @@ function lock() {
   focusAgain();
 }
 
+const alone = ["no_cell", "broken_cell"];  // states with a tab of their own
 let polling = null;
 async function poll() {
   clearTimeout(polling);
   try {
     const state = await (await ask(`state?version=${version}`)).json();
-    document.getElementById("next").textContent = state.next.command ? `Next: ${state.next.reason}.` : `Nothing to do: ${state.next.reason}.`;
-    if (document.body.dataset.state === "no_cell" && state.next.state !== "no_cell") return location.reload();
+    document.getElementById("next").textContent = alone.includes(state.next.state) || state.next.command ? `Next: ${state.next.reason}.` : `Nothing to do: ${state.next.reason}.`;
+    const before = document.body.dataset.state;
+    if (before && before !== state.next.state && (alone.includes(before) || alone.includes(state.next.state))) return location.reload();
     document.body.dataset.state = state.next.state;
     running = state.running;
     document.getElementById("running").hidden = !running;
@@ -252,7 +281,7 @@ document.querySelector("nav").addEventListener("keydown", event => {
 });
 document.getElementById("stop").addEventListener("click", () => steps("stop", { ended: String(ended) }).then(poll));
 content.addEventListener("submit", event => { event.preventDefault(); start(event.target); });
-content.addEventListener("input", event => { if (event.target.form) say(event.target.form); });
+content.addEventListener("input", event => { if (event.target.form) say(event.target.form); store(); });
 content.addEventListener("change", event => { if (event.target.id === "files") uploaded(event.target.files); else if (event.target.matches("[data-links], [data-step=new] [name=robot]")) offer(event.target); else if (event.target.form) say(event.target.form); });
 content.addEventListener("click", event => {
   const one = event.target;
@@ -262,8 +291,8 @@ content.addEventListener("click", event => {
   if (one.dataset.typed !== undefined) uploaded([new File([document.getElementById("typed").value], "typed.csv")]);
   if (one.dataset.growing !== undefined) propose({ files: "growing" });
   if (one.dataset.clear !== undefined) { for (const field of one.closest("fieldset").elements) field.value = ""; }
-  if (one.dataset.discard !== undefined) { kept[tab].forms = {}; show(tab); if (dragging) steps("drag", {}); }
+  if (one.dataset.discard !== undefined) { kept[tab].forms = {}; sessionStorage.removeItem(storeOf(tab)); show(tab); if (dragging) steps("drag", {}); }
   if (one.dataset.drag !== undefined) steps("drag", { on: "true" }).then(async answer => { dragging = (await answer.json()).turn; poll(); }, problem => fault(one.form, problem));
 });
-await show(document.getElementById("tab-" + tab) ? tab : "status");
+await show(document.getElementById("tab-" + tab) ? tab : document.querySelector("[role=tab]").dataset.tab);
 await poll();
