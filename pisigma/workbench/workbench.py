@@ -176,9 +176,8 @@ class Workbench(UploadedRows):
 
     @with_error_answers
     async def _state(self, request: web.Request) -> web.StreamResponse:
-        for _ in range(
-            STATE_CHECKS
-        ):  # while a step runs, changes are answered at once, and progress after 0.3 s
+        # while a step runs, changes are answered at once, and progress after 0.3 s
+        for _ in range(STATE_CHECKS):
             if self.jobs.running is None or request.query.get("version") != str(self.jobs.version):
                 break
             await asyncio.sleep(0.3 / STATE_CHECKS)
