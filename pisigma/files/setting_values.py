@@ -59,9 +59,8 @@ def checked_values(
         kind = known[key].kind
         single = _listed(value, kind)
         several = single if isinstance(single, list | tuple) else (single,)
-        if kind is not bool and any(
-            isinstance(one, bool) for one in several
-        ):  # pydantic would read true as 1
+        # pydantic would read true as 1
+        if kind is not bool and any(isinstance(one, bool) for one in several):
             raise setting_error(key, single, _type_text(kind))
         try:
             converted = TypeAdapter(kind).validate_python(single)

@@ -226,9 +226,8 @@ class PoseSelection:
         half = torch.linalg.solve_triangular(lower, G.t(), upper=False).contiguous()
         U = self._B @ half.t()
         P = self._P
-        if (
-            self._criterion == "I" and sign < 0
-        ):  # for an added candidate this would cancel, so `_take` computes it from X
+        # for an added candidate this would cancel, so `_take` computes it from X
+        if self._criterion == "I" and sign < 0:
             task = half @ self._goal.t()
             cross = (self._X @ task.t()) @ U.mT
             P = P + cross + cross.mT + U @ (task @ task.t()) @ U.mT

@@ -35,9 +35,8 @@ def csv_of(figure: Figure) -> str:
     for axes in figure.axes:
         if axes not in bars:
             points += _points_of(axes)
-    columns = dict.fromkeys(
-        name for one in points for name, text in one.items() if text
-    )  # without empty ones
+    # without columns that are empty in all lines
+    columns = dict.fromkeys(name for one in points for name, text in one.items() if text)
     stream = io.StringIO()
     writer = csv.DictWriter(stream, columns, extrasaction="ignore", lineterminator="\n")
     writer.writeheader()
