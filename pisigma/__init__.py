@@ -20,6 +20,7 @@ _NAMES = {
     "joint_correction.registry": "register_feature",
     "deployment.lerobot.correction": "LeRobotCorrection",
     "deployment.lerobot.dataset": "correct_lerobot_dataset",
+    "lifetime.comparison.paired_arms": "compare_paired_arms estimate_zero_changes",
     "robot.kernels.array_kinematics": "forward_kinematics joint_jacobian",
     "robot.kinematics.status": "Status",
     "network.pi_sigma": "PiSigma",

@@ -7,6 +7,8 @@ from pisigma.deployment.lerobot.correction import LeRobotCorrection as LeRobotCo
 from pisigma.deployment.lerobot.dataset import correct_lerobot_dataset as correct_lerobot_dataset
 from pisigma.files.errors import PisigmaError as PisigmaError
 from pisigma.joint_correction.registry import register_feature as register_feature
+from pisigma.lifetime.comparison.paired_arms import compare_paired_arms as compare_paired_arms
+from pisigma.lifetime.comparison.paired_arms import estimate_zero_changes as estimate_zero_changes
 from pisigma.measurement.dataset import Measurements as Measurements
 from pisigma.measurement.sensors.registry import register_sensor as register_sensor
 from pisigma.model.inverse.corrected_ik import CorrectedIK as CorrectedIK
