@@ -92,6 +92,14 @@ PresentCounts = Annotated[
     str | None, typer.Option(help="With epson and fanuc-mastering, present counts of the controller.")
 ]
 
+Address = Annotated[
+    str | None,
+    typer.Option(
+        metavar="IP:PORT",
+        help="With rsi, address at which this computer receives, such as 192.168.1.10:49152.",
+    ),
+]
+
 
 def export(
     model: ModelOrCell,
@@ -110,6 +118,7 @@ def export(
     tolerance_mm: ToleranceMm = None,
     counts_per_turn: CountsPerTurn = None,
     present_counts: PresentCounts = None,
+    address: Address = None,
     payload_kg: PayloadKg = None,
     temperature_c: TemperatureC = None,
     as_json: AsJson = False,
@@ -144,6 +153,7 @@ def export(
         tolerance_mm=tolerance_mm,
         counts_per_turn=counts_per_turn,
         present_counts=present_counts,
+        address=address,
         payload_kg=payload_kg,
         temperature_c=temperature_c,
     )

@@ -52,8 +52,10 @@ TAB_OF = {
     "use": "status",
 }
 """Tab of a command that has not the name of a tab."""
-FORMATS = tuple(name for name in BUILT_IN if name not in ("staubli", "xacro", "library", "ur-calibration"))
-"""Formats that need no file of the controller."""
+FORMATS = tuple(
+    name for name in BUILT_IN if name not in ("staubli", "xacro", "library", "ur-calibration", "rsi")
+)
+"""Formats that need neither a file nor the address of the controller."""
 CHARTS = "-monitoring.html"
 """End of the names of pages with control charts in the reports of a cell."""
 FIGURES = (".png", ".svg")

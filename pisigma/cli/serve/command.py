@@ -1,5 +1,6 @@
 """`pisigma serve`: answer requests of other programs for corrected joint values."""
 
+import math
 import signal
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -35,9 +36,14 @@ def serve(
     """Answer requests for corrected joint values, paths and poses, until SIGTERM or Ctrl-C.
 
     Prints one JSON line with its ports when it is ready. SIGHUP reloads models whose folders have changed. If a cell's
-    model in use changes, later requests are answered with the new one.
+    model in use changes, later requests are answered with the new one. With --rsi, the model at the start corrects the
+    joints of a KUKA controller in every cycle; a fault ends the stream with status 2.
     """
     from pisigma.deployment.serve.server import Server
+
+    if settings.rsi is not None:
+        _stream(settings, settings.rsi, model)
+        return
 
     def report(line: str) -> None:
         print_line(line, to_stderr=True)
@@ -75,3 +81,21 @@ def _load(model: Path | None, models: Path | None, pin: bool) -> "ServedModels":
             "expected either a model folder or --models", param_hint="'MODEL' / '--models'"
         )
     return ServedModels(model_folders(models), within=models)
+
+
+def _stream(settings: ServeSettings, file: Path, model: Path | None) -> None:
+    """Correct the joints of a KUKA controller over RSI."""
+    from pisigma.deployment.serve.rsi import RsiAddress, RsiServer
+    from pisigma.lifetime.cell.controller import checked_model_folder
+    from pisigma.model.inverse.corrected_ik import load
+
+    if model is None:
+        raise typer.BadParameter("expected a model folder or a cell", param_hint="'MODEL'")
+    folder, warnings = checked_model_folder(model, "serve")
+    for warning in warnings:
+        print_line(warning, to_stderr=True)
+    server = RsiServer(load(folder), RsiAddress.read(file), math.degrees(settings.rsi_max_correction))
+    for name in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(name, lambda *_: server.stop())
+    print_json({"rsi_port": server.port})
+    server.run(lambda line: print_line(line, to_stderr=True))

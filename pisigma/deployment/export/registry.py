@@ -40,6 +40,7 @@ BUILT_IN = {
         "pisigma.deployment.lerobot.calibration_file",
         "calibration JSON of LeRobot with corrected zeros, from --like",
     ),
+    "rsi": ("pisigma.deployment.export.rsi", "RSI configuration of KUKA for serve --rsi"),
     "onnx": ("pisigma.deployment.export.onnx_model", "the network alone"),
     "library": ("pisigma.deployment.export.library.c_library", "a shared library for C with a header"),
 }

@@ -1,6 +1,7 @@
 """Settings of a server."""
 
 import ipaddress
+import math
 import socket
 from dataclasses import dataclass
 from pathlib import Path
@@ -55,6 +56,8 @@ class ServeSettings:
             certificates of clients in its folder `trusted`. Needed if other machines can reach the server.
         token: token that every client has to send first; on a command line, a file that contains it.
         client_timeout: see `CLIENT_TIMEOUT`.
+        rsi: answer a KUKA controller over RSI, and nothing else; file of `pisigma export --format rsi`.
+        rsi_max_correction: largest correction of a joint over RSI [rad]; a larger one ends the stream.
         polling: time to busy-poll for the next request [s] (0: sleep at once). The server polls only if requests
             arrive at least that often and no other program needs the processor.
     """
@@ -68,4 +71,8 @@ class ServeSettings:
     opcua_certificates: Path | None = None
     token: Annotated[str | None, Option("--token-file", kind=Path, read=read_token)] = None
     client_timeout: Annotated[float, HIDDEN] = CLIENT_TIMEOUT
+    rsi: Path | None = None
+    rsi_max_correction: Annotated[
+        float, Option("--rsi-max-correction-deg", unit="deg", min=0, max=5, is_key=True)
+    ] = math.radians(1.0)
     polling: Annotated[float, Option("--poll-ms", unit="ms", min=0, max=100, is_key=True)] = POLL_DURATION
