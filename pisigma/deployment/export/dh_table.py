@@ -20,7 +20,7 @@ CONVENTION = (
     "Trans(x, y, z) RotZ(roll) RotY(pitch) RotX(yaw)."
 )
 
-TABLE_SUFFIXES = (".csv", ".yaml", ".yml")
+TABLE_SUFFIXES: tuple[str, ...] = (".csv", ".yaml", ".yml")
 
 
 def dh_yaml(robot: Robot, comments: tuple[str, ...] = ()) -> str:

@@ -154,6 +154,15 @@ def test_the_factory_calibration_meets_the_controllers_poses(shared_data):
     assert len(off) == 18
     assert off.max() < 0.085
     assert off.mean() < 0.045
+    factory = (folder / "calibration.conf").read_text()
+    request = replace(REQUEST, like=folder / "calibration.conf")
+    exported = universal_robots.FILE.text(FileContent(robot, robot, request))
+    assert re.findall(r"(?m)^joint_.*", exported) == re.findall(r"(?m)^joint_.*", factory)
+    for key, values in deltas_of(exported).items():
+        # d of joints 2 to 4 is the distance to a point where nearly parallel axes meet: 200 m, with fewer digits
+        off = np.array(values) - deltas_of(factory)[key]
+        off = np.angle(np.exp(1j * off)) if key == "delta_theta" else off  # a whole turn is no difference
+        assert_close(off, np.zeros(6), atol=1e-6 if key == "delta_d" else 1e-9)
 
 
 def test_a_calibrated_robot_is_written_against_the_makers_nominal_one():
