@@ -88,3 +88,16 @@ def test_what_does_not_fit_is_refused(run, refuses, folder):
         pisigma.calibrate_frame(
             hand_made_model("ur10"), touches(touching_joints(6), random_noise(6, 0)), "tool"
         )
+
+
+def test_tool_of_a_cell_is_stored_as_its_model(run, folder):
+    cell = folder / "cell"
+    assert run("new", "ur5", "--out", cell).exit_code == 0
+    assert run("import", folder / "touches.csv", "--cell", cell).exit_code == 0
+    printed = run("calibrate", cell, "--only", "tool", "--json")
+    assert printed.exit_code == 0, printed.output
+    figures = json.loads(printed.stdout)
+    assert_close(load_model(figures["model"]).robot.tool[:3], TIP[:3], atol=2e-4)
+    (entry,) = pisigma.Cell.open(cell).history.models()
+    assert figures["model"].endswith(entry.name)
+    assert entry.remark.startswith("tool")
