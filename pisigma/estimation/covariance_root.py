@@ -7,6 +7,8 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from pisigma.estimation.rounded_root import RoundedRoot
+
 
 @dataclass(frozen=True, eq=False)
 class ImplicitCovarianceRoot:
@@ -66,10 +68,17 @@ class CovarianceRoot:
     Attributes:
         directions: columns of R for all unknowns.
         weights: further columns, which are 0 for the parameters; None if there are none.
+        rounded: form of R that a model folder stores instead of R, and of which R was made; None if R is stored.
     """
 
     directions: Float64[Tensor, "unknowns directions"]
     weights: ImplicitCovarianceRoot | None = None
+    rounded: RoundedRoot | None = None
+
+    @staticmethod
+    def from_rounded(rounded: RoundedRoot) -> "CovarianceRoot":
+        """Make R of its rounded form."""
+        return CovarianceRoot(rounded.as_matrix, rounded=rounded)
 
     @cached_property
     def as_matrix(self) -> Float64[Tensor, "unknowns directions"]:

@@ -9,8 +9,6 @@ from torch import Tensor
 from pisigma.calibration.geometric.problem.setup import IdentifiedGeometry
 from pisigma.calibration.geometric.result import CalibrationResult
 from pisigma.calibration.hybrid.result import HybridResult
-from pisigma.calibration.hybrid.uncertainty import PositionUncertainty
-from pisigma.estimation.covariance_root import CovarianceRoot
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel, Provenance
 from pisigma.model.stored_starts import nearest_branch, spread_rows
@@ -77,15 +75,17 @@ def model_of_hybrid(
 
     The arguments are those of `model_of_calibration`.
     """
-    return with_hybrid(model_of_calibration(name, nominal, result.geometric, measurements, recipe), result)
+    model = model_of_calibration(name, nominal, result.geometric, measurements, recipe)
+    return with_hybrid(model, result, measurements)
 
 
-def with_hybrid(model: CalibratedModel, result: HybridResult) -> CalibratedModel:
+def with_hybrid(model: CalibratedModel, result: HybridResult, measurements: Measurements) -> CalibratedModel:
     """Return the model of a geometric part with joint correction and uncertainty of the hybrid calibration."""
     known, learned = result.geometric, result.learned
+    uncertainty = result.uncertainty.with_rounded_root(measurements)
     if learned is None:
         geometry = IdentifiedGeometry(known.robot, model.bases, model.tools, known.unknowns)
-        return replace(model, uncertainty=_kept(result.uncertainty, geometry))
+        return replace(model, uncertainty=replace(uncertainty, geometry=geometry))
     bases, tools = dict(learned.geometry.bases), dict(learned.geometry.tools)
     geometry = IdentifiedGeometry(learned.geometry.robot, bases, tools, learned.geometry.unknowns)
     return replace(
@@ -94,13 +94,8 @@ def with_hybrid(model: CalibratedModel, result: HybridResult) -> CalibratedModel
         hybrid=result.arm(),
         hybrid_bases=bases,
         hybrid_tools=tools,
-        uncertainty=_kept(result.uncertainty, geometry),
+        uncertainty=replace(uncertainty, geometry=geometry),
     )
-
-
-def _kept(uncertainty: PositionUncertainty, geometry: IdentifiedGeometry) -> PositionUncertainty:
-    """Return the uncertainty for the geometry of a model, with the covariance root as folders store it."""
-    return replace(uncertainty, geometry=geometry, covariance_root=CovarianceRoot(uncertainty.root))
 
 
 def branches_of(nominal: Robot, q: Float64[Tensor, "rows dof"]) -> tuple[str, ...]:

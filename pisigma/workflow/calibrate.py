@@ -221,7 +221,7 @@ def compose_calibration(
         summary = summary.with_figures(held_out_rows=kept.hashes(kept.to_csv(nominal)))
     model = model_of_calibration(recipe[0] or nominal.name, nominal, geometric_result(result), rows, recipe)
     if isinstance(result, HybridResult):
-        model = with_hybrid(model, result)
+        model = with_hybrid(model, result, rows)
     model = replace(model, metrics=summary.to_json())
     return Calibration(model, result, rows, validation, test, kept, summary, texts)
 

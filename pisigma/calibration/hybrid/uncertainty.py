@@ -1,6 +1,6 @@
 """Standard deviations of predicted positions from the posterior of parameters and weights."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from jaxtyping import Float64
@@ -21,6 +21,7 @@ from pisigma.calibration.hybrid.sensor_values import joint_columns, weight_colum
 from pisigma.estimation.covariance_root import CovarianceRoot
 from pisigma.estimation.held_out import HeldOutErrors, held_out_scale
 from pisigma.estimation.regression import Posterior, prior_size_columns
+from pisigma.estimation.rounded_root import round_root
 from pisigma.joint_correction.feature import AbstractFeature
 from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.measurement.conditions import JointState
@@ -39,6 +40,14 @@ FOLD_UPDATES, FEWER_UPDATES, SOME_GROUPS = 3, 1, 150
 """Number of updates of noise and prior sizes for every fold, for few and for more groups, and the number of groups
 up to which the first applies. With one update, 0.9 % fewer of 30 rows are in the predicted 95 % intervals, 0.4 % of
 100 rows and 0.3 % of 300 rows; fitting 300 rows then takes four fifths of the time."""
+
+MAX_EXACT_ENTRIES = 1 << 18
+"""Entries of a covariance root up to which it is not rounded: 2 MB in a model folder."""
+ROUNDING_TOLERANCE = 0.009
+"""Largest relative change of a predicted standard deviation by rounding the covariance root; the standard deviations
+themselves are known to some 2 % from 1,000 held-out rows."""
+PROBED_ROWS, PROBED_FRAMES = 200, 8
+"""Rows, and frames or targets, at which the change is computed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +76,13 @@ class PositionUncertainty:
         """Root `R` as a dense matrix."""
         return self.covariance_root.as_matrix
 
+    @property
+    def uncertain_unknowns(self) -> list[int]:
+        """Indices of the unknowns whose rows of R a model folder stores: the free parameters, and all weights."""
+        parameters = len(self.space.parameters)
+        free: list[int] = self.root[:parameters].any(1).nonzero()[:, 0].tolist()
+        return [*free, *range(parameters, len(self.root))]
+
     def deviation(
         self, measurements: Measurements, correction: JointCorrection | None = None
     ) -> Float64[Tensor, "rows 3"]:
@@ -88,6 +104,40 @@ class PositionUncertainty:
                 for part in torch.split(rows, CHUNK):
                     deviation[part] = self._of_rows(state[part], correction, f, t)
         return deviation
+
+    def with_rounded_root(self, rows: Measurements) -> "PositionUncertainty":
+        """Round a large covariance root, so that a model folder stores some 1/40 of the bytes.
+
+        Predicted standard deviations change by at most `ROUNDING_TOLERANCE` at the rows, at joint values permuted
+        between rows, and of the motions between both; those of single unknowns do not change.
+
+        Args:
+            rows: rows of the calibration.
+
+        Returns:
+            The same uncertainty, with `R` in one matrix if it is small or cannot be rounded.
+        """
+        kept = CovarianceRoot(root := self.root)
+        if root.numel() > MAX_EXACT_ENTRIES:
+            uncertain = self.uncertain_unknowns
+            probes = self._probes(JointState.from_measurements(rows))[:, uncertain]
+            if (rounded := round_root(root[uncertain], probes, ROUNDING_TOLERANCE)) is not None:
+                kept = CovarianceRoot.from_rounded(rounded.among(uncertain, len(root)))
+        return replace(self, covariance_root=kept)
+
+    def _probes(self, state: JointState) -> Float64[Tensor, "probes unknowns"]:
+        """Return the combinations of unknowns in poses of rows, at permuted joint values, and in motions between."""
+        rows = state[torch.linspace(0, len(state.q) - 1, min(len(state.q), PROBED_ROWS)).round().long()]
+        generator = torch.Generator().manual_seed(0)
+        order = torch.rand(rows.q.shape, generator=generator).argsort(0)
+        others = replace(rows, q=rows.q.take_along_dim(order, 0))
+        frames, targets = len(self.space.frames), len(self.space.targets)
+        pairs = sorted({(f % frames, f % targets) for f in range(min(max(frames, targets), PROBED_FRAMES))})
+        probes = []
+        for frame, target in pairs:
+            here, there = (self.columns(one, one.q, frame, target) for one in (rows, others))
+            probes += [here, there, here - there]
+        return torch.cat(probes).flatten(0, 1)
 
     def _of_rows(
         self, state: JointState, correction: JointCorrection | None, frame: int, target: int

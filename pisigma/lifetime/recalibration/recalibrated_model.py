@@ -66,6 +66,7 @@ def recalibrated_model(model: CalibratedModel, adaptation: Adaptation, rows: Mea
     root = CovarianceRoot(adaptation.root)
     space = adaptation.problem.design.problem.space
     noise = known.noise.updated(adaptation.noise)
+    uncertainty = PositionUncertainty(space, geometry, known.features, root, known.prior_scale, noise)
     return replace(
         model,
         kind=KIND,
@@ -78,7 +79,7 @@ def recalibrated_model(model: CalibratedModel, adaptation: Adaptation, rows: Mea
         hybrid=hybrid,
         hybrid_bases=geometry.bases if hybrid else {},
         hybrid_tools=geometry.tools if hybrid else {},
-        uncertainty=PositionUncertainty(space, geometry, known.features, root, known.prior_scale, noise),
+        uncertainty=uncertainty.with_rounded_root(rows),
         made_of=stored_training_rows(nominal, rows, model.made_of),
         provenance=Provenance(
             data_source=rows.file_names,

@@ -20,6 +20,7 @@ from pisigma.calibration.hybrid.arm import HybridArm, JointCoverage
 from pisigma.calibration.hybrid.noise import CalibrationNoise
 from pisigma.calibration.hybrid.uncertainty import PositionUncertainty
 from pisigma.estimation.covariance_root import CovarianceRoot
+from pisigma.estimation.rounded_root import RoundedRoot
 from pisigma.files.model_files import WEIGHTS
 from pisigma.joint_correction.feature import AbstractFeature, angle_per_joint_value
 from pisigma.joint_correction.input_products import InputProducts
@@ -42,7 +43,7 @@ Shape = tuple[int | None, ...]
 ROUNDING = 1e-9
 """Largest difference [m or rad] between the geometry in `model.yaml` and in the weights file."""
 
-DTYPES = {"coverage.joint": torch.int64, "rows.measured": torch.uint8}
+DTYPES = {"coverage.joint": torch.int64, "rows.measured": torch.uint8, "uncertainty.numbers": torch.uint8}
 """Types of the tensors that are not float64."""
 
 _GEOMETRY = ("dh", "base", "tool")
@@ -65,7 +66,8 @@ def hybrid_sections(model: CalibratedModel) -> dict[str, Any]:
                 group: {owner: values.tolist() for owner, values in owners.items()}
                 for group, owners in known.geometry.unknowns.items()
             },
-            "free": _free_rows(known),
+            "free": [row for row in known.uncertain_unknowns if row < len(known.space.parameters)],
+            "rounded": known.covariance_root.rounded is not None,
             "features": [chosen.name for chosen in known.features],
             "prior_scale": known.prior_scale,
             "noise": dict(known.noise.value),
@@ -87,8 +89,12 @@ def hybrid_tensors(model: CalibratedModel) -> dict[str, Tensor]:
         result |= {f"correction.{key}": value for key, value in arm.correction.state_dict().items()}
         result |= {f"coverage.{name}": getattr(arm.coverage, name) for name in ("joint", "middle", "half")}
     if (known := model.uncertainty) is not None:
-        weights = range(len(known.space.parameters), known.root.shape[0])
-        result["uncertainty.root"] = known.root[[*_free_rows(known), *weights]]
+        if (rounded := known.covariance_root.rounded) is None:
+            result["uncertainty.root"] = known.root[known.uncertain_unknowns]
+        else:
+            rounded = rounded.select(known.uncertain_unknowns)
+            result["uncertainty.unit"] = rounded.unit
+            result["uncertainty.numbers"] = torch.frombuffer(bytearray(rounded.packed()), dtype=torch.uint8)
     return result
 
 
@@ -138,7 +144,11 @@ def hybrid_shapes(document: ModelDocument, robot: Robot) -> dict[str, Shape]:
         if known is not None:
             weights = sum(int(chosen.used.sum()) for chosen in _weighted(known, empty))
     if known is not None:
-        result["uncertainty.root"] = (len(known.free) + weights, None)
+        unknowns = len(known.free) + weights
+        if not known.rounded:
+            result["uncertainty.root"] = (unknowns, None)
+        else:
+            result |= {"uncertainty.unit": (unknowns,), "uncertainty.numbers": (None,)}
     return result
 
 
@@ -176,14 +186,8 @@ def with_hybrid(
         model = replace(model, hybrid=arm, hybrid_bases=place[1], hybrid_tools=place[2])
     if known is None:
         return model
-    uncertainty = _uncertainty(known, model.hybrid, nominal, tensors["uncertainty.root"], place)
+    uncertainty = _uncertainty(known, model.hybrid, nominal, tensors, place)
     return replace(model, uncertainty=uncertainty)
-
-
-def _free_rows(known: PositionUncertainty) -> list[int]:
-    """Return the indices of the free parameters, whose rows of the root are not 0."""
-    result: list[int] = known.root[: len(known.space.parameters)].any(1).nonzero()[:, 0].tolist()
-    return result
 
 
 def _limited(robot: Robot) -> np.ndarray:
@@ -263,7 +267,7 @@ def _uncertainty(
     known: UncertaintySection,
     hybrid: HybridArm | None,
     nominal: Robot,
-    root: Tensor,
+    tensors: Mapping[str, Tensor],
     place: tuple[Robot, Frames, Frames],
 ) -> PositionUncertainty:
     """Return the uncertainty, with zero rows of the root for parameters that were not free."""
@@ -285,8 +289,6 @@ def _uncertainty(
             column="uncertainty.free",
             value=free,
         )
-    full = torch.zeros(count + len(root) - len(free), root.shape[1], dtype=torch.float64)
-    full[[*free, *range(count, len(full))]] = root
     unknowns = {
         group: {owner: np.array(values) for owner, values in owners.items()}
         for group, owners in known.values.items()
@@ -302,7 +304,27 @@ def _uncertainty(
     geometry = IdentifiedGeometry(robot, bases, tools, unknowns)
     features = _weighted(known, None if hybrid is None else hybrid.correction)
     noise = CalibrationNoise(known.noise, known.stated_noise)
-    return PositionUncertainty(space, geometry, features, CovarianceRoot(full), known.prior_scale, noise)
+    root = _root(known, tensors, free, count)
+    return PositionUncertainty(space, geometry, features, root, known.prior_scale, noise)
+
+
+def _root(
+    known: UncertaintySection, tensors: Mapping[str, Tensor], free: list[int], parameters: int
+) -> CovarianceRoot:
+    """Make the covariance root of all unknowns, with rows of zeros for the parameters that were not free."""
+    rows = tensors["uncertainty.unit" if known.rounded else "uncertainty.root"]
+    count = parameters + len(rows) - len(free)
+    uncertain = [*free, *range(parameters, count)]
+    if not known.rounded:
+        full = rows.new_zeros(count, rows.shape[1])
+        full[uncertain] = rows
+        return CovarianceRoot(full)
+    try:
+        content = tensors["uncertainty.numbers"].numpy().tobytes()
+        rounded = RoundedRoot.unpacked(content, rows)
+    except ValueError as problem:
+        raise MisfitError(str(problem), file=WEIGHTS, value="uncertainty.numbers") from None
+    return CovarianceRoot.from_rounded(rounded.among(uncertain, count))
 
 
 def _unknowns_section(group: UnknownGroup) -> dict[str, object]:

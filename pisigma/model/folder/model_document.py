@@ -90,6 +90,7 @@ class UncertaintySection(Section):
             folders that were upgraded from a format without them.
         free: indices of the parameters that have a row in the root, before the rows of all weights; the rows of other
             parameters are 0.
+        rounded: whether the root is stored in whole numbers, see `pisigma.estimation.rounded_root.RoundedRoot`.
         features: names of the features whose weights follow: the features of the learned part, and `products` for
             the products of inputs in its product units.
         prior_scale: see `pisigma.calibration.hybrid.uncertainty.PositionUncertainty`.
@@ -100,6 +101,7 @@ class UncertaintySection(Section):
     unknowns: tuple[UnknownsSection, ...] = ()
     values: dict[str, dict[str, tuple[FiniteFloat, ...]]] = Field(default_factory=dict)
     free: tuple[Annotated[int, Field(ge=0)], ...]
+    rounded: bool = False
     features: Annotated[tuple[str, ...], Field(max_length=MAX_UNITS)]
     prior_scale: Annotated[float, Field(gt=0)]
     noise: dict[str, Annotated[FiniteFloat, Field(gt=0)]] = Field(default_factory=dict)

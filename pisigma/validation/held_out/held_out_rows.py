@@ -74,7 +74,7 @@ class HeldOutRows:
         columns: dict[str, list[str]] = {}
         for j, revolute in enumerate(robot.revolute):
             factor, unit = (_DEGREES, "deg") if revolute else (1e3, "mm")
-            columns[f"q{j + 1}_{unit}"] = [repr(value) for value in (self.q[:, j] * factor).tolist()]
+            columns[f"q{j + 1}_{unit}"] = [f"{value:.10g}" for value in (self.q[:, j] * factor).tolist()]
         columns |= {"frame": list(self.frame), "target": list(self.target)}
         for name, errors in self.models.items():
             columns[f"{name}_mm"] = _cells(errors.position * 1e3)
@@ -131,7 +131,7 @@ def read_held_out(folder: Path, model: CalibratedModel) -> HeldOutRows | None:
 
 
 def _cells(values: Float64[Tensor, " rows"]) -> list[str]:
-    return ["" if value != value else f"{value:.7g}" for value in values.tolist()]
+    return ["" if value != value else f"{value:.5g}" for value in values.tolist()]
 
 
 def _numbers(cells: tuple[str, ...]) -> Float64[Tensor, " rows"]:

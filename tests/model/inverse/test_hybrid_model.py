@@ -11,6 +11,7 @@ from testing.edited_folders import edit, edit_tensors
 from testing.hybrid import hybrid_of, joints_in
 from testing.refusals import refused
 
+from pisigma.calibration.hybrid.uncertainty import ROUNDING_TOLERANCE
 from pisigma.estimation.covariance_root import CovarianceRoot
 from pisigma.files.errors import MeasurementError, ModelError, PoseError
 from pisigma.measurement.dataset import Measurements
@@ -87,12 +88,13 @@ def test_frames_and_targets_are_distinguished():
 def test_deviations_are_those_of_the_calibration(hybrid):
     arm, model = hybrid
     own = replace(arm.measurements, q=everywhere(arm, len(arm.measurements.q)), position=None)
+    rounding = 1e-5 if model.uncertainty.covariance_root.rounded is None else 1.5 * ROUNDING_TOLERANCE
     expected = arm.result.deviation(own)
-    assert_close(deviation_of_rows(model, own), expected, atol=1e-12, rtol=1e-5)
+    assert_close(deviation_of_rows(model, own), expected, atol=1e-12, rtol=rounding)
     rows = [i for i in range(own.rows) if (own.frame[i], own.target[i]) == (own.frame[0], own.target[0])]
     found = position_accuracy(model, own.q[rows].reshape(1, len(rows), -1))
     expected = arm.result.deviation(replace(own, payload=None))  # under the usual conditions
-    assert_close(found[0], expected[rows].norm(dim=-1), atol=1e-12, rtol=1e-5)
+    assert_close(found[0], expected[rows].norm(dim=-1), atol=1e-12, rtol=rounding)
 
 
 def test_rows_without_a_name_use_the_only_frame():
@@ -145,6 +147,30 @@ def test_a_folder_predicts_the_same_to_the_last_bit(hybrid, tmp_path):
     save_model(loaded, again)
     assert (again / "model.yaml").read_bytes() == (tmp_path / "model.yaml").read_bytes()
     assert (again / "model.safetensors").read_bytes() == (tmp_path / "model.safetensors").read_bytes()
+
+
+def test_a_folder_with_a_rounded_root(tmp_path):
+    arm, rounded = model_of("products")
+    root = CovarianceRoot(arm.result.uncertainty.root)
+    exact = replace(rounded, uncertainty=replace(rounded.uncertainty, covariance_root=root))
+    save_model(rounded, tmp_path)
+    loaded = load_model(tmp_path)
+    assert loaded.uncertainty.covariance_root.rounded is not None
+    assert torch.equal(loaded.uncertainty.root, rounded.uncertainty.root)
+    q = everywhere(arm)
+    assert torch.equal(loaded.forward(q), exact.forward(q))
+    assert torch.equal(position_accuracy(loaded, q), position_accuracy(rounded, q))
+    assert_close(position_accuracy(loaded, q), position_accuracy(exact, q), rtol=0.015)
+    assert_close(
+        deviation_of_rows(loaded, arm.measurements), deviation_of_rows(exact, arm.measurements), rtol=0.01
+    )
+    sizes = []
+    for model in (exact, rounded):
+        folder = tmp_path / str(len(sizes))
+        folder.mkdir()
+        save_model(model, folder)
+        sizes.append((folder / "model.safetensors").stat().st_size)
+    assert sizes[1] < sizes[0] / 5
 
 
 def test_without_a_correction_it_is_the_geometric_model(tmp_path):
@@ -249,13 +275,13 @@ def _known(**values):
         (lambda document: document["bases"].pop("floor"), "key 'learned'"),
         (_learned(tools={}), "key 'learned'"),
         (lambda document: document.pop("learned"), "correction."),
-        (lambda document: document.pop("uncertainty"), "'uncertainty.root'"),
+        (lambda document: document.pop("uncertainty"), "'uncertainty.numbers'"),
         (lambda document: document.update(calibrated=None), "key 'calibrated'"),
-        (_known(free=[0, 1]), "(494, any)"),
+        (_known(free=[0, 1]), "(494,)"),
         (lambda document: document["uncertainty"]["free"].reverse(), "key 'uncertainty.free'"),
         (lambda document: document["uncertainty"]["free"].__setitem__(-1, 9999), "key 'uncertainty.free'"),
         (lambda document: document["uncertainty"]["features"].pop(0), "key 'uncertainty.features'"),
-        (lambda document: document["uncertainty"]["features"].remove("products"), "(168, any)"),
+        (lambda document: document["uncertainty"]["features"].remove("products"), "(168,)"),
         (_known(features=3), "features"),
         (_known(unknowns=[{"name": "socket"}]), "unknowns"),
         (_known(prior_scale=-1.0), "prior_scale"),
@@ -295,11 +321,13 @@ def _put(name: str, value: torch.Tensor):
         (lambda tensors: tensors["coverage.half"].fill_(-1.0), "coverage.joint"),
         (lambda tensors: tensors["coverage.half"].fill_(torch.nan), "coverage.half"),
         (lambda tensors: tensors["correction.weight"].view(-1)[3:4].fill_(torch.inf), "correction.weight"),
+        (_put("uncertainty.numbers", torch.zeros(9, dtype=torch.uint8)), "uncertainty.numbers"),
+        (lambda tensors: tensors["uncertainty.numbers"].resize_(99), "uncertainty.numbers"),
         (lambda tensors: tensors["drawn.dh"].add_(1e-6), "drawn.dh"),
         (lambda tensors: tensors["calibrated.base"].add_(1e-6), "calibrated.base"),
         (lambda tensors: tensors["drawn.limits"].add_(1e-6), "drawn.limits"),
         (
-            lambda tensors: tensors.update({"uncertainty.root": tensors["uncertainty.root"].float()}),
+            lambda tensors: tensors.update({"uncertainty.unit": tensors["uncertainty.unit"].float()}),
             torch.float32,
         ),
     ],
