@@ -125,7 +125,7 @@ class CellScene:
             if found is not None:
                 top, note = (
                     round_up(float(found[1].p95.max())),
-                    f"Model {found[0]}: 95 % of the position errors.",
+                    f"Model {found[0]}: 95 % of the position errors are smaller.",
                 )
             self._legend.content = str(self._text.legend("predicted error", top, RAMP, note))
             if self._scene is not None:
