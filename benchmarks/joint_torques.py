@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 from closed_loop import ARMS, NOISE_MM, rms
-from mujoco_arm import ArmErrors, DrawnArm, FalseArm
+from mujoco_arm import ArmErrors, DrawnArm, PerturbedArm
 
 import pisigma
 from pisigma.calibration.hybrid.calibrator import HybridCalibrator
@@ -36,7 +36,7 @@ def measured(drawn: DrawnArm, robot: pisigma.Robot, seed: int, rows: int) -> Mea
     position, torque = np.empty((rows, 3)), np.empty_like(q)
     for k, payload in enumerate(PAYLOADS_KG):
         some = slice(k, rows, len(PAYLOADS_KG))
-        driven = FalseArm(drawn, ArmErrors(elastic=drawn.elastic), seed, payload).drive(q[some])
+        driven = PerturbedArm(drawn, ArmErrors(elastic=drawn.elastic), seed, payload).drive(q[some])
         position[some], torque[some] = driven.position, driven.torque
     position += rng.normal(0, NOISE_MM * 1e-3, position.shape)
     torque += rng.normal(size=torque.shape) * TORQUE_NOISE * torque.std(0)
