@@ -46,12 +46,13 @@ Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace the model 
 
 PayloadKg = Annotated[
     float | None,
-    typer.Option(help="Payload [kg], for models that learned its effect. [default: the mean of its rows]"),
+    typer.Option(help="Payload [kg], for models with payload effects. [default: mean of training rows]"),
 ]
 TemperatureC = Annotated[
     float | None,
     typer.Option(
-        help="Temperature of the robot [deg C], for models that learned its effect. [default: the mean of its rows]"
+        help="Temperature of the robot [deg C], for models with temperature effects. [default: mean of "
+        "training rows]"
     ),
 ]
 

@@ -41,7 +41,7 @@ def evaluate(
     verbose: Verbose = False,
     as_json: AsJson = False,
 ) -> None:
-    """Compare models on measurements, with confidence intervals, and accept them or not.
+    """Compare models on measurements, with confidence intervals, and check them against acceptance limits.
 
     Compares a single model with the nominal robot. Excludes rows of the set "train". Exits with status 3 if a
     model misses a limit, the base or the tool has moved, or the errors are too large for a calibrated robot.

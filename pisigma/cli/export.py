@@ -84,8 +84,8 @@ ToleranceMm = Annotated[
 CountsPerTurn = Annotated[
     str | None,
     typer.Option(
-        help="With epson and fanuc-mastering, encoder counts per turn of every joint with its gear, or per mm of a "
-        "prismatic joint, such as 8388608,8388608,524288,1048576."
+        help="With epson and fanuc-mastering, encoder counts per turn of each joint (including the gear ratio), or "
+        "per mm of a prismatic joint, such as 8388608,8388608,524288,1048576."
     ),
 ]
 PresentCounts = Annotated[
@@ -126,8 +126,8 @@ def export(
     """Export a model for other programs.
 
     Exits with status 2 if a pose of --poses is unreachable, singular or outside the joint limits: its values are empty
-    in a .csv file, and no program is written. With --program, such poses keep their line and the status is 3. Test
-    every program at low speed.
+    in a .csv file, and no program is written. With --program, the lines of such poses remain unchanged, and the exit
+    status is 3. Test every program at low speed.
     """
     from pisigma.deployment.export.export_format import ExportRequest
     from pisigma.deployment.export.registry import export_format, export_model

@@ -39,7 +39,7 @@ def feature_by_name(name: str) -> type[AbstractFeature]:
     """Return the class of the feature with the given name.
 
     Raises:
-        ModelError: there is no such feature.
+        ModelError: the feature is unknown.
     """
     if name not in FEATURES:
         hint = f"{nearest_choice(name, FEATURES)} Features of plug-ins need their plug-in (--plugin FILE)."
@@ -59,7 +59,7 @@ def feature_section(value: Any) -> FeatureSection:
         value: mapping with the key "name" and the other keys of that feature's section.
 
     Raises:
-        ValueError: there is no such feature, or its keys are missing, unknown or invalid.
+        ValueError: the feature is unknown, or its keys are missing, unknown or invalid.
     """
     if isinstance(value, FeatureSection):
         return value

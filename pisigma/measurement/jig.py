@@ -121,8 +121,8 @@ class Jig:
         """Load a jig by its name in pisigma's catalogue, or from a YAML file.
 
         Raises:
-            MeasurementError: there is neither such a jig nor such a file, or the file is not a valid jig; `file`,
-                `line` and `column` state which.
+            MeasurementError: `jig` is neither in the catalogue nor an existing file, or the file is not a valid jig;
+                `file`, `line` and `column` state where.
         """
         name = os.fspath(jig)
         if name in catalogue():

@@ -159,17 +159,17 @@ class CameraProspects:
 
     Attributes:
         rms: RMS position error over the task [m].
-        more_images: RMS error with `MORE_IMAGES` more images [m].
-        exact_corners: RMS error with corners without noise [m].
-        exact_robot: RMS error with a robot that repeats exactly [m].
+        rms_with_more_images: RMS error with `MORE_IMAGES` more images [m].
+        rms_with_exact_corners: RMS error with corners without noise [m].
+        rms_with_exact_robot: RMS error with a robot that repeats exactly [m].
         room: distance that the board may be from its place in the surroundings before it leaves an image [m].
         unidentifiable: parameters of the arm that images cannot identify, one sentence each.
     """
 
     rms: float
-    more_images: float
-    exact_corners: float
-    exact_robot: float
+    rms_with_more_images: float
+    rms_with_exact_corners: float
+    rms_with_exact_robot: float
     room: float
     unidentifiable: tuple[str, ...]
 
@@ -222,16 +222,16 @@ class CameraProspects:
     def to_json(self) -> dict[str, object]:
         """Return the figures as plain values."""
         names = ("more_images", "exact_corners", "exact_robot")
-        figures = {f"{name}_rms_mm": getattr(self, name) * 1e3 for name in names}
+        figures = {f"{name}_rms_mm": getattr(self, f"rms_with_{name}") * 1e3 for name in names}
         return {**figures, "room_mm": self.room * 1e3, "sentences": list(self.sentences)}
 
     @property
     def sentences(self) -> tuple[str, ...]:
         """Sentences about what limits the accuracy, what is not identifiable, and how exactly to place the board."""
         better = {
-            f"{MORE_IMAGES} more images": self.more_images,
-            "corners without noise": self.exact_corners,
-            "a robot that repeats exactly": self.exact_robot,
+            f"{MORE_IMAGES} more images": self.rms_with_more_images,
+            "corners without noise": self.rms_with_exact_corners,
+            "a robot that repeats exactly": self.rms_with_exact_robot,
         }
         limits = dict(zip(better, ("the number of images", "the camera", "the repeatability"), strict=True))
         what = limits[min(better, key=lambda name: better[name])]

@@ -46,7 +46,7 @@ class PlanDocument(Section):
     """Content of the YAML file of a plan.
 
     Attributes:
-        poses: name of the CSV file in the same folder.
+        poses_file: name of the CSV file in the same folder; `poses` in the file.
         robot: nominal robot.
         model: folder of the planned model, relative to this file; None for a nominal robot.
         settings: settings of the plan, with paths relative to this file.
@@ -54,7 +54,7 @@ class PlanDocument(Section):
         way_points: waypoints between poses where the straight joint motion is not free.
     """
 
-    poses: str
+    poses_file: str = Field(alias="poses")
     robot: RobotDocument
     model: str | None = None
     settings: PlanSettings
@@ -171,7 +171,7 @@ def read_plan(path: str | os.PathLike[str]) -> StoredPlan:
         file = yaml_of(file)
     document = read_yaml(file, PlanDocument, PlanningError)
     arm = ArmInSurroundings.from_robot(Robot(*document.robot.to_fields()), document.cell)
-    poses = file.parent / document.poses
+    poses = file.parent / document.poses_file
     table, q = read_table(poses), read_joints(poses, arm.robot)
     order = _numbers(table, "order")
     axes = arm.robot.axes

@@ -58,7 +58,7 @@ class Subject:
             tip: link of a URDF file that is the tool.
 
         Raises:
-            RobotError: there is no such robot.
+            RobotError: the robot is unknown.
             ModelError: the folder cannot be used.
         """
         if isinstance(subject, Robot):

@@ -77,8 +77,8 @@ def _accuracy(summary: CalibrationSummary) -> str:
     )
     if figures is None and summary.predicted_rms_mm is not None and not implausible:
         return (
-            f"{rounded(summary.predicted_rms_mm, 0)} mm RMS at other poses, because the calibration's own uncertainty "
-            "predicts; no row was held out."
+            f"{rounded(summary.predicted_rms_mm, 0)} mm RMS at other poses, as predicted from the uncertainty "
+            "of the calibration; no row was held out."
         )
     figures = figures or summary.calibrated
     if figures is None or not figures.models:

@@ -30,7 +30,7 @@ OF_FLEET = CANDIDATES | {"recalibrated": "fleet and these rows", "old": "mean ro
 
 
 def write_recalibration_card(model: CalibratedModel, summary: RecalibrationSummary, folder: Path) -> None:
-    """Write the card of a derived model into its folder.
+    """Write the card of a recalibrated model into the model folder.
 
     Args:
         model: model of the folder.
@@ -43,7 +43,7 @@ def write_recalibration_card(model: CalibratedModel, summary: RecalibrationSumma
 
 
 def write_frame_card(model: CalibratedModel, summary: FrameSummary, folder: Path) -> None:
-    """Write the card of a derived model into its folder.
+    """Write the card of a model with a calibrated frame or tool into the model folder.
 
     Args:
         model: model of the folder.
@@ -81,7 +81,7 @@ _STATISTICS = (("mean", "mean"), ("rms", "RMS"), ("max", "max"))
 
 
 def write_distilled_card(model: CalibratedModel, summary: DistillationSummary, folder: Path) -> None:
-    """Write the card of a derived model into its folder.
+    """Write the card of a distilled model into the model folder.
 
     Args:
         model: distilled model.
@@ -135,7 +135,7 @@ UNDETERMINED = (
 
 
 def write_fleet_prior_card(model: CalibratedModel, summary: FleetPriorSummary, folder: Path) -> None:
-    """Write the card of a derived model into its folder.
+    """Write the card of a fleet prior into the model folder.
 
     Args:
         model: mean robot.

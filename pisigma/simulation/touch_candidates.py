@@ -43,7 +43,7 @@ class JigPlacement(Section):
         """Return the jig that is placed.
 
         Raises:
-            MeasurementError: there is no such jig.
+            MeasurementError: the jig is unknown.
         """
         return Jig.load(self.jig)
 
@@ -191,7 +191,7 @@ class TouchCandidatesSection(Section):
 
         Raises:
             RecipeError: the robot cannot make the requested number of touches, or the sections do not fit together.
-            MeasurementError: there is no such jig.
+            MeasurementError: a placement names an unknown jig.
         """
         check_names(placements)
         generator = torch.Generator().manual_seed(self.seed)

@@ -104,7 +104,7 @@ class Tabs:
             "pisigma.workbench",
             {
                 "together": merge_alike_warnings,
-                "lines": lines_in,
+                "lines": line_numbers_in,
                 "name": lambda path: Path(path).name,
                 "tab_of": lambda step: TAB_OF.get(step, step),
                 "code": code,
@@ -194,7 +194,7 @@ class Tabs:
         fields = {
             sentence: repaired_fields(incoming, repair) for sentence, repair in repairs.items() if repair
         }
-        lines = {line for one in found for line in lines_in(" ".join(one.rows))}
+        lines = {line for one in found for line in line_numbers_in(" ".join(one.rows))}
         tables = []
         for mapping in () if problem else incoming.proposal.mappings:
             rows = sorted(
@@ -220,8 +220,8 @@ def repaired_fields(incoming: IncomingRows, repair: Repair) -> dict[str, str]:
     return fields | {"new_frame_at": " ".join(map(str, repair.settings.new_frame_at))}
 
 
-def lines_in(text: str) -> list[int]:
-    """Return the lines of rows that a sentence names, such as "line 12" or "lines 3, 7 to 9"."""
+def line_numbers_in(text: str) -> list[int]:
+    """Return the line numbers of the rows that a sentence names, such as "line 12" or "lines 3, 7 to 9"."""
     found: list[int] = []
     for first, last in RANGES.findall(" ".join(LINES.findall(text))):
         found += range(int(first), min(int(last or first), int(first) + MAX_LINES) + 1)
@@ -313,7 +313,7 @@ def download_of(cell: Cell, kind: str, names: tuple[str, ...]) -> Path:
         names: name of the file; for a model, name of the model and of the file.
 
     Raises:
-        ModelError: there is no such file.
+        ModelError: the file does not exist.
     """
     check_choice(ModelError, "download", kind, tuple(FOLDERS))
     folder = cell.folder / FOLDERS[kind]

@@ -13,7 +13,7 @@ from pisigma.robot.urdf_file import read_urdf
 from pisigma.workbench import steps
 from pisigma.workbench.cell_scene import CellScene
 from pisigma.workbench.server.answers import form_of, with_error_answers
-from pisigma.workbench.tabs import Tabs, lines_in
+from pisigma.workbench.tabs import Tabs, line_numbers_in
 from pisigma.workbench.uploads import Uploads
 from pisigma.workflow.cell.cell import Cell
 from pisigma.workflow.cell.incoming_rows import IncomingRows
@@ -69,7 +69,7 @@ class UploadedRows:
                 found = incoming.check(form.get("date", "").strip())
             except PisigmaError as problem:
                 return self._uploads.without_folder(self._tabs.findings(incoming, (), str(problem)))
-            self._scene.mark_lines(lines_in(" ".join(row for one in found for row in one.rows)))
+            self._scene.mark_lines(line_numbers_in(" ".join(row for one in found for row in one.rows)))
             return self._uploads.without_folder(self._tabs.findings(incoming, found))
 
         return web.Response(text=await asyncio.to_thread(check), content_type="text/html")
@@ -86,7 +86,7 @@ class UploadedRows:
                     rows = cell.sessions.as_measured(session)
                     self._scene.show_rows(RowsSoFar.unjudged(rows.line, rows.q.numpy()))
                     break
-            self._scene.mark_lines(lines_in(text))
+            self._scene.mark_lines(line_numbers_in(text))
 
         await asyncio.to_thread(show)
         return web.json_response({})

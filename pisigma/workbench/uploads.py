@@ -50,7 +50,7 @@ class Uploads:
         """Return the files with some numbers.
 
         Raises:
-            MeasurementError: there is no such file.
+            MeasurementError: the file does not exist.
         """
         for number in numbers:
             if number not in self._files:

@@ -122,7 +122,7 @@ def calibrate(
         The calibrated model with its validation; `save` writes it as a model folder.
 
     Raises:
-        RobotError: there is no such robot.
+        RobotError: the robot is unknown.
         MeasurementError: the data cannot be read, or cannot be split as the settings say.
         IdentificationError: the data do not determine the free parameters.
     """

@@ -157,7 +157,7 @@ def _check_parent(parent: CalibratedModel) -> None:
             f"model '{parent.name}' already corrects nominal joint values with a network",
             expected="a model without a network",
             value=parent.name,
-            remedy="export it as it is",
+            remedy="export it unchanged",
         )
     if parent.calibrated is None or not len(parent.starts):
         raise ModelError(
@@ -172,7 +172,7 @@ def _check_parent(parent: CalibratedModel) -> None:
             "this coupling",
             expected="a model without coupled joints",
             value=parent.name,
-            remedy="use the model as it is",
+            remedy="use the model unchanged",
         )
 
 

@@ -184,8 +184,8 @@ def plan(
         progress: called with the current step.
 
     Raises:
-        RobotError: there is no such robot.
-        ModelError: there is no such model.
+        RobotError: the robot is unknown.
+        ModelError: the model is unknown.
         MeasurementError: a file of joint values or of measurements cannot be used, or a fault of the setup explains
             the measurements.
         IdentificationError: no calibration error explains the measurements.

@@ -29,7 +29,7 @@ from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.report.error_map import map_of_workspace
 from pisigma.workbench.job import BusyError, Jobs, Outcome
 from pisigma.workbench.steps import rows_at_fault, side_by_side
-from pisigma.workbench.tabs import MAX_LINES, TABS, lines_in
+from pisigma.workbench.tabs import MAX_LINES, TABS, line_numbers_in
 from pisigma.workbench.workbench import STEPS, Workbench
 from pisigma.workflow.cell.cell import Cell
 
@@ -255,8 +255,14 @@ def test_changes_of_a_program_are_shown_side_by_side():
 
 
 def test_sentences_name_the_lines_of_rows():
-    assert lines_in("rows.csv, line 62: moved; 3 more of this kind: lines 3, 7 to 9.") == [62, 3, 7, 8, 9]
-    assert len(lines_in("lines 1 to 999999999")) <= MAX_LINES
+    assert line_numbers_in("rows.csv, line 62: moved; 3 more of this kind: lines 3, 7 to 9.") == [
+        62,
+        3,
+        7,
+        8,
+        9,
+    ]
+    assert len(line_numbers_in("lines 1 to 999999999")) <= MAX_LINES
 
 
 def test_one_acts_and_others_see_who(browser_with_link, bench, cell, monkeypatch):

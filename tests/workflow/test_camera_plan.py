@@ -61,7 +61,7 @@ def test_limiting_factors_and_unidentifiable_parameters_are_reported(planned: Pl
     camera = planned.camera
     assert camera is not None
     assert_close(camera.rms, planned.curve[-1].rms, rtol=1e-9)
-    for better in (camera.more_images, camera.exact_corners, camera.exact_robot):
+    for better in (camera.rms_with_more_images, camera.rms_with_exact_corners, camera.rms_with_exact_robot):
         assert 0 < better < camera.rms
     assert 0 < camera.room < 0.1
     text = " ".join(camera.unidentifiable)
@@ -69,7 +69,7 @@ def test_limiting_factors_and_unidentifiable_parameters_are_reported(planned: Pl
     assert "theta_1 and d_1" in text
     figures = planned.to_json()["camera"]
     assert isinstance(figures, dict)
-    assert_close(figures["exact_robot_rms_mm"], camera.exact_robot * 1e3)
+    assert_close(figures["exact_robot_rms_mm"], camera.rms_with_exact_robot * 1e3)
 
 
 def test_frontal_views_are_warned_of(settings: PlanSettings):

@@ -37,5 +37,5 @@ def test_the_message_states_what_the_controller_shows() -> None:
     values = torch.tensor([0.1, 0.2, 0.3, 0.4, 0.5, 0.6]).double()
     q = robot.to_dh(values)
     pose = NextPose(1, 2, q.numpy(), False, robot.to_controller(q.numpy()))
-    assert_close(pose.values, values, atol=1e-15)
-    assert_close(NextPose(1, 2, q.numpy(), False).values, q, atol=0)
+    assert_close(pose.controller_values, values, atol=1e-15)
+    assert_close(NextPose(1, 2, q.numpy(), False).controller_values, q, atol=0)

@@ -143,8 +143,9 @@ def _compared(table: CorrelationTriangle, ours: dict[str, Any], kind: str) -> st
         f"In Table {table.table} ({kind}), {int(pairs[0].sum())} pairs are at ±1 in the paper and "
         f"{int(pairs[1].sum())} here, "
         f"{'which are the same, with the same signs' if same_pairs else 'which are not the same'}, and the parameters "
-        f"without effect are {'the same' if same_none else 'not the same'}. The other {int(other.sum())} pairs depend "
-        f"on the poses and differ by {np.median(apart):.3f} (median) and by at most {apart.max():.3f}; the largest is "
+        f"without effect are {'the same' if same_none else 'not the same'}. The correlations of the other "
+        f"{int(other.sum())} pairs depend on the poses; ours differ from the paper's by {np.median(apart):.3f} "
+        f"(median) and by at most {apart.max():.3f}. The largest absolute correlation among these pairs is "
         f"{largest[0]:.3f} in the paper and {largest[1]:.3f} here."
     )
 

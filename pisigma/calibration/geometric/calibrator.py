@@ -149,10 +149,10 @@ class GeometricCalibrator:
         rough, findings, active = self._solve_roughly(setup, findings, candidates, active)
         problem = setup.problem.with_active(active)
         start = rough.linearisation
-        if findings.extended or len(sensor_view_of(start).sums[0].distance) < problem.rows:
+        if findings.extended or len(sensor_view_of(start).contributions[0].distance) < problem.rows:
             start = problem.linearise(start.point, start)
         else:
-            start = problem.combine_sums(start.point, sensor_view_of(start))
+            start = problem.combine_contributions(start.point, sensor_view_of(start))
         left = self.maximum_iterations - rough.iterations
         fine = levenberg_marquardt(problem, start, left, close_enough=SHORTEST_STEP)
         refuse_implausible(problem, fine.linearisation, measurements.source)

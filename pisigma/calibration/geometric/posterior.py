@@ -44,7 +44,7 @@ class ParameterPosterior:
         return tuple(parameter.name for parameter in self.parameters)
 
     @property
-    def weights(self) -> int:
+    def weight_count(self) -> int:
         """Number of weights of a joint correction, which follow the parameters in the covariance."""
         return len(self.root) - len(self.parameters)
 

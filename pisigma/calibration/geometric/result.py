@@ -197,7 +197,9 @@ class CalibrationResult:
     def observability(self) -> Observability:
         """Indices O1 to O5 of the free parameters at the solution."""
         problem, here = self.solved.problem, self.solved.refined
-        gram = sum((sums.normal for sums in sensor_view_of(here).sums), torch.zeros_like(here.normal))
+        gram = sum(
+            (part.normal for part in sensor_view_of(here).contributions), torch.zeros_like(here.normal)
+        )
         usual = problem.step_scale * 1e3  # converted to rows in mm and mrad, and columns per 1 mm and 1 mrad
         poses = int(torch.stack([sensor.present for sensor in problem.sensors]).any(0).sum())
         return observability_of(gram * usual * usual[:, None], poses)
@@ -306,8 +308,8 @@ def _residuals(solved: SolvedCalibration) -> dict[str, Float64[np.ndarray, "rows
     measurements, setup, problem = solved.measurements, solved.setup, solved.problem
     R = setup.anchors.bases[:, :3, :3].to(problem.frame.device)[problem.frame]
     residuals = {}
-    for sensor, sums in zip(problem.sensors, sensor_view_of(solved.refined).sums, strict=True):
-        own = sums.residual.t()
+    for sensor, part in zip(problem.sensors, sensor_view_of(solved.refined).contributions, strict=True):
+        own = part.residual.t()
         if sensor.components == 3:
             own = (R @ own[..., None])[..., 0]
         values = torch.full((measurements.q.shape[0], sensor.components), torch.nan, dtype=own.dtype)
@@ -319,12 +321,12 @@ def _residuals(solved: SolvedCalibration) -> dict[str, Float64[np.ndarray, "rows
 def _outliers(solved: SolvedCalibration) -> tuple[Outlier, ...]:
     found = []
     view = sensor_view_of(solved.refined)
-    for number, (sensor, sums) in enumerate(zip(solved.problem.sensors, view.sums, strict=True)):
-        deviations = sums.distance / view.scales[number]
+    for number, (sensor, part) in enumerate(zip(solved.problem.sensors, view.contributions, strict=True)):
+        deviations = part.distance / view.scales[number]
         weight = solved.problem.loss_for_sensor(sensor).weight(deviations, sensor.components)
         rows = torch.arange(len(weight))
         found += outliers_of(
-            solved.setup, solved.measurements, sensor, rows, sums.residual.norm(dim=0), deviations, weight
+            solved.setup, solved.measurements, sensor, rows, part.residual.norm(dim=0), deviations, weight
         )
     return tuple(sorted(found, key=lambda outlier: -outlier.deviations))
 
@@ -334,7 +336,7 @@ def _noise(solved: SolvedCalibration) -> tuple[SensorNoise, ...]:
     problem, here = solved.problem, solved.refined
     view = sensor_view_of(here)
     used = parameters_used(view, covariance_of(here.normal)).tolist()
-    for k, (sensor, sums) in enumerate(zip(problem.sensors, view.sums, strict=True)):
+    for k, (sensor, part) in enumerate(zip(problem.sensors, view.contributions, strict=True)):
         if sensor.certain:
             continue
         sigma = float(view.noise[k])
@@ -346,7 +348,7 @@ def _noise(solved: SolvedCalibration) -> tuple[SensorNoise, ...]:
                 unit=unit,
                 values=problem.values_measured[k],
                 used=used[k],
-                rms=float(sums.rms),
+                rms=float(part.rms),
                 quantity=sensor.unit,
                 components=sensor.components,
             )

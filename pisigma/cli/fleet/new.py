@@ -20,7 +20,8 @@ def new(
         str,
         typer.Argument(
             metavar="[ROBOT]",
-            help="Catalogue name or robot file (YAML or URDF); with --from, robot of the rows that do not state one.",
+            help="Catalogue name or robot file (YAML or URDF); with --from, robot for manifest rows that do not "
+            "state one.",
             autocompletion=complete_robot,
         ),
     ] = "",

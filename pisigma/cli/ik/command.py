@@ -46,12 +46,13 @@ def ik(
     out: Annotated[Path | None, typer.Option(help="CSV file of joint values to write, with --poses.")] = None,
     branch: Annotated[str | None, typer.Option(help="Branch to use instead of the default.")] = None,
     all_branches: Annotated[
-        bool, typer.Option("--all-branches", help="Print the solutions on all branches of --pose.")
+        bool, typer.Option("--all-branches", help="With --pose, print all branches.")
     ] = False,
     accuracy: Annotated[
         bool,
         typer.Option(
-            "--accuracy", help="With --poses, also predict the tool's standard deviation; slow with a hybrid."
+            "--accuracy",
+            help="With --poses, also predict the standard deviation of the tool's position; slow for hybrid models.",
         ),
     ] = False,
     path: Annotated[

@@ -122,7 +122,7 @@ def write_joint_file(
     Raises:
         MeasurementError: the file of poses or its header cannot be used.
         OutputError: the file cannot be written there.
-        PoseError: there is no such branch.
+        PoseError: the branch is unknown.
     """
     outcome, begun = PoseFileResult(), time.monotonic()
     with open_atomically(out) as file:

@@ -70,7 +70,7 @@ def next_text(state: SessionState) -> str:
     if following is None:
         return "No pose is left."
     units = ("deg" if turns else "mm" for turns in state.revolute)
-    values = zip(state.in_file_units(following.values), units, strict=True)
+    values = zip(state.in_file_units(following.controller_values), units, strict=True)
     joints = ", ".join(f"{value:.3f} {unit}" for value, unit in values)
     kind = " (check)" if following.check else ""
     return f"Next: pose {following.number} of {following.count}{kind}: {joints}."

@@ -233,7 +233,8 @@ def _fault(expected: str, limit: str, correction: tuple[float, ...]) -> RequestE
         expected=f"{expected} {limit}",
         value=", ".join(f"{axis} {value:.4f}" for axis, value in zip(AXES, correction, strict=True)),
         option="AKorr",
-        remedy="check that the controller counts joints like the robot description, and avoid singularities",
+        remedy="check that the joints of the controller have the zeros and directions of the robot description, and "
+        "avoid singularities",
     )
 
 

@@ -118,7 +118,7 @@ def _network_type(folder: str) -> str | None:
 def linux_mounts(mountinfo: str) -> list[tuple[str, str]]:
     """Return mount point and type of every file system in a table such as `/proc/self/mountinfo`.
 
-    proc(5) defines the format: the fifth field is the mount point, with blanks as octal escapes, and the first field
+    proc(5) defines the format: the fifth field is the mount point, with spaces as octal escapes, and the first field
     after " - " is the type.
     """
     mounts = []

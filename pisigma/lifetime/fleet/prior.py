@@ -265,7 +265,7 @@ class FleetConsistency:
 
     @property
     def is_inconsistent(self) -> bool:
-        """Whether the robot is inconsistent with the fleet, and its class explains the rows better."""
+        """Whether the robot is inconsistent with the fleet, and the robot's class explains the rows better."""
         return self.probability < FALSE_ALARM and self.gain < 0
 
     @property
@@ -273,9 +273,9 @@ class FleetConsistency:
         """The result of the comparison as a sentence."""
         if self.is_inconsistent:
             return (
-                f"This robot is inconsistent with the fleet: fewer than 1 in {1 / FALSE_ALARM:,.0f} of its robots are "
-                "as far from the mean, and the usual errors of its class explain the rows better. The fleet prior is "
-                "not used if the rows suffice for a calibration without it."
+                f"This robot is inconsistent with the fleet: fewer than 1 in {1 / FALSE_ALARM:,.0f} robots of the "
+                "fleet are this far from the mean, and the usual errors of the robot's class explain the rows better. "
+                "The fleet prior is not used if the rows suffice for a calibration without it."
             )
         share = f"{100 * self.probability:.0f} %" if self.probability >= 0.01 else "fewer than 1 %"
-        return f"This robot is consistent with the fleet: {share} of its robots are as far from the mean, or farther."
+        return f"This robot is consistent with the fleet: {share} of its robots are at least this far from the mean."

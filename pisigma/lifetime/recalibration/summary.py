@@ -1,4 +1,4 @@
-"""Figures of a recalibration, which cards, tables and JSON render and a model folder stores."""
+"""Figures of a recalibration that are shown on cards, in tables and as JSON, and stored in the model folder."""
 
 from pisigma.files.yaml_file import Section
 from pisigma.lifetime.recalibration.candidates import Kept

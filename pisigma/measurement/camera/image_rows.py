@@ -143,8 +143,8 @@ def _readings(
         CAMERA_COLUMN: (solved.camera.name,) * count,
     }
     if solved.sigma.any():
-        by = np.stack(changes) @ solved.intrinsics.by
-        readings[INTRINSICS_COLUMN] = replace(solved.intrinsics, by=by).texts
+        J = np.stack(changes) @ solved.intrinsics.pose_jacobian
+        readings[INTRINSICS_COLUMN] = replace(solved.intrinsics, pose_jacobian=J).texts
     if board.scale_deviation is not None:
         readings[SCALE_COLUMN] = (f"{board.scale_deviation:.17g}",) * count
     return readings

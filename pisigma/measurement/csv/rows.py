@@ -23,9 +23,9 @@ _Values = Float64[np.ndarray, "rows columns"]
 
 _UNIT_DOUBT = {
     "rad": "check the value, and whether these are degrees in a _rad column",
-    "deg": "check the value, its unit and how the controller counts",
+    "deg": "check the value, the unit, and the zeros and directions of the controller",
     "m": "check the value, and whether these are millimetres in a _m column",
-    "mm": "check the value, its unit and how the controller counts",
+    "mm": "check the value, the unit, and the zeros and directions of the controller",
 }
 
 

@@ -24,7 +24,7 @@ class Table:
 
     Attributes:
         source: name of the file in messages.
-        header: names of the columns, without surrounding blanks.
+        header: names of the columns, without surrounding spaces.
         header_line: line number of the header.
         records: the fields of every row; empty for rows that are not valid CSV.
         lines: line numbers of the rows.
@@ -112,7 +112,7 @@ def _is_failed_row(line: str, columns: int) -> bool:
 
 
 def header_names(line: str, place: Place) -> tuple[str, ...]:
-    """Return the names of the columns, without surrounding blanks.
+    """Return the names of the columns, without surrounding spaces.
 
     Raises:
         MeasurementError: the line is not valid CSV.

@@ -93,7 +93,7 @@ def _check(data: MeasuredFields, texts: Mapping[str, Sequence[str]]) -> None:
                     expected="a name that a CSV cell can contain",
                     value=text,
                     at=data.place_of(names.index(text), name),
-                    remedy="use a single line without leading or trailing blanks",
+                    remedy="use a single line without leading or trailing spaces",
                 )
 
 

@@ -14,12 +14,12 @@ from pisigma.files.errors import MeasurementError, Place
 from pisigma.measurement.csv.table import SPREADSHEET_ERRORS
 
 SEPARATORS = ("\t", ";", ",", "|", " ")
-"""Separators of cells; a blank stands for any number of blanks and tabs."""
+"""Separators of cells; a space stands for any number of spaces and tabs."""
 SAMPLED_LINES = 300
 """Number of lines from which the format is recognised."""
 MAX_COLUMNS = 2000
 _BLANKS = 0.8
-"""Weight of blanks as separators; it is small, because names contain blanks, too."""
+"""Weight of spaces as separators; it is small, because names contain spaces, too."""
 _SMALL, _FAR = 20.0, 200.0
 """Limits below which numbers such as 2.104 may be lengths in mm with a group of thousands: no robot reaches 20,000
 mm, and no measured position is 200,000 mm away."""
@@ -106,11 +106,11 @@ class Dialect:
 
     def __str__(self) -> str:
         """Return a description such as "semicolons between cells, decimal commas"."""
-        signs = {".": "points", ",": "commas", "\t": "tabs", ";": "semicolons", "|": "bars", " ": "blanks"}
+        signs = {".": "points", ",": "commas", "\t": "tabs", ";": "semicolons", "|": "bars", " ": "spaces"}
         return f"{signs[self.separator]} between cells, decimal {signs[self.numbers.decimal]}"
 
     def split(self, line: str) -> list[str]:
-        """Return the cells of a line without surrounding blanks; an unclosed quote is part of the cell."""
+        """Return the cells of a line without surrounding spaces; an unclosed quote is part of the cell."""
         if '"' in line:
             with contextlib.suppress(csv.Error):
                 reader = csv.reader(
@@ -161,7 +161,7 @@ def detect_dialect(lines: Sequence[tuple[int, str]], source: str, decimal: Decim
             expected="a table of numbers with one measurement per line",
             value="no lines with the same number of numbers",
             at=Place(source),
-            remedy="separate cells with tabs, semicolons, commas or blanks",
+            remedy="separate cells with tabs, semicolons, commas or spaces",
         )
     dialect = choices[scores.index(best)]
     if decimal is None:

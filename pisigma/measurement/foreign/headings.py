@@ -133,7 +133,7 @@ _MEANINGS = {
     "set": "set split",
 }
 MEANINGS = {name: quantity for quantity, names in _MEANINGS.items() for name in names.split()}
-"""Names of other quantities, in the order of preference, separated by blanks."""
+"""Names of other quantities, in the order of preference, separated by spaces."""
 _OTHERS = {
     name
     for names in (

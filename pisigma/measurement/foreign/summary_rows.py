@@ -19,7 +19,7 @@ ecarttype écarttype somme devstd deviazionestandard scartotipo
 desviación desviaciónestándar desviacionestandar desvestándar desvestandar desvest desvstd suma
 """
 _AVERAGES = frozenset(_CALLED_AVERAGES.split())
-"""Names of means in instruments and spreadsheets, in lower case and without blanks, points and dashes."""
+"""Names of means in instruments and spreadsheets, in lower case and without spaces, points and dashes."""
 _OTHERS = frozenset(_CALLED_OTHERWISE.split())
 """Names of other statistics."""
 
@@ -78,7 +78,7 @@ def named_statistics(records: Sequence[Sequence[str]]) -> dict[int, str]:
 
 
 def statistic_name(cell: str) -> str:
-    """Return the name of a statistic in a cell, without blanks, signs, multiples ("3σ") and quantity ("mean of X")."""
+    """Return the name of a statistic in a cell, without spaces, signs, multiples ("3σ") and quantity ("mean of X")."""
     text = re.sub(r"^\d+\s*[x*]?\s*(?=σ|sigma)|\(.*?\)|\[.*?\]|\s(?:of|von)\s.*", "", cell.casefold().strip())
     return re.sub(r"[\W_]+|values?$|wert$", "", text) if text[:1].isalpha() else ""
 

@@ -44,7 +44,7 @@ WEIGHTS = 21
 
 
 def weight_text(weight: Float64[np.ndarray, "6 6"]) -> str:
-    """Return the weights as the text of a cell: the lower triangle, row by row, separated by blanks."""
+    """Return the weights as the text of a cell: the lower triangle, row by row, separated by spaces."""
     return " ".join(f"{value:.17g}" for value in weight[np.tril_indices(6)])
 
 
@@ -57,13 +57,15 @@ def _row_faults(readings: Readings) -> Iterator[RowFault]:
         np.isfinite(noise) != weighted,
         lambda row: Fault(
             column=WEIGHT_COLUMN,
-            expected=f"a noise and {WEIGHTS} weights separated by blanks",
+            expected=f"a value in {NOISE_COLUMN}, and {WEIGHTS} weights separated by spaces",
             value=str(texts[row]),
         ),
     )
     yield (
         noise <= 0,
-        lambda row: Fault(expected="a noise > 0 mm", value=float(f"{noise[row] * 1e3:.6g}")),
+        lambda row: Fault(
+            expected="a noise standard deviation > 0 mm", value=float(f"{noise[row] * 1e3:.6g}")
+        ),
     )
     for name, count in ((INTRINSICS_COLUMN, SIZE), (SCALE_COLUMN, 1)):
         stated = [str(text) for text in readings[name]]
@@ -71,7 +73,7 @@ def _row_faults(readings: Readings) -> Iterator[RowFault]:
         yield (
             wrong,
             lambda row, name=name, count=count, stated=stated: Fault(  # type: ignore[misc]
-                column=name, expected=f"{count} numbers separated by blanks", value=stated[row][:40]
+                column=name, expected=f"{count} numbers separated by spaces", value=stated[row][:40]
             ),
         )
 
@@ -137,7 +139,7 @@ class CornerSensor(AbstractSensor):
         rotated = torch.where(present[:, None, None], rotated, 0.0)
         images = ImageIntrinsics.from_texts(texts_of(data, INTRINSICS_COLUMN))
         of_camera, of_board = cameras(data), boards(data)
-        at, by = (torch.from_numpy(values).to(R) for values in (images.at, images.by))
+        at, by = (torch.from_numpy(values).to(R) for values in (images.at, images.pose_jacobian))
         by_scale = torch.where(present, torch.einsum("nij,nj->in", weight[..., :3], data.position), 0.0)
         return cls(
             position,
@@ -231,7 +233,7 @@ def as_poses(
         moved[row] = unknowns.get("camera", {}).get(camera, images.at[row]) - images.at[row]
     for row, board in enumerate(boards(measurements) or ()):
         scale[row] += float(unknowns.get("board", {}).get(board, np.zeros(1))[0])
-    change = torch.from_numpy(np.einsum("nij,nj->ni", images.by, moved)).to(position)
+    change = torch.from_numpy(np.einsum("nij,nj->ni", images.pose_jacobian, moved)).to(position)
     return replace(
         measurements,
         position=(position + change[:, :3]) * torch.from_numpy(scale).to(position)[:, None],

@@ -51,7 +51,8 @@ class ImageIntrinsics:
     """Information of the corners of images on their camera's intrinsics k, linearised at `at`.
 
     Attributes:
-        by: derivative of the measured position and rotation vector, in the axes of the row's frame, with respect to k.
+        pose_jacobian: derivative of the measured position and rotation vector, in the axes of the row's frame, with
+            respect to k.
         root: matrix of the equations of k with the poses eliminated, `root (k - at) = residual` with unit variances.
         residual: right side of the equations of `root`.
         at: intrinsics at which the images were linearised.
@@ -59,7 +60,7 @@ class ImageIntrinsics:
         sigma: prior standard deviations; 0 for fixed intrinsics.
     """
 
-    by: Float64[np.ndarray, "*rows 6 9"]
+    pose_jacobian: Float64[np.ndarray, "*rows 6 9"]
     root: Float64[np.ndarray, "*rows 9 9"]
     residual: Float64[np.ndarray, "*rows 9"]
     at: Float64[np.ndarray, "*rows 9"]
@@ -72,7 +73,7 @@ class ImageIntrinsics:
 
     @property
     def texts(self) -> tuple[str, ...]:
-        """Cells of the column of intrinsics: all numbers of an image as text, separated by blanks."""
+        """Cells of the column of intrinsics: all numbers of an image as text, separated by spaces."""
         blocks = [getattr(self, item.name).reshape(len(self.at), -1) for item in fields(self)]
         return tuple(" ".join(f"{value:.17g}" for value in row) for row in np.concatenate(blocks, 1))
 
@@ -136,7 +137,7 @@ def without_stated_priors(measurements: Measurements, counted: Mapping[str, Coll
 
 
 def numbers_in(text: str, count: int) -> list[float]:
-    """Return `count` numbers separated by blanks in a text; empty if the text is anything else."""
+    """Return `count` numbers separated by spaces in a text; empty if the text is anything else."""
     try:
         numbers = [float(word) for word in text.split()]
     except ValueError:

@@ -99,7 +99,7 @@ class SocketSensor(AbstractSensor):
             return None
         socket = numbers_of(measurements.socket, names, measurements.rows)
         points, socket = T[socket >= 0, :3, 3], socket[socket >= 0]
-        middle = means_by_number(points, socket, len(names))
+        middle = group_means(points, socket, len(names))
         usual = float((points - middle[socket]).norm(dim=-1).median())
         if usual > MAX_SCATTER * reach:
             raise IdentificationError(
@@ -234,12 +234,12 @@ def _check_distance(one: str, other: str, distance: float, order: tuple[str, ...
         )
 
 
-def means_by_number(
-    values: Float64[Tensor, "rows size"], number: Int64[Tensor, " rows"], count: int
+def group_means(
+    values: Float64[Tensor, "rows size"], group: Int64[Tensor, " rows"], group_count: int
 ) -> Tensor:
-    """Return the mean of the values over the rows of every index from 0 to `count - 1`."""
-    total = values.new_zeros((count, values.shape[1])).index_add(0, number, values)
-    return total / torch.bincount(number, minlength=count).clamp(min=1)[:, None]
+    """Return the mean of the values over the rows of every group from 0 to `group_count - 1`."""
+    total = values.new_zeros((group_count, values.shape[1])).index_add(0, group, values)
+    return total / torch.bincount(group, minlength=group_count).clamp(min=1)[:, None]
 
 
 def matching_sockets(

@@ -115,7 +115,7 @@ class CompiledIK:
             axes: axes of the tool that are constrained; None for the arm's `task_axes`.
 
         Raises:
-            PoseError: the matrix is not a valid pose, a shape is wrong, or there is no such branch.
+            PoseError: the matrix is not a valid pose, a shape is wrong, or the branch is unknown.
         """
         T = numbers(T_base_tool, "T_base_tool", throw)
         if T.shape != (4, 4):

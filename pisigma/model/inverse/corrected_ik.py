@@ -316,7 +316,7 @@ class CorrectedIK(AbstractInverse):
             elbow_angle: elbow angle of an arm with seven revolute joints [rad], see `kinematics.task_axes.TaskAxes`.
 
         Raises:
-            PoseError: there is no such axis, a tolerance is invalid, or the robot has no elbow.
+            PoseError: the axis is unknown, a tolerance is invalid, or the robot has no elbow.
         """
         if ignore_axes is None and tolerance_mm is None and tolerance_deg is None and elbow_angle is None:
             return self

@@ -86,7 +86,7 @@ class NextPose:
     commanded: Float64[np.ndarray, " axes"] | None = None
 
     @property
-    def values(self) -> Float64[np.ndarray, " axes"]:
+    def controller_values(self) -> Float64[np.ndarray, " axes"]:
         """Values to command at the controller [rad or m]."""
         return self.q if self.commanded is None else self.commanded
 
@@ -202,7 +202,7 @@ class SessionState:
                 "number": following.number,
                 "of": following.count,
                 "set": "test" if following.check else "train",
-                "joints": self.in_file_units(following.values),
+                "joints": self.in_file_units(following.controller_values),
             },
             "coverage": [
                 {"joint": span.name, "lower": lower, "upper": upper, "share_of_plan": span.planned}

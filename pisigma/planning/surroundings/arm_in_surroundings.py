@@ -186,7 +186,7 @@ class ArmInSurroundings:
         return faults
 
     def _gaps(self, segments: Float64[Tensor, "poses pieces 2 3"]) -> dict[str, Float64[Tensor, " poses"]]:
-        """Yield distances between the links and every obstacle, minus the clearance [m]."""
+        """Return, by reason, distances between the links and every obstacle, minus the clearance [m]."""
         clearance, radius = self.surroundings.clearance, self.capsules.radius
         infinite = segments.new_full((len(segments), 1), torch.inf)
         gaps = {"links of the robot touch each other": _least(self._apart(segments) - self.room, infinite)}
@@ -223,7 +223,7 @@ class ArmInSurroundings:
         lines: Float64[Tensor, "poses lines 2 3"],
         what: str,
     ) -> dict[str, Bool[Tensor, " poses"]]:
-        """Yield masks of the poses in which a line of sight is nearer to an obstacle than the clearance."""
+        """Return, by reason, masks of the poses in which an obstacle is too near to a line of sight."""
         clearance = self.surroundings.clearance
         infinite = lines.new_full((len(lines), 1), torch.inf)
         distance = (

@@ -14,9 +14,10 @@ from pisigma.simulation.errors.source import AbstractPlaySource, joint_values
 class Backlash(AbstractPlaySource):
     """Backlash by which every joint stops short by half of its play: `e_j = -play_j / 2 · approach_j`.
 
-    The approach is +1 if the joint's value increased before it stopped and -1 if it decreased. Simulated trackers
-    and distances draw a random direction for every row and joint, and state it. Touches and sockets are approached
-    until they fit, so their joints are in the middle of the play.
+    The approach is +1 if the joint's value increased before it stopped and -1 if it decreased. For
+    simulated trackers and distance sensors, the approach direction of every joint is drawn at random for every row and
+    written to the measurements. Touches and sockets are approached until they fit, so their joints are in the middle of
+    the play.
 
     Source: Whitney, Lozinski and Rourke, "Industrial robot forward calibration method and results", ASME
     Journal of Dynamic Systems, Measurement, and Control 108(1), 1986, 1-8.

@@ -39,7 +39,7 @@ def check_prior_ratio(checked: CheckedCalibration) -> Iterator[Diagnostic]:
     """
     unusual = [ratio for ratio in checked.geometric.prior_ratios if ratio.at_least > UNUSUAL]
     large = [ratio for ratio in unusual if ratio.at_least > IMPLAUSIBLE]
-    possible = narrowest_class(checked, large)
+    possible = narrowest_robot_class(checked, large)
     usual = checked.robot_class
     for ratio in unusual:
         believed = ratio not in large or (
@@ -55,7 +55,9 @@ def check_prior_ratio(checked: CheckedCalibration) -> Iterator[Diagnostic]:
         )
 
 
-def narrowest_class(checked: CheckedCalibration, large: Sequence[PriorRatio]) -> RobotClass | None:
+def narrowest_robot_class(
+    checked: CheckedCalibration, large_ratios: Sequence[PriorRatio]
+) -> RobotClass | None:
     """Return the class of a robot with errors of these sizes: the stated class, or the narrowest that allows them.
 
     The search for the narrowest class starts with the maker's class.
@@ -67,8 +69,8 @@ def narrowest_class(checked: CheckedCalibration, large: Sequence[PriorRatio]) ->
         The class; None if no class allows these errors.
     """
     usual = checked.robot_class
-    sizes = [(ratio.group, ratio.size) for ratio in large]
-    at_least = [(ratio.group, ratio.size_at_least) for ratio in large]
+    sizes = [(ratio.group, ratio.size) for ratio in large_ratios]
+    at_least = [(ratio.group, ratio.size_at_least) for ratio in large_ratios]
     if usual.allows(at_least) or checked.calibrator.robot_class is not None:
         return usual if usual.allows(at_least) else None
     if any(

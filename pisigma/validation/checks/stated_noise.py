@@ -27,10 +27,12 @@ def check_stated_noise(checked: CheckedCalibration) -> Iterator[Diagnostic]:
     """
     solved = checked.geometric.solved
     learned = None if checked.hybrid is None else checked.hybrid.learned
-    for sensor, sums in zip(solved.problem.sensors, sensor_view_of(solved.refined).sums, strict=True):
+    for sensor, part in zip(
+        solved.problem.sensors, sensor_view_of(solved.refined).contributions, strict=True
+    ):
         if sensor.sigma is None or sensor.certain or sensor.components not in CHI_MEDIAN:
             continue
-        distance = sums.distance[sensor.present]
+        distance = part.distance[sensor.present]
         ratio = float(distance.median()) / CHI_MEDIAN[sensor.components]
         margin = math.exp(3 / math.sqrt(len(distance)))
         larger = ratio if learned is None else learned.noise[sensor.name]

@@ -27,7 +27,7 @@ _DEGREES = float(np.rad2deg(1.0))
 
 @dataclass(frozen=True, eq=False)
 class HeldOutRows:
-    """Errors of rows under calibrations without them, in the order of the measurements.
+    """Errors of held-out rows, each under calibrations fitted without that row, in the order of the measurements.
 
     Attributes:
         q: commanded joint values [rad or m].

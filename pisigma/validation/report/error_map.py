@@ -112,7 +112,7 @@ def map_of_workspace(model: CalibratedModel) -> ErrorMap:
 
 
 def samples_of_workspace(model: CalibratedModel) -> tuple[Float64[Tensor, "samples dof"], int]:
-    """Return joint values that the model keeps and random ones in their ranges [rad or m], and how many are random."""
+    """Return stored joint values and random ones within their ranges [rad or m], and the number of random ones."""
     q = model.starts
     more = max(SAMPLES - len(q), 0) if len(q) else 0
     if more:

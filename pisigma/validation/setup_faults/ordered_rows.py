@@ -117,7 +117,7 @@ class OrderedRows:
             sigma = float(view.noise[k]) if learned is None else learned.noise[sensor.name]
             if sensor.name not in SENSORS or sigma <= ALWAYS_GOOD:
                 continue
-            residual = view.sums[k].residual[:, some]
+            residual = view.contributions[k].residual[:, some]
             if errors is not None:
                 residual = (R.mT @ errors[sensor.name][rows[some], :, None])[..., 0].t()
             root = sensor.present / (sigma if sensor.sigma is None else sigma * sensor.sigma)

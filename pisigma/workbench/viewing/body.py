@@ -211,7 +211,7 @@ def _mesh_file(name: str, path: Path, inside: Path | None) -> Path:
     """Find the file of a mesh; `package://name/...` is searched for in the parent folders of the URDF file.
 
     Raises:
-        RobotError: there is no such file.
+        RobotError: the file does not exist.
     """
     kind, _, rest = name.rpartition("://")
     folders = path.resolve().parents

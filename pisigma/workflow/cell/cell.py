@@ -98,7 +98,7 @@ class Cell:
 
         Raises:
             OutputError: the folder exists and is not empty, or cannot be written.
-            RobotError: there is no such robot.
+            RobotError: the robot is unknown.
             PlanningError: a value is not valid.
         """
         NewCell(os.fspath(robot), sensor, limit_mm, base, tip, cameras).write(Path(folder))

@@ -273,7 +273,7 @@ class Sessions:
         """Return a session that is new to a model (see `new_to`) by its name; None: the newest.
 
         Raises:
-            MeasurementError: there is no such session with this name.
+            MeasurementError: there is no session with this name.
         """
         sessions = {one.name: one for one in self.new_to(model)}
         name = [*sessions][-1] if name is None else name

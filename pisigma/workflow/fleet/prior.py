@@ -76,7 +76,7 @@ def estimate_fleet_prior(
             refused[path.name] = str(problem)
     if len(rows) < MIN_ROBOTS and refused:
         raise FleetError(
-            f"expected {MIN_ROBOTS} robots or more, got {len(rows)} with rows; the first without: "
+            f"expected at least {MIN_ROBOTS} robots with usable rows, got {len(rows)}; the first refused cell: "
             f"{next(iter(refused.values()))}",
             value=len(rows),
         )

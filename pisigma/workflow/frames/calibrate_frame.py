@@ -71,7 +71,7 @@ def calibrate_frame(
         The robot or model with the calibrated frames; `save` writes it as a model folder.
 
     Raises:
-        RobotError: there is no such robot.
+        RobotError: the robot is unknown.
         ModelError: the folder is not that of a model, or a network of the model depends on base and tool.
         MeasurementError: the data cannot be read, or the model does not know a frame or target of the rows.
         IdentificationError: there are too few rows.

@@ -19,7 +19,7 @@ class ComparisonSettings:
     """Settings of the comparison of two models.
 
     Attributes:
-        frames: compare base and tool as they are, for models measured in the same frame with the same tool ("fixed").
+        frames: compare base and tool unchanged, for models measured in the same frame with the same tool ("fixed").
             Otherwise ("fitted"), base and tool of the second model are first fitted so that the arms agree best, and
             are compared separately.
         level: probability of calling any parameter different by chance.

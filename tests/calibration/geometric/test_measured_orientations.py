@@ -96,7 +96,7 @@ def test_the_factor_makes_lengths_move_by_as_much_as_expected() -> None:
     factor = angle_disagreement(problem.sensors, view, held, -held * off)[1]
     usual = torch.diag(problem.step_scale)
     (Q, R), (lengths, angles) = (
-        [getattr(sums, name) / view.noise[k] ** 2 for k, sums in enumerate(view.sums)]
+        [getattr(part, name) / view.noise[k] ** 2 for k, part in enumerate(view.contributions)]
         for name in ("normal", "descent")
     )
     A, a = Q + torch.diag(held), lengths - held * off

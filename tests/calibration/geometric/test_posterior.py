@@ -31,7 +31,7 @@ def test_all_parameters_and_correlations_are_listed(result: CalibrationResult) -
         posterior.covariance * unit * unit[:, None], covariance * unit * unit[:, None], atol=1e-9, rtol=0.0
     )
     assert_close(posterior.standard_errors, deviation, rtol=1e-9)
-    assert posterior.weights == 0
+    assert posterior.weight_count == 0
 
 
 def test_sensors_unknowns_are_among_them(result: CalibrationResult) -> None:

@@ -133,10 +133,10 @@ def test_pairs_in_any_order_and_many_rows_stay_together() -> None:
     tool = setup.problem.space.split(setup.start)[2][0].numpy()
     started = arm.nominal.with_geometry(tool=tool)
     for chosen in (problem, part):
-        sums = sensor_view_of(chosen.linearise(setup.start, None)).sums[0]
+        part = sensor_view_of(chosen.linearise(setup.start, None)).contributions[0]
         p = forward_kinematics(started, chosen.q)[:, :3, 3]
         expected = chosen.sensors[0].measured[::2] - (p[::2] - p[1::2]).norm(dim=-1)  # type: ignore[attr-defined]
-        assert_close(sums.residual[0, ::2], expected, atol=1e-12)
+        assert_close(part.residual[0, ::2], expected, atol=1e-12)
     result = calibrator.fit(mixed)
     assert_close(result.robot.dh, arm.geometric_robot.dh, atol=1e-7)
     assert np.isfinite(result.residuals["pair"]).sum() == 2200

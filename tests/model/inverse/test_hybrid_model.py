@@ -134,7 +134,7 @@ def test_a_folder_predicts_the_same_to_the_last_bit(hybrid, tmp_path):
         deviation_of_rows(loaded, arm.measurements), deviation_of_rows(model, arm.measurements)
     )
     posterior, kept = parameter_posterior(model), parameter_posterior(loaded)
-    assert (kept.names, kept.weights) == (posterior.names, posterior.weights)
+    assert (kept.names, kept.weight_count) == (posterior.names, posterior.weight_count)
     assert torch.equal(kept.mean, posterior.mean)
     assert torch.equal(kept.root, posterior.root)
     assert np.array_equal(loaded.robot.dh, model.robot.dh)

@@ -128,8 +128,8 @@ def misfitting_frames(
 def residual_sizes(problem: CalibrationProblem, here: Linearisation[Tensor]) -> Float64[Tensor, " rows"]:
     """Compute the length of every row's residual per component [m]; NaN if no length was measured."""
     sizes = problem.q.new_full((problem.rows,), torch.nan)
-    for sensor, sums in zip(problem.sensors, sensor_view_of(here).sums, strict=True):
+    for sensor, part in zip(problem.sensors, sensor_view_of(here).contributions, strict=True):
         if sensor.unit == "m" and not sensor.certain:
-            size = sums.residual.norm(dim=0) / sensor.components**0.5
+            size = part.residual.norm(dim=0) / sensor.components**0.5
             sizes = torch.where(sensor.present, size, sizes)
     return sizes

@@ -24,7 +24,7 @@ from pisigma.files.errors import IdentificationError, Place, nearest_choice
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.sensors.registry import SENSORS
 from pisigma.measurement.sensors.sensor import distinct_names, numbers_of
-from pisigma.measurement.sensors.socket import means_by_number
+from pisigma.measurement.sensors.socket import group_means
 from pisigma.robot.description import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.se3 import (
@@ -269,8 +269,8 @@ def tool_from_sockets(
     return ball
 
 
-def _centred(values: Tensor, number: Tensor) -> Tensor:
-    return values - means_by_number(values, number, int(number.max()) + 1)[number]
+def _centred(values: Tensor, group: Tensor) -> Tensor:
+    return values - group_means(values, group, int(group.max()) + 1)[group]
 
 
 def _check_frame_names(stated: Mapping[str, object], frames: tuple[str, ...], source: str) -> None:

@@ -28,7 +28,7 @@ MAX_DISAGREEMENT = 1e6
 
 
 @dataclass(frozen=True, eq=False)
-class SensorSums:
+class SensorContribution:
     """Contribution of a sensor to the normal equations at a point, before division by the variance of its noise.
 
     Attributes:
@@ -52,16 +52,16 @@ class SensorSums:
         return size / math.sqrt(max(self.measured, 1))
 
 
-def joined_sums(chunks: Sequence[SensorSums]) -> SensorSums:
+def joined_contributions(chunks: Sequence[SensorContribution]) -> SensorContribution:
     """Return the sum of the contributions of a sensor in successive chunks of rows."""
     first, *others = chunks
     if not others:
         return first
-    return SensorSums(
-        normal=torch.stack([sums.normal for sums in chunks]).sum(0),
-        descent=torch.stack([sums.descent for sums in chunks]).sum(0),
-        residual=torch.cat([sums.residual for sums in chunks], 1),
-        distance=torch.cat([sums.distance for sums in chunks]),
+    return SensorContribution(
+        normal=torch.stack([part.normal for part in chunks]).sum(0),
+        descent=torch.stack([part.descent for part in chunks]).sum(0),
+        residual=torch.cat([part.residual for part in chunks], 1),
+        distance=torch.cat([part.distance for part in chunks]),
         measured=first.measured,
     )
 
@@ -71,7 +71,7 @@ class SensorView:
     """Contributions of all sensors at a point, with their estimated noise.
 
     Attributes:
-        sums: contributions per sensor.
+        contributions: contributions per sensor.
         noise: standard deviation per sensor [m or rad], or a factor >= 1 on the standard deviations that the rows
             state.
         repetition: factor >= 1 on the variance per sensor, because repeats of a pose and several targets in it share
@@ -81,18 +81,18 @@ class SensorView:
         prior_scale: scale of the prior standard deviations, per group of parameters.
     """
 
-    sums: tuple[SensorSums, ...]
+    contributions: tuple[SensorContribution, ...]
     noise: Float64[Tensor, " sensors"]
     repetition: Float64[Tensor, " sensors"]
     disagreement: Float64[Tensor, " sensors"]
     prior_scale: Float64[Tensor, " groups"]
 
     @staticmethod
-    def without_noise(sums: tuple[SensorSums, ...]) -> "SensorView":
+    def without_noise(contributions: tuple[SensorContribution, ...]) -> "SensorView":
         """Return the contributions with standard deviations of 1 and the stated prior."""
-        ones = sums[0].normal.new_ones(max(len(sums), len(PriorGroup)))
-        sensors = ones[: len(sums)]
-        return SensorView(sums, sensors, sensors, sensors, ones[: len(PriorGroup)])
+        ones = contributions[0].normal.new_ones(max(len(contributions), len(PriorGroup)))
+        sensors = ones[: len(contributions)]
+        return SensorView(contributions, sensors, sensors, sensors, ones[: len(PriorGroup)])
 
     @cached_property
     def scales(self) -> Float64[Tensor, " sensors"]:
@@ -121,7 +121,7 @@ def parameters_used(
     view: SensorView, covariance: Float64[Tensor, "active active"]
 ) -> Float64[Tensor, " sensors"]:
     """Compute the effective number of parameters that are estimated from every sensor's values (Förstner 1979)."""
-    used = [(sums.normal * covariance).sum() for sums in view.sums]
+    used = [(part.normal * covariance).sum() for part in view.contributions]
     return torch.stack(used) / view.variances
 
 
@@ -146,8 +146,8 @@ def loss_scale(
         if sensor.certain:
             scales.append(torch.ones_like(used[k]))
             continue
-        distance = view.sums[k].distance
-        if view.sums[k].measured < len(distance):
+        distance = view.contributions[k].distance
+        if view.contributions[k].measured < len(distance):
             distance = distance[sensor.present]
         if refine:
             scale = loss.deviation(distance, sensor.components, used[k], view.scales[k])
@@ -159,10 +159,10 @@ def loss_scale(
 
 def rejects_rows(sensors: Sequence[AbstractSensor], losses: Sequence[AbstractLoss], view: SensorView) -> bool:
     """Return whether the loss gives any row the weight 0."""
-    of_each = zip(sensors, losses, view.sums, view.scales, strict=True)
+    of_each = zip(sensors, losses, view.contributions, view.scales, strict=True)
     return any(
-        bool((loss.weight(sums.distance / scale, sensor.components) == 0).any())
-        for sensor, loss, sums, scale in of_each
+        bool((loss.weight(part.distance / scale, sensor.components) == 0).any())
+        for sensor, loss, part, scale in of_each
     )
 
 
@@ -194,20 +194,20 @@ def group_variance_ratio(
         configuration: index of every row's joint values and frame; None if no configuration has several targets.
     """
     ratios = []
-    for k, (sensor, sums) in enumerate(zip(sensors, view.sums, strict=True)):
+    for k, (sensor, part) in enumerate(zip(sensors, view.contributions, strict=True)):
         ratio = torch.ones_like(used[k])
         ratios.append(ratio)
         if sensor.certain:
             continue
-        weight = loss.weight(sums.distance / view.scales[k], sensor.components) * sensor.present
+        weight = loss.weight(part.distance / view.scales[k], sensor.components) * sensor.present
         if sensor.sigma is not None:
             weight = torch.where(sensor.present, weight / sensor.sigma.square(), 0.0)
-        square, values = _group_squares(sums.residual, weight, pose)
+        square, values = _group_squares(part.residual, weight, pose)
         if pose is not None:
             left = (values - used[k]).clamp(min=1.0)
             ratio = (square / left / view.noise[k].square()).clamp(min=1.0)
         if configuration is not None:
-            shared, fewer = _group_squares(sums.residual, weight, configuration)
+            shared, fewer = _group_squares(part.residual, weight, configuration)
             larger = ((shared / fewer) / (square / values)).clamp(min=1.0)
             ratio = torch.where(square > 0, ratio * larger, ratio)
         ratios[-1] = ratio
@@ -241,8 +241,8 @@ def angle_disagreement(
     if not any(angular) or not any(lengths):
         return torch.ones_like(view.noise)
     variance = view.noise.square() * view.repetition
-    normals = [sums.normal / variance[k] for k, sums in enumerate(view.sums)]
-    descents = [sums.descent / variance[k] for k, sums in enumerate(view.sums)]
+    normals = [part.normal / variance[k] for k, part in enumerate(view.contributions)]
+    descents = [part.descent / variance[k] for k, part in enumerate(view.contributions)]
     zero = torch.zeros_like(normals[0]), torch.zeros_like(pull)
     by_lengths, by_angles = (
         (

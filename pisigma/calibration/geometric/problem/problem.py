@@ -14,11 +14,11 @@ from pisigma.calibration.geometric.problem.least_squares import (
     covariance_of,
 )
 from pisigma.calibration.geometric.problem.noise import (
-    SensorSums,
+    SensorContribution,
     SensorView,
     angle_disagreement,
     group_variance_ratio,
-    joined_sums,
+    joined_contributions,
     loss_scale,
     parameters_used,
     rejects_rows,
@@ -173,7 +173,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
 
     def rms(self, linearisation: Linearisation[Tensor]) -> Float64[Tensor, ""]:
         """Return the RMS residual length of the first sensor [m or rad]."""
-        return sensor_view_of(linearisation).sums[0].rms
+        return sensor_view_of(linearisation).contributions[0].rms
 
     def linearise(self, point: Tensor, like: Linearisation[Tensor] | None) -> Linearisation[Tensor]:
         """Sum the normal equations, with rows weighted by the noise of `like`, or equally if None."""
@@ -183,9 +183,9 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         for rows in self.chunks():
             motion = self.motion(point, rows, self.active)
             chunks.append([self._sums(k, before, motion, unknowns, rows) for k in range(len(self.sensors))])
-        sums = tuple(joined_sums(of_sensor) for of_sensor in zip(*chunks, strict=True))
-        view = SensorView.without_noise(sums) if before is None else replace(before, sums=sums)
-        return self.combine_sums(point, view)
+        parts = tuple(joined_contributions(of_sensor) for of_sensor in zip(*chunks, strict=True))
+        view = SensorView.without_noise(parts) if before is None else replace(before, contributions=parts)
+        return self.combine_contributions(point, view)
 
     def linearise_at_start(self, point: Tensor) -> Linearisation[Tensor]:
         """Linearise the problem at a start, with rows weighted by the noise estimated from them.
@@ -231,7 +231,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
             torch.cat([one.noise, one.repetition, one.disagreement, one.prior_scale])
             for one in (view, renewed)
         )
-        return self.combine_sums(linearisation.point, renewed), has_converged(
+        return self.combine_contributions(linearisation.point, renewed), has_converged(
             before, after, CONVERGENCE_TOLERANCE
         )
 
@@ -249,7 +249,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         scale = prior_scales(off, *prior, view.prior_scale, covariance, floor)
         if refine:
             return scale
-        normal, descent = self._data_sums(view)
+        normal, descent = self._data_equations(view)
         return converged_prior_scales(normal, descent + normal @ off, *prior, scale, floor)
 
     @cached_property
@@ -311,30 +311,30 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
                 J = J.index_add(0, positions, block.derivative[column] * theirs)
         return J
 
-    def combine_sums(self, point: Tensor, view: SensorView) -> Linearisation[Tensor]:
-        """Return the linearisation from the sensors' sums, divided by their variances, and the prior."""
+    def combine_contributions(self, point: Tensor, view: SensorView) -> Linearisation[Tensor]:
+        """Return the linearisation from the sensors' contributions, divided by their variances, and the prior."""
         off = self._off(point)
         precision = view.scaled_precision(self._prior, self.prior_group)
         pull = off * precision
-        normal, descent = self._data_sums(view)
+        normal, descent = self._data_equations(view)
         normal.diagonal().add_(precision)
         descent.sub_(pull)
         costs = [
-            self.loss_for_sensor(sensor).cost(sums.distance / view.scales[k], sensor.components).sum()
-            for k, (sensor, sums) in enumerate(zip(self.sensors, view.sums, strict=True))
+            self.loss_for_sensor(sensor).cost(part.distance / view.scales[k], sensor.components).sum()
+            for k, (sensor, part) in enumerate(zip(self.sensors, view.contributions, strict=True))
         ]
         misfit = (torch.stack(costs) * view.scales.square() / view.variances).sum()
         rounding = (self._rounding / view.variances).sum()
         cost = misfit + (off * pull).sum()
         return Linearisation(point, cost, descent, normal, misfit, rounding, view)
 
-    def _data_sums(
+    def _data_equations(
         self, view: SensorView
     ) -> tuple[Float64[Tensor, "active active"], Float64[Tensor, " active"]]:
-        """Return the total of the sensors' sums, divided by their variances, without the prior."""
+        """Return the total of the sensors' contributions, divided by their variances, without the prior."""
         terms = [
-            (sums.normal / variance, sums.descent / variance)
-            for sums, variance in zip(view.sums, view.variances, strict=True)
+            (part.normal / variance, part.descent / variance)
+            for part, variance in zip(view.contributions, view.variances, strict=True)
         ]
         normal, descent = terms[0]
         for more_normal, more_descent in terms[1:]:
@@ -369,8 +369,8 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
 
     def _sums(
         self, number: int, view: SensorView | None, motion: ToolMotion, unknowns: Unknowns, rows: slice
-    ) -> SensorSums:
-        """Compute the sums of a sensor over rows, weighted by its noise, or equally if `view` is None."""
+    ) -> SensorContribution:
+        """Compute the contribution of a sensor in rows, weighted by its noise, or equally if `view` is None."""
         sensor, everywhere = self.sensors[number], self.measured_in_every_row[number]
         residual = sensor.residual(motion, unknowns, rows)
         if not everywhere:
@@ -395,4 +395,4 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         torch.mul(residual, root, out=A[-1])
         A = A.flatten(1)
         sums, measured = A @ A.mT, self.values_measured[number] // sensor.components
-        return SensorSums(sums[:-1, :-1], sums[:-1, -1], residual, distance, measured)
+        return SensorContribution(sums[:-1, :-1], sums[:-1, -1], residual, distance, measured)

@@ -253,7 +253,7 @@ def _among(kept: Mapping[tuple[int, int], Target], target: Target | None) -> Tar
 
 
 def mask_comments(text: str, hidden: re.Pattern[str]) -> str:
-    """Replace comments and strings by blanks, so that all positions are preserved."""
+    """Replace comments and strings by spaces, so that all positions are preserved."""
     return hidden.sub(lambda match: re.sub(r"[^\n]", " ", match[0]), text)
 
 
