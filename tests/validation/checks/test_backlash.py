@@ -88,7 +88,7 @@ def test_a_joint_keeps_its_side_until_it_moves_and_files_are_apart():
 def test_the_predicted_accuracy_contains_the_play_if_no_side_is_stated():
     robot, rows, _ = with_backlash("scara", 3)
     result = HybridCalibrator(robot, features=("backlash",), products=False).fit(sided(rows))
-    model = with_hybrid(model_of_calibration("scara", robot, result.geometric, rows), result)
+    model = with_hybrid(model_of_calibration("scara", robot, result.geometric, rows), result, sided(rows))
     stated = deviation_of_rows(model, sided(rows).select(torch.arange(20, 60)))
     unstated = deviation_of_rows(model, rows.select(torch.arange(20, 60)))
     halves = result.learned.correction.linear[0][:, 0].detach()
