@@ -60,7 +60,7 @@ AcceptImplausible = Annotated[
     bool,
     typer.Option(
         "--accept-implausible",
-        help="Write the model even if the result must not be trusted.",
+        help="Write the model even if the result is implausible.",
     ),
 ]
 """Option `--accept-implausible` of commands that check a model before they write it."""

@@ -41,15 +41,15 @@ RobotName = Annotated[
     ),
 ]
 Data = Annotated[
-    list[Path] | None, typer.Argument(metavar="DATA...", help="Measurements (CSV), one or more files.")
+    list[Path] | None, typer.Argument(metavar="DATA...", help="One or more measurement files (CSV).")
 ]
 Out = Annotated[Path | None, typer.Option(help="Model folder to write.")]
-Base = Annotated[str | None, typer.Option(help="Base link of a URDF file. [default: its root]")]
-Tip = Annotated[str | None, typer.Option(help="Tool link of a URDF file. [default: its only leaf]")]
+Base = Annotated[str | None, typer.Option(help="Base link of a URDF file. [default: root link]")]
+Tip = Annotated[str | None, typer.Option(help="Tool link of a URDF file. [default: only leaf link]")]
 Prior = Annotated[
     Path | None,
     typer.Option(
-        help="Start from this model folder of `pisigma fleet prior` if it predicts held-out rows better.",
+        help="Model folder of `pisigma fleet prior` to start from if this prior predicts held-out rows better.",
         autocompletion=complete_model,
     ),
 ]
@@ -58,7 +58,9 @@ FrameChoice = Literal["tool", "base", "hand-eye"]
 
 Only = Annotated[
     FrameChoice | None,
-    typer.Option(metavar="FRAME", help="Fit only tool, base or hand-eye; ROBOT may be a model."),
+    typer.Option(
+        metavar="FRAME", help="Fit only the tool, base or hand-eye transform; ROBOT may be a model."
+    ),
 ]
 ARM_AS_GIVEN = "with --only, the arm is used as given and no row is held out"
 

@@ -163,7 +163,7 @@ def print_next(status: "CellStatus") -> None:
 
 def use(
     cell: CellFolder,
-    model: Annotated[str | None, typer.Argument(help="Name of the model, unless --undo.")] = None,
+    model: Annotated[str | None, typer.Argument(help="Name of the model; not with --undo.")] = None,
     undo: Annotated[bool, typer.Option("--undo", help="Put the previous model back into use.")] = False,
     reason: Reason = "",
     as_json: AsJson = False,
@@ -187,7 +187,7 @@ def use(
 def session(
     cell: CellFolder,
     name: Annotated[str, typer.Argument(help="Name of the session.")],
-    set_aside: Annotated[str, typer.Option(help="Exclude the session from further use, for this reason.")],
+    set_aside: Annotated[str, typer.Option(help="Reason for excluding the session from further use.")],
     as_json: AsJson = False,
 ) -> None:
     """Set a session of a cell aside; its file is kept."""
@@ -219,8 +219,7 @@ def event(
     export: Annotated[
         Path | None,
         typer.Option(
-            help="With controller, file of `pisigma export CELL` that is active on the controller from that day on, "
-            "or none."
+            help="With controller, file of `pisigma export CELL` that the controller uses from this day, or none."
         ),
     ] = None,
     as_json: AsJson = False,

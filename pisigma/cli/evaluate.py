@@ -20,8 +20,8 @@ Paths = Annotated[
     list[str],
     typer.Argument(
         metavar="MODEL... DATA|CELL",
-        help="Model folders, 'nominal' (base and tool fitted) or 'geometric' (without the joint correction), and last "
-        "the measurements (CSV) in the models' frames; or a cell.",
+        help="Model folders, 'nominal' (base and tool fitted) or 'geometric' (without the joint correction), followed "
+        "by the measurements (CSV) in the frames of the models; or a cell.",
     ),
 ]
 Hashes = Annotated[

@@ -33,16 +33,16 @@ Form = Annotated[
 Like = Annotated[
     Path | None,
     typer.Option(
-        help="File to update: a URDF file for urdf, mjcf and xacro (default: that of the robot), a drawn MJCF model "
+        help="File to update: a URDF file for urdf, mjcf and xacro (default: file of the robot), a drawn MJCF model "
         "for mjcf, the controller's file for ur-calibration and staubli."
     ),
 ]
-Tip = Annotated[str | None, typer.Option(help="With --like, tool link with which the robot was loaded.")]
+Tip = Annotated[str | None, typer.Option(help="With --like, tool link that was used to load the robot.")]
 Geometry = Annotated[
     str | None,
     typer.Option(
-        help="With urdf, mjcf and dh, geometry to write: that of the geometric fit (geometric, default), or the one "
-        "fitted together with the joint correction of --format onnx (hybrid)."
+        help="With urdf, mjcf and dh, geometry to write: geometric (from the geometric calibration, default) or hybrid "
+        "(fitted together with the joint correction, for use with --format onnx)."
     ),
 ]
 Poses = Annotated[
@@ -89,14 +89,15 @@ CountsPerTurn = Annotated[
     ),
 ]
 PresentCounts = Annotated[
-    str | None, typer.Option(help="With epson and fanuc-mastering, present counts of the controller.")
+    str | None,
+    typer.Option(help="With epson and fanuc-mastering, counts that the controller uses at present."),
 ]
 
 Address = Annotated[
     str | None,
     typer.Option(
         metavar="IP:PORT",
-        help="With rsi, address at which this computer receives, such as 192.168.1.10:49152.",
+        help="With rsi, address at which this computer receives packets, such as 192.168.1.10:49152.",
     ),
 ]
 

@@ -17,9 +17,9 @@ if TYPE_CHECKING:
     from pisigma.workflow.cell.incoming_rows import IncomingRows
     from pisigma.workflow.import_rows import ImportProposal
 
-Files = Annotated[list[Path], typer.Argument(help="Exports (tables as text), or a LeRobot data set.")]
+Files = Annotated[list[Path], typer.Argument(help="Exported text tables, or a LeRobot data set.")]
 Yes = Annotated[bool, typer.Option("--yes", "-y", help="Accept the proposed mapping without asking.")]
-SaveMap = Annotated[Path | None, typer.Option(help="Write the mapping to this file, for --map.")]
+SaveMap = Annotated[Path | None, typer.Option(help="File to write the mapping to, for use with --map.")]
 
 
 @takes_settings
@@ -30,10 +30,12 @@ def import_(
     cell: Annotated[Path | None, typer.Option(help="Cell to which the rows are added as a session.")] = None,
     date: Annotated[
         str,
-        typer.Option(help="Day of the session. [default: from the column date or the file name, else today]"),
+        typer.Option(
+            help="Day of the session. [default: from the date column or the file name, otherwise today]"
+        ),
     ] = "",
     accept_implausible: Annotated[
-        bool, typer.Option("--accept-implausible", help="Add rows even if they must not be trusted.")
+        bool, typer.Option("--accept-implausible", help="Add the rows even if they are implausible.")
     ] = False,
     yes: Yes = False,
     save_map: SaveMap = None,

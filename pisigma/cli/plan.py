@@ -25,7 +25,9 @@ Subject = Annotated[
         autocompletion=complete_robot,
     ),
 ]
-Out = Annotated[Path | None, typer.Option(help="CSV file of poses to write, with a .plan.yaml next to it.")]
+Out = Annotated[
+    Path | None, typer.Option(help="CSV file of poses to write, together with a .plan.yaml file.")
+]
 SurroundingsFile = Annotated[
     Path | None,
     typer.Option("--surroundings", help="Obstacles around the robot and limits of its motion (YAML)."),

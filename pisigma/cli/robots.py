@@ -41,8 +41,8 @@ MaxChange = Annotated[
 Check = Annotated[
     str | None,
     typer.Option(
-        help="Print the tool of a robot (name, YAML or URDF) with all axes at 0 and each at 90 deg, to compare with "
-        "the teach pendant.",
+        help="Print the tool pose of a robot (name, YAML or URDF) with all axes at 0 and with each at 90 deg, for "
+        "comparison with the teach pendant.",
         autocompletion=complete_robot,
     ),
 ]

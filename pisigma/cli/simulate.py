@@ -27,7 +27,8 @@ def simulate(
     at: Annotated[
         Path | None,
         typer.Option(
-            help="CSV file of joint values to measure at, or a cell with its newest plan. [default: the recipe's]"
+            help="CSV file of joint values to measure at, or a cell, whose newest plan is used. [default: as in the "
+            "recipe]"
         ),
     ] = None,
     as_json: AsJson = False,

@@ -31,7 +31,10 @@ Data = Annotated[
     ),
 ]
 OfModel = Annotated[
-    str | None, typer.Option("--model", help="Name of a model of the cell. [default: in use, else newest]")
+    str | None,
+    typer.Option(
+        "--model", help="Name of a model of the cell. [default: the model in use, otherwise the newest]"
+    ),
 ]
 
 

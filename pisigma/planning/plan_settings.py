@@ -95,13 +95,13 @@ class PlanSettings:
         criterion: optimality criterion: I (uncertainty of the tool's position over the task) or D (uncertainty of all
             unknowns).
         limit_mm: limit of the 95 % quantile of the tool's position errors over the task [mm], as in `measure`. The plan
-            then states how many poses this takes.
+            then states the number of poses needed.
         candidates: number of random candidate poses to choose from.
         candidates_from: CSV file of candidate joint values to choose from, instead of random ones.
-        box_mm: box of the reflector's positions, lowest and then highest x, y, z in the robot's base frame [mm].
-        task: CSV file of joint values or tool poses where the robot has to be accurate. Poses are those of the tool of
-            the nominal robot or of the model. None: the whole workspace.
-        measured: measurements that already exist (CSV).
+        box_mm: box of reflector positions, smallest and then largest x, y, z in the robot's base frame [mm].
+        task: CSV file of joint values or tool poses where the robot has to be accurate. Poses refer to the tool of the
+            nominal robot or of the model. None: the whole workspace.
+        measured: existing measurements (CSV).
         seed: random seed.
         speed_deg_s: joint speed between the poses [deg/s].
         settling_s: time to wait at every pose before it is measured [s].

@@ -26,9 +26,7 @@ def new(
         ),
     ] = "",
     *,
-    out: Annotated[
-        Path, typer.Option(help="Folder to write: the cell, or with a manifest the folder of cells.")
-    ],
+    out: Annotated[Path, typer.Option(help="Cell to write; with a manifest, folder of cells to write.")],
     source: Annotated[
         Path | None,
         typer.Option(
@@ -44,9 +42,7 @@ def new(
     limit_mm: Annotated[
         float | None, typer.Option(help="Limit of the 95 % quantile of the position errors [mm].")
     ] = None,
-    base: Annotated[
-        str | None, typer.Option(help="Base link of a URDF file; poses are in its frame.")
-    ] = None,
+    base: Annotated[str | None, typer.Option(help="Base link of a URDF file, to which poses refer.")] = None,
     tip: Annotated[str | None, typer.Option(help="Tool link of a URDF file.")] = None,
     camera: Annotated[list[Path] | None, typer.Option(help="Camera file (YAML); may be repeated.")] = None,
     board: Annotated[list[Path] | None, typer.Option(help="Board file (YAML); may be repeated.")] = None,

@@ -23,7 +23,7 @@ Images = Annotated[list[Path], typer.Argument(help="Image files of one camera, o
 def camera(
     images: Images,
     board: BoardFile,
-    out: Annotated[Path, typer.Option(help="File of the camera to write (.yaml).")],
+    out: Annotated[Path, typer.Option(help="Camera file to write (.yaml).")],
     settings: IntrinsicsSettings,
     page: Page = None,
     verbose: Verbose = False,

@@ -17,17 +17,17 @@ if TYPE_CHECKING:
     from pisigma.workflow.images.detect import DetectedCorners
 
 Images = Annotated[list[Path] | None, typer.Argument(help="Image files, or folders of them.")]
-BoardFile = Annotated[Path, typer.Option(help="Board (YAML) that the images show.")]
-CameraFile = Annotated[Path | None, typer.Option(help="Camera (YAML) that took the images.")]
-Out = Annotated[Path | None, typer.Option(help="File of corners to write (.csv).")]
+BoardFile = Annotated[Path, typer.Option(help="File of the board in the images (YAML).")]
+CameraFile = Annotated[Path | None, typer.Option(help="File of the camera that took the images (YAML).")]
+Out = Annotated[Path | None, typer.Option(help="Corner file to write (.csv).")]
 Print = Annotated[
     Path | None,
-    typer.Option("--print", help="Only draw the board at its true size, to be printed (.pdf)."),
+    typer.Option("--print", help="Only write a page for printing the board at true size (.pdf)."),
 ]
 Joints = Annotated[
     Path | None,
     typer.Option(
-        help="Joint values (CSV) with a column 'image', or 'time' if images are named by their time."
+        help="Joint values (CSV) with a column 'image', or 'time' if images are named by time stamps."
     ),
 ]
 

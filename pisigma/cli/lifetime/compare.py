@@ -31,15 +31,17 @@ Second = Annotated[
     str | None,
     typer.Argument(
         metavar="B",
-        help="Second model, B. [default: for a cell, the model in use, compared with its predecessor as A]",
+        help="Second model, B. [default: for a cell, the model in use, with the preceding model as A]",
         autocompletion=complete_model,
     ),
 ]
-Rows = Annotated[Path | None, typer.Option(help="Measurements (CSV) that both models predict.")]
+Rows = Annotated[
+    Path | None, typer.Option(help="Measurements (CSV) with which to compare the predictions of both models.")
+]
 Program = Annotated[
     Path | None,
     typer.Option(
-        help="Joint values or poses (CSV) of a program taught with A; its pose errors under B are computed."
+        help="Joint values or poses (CSV) of a program taught with A, to compute its pose errors under B."
     ),
 ]
 Page = Annotated[Path | None, typer.Option(help="HTML page to write, with a map of the workspace.")]

@@ -27,7 +27,7 @@ Data = Annotated[
         help="New measurements (CSV) of ten poses or more. [default: newest session of a cell]",
     ),
 ]
-Out = Annotated[Path | None, typer.Option(help="Model folder to write, unless --dry-run.")]
+Out = Annotated[Path | None, typer.Option(help="Model folder to write; not with --dry-run.")]
 DryRun = Annotated[
     bool, typer.Option("--dry-run", help="Report which model would be kept, without writing it.")
 ]

@@ -32,23 +32,25 @@ PlanFile = Annotated[
     Path,
     typer.Argument(
         metavar="PLAN|CELL",
-        help="Plan of `pisigma plan` (CSV, or the YAML next to it), or a cell with its newest plan.",
+        help="Plan of `pisigma plan` (.csv or .plan.yaml), or a cell, whose newest plan is used.",
     ),
 ]
-RowsFile = Annotated[Path, typer.Option("--rows", help="Measurements (CSV) that grow row by row.")]
+RowsFile = Annotated[
+    Path, typer.Option("--rows", help="Measurement file (CSV) to which rows are added during the session.")
+]
 Programs = Annotated[
     list[Path] | None,
     typer.Option(
         "--program",
-        help="Robot program to rewrite whenever the remaining poses are planned again.",
+        help="Robot program to rewrite whenever the remaining poses are replanned.",
     ),
 ]
 RestFile = Annotated[
     Path | None,
     typer.Option("--rest", help="CSV file of the remaining poses. [default: PLAN.rest.csv next to the plan]"),
 ]
-Once = Annotated[bool, typer.Option("--once", help="Evaluate the present rows and exit.")]
-View = Annotated[bool, typer.Option("--view", help="Also show robot, rows and errors in the browser.")]
+Once = Annotated[bool, typer.Option("--once", help="Evaluate the existing rows and exit.")]
+View = Annotated[bool, typer.Option("--view", help="Also show robot, rows and errors in a browser.")]
 
 
 @dataclass(frozen=True)
@@ -56,8 +58,8 @@ class PageOptions:
     """Display of a session in the browser.
 
     Attributes:
-        host: address to serve the page at (0.0.0.0: also for other machines).
-        port: port of the page, or the next free one.
+        host: address at which to serve the page (0.0.0.0: also for other machines).
+        port: port of the page; the next free port is used if it is occupied.
         urdf: URDF file whose meshes the page shows instead of capsules.
     """
 

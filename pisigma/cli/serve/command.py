@@ -21,7 +21,9 @@ Model = Annotated[
 ]
 Pin = Annotated[
     bool,
-    typer.Option("--pin", help="Keep serving the model in use at the start, even if the cell changes it."),
+    typer.Option(
+        "--pin", help="Keep serving the model in use at the start, even if another is put into use."
+    ),
 ]
 Models = Annotated[Path | None, typer.Option("--models", help="Folder of model folders to serve by name.")]
 

@@ -23,8 +23,9 @@ class PageAddress:
     """Address at which the page of a cell is served.
 
     Attributes:
-        host: address to serve the page at; an address of this machine or 0.0.0.0 opens it to other machines.
-        port: port of the page, or the next free one.
+        host: address at which to serve the page; 0.0.0.0 or an address of this machine in the network makes the page
+            accessible to other machines.
+        port: port of the page; the next free port is used if it is occupied.
     """
 
     host: str = "127.0.0.1"
@@ -37,9 +38,9 @@ def open_(
     address: PageAddress,
     rows: Annotated[
         Path | None,
-        typer.Option("--rows", help="Measurements (CSV) that grow row by row, to follow on the page."),
+        typer.Option("--rows", help="Measurement file (CSV) whose new rows appear on the page."),
     ] = None,
-    no_browser: Annotated[bool, typer.Option("--no-browser", help="Print the link only.")] = False,
+    no_browser: Annotated[bool, typer.Option("--no-browser", help="Only print the link.")] = False,
     as_json: AsJson = False,
 ) -> None:
     """Open a cell as a page in the browser, until Ctrl-C; in an empty or new folder, the page creates the cell.

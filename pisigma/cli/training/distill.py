@@ -29,8 +29,8 @@ Out = Annotated[Path | None, typer.Option(help="Model folder to write. [default:
 RegionMm = Annotated[
     Box | None,
     typer.Option(
-        help="Region of the tool in the base frame, X_MIN X_MAX Y_MIN Y_MAX Z_MIN Z_MAX [mm]. [default: where the "
-        "model was measured]"
+        help="Region of the tool in the base frame, X_MIN X_MAX Y_MIN Y_MAX Z_MIN Z_MAX [mm]. [default: region of "
+        "the measurements of the model]"
     ),
 ]
 Joints = Annotated[
@@ -39,13 +39,11 @@ Joints = Annotated[
 ]
 Orders = Annotated[
     str | None,
-    typer.Option(help="Orders of the product units, such as 1,2,3. [default: the best of several]"),
+    typer.Option(help="Orders of the product units, such as 1,2,3. [default: best of several]"),
 ]
 Harmonics = Annotated[
     int | None,
-    typer.Option(
-        help="With --orders, number of harmonics of every joint value that are inputs. [default: 1]"
-    ),
+    typer.Option(help="With --orders, number of harmonics of every joint value used as inputs. [default: 1]"),
 ]
 
 

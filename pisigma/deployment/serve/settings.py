@@ -49,15 +49,15 @@ class ServeSettings:
         host: address to listen on. Addresses other than those of this machine need a token.
         json_port: port for lines of JSON (0: any free port).
         binary_port: port for binary frames (0: any free port).
-        zmq_port: port for ZeroMQ (0: any free port). Needs the extra serve. None: no ZeroMQ.
-        opcua: also serve over OPC UA. Needs the extra opcua.
+        zmq_port: port for ZeroMQ (0: any free port). Requires the extra serve. None: no ZeroMQ.
+        opcua: also serve over OPC UA. Requires the extra opcua.
         opcua_port: port for OPC UA (0: any free port).
-        opcua_certificates: folder of the certificate for OPC UA, which is made if it is missing, and of the
-            certificates of clients in its folder `trusted`. Needed if other machines can reach the server.
-        token: token that every client has to send first; on a command line, a file that contains it.
+        opcua_certificates: folder of the certificate for OPC UA, which is created if it is missing, and of the
+            certificates of clients in the subfolder `trusted`. Required if other machines can reach the server.
+        token: token that every client has to send first; on a command line, a file that contains the token.
         client_timeout: see `CLIENT_TIMEOUT`.
-        rsi: answer a KUKA controller over RSI, and nothing else; file of `pisigma export --format rsi`.
-        rsi_max_correction: largest correction of a joint over RSI [rad]; a larger one ends the stream.
+        rsi: file of `pisigma export --format rsi`, to serve only a KUKA controller over RSI.
+        rsi_max_correction: largest correction of a joint over RSI [rad]; a larger correction ends the stream.
         polling: time to busy-poll for the next request [s] (0: sleep at once). The server polls only if requests
             arrive at least that often and no other program needs the processor.
     """

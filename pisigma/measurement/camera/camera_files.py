@@ -47,8 +47,8 @@ class CameraFiles:
         is_fixed: state that all cameras are fixed and the boards are on the flange (default: the opposite). If only
             some are fixed, state is_fixed in their files instead.
         repeatability: repeatability of the robot.
-        intrinsics: treatment of the cameras' intrinsics: fixed (as in their files), prior (within their standard
-            deviations) or free. Where a file states no standard deviations, those of a typical calibration are used.
+        intrinsics: treatment of the cameras' intrinsics: fixed (as in the camera files), prior (within the stated
+            standard deviations) or free. If none are stated, those of a typical calibration are used.
 
     Raises:
         MeasurementError: no camera or no board is given.

@@ -111,7 +111,7 @@ class CalibrationSettings:
         robust: down-weight outliers.
         features: features of the joint correction to try, such as gravity,lines,series. None: all that apply.
         gravity: direction of gravity in the robot's base frame, such as 0,0,-1. None: found from the data.
-        new_frame_at: first line measured after the instrument was moved. From there, rows are in a new frame.
+        new_frame_at: first line measured after the instrument was moved. From this line, rows are in a new frame.
         socket_distances: known distance between two sockets [m], such as */0,*/1,50. An asterisk stands for the same
             text in both names, here for every placement.
         cameras: cameras and boards, for files of detected board corners.

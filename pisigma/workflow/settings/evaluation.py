@@ -94,8 +94,9 @@ class EvaluationSettings:
 
     Attributes:
         limits: limits of acceptance of every model, except the references.
-        fit_frame: fit the sensor's frame to these rows, because the sensor was moved. Needs 6 poses or more.
-        fit_tool: fit the reflector's position to these rows, because it was replaced. Needs 6 poses or more.
+        fit_frame: fit the frame of the sensor to these rows, for example after it was moved. Requires 6 poses or more.
+        fit_tool: fit the position of the reflector to these rows, for example after it was replaced. Requires 6 poses
+            or more.
         bootstrap: how confidence intervals are computed.
         cameras: cameras and boards, for files of detected board corners.
         socket_distances: known distance between two sockets [m], such as */0,*/1,50. An asterisk stands for the same

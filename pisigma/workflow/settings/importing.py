@@ -40,7 +40,7 @@ class ImportSettings:
             named by heading or by number (from 1). Meanings are a column of measurement files (q1_deg), its quantity in
             another unit (x_in) or in the unit stated in the file (x), a value of a rotation (ur_rx_rad), point, time,
             or - for a column to skip. A - before a meaning reverses the sign (-q4_deg), a ! after it overrules the unit
-            stated in the file (x_in!). If several mappings are given, each file uses the one that fits it.
+            stated in the file (x_in!). If several mappings are given, the one that fits is used for each file.
         units: units of the columns for which the file states none, such as mm,deg or m,rad.
         rotation: maker whose rotation convention applies, such as kuka or ur, or none to skip rotations. None: from the
             headings.
@@ -48,7 +48,7 @@ class ImportSettings:
         join: how to join joint values of one file with measurements of another: by point, order or time. None:
             the files are concatenated.
         within: maximum difference between joined time stamps [s].
-        new_frame_at: first line measured after the instrument was moved. From there, rows are in a new frame.
+        new_frame_at: first line measured after the instrument was moved. From this line, rows are in a new frame.
         lerobot_units: units of the joint values of a LeRobot data set, degrees or normalized (-100 to 100).
         lerobot_calibration: calibration file of LeRobot with which normalized values were recorded.
 

@@ -16,8 +16,8 @@ class MonitorSettings:
     """Settings of the monitoring of a robot.
 
     Attributes:
-        dates: date of each file, such as 2026-10-01,2026-11-01. None: the column date, else the file name, else its
-            modification time.
+        dates: date of each file, such as 2026-10-01,2026-11-01. None: from the date column, otherwise from the
+            file name, otherwise from the modification time.
         moved: what was moved after the model was made: base, tool or base,tool (empty: neither). None: detected from
             the rows.
         limit_mm: limit of the RMS error [mm]; the date of crossing it is predicted.

@@ -1,4 +1,4 @@
-"""Settings of how a training is run; they do not change what it computes."""
+"""Settings for running a training; they do not change the result."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +10,7 @@ from pisigma.files.setting import HIDDEN
 
 @dataclass(frozen=True)
 class TrainSettings:
-    """Settings of how a training is run; they do not change what it computes.
+    """Settings for running a training; they do not change the result.
 
     Attributes:
         checkpoints: folder for checkpoints of networks, and of a hybrid on mini-batches. It is kept after the training.

@@ -16,8 +16,9 @@ class VerificationSettings:
     """Settings of a verification.
 
     Attributes:
-        fit_frame: fit the sensor's frame to these rows, because the sensor was moved. Needs 6 poses or more.
-        fit_tool: fit the reflector's position to these rows, because it was replaced. Needs 6 poses or more.
+        fit_frame: fit the frame of the sensor to these rows, for example after it was moved. Requires 6 poses or more.
+        fit_tool: fit the position of the reflector to these rows, for example after it was replaced. Requires 6 poses
+            or more.
         seed: random seed of the resamples for confidence intervals.
         cameras: cameras and boards, for files of detected board corners.
         socket_distances: known distance between two sockets [m], such as */0,*/1,50. An asterisk stands for the same
