@@ -21,7 +21,7 @@ Figure = Float[Tensor, ""] | float
 
 
 class AbstractLoss(ABC):
-    """Cost of a row as a function of its distance in standard deviations; `components` is its number of values."""
+    """Cost of a row as a function of its distance in standard deviations; `components` is the number of values."""
 
     @abstractmethod
     def cost(self, distance: Float[Tensor, " rows"], components: int) -> Float[Tensor, " rows"]:

@@ -63,7 +63,7 @@ class ConditionFeatures(AbstractFeature):
         """Create the feature for the given conditions.
 
         Raises:
-            ValueError: there is no condition, one does not vary, or its mean is outside its measured values.
+            ValueError: there is no condition, one does not vary, or a mean is outside the measured values.
         """
         super().__init__(robot)
         if not names or not len(names) == len(mean) == len(spread) or min(spread) <= 0:

@@ -221,7 +221,7 @@ def _fit(summary: CalibrationSummary) -> Iterator[Block]:
 
 
 def _parameters(summary: CalibrationSummary) -> Iterator[Block]:
-    """Return all parameters, and which of them the data cannot determine, as text."""
+    """Yield a table of all parameters, and the parameters that the data cannot determine."""
     yield table_block(
         "parameters", *parameter_table(summary.parameters), f"{len(summary.parameters)} parameters"
     )

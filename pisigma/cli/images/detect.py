@@ -47,7 +47,7 @@ def detect(
 ) -> None:
     """Detect the corners of a board in images, to a fraction of a pixel.
 
-    Excludes images without a whole board and blurred images, and names them.
+    Excludes blurred images and images without a complete board, and prints their names.
     """
     if sheet is not None:
         _print_board(board, sheet, as_json)

@@ -196,7 +196,7 @@ class _Robot:
 
     @staticmethod
     async def add(server: "asyncua.Server", index: int, name: str, call: Any, dof: int) -> "_Robot":
-        """Add the object of a model with `dof` joints to the address space; its NodeIds begin with its name."""
+        """Add the object of a model with `dof` joints to the address space; NodeIds begin with the model's name."""
         from asyncua import ua
 
         owner = await server.nodes.objects.add_object(ua.NodeId(name, index), ua.QualifiedName(name, index))

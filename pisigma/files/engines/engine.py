@@ -26,7 +26,7 @@ class AbstractEngine(ABC):
     def _chunks(
         self, work: Callable[[Item], Result], chunks: Sequence[Sequence[Item]]
     ) -> Iterator[tuple[Sequence[Item], list[Result] | None]]:
-        """Yield every chunk with its results as they finish; None instead of results if its worker died."""
+        """Yield every finished chunk with its results, or with None instead of results if the worker died."""
 
     def results(
         self, work: Callable[[Item], Result], items: Sequence[Item], chunk: int

@@ -303,7 +303,7 @@ class Database:
             raise OutputError(
                 f"the history cannot be used: {problem}",
                 at=Place(self.path),
-                remedy="check that it is an SQLite file, and that its folder is writable and its disk not full",
+                remedy="check that it is an SQLite file, that the folder is writable, and that the disk is not full",
             ) from None
 
     def _upgrade(self, database: sqlite3.Connection) -> None:

@@ -1,4 +1,4 @@
-"""Read the facts about a cell from its folder, without its robot: the status of many cells is read quickly."""
+"""Read the facts about a cell without reading its robot, so that the status of many cells is read quickly."""
 
 import datetime
 import hashlib

@@ -114,7 +114,7 @@ def _sound_rows(table: Table, layout: Layout, robot: Robot | None) -> MeasuredFi
                 expected=f"no torques for robot '{robot.name}', whose joints are coupled",
                 value="tau_1, ...",
                 at=Place(table.source),
-                remedy="remove these columns: torques of its axes are not those of its joints",
+                remedy="remove these columns: the torques of the axes are not those of the joints",
             )
         if "approach" in numbers:
             numbers["approach"] = robot.coupling.approach_to_dh(numbers["approach"])

@@ -185,7 +185,7 @@ def scale_deviations(measurements: Measurements) -> Float64[Tensor, " boards"]:
 
 @dataclass(frozen=True, eq=False)
 class IntrinsicsSensor(AbstractSensor):
-    """Information of all images of a camera and of its prior on its intrinsics, as the value of one row.
+    """Information of all images of a camera and of the prior on the intrinsics, as the value of one row.
 
     The poses of the boards are eliminated from the images (variable projection, Golub and Pereyra 1973); the remaining
     information is summed over the images and the prior. Values are the noise of one corner, as a length at the board,

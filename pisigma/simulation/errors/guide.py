@@ -43,9 +43,9 @@ class GuideWave(Section):
 class Guide(AbstractJointSource):
     """Straightness and angular errors of a rail along its travel, as errors of the joints after the rail.
 
-    `e_j = Σ A · sin(harmonic · pi · q / travel + phase)` with q the controller's value of the axis and its travel
-    between its limits. In the robot's file, the joints with errors follow the rail and are coupled to it with the
-    factor 0.
+    `e_j = Σ A · sin(harmonic · pi · q / travel + phase)` with the controller's value q of the axis and the
+    travel between the limits of the axis. In the robot's file, the joints with errors follow the rail and are coupled
+    to it with the factor 0.
 
     Source: error motions of a linear axis of ISO 230-1:2012, 3.4 (straightness and angular error motions).
 

@@ -242,7 +242,7 @@ def _from_socket(rows: Measurements, ball: Float64[Tensor, "rows 3"]) -> Float64
 def _means_by_name(
     values: Float64[Tensor, "rows 3"], names: Sequence[Hashable]
 ) -> tuple[Float64[Tensor, "rows 3"], Float64[Tensor, " rows"]]:
-    """Compute for every row the mean of the values of its name, and how many rows have this name."""
+    """Compute for every row the mean of the values of all rows with the same name, and the number of these rows."""
     number = numbers_of_names(names)
     counts = torch.bincount(number).double()
     sums = torch.zeros(len(counts), 3, dtype=torch.float64).index_add_(0, number, values)

@@ -47,7 +47,7 @@ _MODIFIED = re.compile(r"\b(Offset|Tool_Offset|INC|VOFFSET|TOOL_OFFSET|Skip|OFFS
 
 
 def scan_fanuc(text: str, stated: FrameFile) -> ScannedProgram:
-    """Scan a program; a position is that of its `UT` in its `UF`, where 0 is the flange and the world.
+    """Scan a program; a position is that of tool `UT` in frame `UF`, where 0 is the flange or the world, respectively.
 
     Args:
         text: text of the program.
