@@ -1,5 +1,6 @@
 """Programs of four controllers with rewritten targets, and the poses that the real tool reaches."""
 
+import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -195,6 +196,28 @@ def program(language: Language, arm: Path, tmp_path: Path) -> ExportRequest:
     frames = tmp_path / "frames.yaml" if language.suffix == ".ls" else None
     out = tmp_path / f"new{language.suffix}"
     return ExportRequest(arm, out, program=path, frames=frames, tolerance_mm=TOLERANCE_MM)
+
+
+INLINE_POINTS = """DEFDAT CELL
+DECL E6POS XP1={{{P0},S 2,T 35,E1 0.0,E2 0.0}}
+DECL FDAT FP1={{TOOL_NO 4,BASE_NO 3,IPO_FRAME #BASE,POINT2[] " ",TQ_STATE FALSE}}
+DECL E6POS XP2={{{P1},S 2,T 35,E1 0.0,E2 0.0}}
+DECL FDAT FP2={{TOOL_NO 4,BASE_NO 3,IPO_FRAME #TCP,POINT2[] " ",TQ_STATE FALSE}}
+DECL E6POS XP3={{{P2},S 2,T 35}}
+DECL E6AXIS XP4={{A1 0,A2 0,A3 0,A4 0,A5 0,A6 0}}
+ENDDAT
+"""
+
+
+def inline_points(arm: Path, tmp_path: Path) -> ExportRequest:
+    """Write the points of KUKA's inline forms and their frames, and return the request to rewrite them."""
+    T = desired_poses(load_model(arm).robot)
+    path, frames = tmp_path / "cell.dat", tmp_path / "frames.yaml"
+    path.write_text(INLINE_POINTS.format(**{f"P{i}": xyzabc_text(T[i]) for i in range(3)}))
+    columns = ("x_mm", "y_mm", "z_mm", "roll_deg", "pitch_deg", "yaw_deg")
+    frame, tool = (dict(zip(columns, millimetres_and_euler(F).tolist(), strict=True)) for F in (FRAME, TOOL))
+    frames.write_text(json.dumps({"frames": {"BASE_DATA[3]": frame}, "tools": {"TOOL_DATA[4]": tool}}))
+    return ExportRequest(arm, tmp_path / "new.dat", program=path, frames=frames)
 
 
 def scanned(path: Path, frames: Path | None) -> ScannedProgram:

@@ -10,19 +10,16 @@ import torch
 from testing.closeness import assert_close
 from testing.refusals import refused
 from testing.rewritten_programs import (
-    FRAME,
     LANGUAGES,
     TOLERANCE_MM,
-    TOOL,
     attained_poses,
     desired_poses,
+    inline_points,
     program,
     scanned,
-    xyzabc_text,
 )
 
 from pisigma.deployment.export.export_format import Exported, ExportRequest
-from pisigma.deployment.export.programs.text import millimetres_and_euler
 from pisigma.deployment.export.registry import export_model
 from pisigma.deployment.export.rewriting.export import TEST
 from pisigma.deployment.export.rewriting.scan import COMPUTED
@@ -187,31 +184,15 @@ def test_line_endings_are_kept(language, arm, tmp_path):
     assert request.out.read_bytes() == plain.replace(b"\n", b"\r\n")
 
 
-DATA = """DEFDAT CELL
-DECL E6POS XP1={{{P0},S 2,T 35,E1 0.0,E2 0.0}}
-DECL FDAT FP1={{TOOL_NO 4,BASE_NO 3,IPO_FRAME #BASE,POINT2[] " ",TQ_STATE FALSE}}
-DECL E6POS XP2={{{P1},S 2,T 35,E1 0.0,E2 0.0}}
-DECL FDAT FP2={{TOOL_NO 4,BASE_NO 3,IPO_FRAME #TCP,POINT2[] " ",TQ_STATE FALSE}}
-DECL E6POS XP3={{{P2},S 2,T 35}}
-DECL E6AXIS XP4={{A1 0,A2 0,A3 0,A4 0,A5 0,A6 0}}
-ENDDAT
-"""
-
-
 def test_points_of_inline_forms(arm, tmp_path):
     """Their frames are numbers; points with a fixed tool or without frames are left unchanged."""
     T = desired_poses(load_model(arm).robot)
-    program_file, out = tmp_path / "cell.dat", tmp_path / "new.dat"
-    program_file.write_text(DATA.format(**{f"P{i}": xyzabc_text(T[i]) for i in range(3)}))
-    columns = ("x_mm", "y_mm", "z_mm", "roll_deg", "pitch_deg", "yaw_deg")
-    frame, tool = (dict(zip(columns, millimetres_and_euler(F).tolist(), strict=True)) for F in (FRAME, TOOL))
-    frames = tmp_path / "frames.yaml"
-    frames.write_text(json.dumps({"frames": {"BASE_DATA[3]": frame}, "tools": {"TOOL_DATA[4]": tool}}))
-    exported = export_model("targets", ExportRequest(arm, out, program=program_file, frames=frames))
-    (target,) = scanned(out, frames).targets
+    request = inline_points(arm, tmp_path)
+    exported = export_model("targets", request)
+    (target,) = scanned(request.out, request.frames).targets
     real = attained_poses(arm, target.pose.T[None], T[:1])
     assert_close(real[0, :3, 3], T[0, :3, 3], atol=1e-8)
     assert [entry["line"] for entry in exported.facts["left_alone"]] == [4, 6]
-    assert out.read_text().splitlines()[2:] == program_file.read_text().splitlines()[2:]
+    assert request.out.read_text().splitlines()[2:] == request.program.read_text().splitlines()[2:]
     with refused(OutputError, option="--out", value=".dat"):
-        export_model("targets", ExportRequest(arm, out, poses=tmp_path / "poses.csv"))
+        export_model("targets", ExportRequest(arm, request.out, poses=tmp_path / "poses.csv"))
