@@ -7,12 +7,15 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.files.errors import PlanningError
+from pisigma.files.errors import MeasurementError, Place, PlanningError
 from pisigma.measurement.camera.board import Board
 from pisigma.measurement.camera.camera import Camera
 from pisigma.measurement.camera.corner_file import read_rows
 from pisigma.measurement.csv.reading import contains_measurements, read_joints
 from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.joint_range import row_warnings
+from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.model.training_rows import known_rows, training_row_warnings
 from pisigma.planning.board_sight import BoardSight
 from pisigma.planning.board_views import BoardViews
 from pisigma.planning.candidates import (
@@ -26,6 +29,8 @@ from pisigma.planning.plan_settings import CameraSettings, PlanSettings
 from pisigma.planning.robot_posterior import Instrument
 from pisigma.planning.surroundings.arm_in_surroundings import ArmInSurroundings
 from pisigma.robot.description import Robot
+from pisigma.validation.checks.check import MOVES
+from pisigma.validation.gate import check_rows
 
 WORKSPACE_POSES = 1000
 """Number of poses that represent the workspace if a camera measures."""
@@ -129,3 +134,31 @@ def sight_of(camera: CameraSettings) -> BoardSight:
     seen_by, board = Camera.load(camera.camera), Board.load(camera.board)
     is_fixed = camera.is_fixed or seen_by.is_fixed
     return BoardSight(seen_by, board, is_fixed, camera.sigma_px, camera.repeatability)
+
+
+def check_measured(model: CalibratedModel | None, settings: PlanSettings, robot: Robot) -> tuple[str, ...]:
+    """Refuse measurements with a fault of the setup, and measurements to which the model was fitted.
+
+    Returns:
+        Warnings, such as that the model may have been fitted to some of the measurements.
+
+    Raises:
+        MeasurementError: they cannot be used; the message names the fault.
+    """
+    if settings.measured is None:
+        return ()
+    rows = read_planned_rows(settings, settings.measured, robot).split_sets()[0]
+    against = robot if model is None else model
+    if implausible := check_rows(rows, against, may_move=MOVES).implausible:
+        raise MeasurementError(f"{settings.measured}: {implausible[0].sentence}", value=implausible[0].kind)
+    if model is not None and bool(known_rows(model, rows).all()):
+        raise MeasurementError(
+            f"expected rows to which model '{model.name}' was not fitted, because these would be used twice",
+            value=model.name,
+            at=Place(settings.measured),
+            option="--measured",
+            remedy="plan with the model alone",
+        )
+    twice = "they count twice, and the expected errors are too small"
+    known = () if model is None else training_row_warnings(model, rows, consequence=twice)
+    return (*row_warnings(robot, rows), *known)

@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
+from pisigma.estimation.covariance_root import multiply_updated_root
 from pisigma.files.errors import PlanningError
 from pisigma.planning.plan_settings import Criterion
 
@@ -241,3 +242,34 @@ class PoseSelection:
             self._X.flatten(0, 1).addmm_(U.flatten(0, 1), half @ self._goal.t(), alpha=-change.sign)
             if change.sign > 0:
                 self._P = self._X @ self._X.mT
+
+
+def complete_selection(
+    B: Float64[Tensor, "candidates values directions"],
+    D: Float64[Tensor, "tasks 3 directions"],
+    kept: Int64[Tensor, " kept"],
+    others: Int64[Tensor, " others"],
+    count: int,
+    criterion: Criterion = "I",
+) -> Int64[Tensor, " count"]:
+    """Add the most useful of other candidates to a selection, and sort all; see `select_poses`.
+
+    Args:
+        B: derivatives of the measured values of the candidates under the prior.
+        D: derivatives of the tool's position over the task under the prior.
+        kept: indices of the candidates that are already selected.
+        others: indices of the candidates to choose from.
+        count: number of poses to select, including those already selected.
+        criterion: "D" or "I".
+
+    Returns:
+        Indices of candidates, the most useful first.
+    """
+    if not len(kept):
+        return others[select_poses(B[others], D, count, criterion)]
+    if added := count - len(kept):
+        # a candidate is worth what it adds to the poses already selected: both are taken under their posterior
+        measured = B[kept].flatten(0, 1)
+        after, task = multiply_updated_root(B[others], measured), multiply_updated_root(D, measured)
+        kept = torch.cat([kept, others[select_poses(after, task, added, criterion)]])
+    return kept[select_poses(B[kept], D, count, criterion)]

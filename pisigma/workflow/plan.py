@@ -15,13 +15,10 @@ from torch import Tensor
 from pisigma.deployment.export.programs.languages import LANGUAGES, check_program
 from pisigma.deployment.export.programs.planned import planned_program
 from pisigma.files.conflicts import Input
-from pisigma.files.errors import MeasurementError, Place
 from pisigma.files.output_file import check_output, write_atomically
 from pisigma.files.progress import Progress
-from pisigma.measurement.joint_range import row_warnings
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import HasModel
-from pisigma.model.training_rows import known_rows, training_row_warnings
 from pisigma.planning.board_views import BoardViews
 from pisigma.planning.candidates import Candidates, select_spread_poses
 from pisigma.planning.expected_accuracy import (
@@ -32,9 +29,9 @@ from pisigma.planning.expected_accuracy import (
     remaining_errors,
 )
 from pisigma.planning.plan_file import StoredPlan, yaml_of
-from pisigma.planning.plan_inputs import allow_measured_poses, find_candidates, read_planned_rows, views_of
+from pisigma.planning.plan_inputs import allow_measured_poses, check_measured, find_candidates, views_of
 from pisigma.planning.plan_settings import PlanSettings
-from pisigma.planning.pose_selection import select_poses
+from pisigma.planning.pose_selection import complete_selection
 from pisigma.planning.robot_posterior import RobotPosterior
 from pisigma.planning.subject import Subject
 from pisigma.planning.surroundings.arm_in_surroundings import ArmInSurroundings
@@ -44,8 +41,6 @@ from pisigma.planning.task import task_poses
 from pisigma.planning.tour import Tour, order_of_use, plan_tour, stage_ends
 from pisigma.robot.description import Robot
 from pisigma.validation.checks.camera import view_warnings
-from pisigma.validation.checks.check import MOVES
-from pisigma.validation.gate import check_rows
 
 STEP = 10
 """Number of poses between two points of the accuracy curve."""
@@ -53,8 +48,8 @@ MIN_WEAK_SHARE = 0.1
 """Share of the remaining variance above which a warning names its cause."""
 MIN_RANGE_SHARE = 0.1
 """Share of the range of a joint that the candidates have to cover in order to represent the workspace."""
-MAX_ROUNDS = 4
-"""Maximum number of times that unreachable poses are replaced."""
+MAX_ROUNDS = 6
+"""Maximum number of times that poses are added in place of unreachable ones."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,7 +195,7 @@ def plan(
     candidates = find_candidates(settings, arm)
     candidates.check_count(settings.count + settings.check)
     progress("prior knowledge")
-    repeated = _check_measured(subject.model, settings, arm.robot)
+    repeated = check_measured(subject.model, settings, arm.robot)
     posterior = subject.posterior(arm, settings)
     task = task_poses(arm, settings, candidates.workspace, subject.model)
     problem = _Problem(subject, settings, arm, candidates, posterior, task)
@@ -274,25 +269,29 @@ class _Problem:
         """
         q, count = self.candidates.q, self.settings.count
         free, motions = torch.arange(len(q)), Motions(self.arm, self.candidates.workspace)
+        kept, kept_check = free[:0], free[:0]
         for _ in range(MAX_ROUNDS):
             progress(f"{count} of {len(free):,} candidates")
-            chosen = free[select_poses(self.measured[free], self.tool, count, self.settings.criterion)]
-            others = free[~torch.isin(free, chosen)]
-            check = others[select_spread_poses(self.arm, q[others], self.settings.check, q[chosen])]
+            others = _without(free, torch.cat([kept, kept_check]))
+            chosen = complete_selection(
+                self.measured, self.tool, kept, others, count, self.settings.criterion
+            )
+            others, taken = _without(others, chosen), q[torch.cat([chosen, kept_check])]
+            missing = self.settings.check - len(kept_check)
+            check = torch.cat([kept_check, others[select_spread_poses(self.arm, q[others], missing, taken)]])
             use = order_of_use(count, len(check))
             poses = torch.cat([chosen, check])[use]
             progress("order of the poses")
-            stages = stage_ends(len(poses))
-            way = plan_tour(motions, q[poses], self.settings.pace, stages=stages)
-            free = free[~torch.isin(free, poses[way.left_out])]
-            if not len(way.left_out) or len(free) < len(poses):
+            way = plan_tour(motions, q[poses], self.settings.pace, stages=stage_ends(len(poses)))
+            unreached = poses[way.left_out]
+            free, kept, kept_check = (_without(some, unreached) for some in (free, chosen, check))
+            if not len(unreached) or len(free) < len(poses):
                 break
-        chosen = chosen[~torch.isin(chosen, poses[way.left_out])]
         ordered = poses[way.order]
         is_check, number = use[way.order] >= count, self.candidates.number[ordered]
         folder = self.subject.folder
         return (
-            chosen,
+            kept,
             StoredPlan(self.arm, self.settings, folder, q[ordered], is_check, number, way.before),
             way,
         )
@@ -361,32 +360,8 @@ class _Problem:
         return accuracy_curve(self.measured, self.tool, chosen, counts, self.settings.seed)
 
 
-def _check_measured(model: CalibratedModel | None, settings: PlanSettings, robot: Robot) -> tuple[str, ...]:
-    """Refuse measurements with a fault of the setup, and measurements to which the model was fitted.
-
-    Returns:
-        Warnings, such as that the model may have been fitted to some of the measurements.
-
-    Raises:
-        MeasurementError: they cannot be used; the message names the fault.
-    """
-    if settings.measured is None:
-        return ()
-    rows = read_planned_rows(settings, settings.measured, robot).split_sets()[0]
-    against = robot if model is None else model
-    if implausible := check_rows(rows, against, may_move=MOVES).implausible:
-        raise MeasurementError(f"{settings.measured}: {implausible[0].sentence}", value=implausible[0].kind)
-    if model is not None and bool(known_rows(model, rows).all()):
-        raise MeasurementError(
-            f"expected rows to which model '{model.name}' was not fitted, because these would be used twice",
-            value=model.name,
-            at=Place(settings.measured),
-            option="--measured",
-            remedy="plan with the model alone",
-        )
-    twice = "they count twice, and the expected errors are too small"
-    known = () if model is None else training_row_warnings(model, rows, consequence=twice)
-    return (*row_warnings(robot, rows), *known)
+def _without(indices: Int64[Tensor, " all"], removed: Int64[Tensor, " removed"]) -> Int64[Tensor, " rest"]:
+    return indices[~torch.isin(indices, removed)]
 
 
 def _warnings(way: Tour) -> tuple[str, ...]:

@@ -8,7 +8,12 @@ from testing.refusals import refused
 from pisigma.files.errors import PlanningError
 from pisigma.planning.expected_accuracy import accuracy_curve, p95_of, remaining_errors, rms_of
 from pisigma.planning.plan_settings import Criterion
-from pisigma.planning.pose_selection import PoseSelection, condense_derivatives, select_poses
+from pisigma.planning.pose_selection import (
+    PoseSelection,
+    complete_selection,
+    condense_derivatives,
+    select_poses,
+)
 from pisigma.planning.robot_posterior import RobotPosterior
 from pisigma.robot import Robot
 
@@ -94,6 +99,26 @@ def test_selected_poses_are_sorted_greedily(posterior: RobotPosterior) -> None:
     )
     choice.add_until(12)
     assert choice.chosen == list(range(12))
+
+
+def test_a_completed_selection_keeps_poses_and_leaves_little_more_error(posterior: RobotPosterior) -> None:
+    q, task = random_joints(150, 2), random_joints(40, 3)
+    B, D = posterior.sensitivities(q), posterior.tool(task)
+    best = select_poses(B, D, 20)
+    unreachable = best[::3]
+    kept = best[~torch.isin(best, unreachable)]
+    others = torch.arange(150)[~torch.isin(torch.arange(150), best)]
+    chosen = complete_selection(B, D, kept, others, 20)
+    assert len(set(chosen.tolist())) == 20
+    assert not torch.isin(chosen, unreachable).any()
+    assert torch.isin(kept, chosen).all()
+    left, least, first, alone = (
+        rms_of(posterior.after_measuring(q[rows]).tool(task))
+        for rows in (chosen, best, torch.cat([kept, others[: 20 - len(kept)]]), kept)
+    )
+    assert least < left < min(1.1 * least, first, alone)
+    assert sorted(complete_selection(B, D, kept, others, len(kept)).tolist()) == sorted(kept.tolist())
+    assert torch.equal(complete_selection(B, D, kept[:0], torch.arange(150), 20), best)
 
 
 def test_the_curve_is_the_covariance_after_the_poses(posterior: RobotPosterior) -> None:
