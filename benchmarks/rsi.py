@@ -1,6 +1,6 @@
 """Joint corrections over RSI, driven by the echo server of RSIPI, which emulates a KUKA controller.
 
-`pisigma export MODEL --format rsi --address 127.0.0.1:49152 --out rsi.xml`
+`pisigma export MODEL --format rsi --out rsi.xml`, then set IP_NUMBER in rsi.xml to 127.0.0.1
 `pisigma serve MODEL --rsi rsi.xml`
 `python benchmarks/rsi.py rsi.xml 10000` (in an environment with `pip install rsipi`; it does not import pisigma)
 

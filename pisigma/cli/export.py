@@ -34,7 +34,7 @@ Like = Annotated[
     Path | None,
     typer.Option(
         help="File to update: a URDF file for urdf, mjcf and xacro (default: file of the robot), a drawn MJCF model "
-        "for mjcf, the controller's file for ur-calibration and staubli."
+        "for mjcf, the controller's file for ur-calibration, staubli and rsi."
     ),
 ]
 Tip = Annotated[str | None, typer.Option(help="With --like, tool link that was used to load the robot.")]
@@ -93,14 +93,6 @@ PresentCounts = Annotated[
     typer.Option(help="With epson and fanuc-mastering, counts that the controller uses at present."),
 ]
 
-Address = Annotated[
-    str | None,
-    typer.Option(
-        metavar="IP:PORT",
-        help="With rsi, address at which this computer receives packets, such as 192.168.1.10:49152.",
-    ),
-]
-
 
 def export(
     model: ModelOrCell,
@@ -119,7 +111,6 @@ def export(
     tolerance_mm: ToleranceMm = None,
     counts_per_turn: CountsPerTurn = None,
     present_counts: PresentCounts = None,
-    address: Address = None,
     payload_kg: PayloadKg = None,
     temperature_c: TemperatureC = None,
     as_json: AsJson = False,
@@ -154,7 +145,6 @@ def export(
         tolerance_mm=tolerance_mm,
         counts_per_turn=counts_per_turn,
         present_counts=present_counts,
-        address=address,
         payload_kg=payload_kg,
         temperature_c=temperature_c,
     )

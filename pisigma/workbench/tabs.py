@@ -55,7 +55,7 @@ TAB_OF = {
 FORMATS = tuple(
     name for name in BUILT_IN if name not in ("staubli", "xacro", "library", "ur-calibration", "rsi")
 )
-"""Formats that need neither a file nor the address of the controller."""
+"""Formats that need no file of the controller."""
 CHARTS = "-monitoring.html"
 """End of the names of pages with control charts in the reports of a cell."""
 FIGURES = (".png", ".svg")

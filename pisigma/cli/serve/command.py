@@ -87,7 +87,8 @@ def _load(model: Path | None, models: Path | None, pin: bool) -> "ServedModels":
 
 def _stream(settings: ServeSettings, file: Path, model: Path | None) -> None:
     """Correct the joints of a KUKA controller over RSI."""
-    from pisigma.deployment.serve.rsi import RsiAddress, RsiServer
+    from pisigma.deployment.export.rsi import RsiAddress
+    from pisigma.deployment.serve.rsi import RsiServer
     from pisigma.lifetime.cell.controller import checked_model_folder
     from pisigma.model.inverse.corrected_ik import load
 

@@ -31,7 +31,6 @@ class ExportRequest:
         tolerance_mm: largest deviation of the tool from a straight line between waypoints of `program` [mm].
         counts_per_turn: comma-separated encoder counts per turn of every joint, for counts.
         present_counts: comma-separated current counts of the controller, for counts.
-        address: IPv4 address and port at which this computer receives, for rsi.
         payload_kg: mass that the robot carries [kg].
         temperature_c: temperature of the robot [deg C].
     """
@@ -50,7 +49,6 @@ class ExportRequest:
     tolerance_mm: float | None = None
     counts_per_turn: str | None = None
     present_counts: str | None = None
-    address: str | None = None
     payload_kg: float | None = None
     temperature_c: float | None = None
 
@@ -96,7 +94,6 @@ OPTIONS = (
     "tolerance_mm",
     "counts_per_turn",
     "present_counts",
-    "address",
     "payload_kg",
     "temperature_c",
 )

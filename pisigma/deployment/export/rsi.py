@@ -6,13 +6,15 @@ joints (`AKorr`) [deg] with the same time stamp. The file was loaded by RSIPI 0.
 """
 
 import ipaddress
+from dataclasses import dataclass
+from pathlib import Path
 
 from lxml import etree
 
 from pisigma.deployment.export.export_format import Exported, ExportFormat, ExportRequest, model_facts
 from pisigma.deployment.export.geometry import condition_remarks
 from pisigma.deployment.export.programs.languages import COUNTING
-from pisigma.files.errors import OutputError
+from pisigma.files.errors import OutputError, Place
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.robot.writing import comment_text
 
@@ -28,25 +30,53 @@ REMARKS = (
 )
 
 
-def parse_address(address: str) -> tuple[str, int]:
-    """Split an address into IP address and port.
+@dataclass(frozen=True)
+class RsiAddress:
+    """Address and name of the sender in an ETHERNET configuration of RSI.
 
-    Raises:
-        OutputError: it is not of the form 192.168.1.10:49152.
+    Attributes:
+        host: IP address to receive at.
+        port: UDP port to receive at.
+        sender: `SENTYPE` of answers.
     """
-    host, _, port = address.rpartition(":")
-    try:
-        ipaddress.IPv4Address(host)
-        if not 0 < int(port) < 65536:
-            raise ValueError(port)
-    except ValueError:
-        raise OutputError(
-            expected="an IPv4 address and a port, such as 192.168.1.10:49152",
-            value=address,
-            option="--address",
-            remedy="state the address at which this computer receives the packets of the controller",
-        ) from None
-    return host, int(port)
+
+    host: str
+    port: int
+    sender: str
+
+    @staticmethod
+    def read(file: Path, option: str = "--rsi") -> "RsiAddress":
+        """Read a file, as given by an option.
+
+        Raises:
+            OutputError: it is not an RSI configuration.
+        """
+        try:
+            settings = etree.parse(file).getroot().find("CONFIG")
+            found = {entry.tag: (entry.text or "").strip() for entry in settings}
+            host = str(ipaddress.IPv4Address(found["IP_NUMBER"]))
+            return RsiAddress(host, _port(found["PORT"]), found["SENTYPE"])
+        except (OSError, etree.XMLSyntaxError, LookupError, TypeError, ValueError):
+            raise OutputError(
+                "the file is not an RSI configuration",
+                at=Place(file),
+                option=option,
+                remedy="make one with: pisigma export MODEL --format rsi --out FILE",
+            ) from None
+
+
+def _port(text: str) -> int:
+    if not 0 < (port := int(text)) < 65536:
+        raise ValueError(text)
+    return port
+
+
+EXAMPLE = RsiAddress("192.168.1.10", 49152, SENDER)
+"""Address in a file that was not made from another one."""
+SET_ADDRESS = (
+    f"IP_NUMBER and PORT ({EXAMPLE.host}:{EXAMPLE.port}) are examples: set them to the address at which the computer "
+    "that runs `pisigma serve` receives the packets of the controller."
+)
 
 
 def check_six_axes(model: CalibratedModel) -> None:
@@ -85,19 +115,8 @@ def rsi_configuration(host: str, port: int, comments: tuple[str, ...] = ()) -> s
     return str(etree.tostring(root, pretty_print=True, encoding="unicode"))
 
 
-def _check(request: ExportRequest) -> None:
-    if request.address is None:
-        raise OutputError(
-            "--format rsi needs the address at which this computer receives",
-            option="--address",
-            remedy="give --address, such as 192.168.1.10:49152",
-        )
-    parse_address(request.address)
-
-
 def _write(request: ExportRequest) -> Exported:
-    assert request.address is not None  # checked in `_check`
-    host, port = parse_address(request.address)
+    address = EXAMPLE if request.like is None else RsiAddress.read(request.like, "--like")
     model = request.load()
     check_six_axes(model)
     comments = (
@@ -105,9 +124,10 @@ def _write(request: ExportRequest) -> Exported:
         COUNTING.format(robot=model.robot.name),
         *condition_remarks(model),
     )
-    text = rsi_configuration(host, port, comments)
-    facts = model_facts(model) | {"address": request.address}
-    return Exported(text, facts, (*comments, *REMARKS), summary="RSI configuration")
+    text = rsi_configuration(address.host, address.port, comments)
+    facts = model_facts(model) | {"address": f"{address.host}:{address.port}"}
+    remarks = (*comments, *REMARKS, *((SET_ADDRESS,) if request.like is None else ()))
+    return Exported(text, facts, remarks, summary="RSI configuration")
 
 
 FORMAT = ExportFormat(
@@ -115,7 +135,6 @@ FORMAT = ExportFormat(
     "an RSI configuration",
     (".xml",),
     _write,
-    frozenset(("address",)),
-    _check,
+    frozenset(("like",)),
     contains="joint_values",
 )

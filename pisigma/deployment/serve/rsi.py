@@ -19,14 +19,12 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
-from lxml import etree
 
-from pisigma.deployment.export.rsi import AXES, check_six_axes
+from pisigma.deployment.export.rsi import AXES, RsiAddress, check_six_axes
 from pisigma.deployment.serve.metrics import KEPT_DURATIONS
-from pisigma.files.errors import ModelError, OutputError, Place, RequestError
+from pisigma.files.errors import ModelError, OutputError, RequestError
 from pisigma.model.inverse.compiled_ik import CompiledIK
 from pisigma.model.inverse.corrected_ik import CorrectedIK
 from pisigma.robot.kernels import arrays
@@ -49,40 +47,6 @@ _SETPOINT = re.compile(rb"<ASPos\s([^>]*)>")
 _VALUE = re.compile(rb'(A[1-6])\s*=\s*"([^"]*)"')
 _SIX = struct.Struct("<6d")
 _SUCCESS = (Status.REACHED, Status.OUTSIDE_DOMAIN)
-
-
-@dataclass(frozen=True)
-class RsiAddress:
-    """Address and name of the sender in a file of `pisigma export --format rsi`.
-
-    Attributes:
-        host: IP address to receive at.
-        port: UDP port to receive at.
-        sender: `SENTYPE` of answers.
-    """
-
-    host: str
-    port: int
-    sender: str
-
-    @staticmethod
-    def read(file: Path) -> "RsiAddress":
-        """Read a file.
-
-        Raises:
-            OutputError: it is not an RSI configuration.
-        """
-        try:
-            settings = etree.parse(file).getroot().find("CONFIG")
-            found = {entry.tag: (entry.text or "").strip() for entry in settings}
-            return RsiAddress(found["IP_NUMBER"], int(found["PORT"]), found["SENTYPE"])
-        except (OSError, etree.XMLSyntaxError, KeyError, TypeError, ValueError):
-            raise OutputError(
-                "the file is not an RSI configuration",
-                at=Place(file),
-                option="--rsi",
-                remedy="make one with: pisigma export MODEL --format rsi --address IP:PORT --out FILE",
-            ) from None
 
 
 @dataclass
@@ -278,7 +242,7 @@ class RsiServer:
                 f"{address.host}:{address.port} cannot be used ({problem.strerror})",
                 value=f"{address.host}:{address.port}",
                 option="--rsi",
-                remedy="export the file with an address of this machine and a free port",
+                remedy="set IP_NUMBER and PORT in the file to an address of this machine and a free port",
             ) from None
         self._socket.setblocking(False)
         self.port = int(self._socket.getsockname()[1])

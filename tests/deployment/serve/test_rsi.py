@@ -17,8 +17,8 @@ from testing.closeness import assert_close
 from testing.identified import geometric_model
 from testing.refusals import refused
 
-from pisigma.deployment.export.rsi import rsi_configuration
-from pisigma.deployment.serve.rsi import RAMP_MS, RsiAddress, RsiAnswers, RsiServer
+from pisigma.deployment.export.rsi import RsiAddress, rsi_configuration
+from pisigma.deployment.serve.rsi import RAMP_MS, RsiAnswers, RsiServer
 from pisigma.files.errors import OutputError, RequestError
 from pisigma.model.inverse.corrected_ik import CorrectedIK
 from pisigma.robot.kinematics.forward import forward_kinematics
