@@ -116,6 +116,11 @@ class Jobs:
             self._thread.start()
             self.version += 1
 
+    def state(self) -> tuple[Job | None, int, int]:
+        """Return the running step, `version` and `ended` at one moment, so that an end comes with its change."""
+        with self._lock:
+            return self.running, self.version, self.ended
+
     def stop(self, person: str, number: str) -> None:
         """Stop the running step when it next reports progress; no incomplete files are left.
 

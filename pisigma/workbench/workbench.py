@@ -181,7 +181,8 @@ class Workbench(UploadedRows):
             if self.jobs.running is None or request.query.get("version") != str(self.jobs.version):
                 break
             await asyncio.sleep(0.3 / STATE_CHECKS)
-        following, job = await asyncio.to_thread(self._next), self.jobs.running
+        following = await asyncio.to_thread(self._next)
+        job, version, ended = self.jobs.state()
         running = job and {
             "step": job.step,
             "person": job.person,
@@ -190,8 +191,8 @@ class Workbench(UploadedRows):
             "stopped_by": job.stopped_by,
         }
         said = {
-            "version": self.jobs.version,
-            "ended": self.jobs.ended,
+            "version": version,
+            "ended": ended,
             "running": running,
             "next": following,
             "dragged": self._scene.dragged_values(),

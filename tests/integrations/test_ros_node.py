@@ -41,7 +41,10 @@ def started(repository, *arguments):
             yield process
         finally:
             process.terminate()
-            process.communicate(timeout=30)
+            try:
+                process.communicate(timeout=30)
+            finally:
+                process.kill()  # a node that does not end fails its test and does not block the others
 
 
 def node(repository, server, **parameters):

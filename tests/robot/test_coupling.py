@@ -126,7 +126,7 @@ BAR = "four_bar: {ground_mm: 9, crank_mm: 1, coupler_mm: 1, rocker_mm: 1, zero_d
             "rank 6",
             5,
         ),
-        ("theta_3: 1}", f"theta_3: 1}}, {BAR}", "a linkage that closes", 3),
+        ("theta_3: 1}", f"theta_3: 1}}, {BAR}", "a linkage that closes within the limits", 3),
     ],
 )
 def test_invalid_couplings_are_rejected(old, new, expected, value):

@@ -16,8 +16,8 @@ from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.held_out.trained_calibrations import base_and_tool
 
 SUSPICIOUS = 0.01
-"""Errors of the nominal robot, as a share of its reach, above which other robots are tried; arms are built to a
-third of it or better."""
+"""Errors of the nominal robot, as a share of its reach, above which other robots are tried, and up to which another
+robot explains the rows; arms are built to a third of it or better."""
 NEARER = 1 / 3
 """Ratio of the errors of another robot to those of this robot below which the other is reported. A nominal arm
 explains measurements of such an arm to a thousandth of its reach; different robots differ by more."""
@@ -34,7 +34,13 @@ def check_other_robot(checked: CheckedCalibration) -> Iterator[Diagnostic]:
     stated = None if nominal is None else nominal.rms_mm
     if stated is None or stated <= SUSPICIOUS * robot.reach * 1e3:
         return
-    others = {name: size for name in catalogue() if (size := _rms_mm(checked, Robot.load(name))) is not None}
+    robots = {name: Robot.load(name) for name in catalogue()}
+    # small arms have small errors for any rows: another robot has to explain the rows as its own
+    others = {
+        name: size
+        for name, other in robots.items()
+        if (size := _rms_mm(checked, other)) is not None and size <= SUSPICIOUS * other.reach * 1e3
+    }
     name = min(others, key=lambda other: others[other], default=None)
     if name is not None and others[name] < NEARER * stated:
         yield Diagnostic(

@@ -95,7 +95,7 @@ def test_a_folder_that_keeps_held_out_rows_shows_them(hybrid, tmp_path):
     for rows in (arm.measurements, None):
         content = report_content(kept, tmp_path / "arm", rows)
         assert content.rows.origin == "held_out"
-        assert_close(content.rows.after.position, 1.1 * training.after.position, rtol=1e-5)
+        assert_close(content.rows.after.position, 1.1 * training.after.position, rtol=6e-5)
         assert content.correlations.tables
     other = report_content(kept, tmp_path / "arm", measured(arm, 40, seed=9))
     assert other.rows.origin == "other"
