@@ -101,7 +101,7 @@ def by_commands(folder: Path, urdf: Path, first: Path, second: Path, program: Pa
     command("calibrate", folder, *(word for key, value in CALIBRATE.items() for word in (f"--{key}", value)))
     command("import", second, "--cell", folder)
     command("verify", folder)
-    (folder / "exports").mkdir()
+    (folder / "exports").mkdir(exist_ok=True)
     command(
         "export",
         folder,
