@@ -65,10 +65,12 @@ function keep(parts, forms, typed) {  // a form that the server sends unchanged 
 
 const nameOf = details => details.dataset.name || details.querySelector("summary").textContent;
 
+let shows = 0;
 async function show(name) {
   wanted = name;
+  const turn = ++shows;
   const text = await (await ask(`tab/${name}`)).text(), parts = document.createElement("div");
-  if (wanted !== name) return;  // another tab was chosen meanwhile
+  if (turn !== shows) return;  // another tab was chosen, or this one was fetched again, meanwhile
   const top = name === tab ? content.scrollTop : 0;
   parts.innerHTML = text;
   if (kept[tab]) kept[tab].open = [...content.querySelectorAll("details[open]")].map(nameOf);
@@ -250,7 +252,7 @@ function lock() {
 }
 
 const alone = ["no_cell", "broken_cell"];  // states with a tab of their own
-let polling = null;
+let polling = null, showing = null;
 async function poll() {
   clearTimeout(polling);
   try {
@@ -265,7 +267,8 @@ async function poll() {
     if (running) document.getElementById("what").textContent = `${running.person} started ${running.step} at ${running.started}: ${running.stopped_by ? `being stopped by ${running.stopped_by}` : running.what || "starting"}`;
     document.getElementById("stop").disabled = Boolean(running?.stopped_by);
     ended = state.ended;
-    if (state.version !== version) { const first = version < 0; version = state.version; if (!first) await show(wanted); }
+    if (state.version !== version) { const first = version === -1; version = state.version; if (!first) showing = show(wanted).catch(() => { version = -2; }); }
+    await showing;  // also if another poll has started it: an end is told after its result is shown
     lock();
     if (state.dragged.turn !== dragging) dragging = 0;
     for (const [name, value] of Object.entries(dragging ? state.dragged.values : {})) for (const one of content.querySelectorAll(`[name="${name}"]`)) one.value = value;
