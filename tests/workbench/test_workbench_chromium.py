@@ -17,6 +17,7 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.kinematics.status import Status
 from pisigma.robot.se3 import xyzrpy_from_transform
+from pisigma.workbench.forms import digest_of
 from pisigma.workbench.workbench import Workbench
 from pisigma.workflow.cell.cell import Cell
 from pisigma.workflow.load import load
@@ -53,6 +54,8 @@ def set_in_form(page, cell: Cell) -> None:
         press(page, "cell")
         assert bool(page.query_selector("[name='plan.candidates'][aria-invalid]")) is is_refused
         assert bool(page.query_selector("label:has([name='plan.candidates']) .fault")) is is_refused
+    digest = digest_of(cell.file.path.read_text())
+    page.wait_for_selector(f"form[data-step=cell] [name=seen][value='{digest}']", state="attached")
     page.fill("[name='plan.candidates']", "200")
     page.reload()
     assert page.wait_for_selector("[name='plan.candidates']").input_value() == "200"
