@@ -51,6 +51,7 @@ class CellScene:
         self._scene: SessionScene | None = None
         self._turn = 0
         self._before: dict[str, str] | None = None
+        self._dragged: set[str] = set()
         server.gui.configure_theme(show_logo=False, show_share_button=False)
         self._slider = server.gui.add_slider("errors magnified by", *MAGNIFICATIONS, initial_value=0)
         self._slider.on_update(self._magnify)
@@ -96,7 +97,7 @@ class CellScene:
             self._cell = cell
             self._reach, self._rows = arm.robot.reach, None
             self._turn += 1
-            self._before = self._places() if is_movable else None
+            self._before, self._dragged = self._places() if is_movable else None, set()
             if planned is None:
                 self._scene.show_pose("/tried", np.zeros(arm.robot.dof))
             else:
@@ -147,11 +148,15 @@ class CellScene:
         return self._predicted
 
     def dragged_values(self) -> dict[str, Any]:
-        """Return the keys of `cell.yaml` that people changed by dragging, since which call of `show_cell`."""
+        """Return the keys of `cell.yaml` that people changed by dragging, since which call of `show_cell`.
+
+        A value that was dragged back is included, because the page has shown it in between.
+        """
         with self._lock:
-            before = self._before
-            moved = {} if before is None else {k: v for k, v in self._places().items() if v != before[k]}
-            return {"turn": 0 if before is None else self._turn, "values": moved}
+            before, places = self._before, {} if self._before is None else self._places()
+            self._dragged |= {key for key, value in places.items() if before and value != before[key]}
+            values = {key: places[key] for key in places if key in self._dragged}
+            return {"turn": 0 if before is None else self._turn, "values": values}
 
     def _places(self) -> dict[str, str]:
         """Return the positions of all objects that can be dragged [mm], and the angles of those that can turn [deg]."""

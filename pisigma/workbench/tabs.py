@@ -123,7 +123,7 @@ class Tabs:
         robot, tabs = ("", {"status": "New cell"}) if cell is None else (cell.robot.name, TABS)
         tabs = {"cell": "Repair"} if is_broken else tabs
         template = self._environment.get_template("page.html.j2")
-        return template.render(tabs=tabs, name=folder.resolve().name, robot=robot, folder=str(folder))
+        return template.render(tabs=tabs, name=folder.resolve().name, robot=robot, folder=folder)
 
     def new_cell(self, folder: Path) -> str:
         """Render the form that creates the cell."""

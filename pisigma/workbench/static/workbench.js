@@ -26,7 +26,7 @@ let proposal = null, dragging = 0;
 
 const keyOf = form => `${form.dataset.step} ${form.dataset.name || form.dataset.command}`;
 
-const storeOf = name => `${document.body.dataset.folder} ${name}`;
+const storeOf = name => `${document.body.dataset.cell} ${name}`;
 
 function store() {  // what was typed in a tab survives a reload
   const found = {};
@@ -75,15 +75,16 @@ async function show(name) {
   parts.innerHTML = text;
   if (kept[tab]) kept[tab].open = [...content.querySelectorAll("details[open]")].map(nameOf);
   const left = kept[name] ||= { forms: {}, open: [] };
+  const typed = JSON.parse(sessionStorage.getItem(storeOf(name)) || "{}");
   let refused = "";
   for (const one of parts.querySelectorAll(".outcome")) if (started[one.dataset.step]?.ended < ended) {
     const { form } = started[one.dataset.step];
     delete started[one.dataset.step];
     if (one.classList.contains("refused")) { refused = refusals[one.dataset.step] = one.outerHTML; continue; }
-    if (form.dataset.once !== undefined) delete left.forms[keyOf(form)];
+    if (form.dataset.once !== undefined) { delete left.forms[keyOf(form)]; delete typed[keyOf(form)]; }
     if (one.dataset.step === "import") proposal = null;
   }
-  keep(parts, left.forms, JSON.parse(sessionStorage.getItem(storeOf(name)) || "{}"));
+  keep(parts, left.forms, typed);
   if (proposal) parts.querySelector("#proposal")?.append(proposal);
   content.replaceChildren(...parts.childNodes);
   content.querySelectorAll("details").forEach(one => { one.open ||= left.open.includes(nameOf(one)); });
@@ -213,16 +214,19 @@ async function offer(input) {  // the links of a robot file, which replaces a ro
 }
 
 async function start(form) {
+  let step = null;
   fault(form, null);
   try {
     const fields = { ...values(form), command: form.querySelector(".command code")?.textContent || "" };
     if (form.dataset.go !== undefined) return show(form.dataset.tabOf);
     for (const one of form.querySelectorAll("[data-upload]")) if (one.files.length) fields[one.dataset.upload] = (await upload(one.files[0])).file;
-    await steps(`step/${form.dataset.step}`, fields);
-    started[form.dataset.step] = { form, ended };
+    step = form.dataset.step;
+    started[step] = { form, ended };  // before the answer: the step may end before it arrives
+    await steps(`step/${step}`, fields);
+    step = null;
     if (form.dataset.tabOf && form.dataset.tabOf !== tab) await show(form.dataset.tabOf);
     await poll();
-  } catch (problem) { fault(form, problem); }
+  } catch (problem) { if (step) delete started[step]; fault(form, problem); }
 }
 
 async function uploaded(files) {
