@@ -87,13 +87,18 @@ def _write_joint_log(files: list[Path], settings: ImportSettings, out: Path, as_
 
     if len(files) > 1:
         raise typer.BadParameter("expected one LeRobot data set without other files", param_hint="'files'")
-    log = read_joint_log(files[0], settings.lerobot_units, settings.lerobot_calibration)
+    log = read_joint_log(
+        files[0], settings.lerobot_units, settings.lerobot_calibration, settings.lerobot_prefix
+    )
     log.save(out)
     if as_json:
         print_json({"file": str(out)} | log.to_json())
         return
     columns = ", ".join(f"{motor} as q{number}_deg" for number, motor in enumerate(log.motors, start=1))
-    print_lines([f"{len(log.rows)} rows of joint values written to {out}: {columns}."])
+    lines = [f"{len(log.rows)} rows of joint values written to {out}: {columns}."]
+    if log.left_out:
+        lines.append(f"Values that are not positions of joints are left out: {', '.join(log.left_out)}.")
+    print_lines(lines)
 
 
 def _take_in(incoming: "IncomingRows", date: str, accept_implausible: bool, as_json: bool) -> None:

@@ -14,7 +14,7 @@ from jaxtyping import Float64
 from pisigma.deployment.export.joint_offsets import JointOffsets, fit_joint_offsets
 from pisigma.files.errors import MeasurementError
 from pisigma.files.model_files import DESCRIPTION, WEIGHTS, content_hash, read_model_file
-from pisigma.measurement.foreign.lerobot_dataset import joint_motors, motor_of
+from pisigma.measurement.foreign.lerobot_dataset import joint_motors
 from pisigma.measurement.foreign.lerobot_motors import LeRobotUnits, Motor, radians_per_unit, read_motors
 from pisigma.model.folder.model_folder import load_model
 from pisigma.robot.description import Robot
@@ -140,11 +140,7 @@ class LeRobotCorrection:
     def _moved(self, frames: Any, offset: Float64[np.ndarray, " values"]) -> Any:
         if isinstance(frames, Mapping):
             return self._moved_by_name(frames, offset)
-        if isinstance(frames, torch.Tensor):
-            moved = self._checked(frames).double() + torch.from_numpy(offset).to(frames.device)
-            return moved.to(frames.dtype)
-        array = self._checked(np.asarray(frames))
-        return (array + offset).astype(array.dtype)
+        return _sum(self._checked(frames if isinstance(frames, torch.Tensor) else np.asarray(frames)), offset)
 
     def _moved_by_name(
         self, frame: Mapping[str, Any], offset: Float64[np.ndarray, " values"]
@@ -156,9 +152,10 @@ class LeRobotCorrection:
                 value=", ".join(frame),
                 remedy=f"add {missing[0]}",
             )
-        by_name = dict(zip(self.names, offset.tolist(), strict=True))
+        moved = {self.names[index] for index in self.joints}
+        by_name = dict(zip(self.names, offset, strict=True))
         return {
-            name: type(value)(value + by_name[name]) if by_name.get(name) else value
+            name: _sum(_checked_type(value, name), by_name[name]) if name in moved else value
             for name, value in frame.items()
         }
 
@@ -174,16 +171,28 @@ class LeRobotCorrection:
                 value=str(tuple(frames.shape)),
                 option="frames",
             )
-        if not (
-            frames.dtype.is_floating_point if isinstance(frames, torch.Tensor) else frames.dtype.kind == "f"
-        ):
-            raise MeasurementError(
-                expected="floating-point values",
-                value=str(frames.dtype),
-                option="frames",
-                remedy="convert them",
-            )
-        return frames
+        return _checked_type(frames, "frames")
+
+
+def _sum(values: Any, offset: Any) -> Any:
+    """Return values plus an offset, computed with 64 bits, of the type of the values."""
+    if isinstance(values, torch.Tensor):
+        return (values.double() + torch.as_tensor(offset, device=values.device)).to(values.dtype)
+    return float(values + offset) if type(values) is float else (values + offset).astype(values.dtype)
+
+
+def _checked_type(values: Any, what: str) -> Any:
+    """Return values that are a float, or an array or a tensor of them.
+
+    Raises:
+        MeasurementError: they are not; an offset would be cut off in integers.
+    """
+    dtype = getattr(values, "dtype", type(values))
+    if not (dtype.is_floating_point if isinstance(dtype, torch.dtype) else np.issubdtype(dtype, np.floating)):
+        raise MeasurementError(
+            expected="floating-point values", value=str(dtype), option=what, remedy="convert them"
+        )
+    return values
 
 
 def joints_of_values(robot: Robot, names: Sequence[str], prefix: str) -> tuple[int, ...]:
@@ -201,7 +210,7 @@ def joints_of_values(robot: Robot, names: Sequence[str], prefix: str) -> tuple[i
             option="names",
             remedy="give the joints of the robot the names of LeRobot's motors, or state the prefix of the arm",
         )
-    return tuple([motor_of(name, prefix) for name in names].index(axis) for axis in axes)
+    return tuple(motors[axis] for axis in axes)
 
 
 def _version(

@@ -14,15 +14,16 @@ from pisigma.deployment.lerobot.correction import LeRobotCorrection
 from pisigma.files.conflicts import check_conflicts
 from pisigma.files.errors import MeasurementError, OutputError, Place
 from pisigma.files.input_file import read_text
+from pisigma.files.output_file import write_failure
 from pisigma.files.scratch import FOLDER, scratch_beside
-from pisigma.measurement.foreign.lerobot_dataset import LeRobotDataset
+from pisigma.measurement.foreign.lerobot_dataset import LeRobotDataset, read_table
 from pisigma.measurement.foreign.lerobot_motors import LeRobotUnits
 
 if TYPE_CHECKING:
     import pyarrow
 
 RECORD = Path("meta", "pisigma.json")
-"""File of a corrected data set with the version of the model."""
+"""File of a corrected data set: the version of the model by prefix of the arm and feature."""
 STATISTICS = ("mean", "min", "max", "q01", "q10", "q50", "q90", "q99")
 """Statistics of a feature that move with its values; the standard deviation and the count do not."""
 
@@ -53,7 +54,8 @@ def correct_lerobot_dataset(
     """Write a copy of a data set with true joint values in `observation.state` and `action`.
 
     Frames keep their shape, type and order; statistics of these features move with them. All other files are copied
-    unchanged. `meta/pisigma.json` has the version of the model.
+    unchanged. `meta/pisigma.json` has the version of the model. A data set of two arms is corrected arm by arm: the
+    second call takes the output of the first one, and the other prefix.
 
     Args:
         dataset: folder of a data set of layout v2.1 or v3.0.
@@ -64,18 +66,14 @@ def correct_lerobot_dataset(
         prefix: start of the names of this arm.
 
     Raises:
-        MeasurementError: the data set cannot be read, was corrected already, or its values are not those of the robot.
+        MeasurementError: the data set cannot be read, this arm was corrected already, or its values are not those of
+            the robot.
         ModelError: the folder is not a model.
         OutputError: the new folder exists or cannot be written.
         ImportError: pyarrow is not installed.
     """
     source, target = LeRobotDataset.open(dataset), Path(os.path.realpath(out))
-    if (source.folder / RECORD).exists():
-        raise MeasurementError(
-            "the data set was corrected already",
-            at=Place(source.folder / RECORD),
-            remedy="correct the original data set",
-        )
+    record = _record(source, prefix)
     check_conflicts(out, (source.folder, Path(model)))
     if target.exists():
         raise OutputError("the output exists", at=Place(out), option="out", remedy="choose another folder")
@@ -83,23 +81,63 @@ def correct_lerobot_dataset(
         key: LeRobotCorrection.load(model, names, units, calibration, prefix)
         for key, names in source.names.items()
     }
-    target.parent.mkdir(parents=True, exist_ok=True)
-    with scratch_beside(target, FOLDER) as scratch:
-        frames = _write_copy(source, corrections, scratch)
-        version = {key: one.version for key, one in corrections.items()}
-        (scratch / RECORD).write_text(json.dumps(version, indent=4))
-        scratch.chmod(0o755)
-        scratch.rename(target)
+    record[prefix] = {key: one.version for key, one in corrections.items()}
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with scratch_beside(target, FOLDER) as scratch:
+            frames = _write_copy(source, corrections, scratch)
+            (scratch / RECORD).write_text(json.dumps(record, indent=4))
+            scratch.chmod(0o755)
+            scratch.rename(target)
+    except shutil.Error as problem:  # of `copytree`: a list of file, copy and reason
+        file, _, reason = problem.args[0][0]
+        raise MeasurementError(f"it cannot be copied ({reason})", at=Place(file)) from None
+    except OSError as problem:
+        raise write_failure(out, problem) from None
     return CorrectedDataset(target, frames, corrections)
+
+
+def _record(source: LeRobotDataset, prefix: str) -> dict[str, Any]:
+    """Return the arms of a data set that were corrected already, by prefix.
+
+    Raises:
+        MeasurementError: this arm is one of them; a prefix that continues another one selects the same values.
+    """
+    path = source.folder / RECORD
+    if not path.exists():
+        return {}
+    record = _json(path, read_text(path, MeasurementError, "JSON"))
+    if any(other.startswith(prefix) or prefix.startswith(other) for other in record):
+        raise MeasurementError(
+            "the data set was corrected already",
+            value=", ".join(map(repr, record)),
+            at=Place(path),
+            remedy="correct the original data set, or state the prefix of the other arm",
+        )
+    return record
+
+
+def _json(path: Path, text: str, line: int | None = None) -> dict[str, Any]:
+    """Return a JSON object of a file.
+
+    Raises:
+        MeasurementError: the text is not one.
+    """
+    try:
+        document = json.loads(text)
+    except ValueError as problem:
+        raise MeasurementError(expected="JSON", value=str(problem), at=Place(path, line)) from None
+    if not isinstance(document, dict):
+        raise MeasurementError(expected="a JSON object", value=type(document).__name__, at=Place(path, line))
+    return document
 
 
 def _write_copy(source: LeRobotDataset, corrections: dict[str, LeRobotCorrection], folder: Path) -> int:
     """Write all files of a data set to a folder; return the number of frames."""
     from pyarrow import parquet
 
-    changed = [file.relative_to(source.folder) for file in source.files]
-    changed += [Path("meta", name) for name in ("stats.json", "episodes_stats.jsonl")]
-    changed += [file.relative_to(source.folder) for file in _episode_files(source)]
+    changed = {file.relative_to(source.folder) for file in (*source.files, *_episode_files(source))}
+    changed |= {Path("meta", name) for name in ("stats.json", "episodes_stats.jsonl")}
 
     def unchanged(where: str, names: list[str]) -> set[str]:
         return {name for name in names if Path(where, name).relative_to(source.folder) in changed}
@@ -113,7 +151,7 @@ def _write_copy(source: LeRobotDataset, corrections: dict[str, LeRobotCorrection
         parquet.write_table(table, folder / file.relative_to(source.folder))
         frames += len(table)
     for file in _episode_files(source):
-        table = _with_statistics(parquet.read_table(file), corrections)
+        table = _with_statistics(read_table(file), corrections)
         parquet.write_table(table, folder / file.relative_to(source.folder))
     _write_json_statistics(source.folder, corrections, folder)
     return frames
@@ -154,13 +192,12 @@ def _write_json_statistics(source: Path, corrections: dict[str, LeRobotCorrectio
     """Move the statistics in `stats.json` (of all frames) and `episodes_stats.jsonl` (of every episode, v2.1)."""
     whole, episodes = Path("meta", "stats.json"), Path("meta", "episodes_stats.jsonl")
     if (source / whole).exists():
-        document = json.loads(read_text(source / whole, MeasurementError, "JSON"))
+        document = _json(source / whole, read_text(source / whole, MeasurementError, "JSON"))
         _move(document, corrections)
         (folder / whole).write_text(json.dumps(document, indent=4))
     if (source / episodes).exists():
-        lines = [
-            json.loads(line) for line in read_text(source / episodes, MeasurementError, "JSON").splitlines()
-        ]
+        text = read_text(source / episodes, MeasurementError, "JSON")
+        lines = [_json(source / episodes, line, n) for n, line in enumerate(text.splitlines(), start=1)]
         for line in lines:
             _move(line["stats"], corrections)
         (folder / episodes).write_text("".join(json.dumps(line) + "\n" for line in lines))

@@ -19,8 +19,12 @@ if TYPE_CHECKING:
 INFO = Path("meta", "info.json")
 VERSIONS = ("v2.1", "v3.0")
 STATE, ACTION = "observation.state", "action"
-GRIPPER = "gripper"
-"""Name of the motor that LeRobot counts as a joint, although it does not move the tool."""
+POSITION = ".pos"
+"""End of the names of positions; velocities and torques end in ".vel" and ".torque"."""
+GRIPPER, SHADOW = "gripper", "_shadow"
+"""Ends of the names of motors that LeRobot counts as joints, although they are none."""
+SIDES = ("left_", "right_")
+"""Prefixes of the two arms of LeRobot's pairs."""
 
 
 def is_lerobot_dataset(path: str | os.PathLike[str]) -> bool:
@@ -78,19 +82,9 @@ class LeRobotDataset:
         return LeRobotDataset(Path(folder), version, fps, names, files)
 
     def tables(self) -> "Iterator[tuple[Path, pyarrow.Table]]":
-        """Read file after file.
-
-        Raises:
-            MeasurementError: a file cannot be read.
-            ImportError: pyarrow is not installed.
-        """
-        from pyarrow import ArrowException, parquet
-
+        """Read file after file; see `read_table`."""
         for file in self.files:
-            try:
-                yield file, parquet.read_table(file)
-            except (ArrowException, OSError) as problem:
-                raise MeasurementError(f"it cannot be read ({problem})", at=Place(file)) from None
+            yield file, read_table(file)
 
     def frames(self, table: "pyarrow.Table", key: str, file: Path) -> Float[np.ndarray, "frames values"]:
         """Return the values of a feature in a table of `tables`, (frames, values).
@@ -109,6 +103,21 @@ class LeRobotDataset:
         return frames
 
 
+def read_table(file: Path) -> "pyarrow.Table":
+    """Read a Parquet file.
+
+    Raises:
+        MeasurementError: it cannot be read.
+        ImportError: pyarrow is not installed.
+    """
+    from pyarrow import ArrowException, parquet
+
+    try:
+        return parquet.read_table(file)
+    except (ArrowException, OSError) as problem:
+        raise MeasurementError(f"it cannot be read ({problem})", at=Place(file)) from None
+
+
 def _value_names(feature: Any, key: str, at: Place) -> tuple[str, ...]:
     """Return the names of the values of a feature, which may be in a list or in a dictionary with one list."""
     names = feature.get("names") if isinstance(feature, dict) else None
@@ -121,26 +130,39 @@ def _value_names(feature: Any, key: str, at: Place) -> tuple[str, ...]:
     return tuple(names)
 
 
-def motor_of(name: str, prefix: str = "") -> str | None:
-    """Return the motor whose position a value is, such as "elbow_flex" of "left_elbow_flex.pos"; None for others.
+def joint_motors(names: Sequence[str], prefix: str = "") -> dict[str, int]:
+    """Return the index of the position of every motor of an arm, by the name of the motor, in the order of the values.
+
+    The positions are the values whose names end in ".pos" ("left_elbow_flex.pos" of motor "elbow_flex"); if there are
+    none, as in data sets from before LeRobot 0.2, they are the values whose names have no dot. The gripper and the
+    second motor of a joint (ALOHA's "elbow_shadow") are left out, because they are no joints of the robot.
 
     Args:
-        name: name of the value in a data set, or key of an observation.
+        names: names of the values of a frame.
         prefix: start of the names of this arm, such as "left_" of a pair.
-    """
-    bare = name.removeprefix("main_")  # of data sets recorded before LeRobot 0.2
-    return bare.removeprefix(prefix).removesuffix(".pos") if bare.startswith(prefix) else None
-
-
-def joint_motors(names: Sequence[str], prefix: str = "") -> list[str]:
-    """Return the motors of an arm in the order of the values, without the gripper.
 
     Raises:
-        MeasurementError: a motor appears twice.
+        MeasurementError: a motor appears twice, or the values are those of two arms and no prefix is given.
     """
-    motors = [motor for name in names if (motor := motor_of(name, prefix)) not in (None, GRIPPER)]
-    if len(set(motors)) < len(motors):
+    suffix = POSITION if any(name.endswith(POSITION) for name in names) else ""
+    motors: dict[str, int] = {}
+    for index, name in enumerate(names):
+        bare = name.removeprefix("main_").removesuffix(suffix)  # "main_" is older than LeRobot 0.2
+        if not name.endswith(suffix) or "." in bare or not bare.startswith(prefix):
+            continue
+        motor = bare.removeprefix(prefix)
+        if motor.endswith((GRIPPER, SHADOW)):
+            continue
+        if motor in motors:
+            raise MeasurementError("a motor appears twice", value=", ".join(names), option="names")
+        motors[motor] = index
+    sides = [side for side in SIDES if any(motor.startswith(side) for motor in motors)]
+    if len(sides) > 1:
         raise MeasurementError(
-            "a motor appears twice", value=", ".join(names), remedy="give the prefix of one arm"
+            "the values are those of two arms",
+            expected=f"the prefix of one arm, {' or '.join(sides)}",
+            value=", ".join(names),
+            option="prefix",
+            remedy=f"state prefix={sides[0]} (on a command line: --set lerobot_prefix={sides[0]})",
         )
-    return [motor for motor in motors if motor is not None]
+    return motors

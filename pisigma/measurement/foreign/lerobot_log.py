@@ -8,12 +8,7 @@ import numpy as np
 
 from pisigma.files.errors import MeasurementError
 from pisigma.files.output_file import check_output, write_atomically
-from pisigma.measurement.foreign.lerobot_dataset import (
-    STATE,
-    LeRobotDataset,
-    joint_motors,
-    motor_of,
-)
+from pisigma.measurement.foreign.lerobot_dataset import STATE, LeRobotDataset, joint_motors
 from pisigma.measurement.foreign.lerobot_motors import LeRobotUnits, radians_per_unit, read_motors
 
 
@@ -23,12 +18,14 @@ class JointLog:
 
     Attributes:
         motors: motors of the columns q1, q2, ..., in their order.
+        left_out: names of the values that are not positions of these motors.
         header: names of the columns: `image`, `time` and the joint values.
         rows: their texts.
         source: the data set.
     """
 
     motors: tuple[str, ...]
+    left_out: tuple[str, ...]
     header: tuple[str, ...]
     rows: list[list[str]]
     source: str
@@ -43,17 +40,18 @@ class JointLog:
         write_atomically(Path(path), "".join(",".join(row) + "\n" for row in (self.header, *self.rows)))
 
     def to_json(self) -> dict[str, object]:
-        """Return the number of rows and the columns."""
+        """Return the number of rows, the columns and the values that are left out."""
         columns = {f"q{number}_deg": motor for number, motor in enumerate(self.motors, start=1)}
-        return {"rows": len(self.rows), "columns": columns}
+        return {"rows": len(self.rows), "columns": columns, "left_out": list(self.left_out)}
 
 
 def read_joint_log(
     dataset: str | os.PathLike[str],
     units: LeRobotUnits | None,
     calibration: str | os.PathLike[str] | None = None,
+    prefix: str = "",
 ) -> JointLog:
-    """Read the observed joint values of all frames, without the gripper.
+    """Read the observed joint values of all frames, without the gripper and what are no positions of joints.
 
     Columns are the motors in their order in the data set. `image` is `episode-000003-frame-000120`, the name of the
     image of that frame, and `time` [s] counts from the start of its episode.
@@ -62,9 +60,11 @@ def read_joint_log(
         dataset: folder of the data set.
         units: units of its values; None if they are not stated.
         calibration: LeRobot's calibration file, needed for normalized values.
+        prefix: start of the names of this arm, such as "left_" of a pair.
 
     Raises:
-        MeasurementError: the data set cannot be read, or the units of its values are not stated.
+        MeasurementError: the data set cannot be read, has no joint values of this arm, or the units of its values are
+            not stated.
         ImportError: pyarrow is not installed.
     """
     if units is None:
@@ -78,10 +78,14 @@ def read_joint_log(
     if STATE not in source.names:
         raise MeasurementError(expected=f"the feature {STATE}", value=", ".join(source.names), option="files")
     names = source.names[STATE]
-    motors = tuple(joint_motors(names))
+    motors = joint_motors(names, prefix)
+    if not motors:
+        raise MeasurementError(
+            expected="positions of motors", value=", ".join(names), option="lerobot_prefix"
+        )
+    columns = list(motors.values())
     known = None if calibration is None else read_motors(calibration)
     scale = np.rad2deg([radians_per_unit(units, motor, known) for motor in motors])
-    columns = [[motor_of(name) for name in names].index(motor) for motor in motors]
     rows = []
     for file, table in source.tables():
         values = source.frames(table, STATE, file)[:, columns].astype(np.float64) * scale
@@ -90,4 +94,5 @@ def read_joint_log(
             image = f"episode-{episode:06d}-frame-{frame:06d}"
             rows.append([image, f"{seconds:.6f}", *(f"{value:.6f}" for value in joints)])
     header = ("image", "time", *(f"q{number}_deg" for number in range(1, len(motors) + 1)))
-    return JointLog(motors, header, rows, str(dataset))
+    left_out = tuple(name for index, name in enumerate(names) if index not in columns)
+    return JointLog(tuple(motors), left_out, header, rows, str(dataset))

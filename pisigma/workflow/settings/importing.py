@@ -51,6 +51,7 @@ class ImportSettings:
         new_frame_at: first line measured after the instrument was moved. From this line, rows are in a new frame.
         lerobot_units: units of the joint values of a LeRobot data set, degrees or normalized (-100 to 100).
         lerobot_calibration: calibration file of LeRobot with which normalized values were recorded.
+        lerobot_prefix: start of the names of the arm in a LeRobot data set of two arms, such as left_.
 
     Raises:
         MeasurementError: `join` or `lerobot_units` is not a valid choice.
@@ -67,6 +68,7 @@ class ImportSettings:
     new_frame_at: Annotated[tuple[int, ...], Option(metavar="LINE", is_key=True)] = ()
     lerobot_units: Annotated["LeRobotUnits | None", Option(kind=str, is_key=True)] = None
     lerobot_calibration: Annotated[str | None, Option(is_key=True)] = None
+    lerobot_prefix: Annotated[str, Option(is_key=True)] = ""
 
     def __post_init__(self) -> None:
         """Check the choices."""

@@ -1,9 +1,11 @@
 """Frames of LeRobot are corrected by the offsets of the joints and keep shape, type and order."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
+import pyarrow
 import pytest
 import torch
 from pyarrow import parquet
@@ -111,7 +113,7 @@ def test_a_data_set_is_corrected(layout, model_folder, tmp_path, correction):
     for file in sorted(source.rglob("*.parquet")):
         old, new = parquet.read_schema(file), parquet.read_schema(tmp_path / "new" / file.relative_to(source))
         assert new.equals(old, check_metadata=True)
-    version = json.loads((result.folder / RECORD).read_text())["action"]
+    version = json.loads((result.folder / RECORD).read_text())[""]["action"]
     assert version["model"] == "so101"
     assert len(version["sha256"]) == 64
     assert_close([version["offsets_deg"][name.removesuffix(".pos")] for name in NAMES[:5]], ZEROS, atol=1e-9)
@@ -157,3 +159,71 @@ def test_another_layout_and_unnamed_values_are_refused(tmp_path, model_folder):
         (tmp_path / "meta" / "info.json").write_text(json.dumps(info | change))
         with refused(MeasurementError, file="info.json"):
             correct_lerobot_dataset(tmp_path, model_folder, tmp_path / "new", "degrees")
+
+
+def pair_of_arms(folder):
+    """Write a data set of two arms, whose frames are those of v2.1 twice."""
+    shutil.copytree(DATA_SETS / "v2.1", folder)
+    info = json.loads((folder / "meta" / "info.json").read_text())
+    for key in ("action", "observation.state"):
+        info["features"][key] |= {
+            "shape": [12],
+            "names": [f"{side}_{name}" for side in ("left", "right") for name in NAMES],
+        }
+    (folder / "meta" / "info.json").write_text(json.dumps(info))
+    (folder / "meta" / "episodes_stats.jsonl").unlink()
+    for file in folder.glob("data/chunk-*/*.parquet"):
+        table = parquet.read_table(file)
+        for key in ("action", "observation.state"):
+            doubled = [[*row, *row] for row in table.column(key).to_pylist()]
+            table = table.set_column(
+                table.column_names.index(key), key, pyarrow.array(doubled, pyarrow.list_(pyarrow.float32()))
+            )
+        parquet.write_table(table, file)
+    return folder
+
+
+def test_both_arms_of_a_pair_are_corrected_one_after_the_other(model_folder, correction, tmp_path):
+    source = pair_of_arms(tmp_path / "pair")
+    with refused(MeasurementError, option="prefix"):
+        correct_lerobot_dataset(source, model_folder, tmp_path / "left", "degrees")
+    left = correct_lerobot_dataset(source, model_folder, tmp_path / "left", "degrees", prefix="left_").folder
+    both = correct_lerobot_dataset(left, model_folder, tmp_path / "both", "degrees", prefix="right_").folder
+    before, after = columns(source), columns(both)
+    assert_close(after["action"], before["action"] + np.tile(correction.offset, 2), atol=1e-5)
+    assert set(json.loads((both / RECORD).read_text())) == {"left_", "right_"}
+    for prefix in ("left_", "right_", "left_arm_"):
+        with refused(MeasurementError, file="pisigma.json"):
+            correct_lerobot_dataset(both, model_folder, tmp_path / "again", "degrees", prefix=prefix)
+
+
+@pytest.mark.parametrize("broken", ["meta/stats.json", "meta/episodes/chunk-000/file-000.parquet"])
+def test_files_that_cannot_be_read_or_written_are_refused(broken, model_folder, tmp_path):
+    shutil.copytree(DATA_SETS / "v3.0", tmp_path / "old")
+    (tmp_path / "old" / broken).write_text("{")
+    with refused(MeasurementError, file=Path(broken).name):
+        correct_lerobot_dataset(tmp_path / "old", model_folder, tmp_path / "new", "degrees")
+    (tmp_path / "file").touch()
+    with refused(OutputError, file="new"):
+        correct_lerobot_dataset(DATA_SETS / "v3.0", model_folder, tmp_path / "file" / "new", "degrees")
+
+
+@pytest.mark.parametrize("kind", [float, np.float64, np.float32, torch.tensor, np.atleast_1d])
+def test_values_by_name_keep_their_type_and_integers_are_refused(kind, correction):
+    frame = {name: kind(10.0) for name in NAMES}
+    moved = correction.true_values(frame)
+    for name, offset in zip(NAMES, correction.offset, strict=True):
+        assert type(moved[name]) is type(frame[name])
+        assert getattr(moved[name], "dtype", None) == getattr(frame[name], "dtype", None)
+        assert_close(np.squeeze(moved[name]), 10.0 + offset, atol=1e-5)
+    for integer in (10, True, np.int64(10), torch.tensor(10)):
+        with refused(MeasurementError, option=NAMES[1]):
+            correction.true_values(frame | {NAMES[1]: integer})
+
+
+def test_velocities_and_torques_are_not_changed(model_folder, correction):
+    names = [f"{name.removesuffix('.pos')}{kind}" for name in NAMES for kind in (".pos", ".vel", ".torque")]
+    wide = pisigma.LeRobotCorrection.load(model_folder, names, "degrees")
+    expected = np.zeros((6, 3))
+    expected[:, 0] = correction.offset
+    assert_close(wide.offset, expected.reshape(-1))

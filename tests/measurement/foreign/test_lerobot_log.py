@@ -9,6 +9,7 @@ from testing.refusals import refused
 
 from pisigma.files.errors import MeasurementError
 from pisigma.measurement.foreign.joining import join_joints
+from pisigma.measurement.foreign.lerobot_dataset import joint_motors
 from pisigma.measurement.foreign.lerobot_log import read_joint_log
 from pisigma.measurement.foreign.lerobot_motors import motors_text
 
@@ -22,6 +23,7 @@ def recorded(layout):
 def test_the_joints_of_every_frame_are_found_by_the_name_of_its_image(layout, tmp_path):
     log = read_joint_log(DATA_SETS / layout, "degrees")
     assert log.motors == MOTORS[:5]
+    assert log.left_out == ("gripper.pos",)
     log.save(tmp_path / "joints.csv")
     images = [f"episode-{episode:06d}-frame-{frame:06d}" for episode in range(2) for frame in range(6)]
     joined = join_joints(images, tmp_path / "joints.csv", within=0.2)
@@ -39,3 +41,21 @@ def test_normalized_values_need_the_calibration_file(tmp_path):
         read_joint_log(DATA_SETS / "v3.0", "normalized")
     with refused(MeasurementError, option="lerobot_units"):
         read_joint_log(DATA_SETS / "v3.0", None)
+
+
+@pytest.mark.parametrize(
+    ("names", "prefix", "expected"),
+    [
+        (("a.pos", "a.vel", "b.pos", "gripper.pos"), "", {"a": 0, "b": 2}),
+        (("main_a", "main_gripper", "x.vel"), "", {"a": 0}),
+        (("left_elbow", "left_elbow_shadow", "left_gripper", "right_elbow"), "left_", {"elbow": 0}),
+        (("camera", "b.pos"), "", {"b": 1}),
+    ],
+)
+def test_only_positions_of_joints_are_taken(names, prefix, expected):
+    assert joint_motors(names, prefix) == expected
+
+
+def test_values_of_two_arms_need_a_prefix():
+    with refused(MeasurementError, option="prefix"):
+        joint_motors(("left_a.pos", "right_a.pos"))
