@@ -1,0 +1,379 @@
+"""Bases of several arms relative to each other, from what the fits of the arms have in common."""
+
+import itertools
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from jaxtyping import Float64
+from scipy.stats import chi2
+from torch import Tensor
+
+from pisigma.calibration.geometric.problem.parameters import ParameterSpace
+from pisigma.calibration.geometric.problem.setup import IdentifiedGeometry
+from pisigma.estimation.equalities import ConditionedUnknowns, condition_on_equalities
+from pisigma.files.errors import IdentificationError
+from pisigma.robot.frame_fits import MeasuredPoses, best_base
+from pisigma.robot.se3 import (
+    invert,
+    pose_error,
+    rotation_from_vector,
+    transform,
+    transform_from_xyzrpy,
+)
+
+CLOSURE = 1e-9
+"""Standard deviation [m or rad] to which frames and points that two arms share are the same, for rounding errors."""
+FALSE_ALARMS = 1e-3
+"""Probability that arms without faults are said to disagree."""
+MAX_ITERATIONS, CONVERGENCE_TOLERANCE = 20, 1e-12
+MIN_POINTS = 3
+COLLINEAR = 1e-3
+"""Second singular value of points over the first one below which they are on a line, which determines no rotation."""
+
+
+@dataclass(frozen=True, eq=False)
+class ArmPosterior:
+    """Normal distribution of the parameters of an arm.
+
+    Attributes:
+        name: name of the arm.
+        space: its parameters, with the bases of its measuring frames and the unknowns of its sensors.
+        geometry: their most probable values.
+        root: root `R` of the covariance `R R^T`, whose first rows are those of the parameters [m and rad].
+    """
+
+    name: str
+    space: ParameterSpace
+    geometry: IdentifiedGeometry
+    root: Float64[Tensor, "unknowns directions"]
+
+    @cached_property
+    def values(self) -> Float64[Tensor, " parameters"]:
+        """Values of all parameters [m or rad]."""
+        return self.geometry.values_of(self.space)
+
+    def base_rows(self, frame: str) -> range:
+        """Return the indices of the base in a frame."""
+        first = self.space.indices_of("base").start + 6 * self.space.frames.index(frame)
+        return range(first, first + 6)
+
+    @cached_property
+    def shared_objects(self) -> dict[tuple[str, str], tuple[str, tuple[int, ...]]]:
+        """Frame and indices of the parameters of everything that another arm could have measured too.
+
+        These are named frames in which the base was calibrated, and points at positions that were estimated: sockets
+        and anchors. For a frame, the parameters are those of the base.
+        """
+        found = {
+            ("frame", frame): (frame, tuple(self.base_rows(frame)))
+            for frame in self.space.frames
+            if frame and bool(self.root[list(self.base_rows(frame))].any())
+        }
+        for group in self.space.unknowns:
+            first, size = self.space.indices_of(group.name).start, len(group.columns)
+            for number, (owner, frame) in enumerate(zip(group.owners, group.frames, strict=False)):
+                rows = tuple(range(first + size * number, first + size * (number + 1)))
+                if group.has_point and bool(self.root[list(rows)].any()):
+                    found[group.name, owner] = frame, rows
+        return found
+
+
+@dataclass(frozen=True)
+class SharedObject:
+    """A frame or a point that several arms measured.
+
+    Attributes:
+        kind: "frame" or the group of the sensor's unknowns, such as "socket".
+        name: its name in the rows of all of these arms.
+        arms: numbers of the arms.
+    """
+
+    kind: str
+    name: str
+    arms: tuple[int, ...]
+
+    @property
+    def key(self) -> tuple[str, str]:
+        """Kind and name."""
+        return self.kind, self.name
+
+
+@dataclass(frozen=True)
+class Disagreement:
+    """A shared object whose poses or positions by the arms differ.
+
+    Attributes:
+        shared: the object.
+        distance: largest distance between its positions by two arms, with the bases found [m].
+        probability: probability that arms without faults differ as much at this object, given the others.
+    """
+
+    shared: SharedObject
+    distance: float
+    probability: float
+
+
+@dataclass(frozen=True, eq=False)
+class ArmBases:
+    """Bases of arms in the base of the first arm.
+
+    Attributes:
+        arms: posteriors of the arms before.
+        shared: what the arms have in common.
+        T_first_base: pose of every arm's base in the base of the first arm.
+        conditioned: the joint posterior; its x are the shifts along and the rotations about the axes of the first
+            arm's base of the bases of all other arms [m and rad], its z the directions of the roots of all arms.
+        equations: per equation, the number of the shared object.
+        distances: per shared object, the largest distance between its positions by two arms [m].
+        system: derivatives of the equations with respect to z and x, and their misclosure at z = 0.
+    """
+
+    arms: tuple[ArmPosterior, ...]
+    shared: tuple[SharedObject, ...]
+    T_first_base: Float64[Tensor, "arms 4 4"]
+    conditioned: ConditionedUnknowns
+    equations: tuple[int, ...]
+    distances: tuple[float, ...]
+    system: tuple[Tensor, Tensor, Tensor]
+
+    @property
+    def root(self) -> Float64[Tensor, "arms 6 directions"]:
+        """Root of the covariance of the bases: shifts along and rotations about the axes of the first base."""
+        found = self.conditioned.x_root
+        return torch.cat([found.new_zeros(6, found.shape[1]), found]).view(len(self.arms), 6, -1)
+
+    def relative(self, first: int, second: int) -> tuple[Float64[Tensor, "4 4"], Float64[Tensor, "6 6"]]:
+        """Return the base of an arm in the base of another one, with its covariance.
+
+        Args:
+            first: number of the arm in whose base the pose is.
+            second: number of the other arm.
+
+        Returns:
+            The pose, and the covariance of its shift along and its rotation about the axes of the first of both bases
+            [m and rad].
+        """
+        T = invert(self.T_first_base[first]) @ self.T_first_base[second]
+        away = self.T_first_base[second, :3, 3] - self.T_first_base[first, :3, 3]
+        moved = self.root[second] - self.root[first]
+        # A rotation of the first base also shifts the second one seen from it.
+        moved[:3] += torch.linalg.cross(away[:, None].expand(3, moved.shape[1]), self.root[first, 3:], dim=0)
+        turned = (self.T_first_base[first, :3, :3].mT @ moved.view(2, 3, -1)).flatten(0, 1)
+        return T, turned @ turned.mT
+
+    @property
+    def probability(self) -> float:
+        """Probability of a larger misfit of arms without faults; 1 if nothing is measured twice."""
+        found = self.conditioned
+        return float(chi2.sf(found.misfit, found.redundancy)) if found.redundancy else 1.0
+
+    @cached_property
+    def disagreements(self) -> tuple[Disagreement, ...]:
+        """Shared objects on whose place the arms disagree, the least probable first; empty if they agree."""
+        if self.probability >= FALSE_ALARMS:
+            return ()
+        found = []
+        B, G, r = self.system
+        number = torch.tensor(self.equations)
+        for index, shared in enumerate(self.shared):
+            others = number != index
+            if int(torch.linalg.matrix_rank(G[others], rtol=COLLINEAR)) < G.shape[1]:
+                drop, freedom = self.conditioned.misfit, self.conditioned.redundancy
+            else:
+                left = condition_on_equalities(B[others], G[others], r[others], closures(others.sum()))
+                drop = self.conditioned.misfit - left.misfit
+                freedom = self.conditioned.redundancy - left.redundancy
+            probability = float(chi2.sf(drop, freedom))
+            if probability < FALSE_ALARMS / len(self.shared):
+                found.append(Disagreement(shared, self.distances[index], probability))
+        return tuple(sorted(found, key=lambda one: (one.probability, -one.distance)))
+
+
+def closures(count: int | Tensor) -> Float64[Tensor, " equations"]:
+    """Return the standard deviations of the equations."""
+    return torch.full((int(count),), CLOSURE, dtype=torch.float64)
+
+
+def find_shared_objects(arms: Sequence[ArmPosterior]) -> tuple[SharedObject, ...]:
+    """Return what two or more arms measured under one name: frames in which they are calibrated, and points."""
+    keys = dict.fromkeys(itertools.chain.from_iterable(arm.shared_objects for arm in arms))
+    found = (
+        SharedObject(*key, tuple(k for k, arm in enumerate(arms) if key in arm.shared_objects))
+        for key in keys
+    )
+    return tuple(one for one in found if len(one.arms) > 1)
+
+
+def fit_arm_bases(arms: Sequence[ArmPosterior]) -> ArmBases:
+    """Find the base of every arm in that of the first one, by equating what the arms have in common.
+
+    The arms were calibrated independently of each other. Their joint posterior is the product of their own ones, given
+    that every shared frame is one frame and every shared point is one point; the bases have no prior. This is what one
+    least-squares fit of all rows gives, to first order in the errors of the arms and with the noise and prior sizes of
+    their own fits, because these summarise their rows as normal distributions; it is exact if positions are linear in
+    the parameters. The equations are linearised again until they close.
+
+    With one shared frame the equations only determine the bases. With more, each arm also learns from the others.
+
+    Args:
+        arms: two or more arms.
+
+    Raises:
+        IdentificationError: the shared frames and points do not connect all arms.
+    """
+    shared = find_shared_objects(arms)
+    T = torch.stack(list(_start(arms, shared)))
+    z = [torch.zeros(arm.root.shape[1], dtype=torch.float64) for arm in arms]
+    for _ in range(MAX_ITERATIONS):
+        B, G, closed = _linearised(arms, shared, T, z)
+        r = B @ torch.cat(z) - closed
+        found = condition_on_equalities(B, G, r, closures(len(r)))
+        step = found.x.view(-1, 6)
+        T = torch.cat([T[:1], _moved(T[1:], step)])
+        z = list(torch.split(found.z, [len(one) for one in z]))
+        if float(step.abs().max()) < CONVERGENCE_TOLERANCE:
+            break
+    numbers = tuple(number for number, one in enumerate(shared) for _ in range(_count(arms, one)))
+    distances = tuple(_distance(arms, one, T) for one in shared)
+    return ArmBases(tuple(arms), shared, T, found, numbers, distances, (B, G, r))
+
+
+def _moved(T: Float64[Tensor, "*batch 4 4"], step: Float64[Tensor, "*batch 6"]) -> Tensor:
+    """Return poses that are shifted along and rotated about the axes of their frame, in place."""
+    R = rotation_from_vector(step[..., 3:]) @ T[..., :3, :3]
+    return transform(R, T[..., :3, 3] + step[..., :3])
+
+
+def _count(arms: Sequence[ArmPosterior], one: SharedObject) -> int:
+    """Return the number of equations of a shared object: one per parameter and further arm."""
+    return len(arms[one.arms[0]].shared_objects[one.key][1]) * (len(one.arms) - 1)
+
+
+def _used(arms: Sequence[ArmPosterior], shared: Sequence[SharedObject]) -> list[list[int]]:
+    """Return the indices of the parameters of every arm on which the equations depend."""
+    used: list[set[int]] = [set() for _ in arms]
+    for one in shared:
+        for number in one.arms:
+            frame, rows = arms[number].shared_objects[one.key]
+            used[number] |= {*rows, *arms[number].base_rows(frame)}
+    return [sorted(rows) for rows in used]
+
+
+def _in_base(
+    arm: ArmPosterior, key: tuple[str, str], values: Callable[[Sequence[int]], Tensor]
+) -> tuple[Tensor, Tensor]:
+    """Return the pose of a shared object in the base of an arm, and what else its sensor has, such as a zero."""
+    frame, rows = arm.shared_objects[key]
+    T_base_frame = invert(transform_from_xyzrpy(values(arm.base_rows(frame))))
+    if key[0] == "frame":
+        return T_base_frame, values(())
+    point = transform(torch.eye(3, dtype=torch.float64), values(rows[:3]))
+    return T_base_frame @ point, values(rows[3:])
+
+
+def _linearised(
+    arms: Sequence[ArmPosterior],
+    shared: Sequence[SharedObject],
+    T: Float64[Tensor, "arms 4 4"],
+    z: Sequence[Tensor],
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return derivatives of all equations with respect to z and the steps of the bases, and their values."""
+    used = _used(arms, shared)
+    roots = [arm.root[rows] for arm, rows in zip(arms, used, strict=True)]
+    now = [arm.values[rows] + R @ one for arm, rows, R, one in zip(arms, used, roots, z, strict=True)]
+    sizes = [len(rows) for rows in used]
+    places = [{row: place for place, row in enumerate(rows)} for rows in used]
+
+    def equations(unknowns: Tensor) -> Tensor:
+        steps = unknowns[sum(sizes) :].view(-1, 6)
+        bases = torch.cat([T[:1], _moved(T[1:], steps)])
+        parts = torch.split(unknowns[: sum(sizes)], sizes)
+        return torch.cat(list(_equations(arms, shared, bases, parts, places)))
+
+    at = torch.cat([*now, torch.zeros(6 * (len(arms) - 1), dtype=torch.float64)])
+    J = torch.func.jacrev(equations)(at)
+    J_own, G = J[:, : sum(sizes)], J[:, sum(sizes) :]
+    B = torch.cat([part @ R for part, R in zip(torch.split(J_own, sizes, 1), roots, strict=True)], 1)
+    return B, G, equations(at)
+
+
+def _equations(
+    arms: Sequence[ArmPosterior],
+    shared: Sequence[SharedObject],
+    bases: Tensor,
+    parts: Sequence[Tensor],
+    places: Sequence[dict[int, int]],
+) -> Iterator[Tensor]:
+    """Yield the differences between the first arm of every shared object and each further one."""
+    for one in shared:
+        seen = []
+        for number in one.arms:
+
+            def values(rows: Sequence[int], number: int = number) -> Tensor:
+                return parts[number][[places[number][row] for row in rows]]
+
+            pose, more = _in_base(arms[number], one.key, values)
+            seen.append((bases[number] @ pose, more))
+        for pose, more in seen[1:]:
+            error = pose_error(pose, seen[0][0])
+            yield torch.cat([error if one.kind == "frame" else error[:3], more - seen[0][1]])
+
+
+def _pose(arm: ArmPosterior, key: tuple[str, str]) -> Float64[Tensor, "4 4"]:
+    """Return the pose of a shared object in the base of an arm by its own fit."""
+    return _in_base(arm, key, lambda rows: arm.values[list(rows)])[0]
+
+
+def _distance(arms: Sequence[ArmPosterior], one: SharedObject, T: Float64[Tensor, "arms 4 4"]) -> float:
+    """Return the largest distance between the positions of a shared object by the fits of two arms [m]."""
+    there = torch.stack([(T[number] @ _pose(arms[number], one.key))[:3, 3] for number in one.arms])
+    return float(torch.cdist(there, there).max())
+
+
+def _start(arms: Sequence[ArmPosterior], shared: Sequence[SharedObject]) -> list[Float64[Tensor, "4 4"]]:
+    """Return a base for every arm, from a frame that it shares with an arm before, or else from its points."""
+    placed = {0: torch.eye(4, dtype=torch.float64)}
+    while len(placed) < len(arms):
+        for number in range(len(arms)):
+            if number in placed:
+                continue
+            found = _place(arms, shared, placed, number)
+            if found is not None:
+                placed[number] = found
+                break
+        else:
+            lost = [arm.name for number, arm in enumerate(arms) if number not in placed]
+            raise IdentificationError(
+                expected=f"a frame, or {MIN_POINTS} sockets or anchors that are not on one line, that arm "
+                f"'{lost[0]}' shares with the other arms",
+                value=", ".join(f"{one.kind} '{one.name}'" for one in shared) or "none",
+                remedy="name the same board, jig or instrument in the column 'frame' of the rows of both arms, or the "
+                "same sockets in the column 'socket'",
+            )
+    return [placed[number] for number in range(len(arms))]
+
+
+def _place(
+    arms: Sequence[ArmPosterior], shared: Sequence[SharedObject], placed: dict[int, Tensor], number: int
+) -> Float64[Tensor, "4 4"] | None:
+    """Return the base of an arm by what it shares with arms whose bases are known; None if it is not enough."""
+    wanted, own = [], []
+    for one in shared:
+        known = [other for other in one.arms if other in placed]
+        if number not in one.arms or not known:
+            continue
+        there = placed[known[0]] @ _pose(arms[known[0]], one.key)
+        mine = _pose(arms[number], one.key)
+        if one.kind == "frame":
+            return there @ invert(mine)
+        wanted.append(there[:3, 3])
+        own.append(mine)
+    if len(own) < MIN_POINTS:
+        return None
+    points = torch.stack(wanted)
+    spread = torch.linalg.svdvals(points - points.mean(0))
+    if spread[1] <= COLLINEAR * spread[0]:
+        return None
+    return best_base(torch.stack(own), MeasuredPoses.from_tensors(points, None, 0.0))

@@ -1,0 +1,140 @@
+"""Bases of two arms: what one least-squares fit of all rows gives, honest errors, and arms that disagree."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.optimize import OptimizeResult, least_squares
+from testing.closeness import assert_close
+from testing.models import no_type_checker
+from testing.refusals import refused
+from testing.two_arms import BASES, FRAMES, FREE, TOOL, UR5, own_fit, pose_of, posterior, posteriors
+
+from pisigma.calibration.frames.arm_bases import fit_arm_bases
+from pisigma.calibration.geometric.result import CalibrationResult
+from pisigma.files.errors import IdentificationError
+from pisigma.robot.kernels.array_kinematics import forward_kinematics
+from pisigma.robot.se3 import invert, pose_error, rotation_from_vector, rotation_vector, transform
+
+SOCKETS = 6
+
+
+def predicted(fit: CalibrationResult, arm: np.ndarray, in_frame: np.ndarray) -> np.ndarray:
+    """Return positions of the tool in the frames of the rows; `arm` has free parameters, then the tool."""
+    values = UR5.dh.copy()
+    for name, value in zip(FREE, arm, strict=False):
+        values[int(name[-1]) - 1, 0] = value
+    robot = UR5.with_geometry(values, base=np.zeros(6), tool=np.array([*arm[len(FREE) :], 0.0, 0.0, 0.0]))
+    p = forward_kinematics(robot, fit.solved.measurements.q.numpy())[:, :3, 3]
+    return np.einsum("rij,rj->ri", in_frame[:, :3, :3], p) + in_frame[:, :3, 3]
+
+
+def fitted_together(seed: int, sensor: str) -> OptimizeResult:
+    """Fit both arms and the second base at once by scipy, with the noise of the arms' own fits."""
+    fits = [own_fit(number, seed, sensor) for number in (0, 1)]
+    own = len(FREE) + 3
+    guess = np.concatenate(
+        [[*(fit.robot.dh[int(name[-1]) - 1, 0] for name in FREE), *TOOL[:3]] for fit in fits]
+    )
+    found = fit_arm_bases(posteriors(seed, sensor)).T_first_base[1].numpy()
+    there = [fits[0].bases[name] for name in FRAMES] if sensor == "frames" else []
+    where = [fits[0].unknowns["socket"][f"plate/{k}"] for k in range(SOCKETS)] if sensor == "sockets" else []
+    start = np.concatenate([guess, np.zeros(6), np.zeros(6 * len(there)), *where])
+
+    def residual(x: np.ndarray) -> np.ndarray:
+        second = x[2 * own : 2 * own + 6]
+        T_second = np.eye(4)
+        T_second[:3, :3] = rotation_from_vector(torch.from_numpy(second[3:])).numpy() @ found[:3, :3]
+        T_second[:3, 3] = found[:3, 3] + second[:3]
+        rest = x[2 * own + 6 :]
+        missed = []
+        for number, (fit, T_arm) in enumerate(zip(fits, (np.eye(4), T_second), strict=True)):
+            rows = fit.solved.measurements
+            if sensor == "sockets":
+                in_first = np.broadcast_to(T_arm, (rows.rows, 4, 4))
+                wanted = rest.reshape(-1, 3)[[int(name.split("/")[1]) for name in rows.socket]]
+            else:
+                steps = dict(zip(FRAMES, rest.reshape(-1, 6), strict=True))
+                moved = {
+                    name: transform(
+                        rotation_from_vector(torch.from_numpy(step[3:])), torch.from_numpy(step[:3])
+                    ).numpy()
+                    @ pose_of(fits[0].bases[name]).numpy()
+                    @ T_arm
+                    for name, step in steps.items()
+                }
+                in_first = np.stack([moved[name] for name in rows.frame])
+                wanted = rows.position.numpy()
+            miss = predicted(fit, x[number * own : (number + 1) * own], in_first) - wanted
+            missed.append(miss.ravel() / fit.noise[0].sigma)
+        return np.concatenate(missed)
+
+    return least_squares(residual, start, x_scale="jac", xtol=1e-9, ftol=1e-12)
+
+
+@pytest.mark.parametrize("sensor", ["frames", "sockets"])
+def test_posterior_is_that_of_one_fit_of_all_rows(sensor):
+    found = fit_arm_bases(posteriors(0, sensor))
+    with no_type_checker():
+        peer = fitted_together(0, sensor)
+    second = slice(2 * (len(FREE) + 3), 2 * (len(FREE) + 3) + 6)
+    covariance = np.linalg.inv(peer.jac.T @ peer.jac)[second, second]
+    error = np.sqrt(np.diag(covariance))
+    assert_close(peer.x[second] / error, 0.0, atol=0.03)
+    assert_close(found.root[1].norm(dim=1).numpy() / error, 1.0, atol=0.01)
+    misfit = peer.fun @ peer.fun - sum(
+        np.square(fit.residuals[fit.noise[0].sensor]).sum() / fit.noise[0].sigma ** 2
+        for fit in (own_fit(number, 0, sensor) for number in (0, 1))
+    )
+    assert_close(found.conditioned.misfit, misfit, rtol=0.02)
+    assert found.conditioned.redundancy == (6 if sensor == "frames" else 3 * SOCKETS - 6)
+
+
+@pytest.mark.parametrize("sensor", ["hall", "sockets"])
+def test_base_is_found_within_its_errors(sensor):
+    found = fit_arm_bases(posteriors(1, sensor))
+    T, covariance = found.relative(0, 1)
+    error = pose_error(pose_of(BASES[1]), T)
+    assert float(error @ torch.linalg.solve(covariance, error)) < 17  # 99 % of chi-squared with 6 degrees
+    back, turned = found.relative(1, 0)
+    assert_close(back, invert(T), atol=1e-12)
+    assert float((rotation_vector(back[:3, :3])).norm()) > 2.5
+    assert_close(turned[3:, 3:].trace(), covariance[3:, 3:].trace(), rtol=1e-9)
+    assert found.disagreements == ()
+
+
+def test_frame_that_moved_between_the_arms_is_named():
+    left, right = posteriors(2, "sockets")
+    moved = {name: point.copy() for name, point in right.geometry.unknowns["socket"].items()}
+    moved["plate/2"] += [1e-3, 0.0, 0.0]
+    shifted = replace(right, geometry=replace(right.geometry, unknowns={"socket": moved}))
+    assert fit_arm_bases((left, right)).disagreements == ()
+    worst, *_ = fit_arm_bases((left, shifted)).disagreements
+    assert worst.shared.name == "plate/2"
+
+
+def test_three_arms_are_connected_through_the_second_one():
+    chain = (
+        posterior("left", own_fit(0, 3, "hall")),
+        posterior("middle", own_fit(1, 3, "frames")),
+        posterior("right", own_fit(0, 4, "jig")),
+    )
+    found = fit_arm_bases(chain)
+    assert [one.name for one in found.shared] == ["hall", "jig"]
+    assert_close(found.T_first_base[2], np.eye(4), atol=2e-4)
+    sides = [found.relative(a, b)[1][:3, :3].trace() for a, b in ((0, 1), (1, 2), (0, 2))]
+    assert float(sides[2]) > max(map(float, sides[:2]))
+
+
+def test_arms_without_anything_in_common_are_refused():
+    hall, jig = posterior("left", own_fit(0, 3, "hall")), posterior("right", own_fit(0, 4, "jig"))
+    with refused(IdentificationError, value="none"):
+        fit_arm_bases((hall, jig))
+
+
+def test_order_of_the_arms_does_not_matter():
+    left, right = posteriors(1, "frames")
+    one, other = fit_arm_bases((left, right)), fit_arm_bases((right, left))
+    assert_close(one.T_first_base[1], invert(other.T_first_base[1]), atol=1e-9)
+    assert_close(one.relative(0, 1)[1], other.relative(1, 0)[1], rtol=1e-6, atol=1e-16)

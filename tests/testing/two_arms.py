@@ -1,0 +1,104 @@
+"""Two simulated UR5s that were measured in shared frames, or whose balls sat in the same sockets."""
+
+from collections.abc import Sequence
+from functools import lru_cache
+
+import numpy as np
+import torch
+
+from pisigma.calibration.frames.arm_bases import ArmPosterior
+from pisigma.calibration.geometric.calibrator import GeometricCalibrator
+from pisigma.calibration.geometric.result import CalibrationResult
+from pisigma.estimation.loss import SquaredLoss
+from pisigma.measurement.dataset import Measurements
+from pisigma.robot import Robot
+from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.robot.kinematics.jacobian import joint_jacobian
+from pisigma.robot.se3 import invert, transform_from_xyzrpy, xyzrpy_from_transform
+
+UR5 = Robot.load("ur5")
+FREE = ("theta_2", "theta_3", "theta_4", "theta_5")
+"""Parameters of the arms that have errors: joint zeros."""
+NOISE = 5e-5
+TOOL = np.array([0.05, -0.03, 0.15, 0.0, 0.0, 0.0])
+BASES = (np.zeros(6), np.array([1.1, 0.1, 0.05, 2.8, 0.1, -0.2]))
+"""Bases of the arms in the base of the first one."""
+FRAMES = {"hall": np.array([0.6, -0.5, 0.0, 0.4, 0.0, 0.1]), "jig": np.array([0.5, 0.3, 0.2, -0.3, 0.1, 0.0])}
+"""Poses of frames in the base of the first arm."""
+
+
+def pose_of(xyzrpy: np.ndarray) -> torch.Tensor:
+    """Return a transform."""
+    return transform_from_xyzrpy(torch.from_numpy(xyzrpy))
+
+
+def true_arm(number: int, seed: int, frame: str = "") -> Robot:
+    """Return an arm with errors of its free parameters and, in a frame, with its base there."""
+    rng = np.random.default_rng([seed, number])
+    values = UR5.dh.copy()
+    for name in FREE:
+        values[int(name[-1]) - 1, 0] += rng.normal(0, 5e-4)
+    base = np.zeros(6)
+    if frame:
+        base = xyzrpy_from_transform(invert(pose_of(FRAMES[frame])) @ pose_of(BASES[number])).numpy()
+    return UR5.with_geometry(values, base=base, tool=TOOL)
+
+
+def measured_positions(
+    number: int, seed: int, frames: Sequence[str] = tuple(FRAMES), rows: int = 30
+) -> Measurements:
+    """Return measured positions of an arm, with the same number of rows in every frame."""
+    rng = np.random.default_rng([seed, number, 1])
+    q = torch.from_numpy(rng.uniform(-2.2, 2.2, (rows * len(frames), 6)))
+    parts = [
+        forward_kinematics(true_arm(number, seed, frame), part)[:, :3, 3]
+        for frame, part in zip(frames, torch.split(q, rows), strict=True)
+    ]
+    position = torch.cat(parts) + torch.from_numpy(rng.normal(0, NOISE, (len(q), 3)))
+    return Measurements(q=q, position=position, frame=tuple(f for f in frames for _ in range(rows)))
+
+
+def socket_positions(count: int) -> torch.Tensor:
+    """Return positions of sockets between the arms, in the base of the first one [m]."""
+    corner = np.random.default_rng(5).uniform([0.4, -0.25, -0.1], [0.7, 0.3, 0.3], (count, 3))
+    return torch.from_numpy(corner)
+
+
+def socket_rows(number: int, seed: int, sockets: int = 6, touches: int = 8) -> Measurements:
+    """Return joint values of an arm whose ball sits in sockets, each in several postures."""
+    rng = np.random.default_rng([seed, number, 2])
+    robot = true_arm(number, seed)
+    there = invert(pose_of(BASES[number]))
+    points = socket_positions(sockets) @ there[:3, :3].mT + there[:3, 3]
+    wanted = points.repeat_interleave(touches, 0)
+    q = torch.from_numpy(np.array([0, -1.5, 1.5, 0, 1.5, 0]) + rng.uniform(-1, 1, (len(wanted), 6)))
+    noise = torch.from_numpy(rng.normal(0, NOISE, wanted.shape))
+    q[:, 0] = torch.atan2(wanted[:, 1], wanted[:, 0]) + np.pi
+    for _ in range(60):
+        T, J = joint_jacobian(robot, q)
+        step = torch.linalg.pinv(J[:, :3]) @ (wanted + noise - T[:, :3, 3])[..., None]
+        q = q + step[..., 0].clamp(-0.3, 0.3)
+    assert float((forward_kinematics(robot, q)[:, :3, 3] - wanted - noise).norm(dim=1).max()) < 1e-9
+    return Measurements(q=q, socket=tuple(f"plate/{k}" for k in range(sockets) for _ in range(touches)))
+
+
+@lru_cache(maxsize=32)
+def own_fit(number: int, seed: int, sensor: str) -> CalibrationResult:
+    """Return the calibration of one arm with its own rows: "frames", "hall" or "sockets"."""
+    rows = (
+        socket_rows(number, seed)
+        if sensor == "sockets"
+        else measured_positions(number, seed, tuple(FRAMES) if sensor == "frames" else (sensor,))
+    )
+    return GeometricCalibrator(UR5, free=FREE, prior=None, loss=SquaredLoss(), tool="position").fit(rows)
+
+
+def posterior(name: str, fit: CalibrationResult) -> ArmPosterior:
+    """Return the posterior of an arm."""
+    return ArmPosterior(name, fit.solved.problem.space, fit.solved.geometry, fit.solved.root)
+
+
+def posteriors(seed: int, sensor: str) -> tuple[ArmPosterior, ArmPosterior]:
+    """Return the posteriors of both arms."""
+    left, right = (posterior(name, own_fit(k, seed, sensor)) for k, name in enumerate(("left", "right")))
+    return left, right
