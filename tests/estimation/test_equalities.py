@@ -27,6 +27,6 @@ def test_solution_and_covariance_are_those_of_weighted_least_squares():
 
 def test_equations_between_exact_values_hold():
     B, G = torch.zeros(6, 3).double(), torch.eye(3).double().repeat(2, 1)
-    found = condition_on_equalities(B, G, torch.ones(6).double(), torch.full((6,), 1e-9).double())
+    found = condition_on_equalities(B, G, torch.ones(6).double(), torch.full((6,), 1e-9, dtype=torch.float64))
     assert_close(found.x, torch.ones(3), atol=1e-12)
     assert_close(found.x_root.norm(dim=1), 1e-9 / 2**0.5, rtol=1e-9)
