@@ -271,6 +271,18 @@ EXTRAS = {
 """Name of the extra (`pip install pisigma[EXTRA]`) that installs each optional package."""
 _PACKAGES = {"cv2": "opencv-python-headless", "pinocchio": "pin"}
 """Names of packages whose module has a different name, by module name."""
+_NOT_IN_IK = {
+    "PIL",
+    "jinja2",
+    "lxml",
+    "markupsafe",
+    "matplotlib",
+    "pytorch_kinematics",
+    "safetensors",
+    "scipy",
+    "torch",
+}
+"""Modules that `pisigma` requires, and `pisigma-ik` (packaging/pisigma-ik) does not."""
 
 
 def system_fault(problem: BaseException) -> str:
@@ -283,8 +295,14 @@ def system_fault(problem: BaseException) -> str:
 
 
 def missing_extra(problem: ImportError) -> MissingExtraError | None:
-    """Return an error that names the extra of a package that could not be imported; None if no extra contains it."""
+    """Return an error that names what installs a package that could not be imported; None if it is not of pisigma."""
     module = (problem.name or "").split(".")[0]
+    if module in _NOT_IN_IK:
+        return MissingExtraError(
+            f"this needs the package {module}, which is not installed with pisigma-ik",
+            value=module,
+            remedy="`pip uninstall pisigma-ik` and `pip install pisigma`, which has all commands",
+        )
     package = _PACKAGES.get(module, module)
     if package not in EXTRAS:
         return None
