@@ -1,5 +1,6 @@
 """Classes of robots: typical and largest sizes of geometric errors, and changes by wear or a collision."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final, Literal
@@ -85,6 +86,8 @@ class RobotClass:
         largest: standard deviations of geometric errors that no robot of the class exceeds.
         change: largest changes by wear or a collision.
         remaining: errors after a calibration, as a share of the reach, that no robot of the class exceeds.
+        joint_repeatability: standard deviation of the values of a revolute joint from image to image [rad]; 0 if the
+            repeatability of the pose that is stated for images contains it.
     """
 
     name: ClassName
@@ -95,6 +98,7 @@ class RobotClass:
     largest: GeometricSizes
     change: ChangeLimits
     remaining: float
+    joint_repeatability: float = 0.0
 
     @staticmethod
     def from_robot(robot: Robot) -> "RobotClass":
@@ -155,6 +159,7 @@ HOBBY: Final = replace(
     largest=GeometricSizes(joint_offset=0.3, length=20e-3, no_length=20e-3, between_axes=20e-3),
     change=ChangeLimits(joint_zero=0.3, length=0.02, angle=0.1),
     remaining=0.04,
+    joint_repeatability=math.radians(0.5),
 )
 """Arms without a reliable zero: built by hobbyists or in a laboratory, surgical arms with potentiometers, old arms that
 were reassembled, and arms of servos. Zeros of reassembled arms are wrong by 20 to 50 mrad, those of servo arms, which

@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
+from pisigma.calibration.geometric.joint_repeatability import with_joint_repeatability
 from pisigma.calibration.geometric.problem.parameters import Prior
 from pisigma.calibration.hybrid.calibrator import HybridCalibrator
 from pisigma.calibration.hybrid.result import HybridResult
@@ -136,10 +137,12 @@ def calibrate(
     splits = splitting.split(training, settings.repeats, settings.train_rows)
     distances = matching_sockets(settings.socket_distances, training.socket or ())
     calibrator = calibrator_of(settings, nominal, distances)
+    training = _with_joint_repeatability(training, calibrator, _class_of(settings, nominal))
     drawn = None if settings.train_rows is None else draw_rows(training, settings.train_rows, settings.seed)
     rows, backlash = training if drawn is None else training.select(drawn), None
     if measurements.approach is None:
-        sided = replace(measurements, approach=approach_by_order(measurements)).split_sets()[0]
+        approach = replace(measurements, approach=approach_by_order(measurements)).split_sets()[0].approach
+        sided = replace(training, approach=approach)
         sided_rows = sided if drawn is None else sided.select(drawn)
         backlash = unstated_backlash(geometric_of(calibrator), sided_rows)
         training, rows = (training, rows) if backlash is None else (sided, sided_rows)
@@ -226,6 +229,22 @@ def compose_calibration(
     return Calibration(model, result, rows, validation, test, kept, summary, texts)
 
 
+def _class_of(settings: CalibrationSettings, robot: Robot) -> RobotClass:
+    """Return the class of a robot that is stated, otherwise that of its maker."""
+    return CLASSES[settings.robot_class] if settings.robot_class else RobotClass.from_robot(robot)
+
+
+def _with_joint_repeatability(
+    rows: Measurements, calibrator: Calibrator, robot_class: RobotClass
+) -> Measurements:
+    """Add the repeatability of the joints to rows of images; see `with_joint_repeatability`."""
+    geometric = geometric_of(calibrator)
+    try:
+        return with_joint_repeatability(rows, geometric, robot_class.joint_repeatability)
+    except IdentificationError as refusal:
+        raise explain_refusal(refusal, geometric.robot, rows) from refusal
+
+
 def _call(robot: Robot, measurements: Measurements, settings: CalibrationSettings) -> str:
     """Return the call that repeats this calibration, with the settings that differ from the defaults."""
     usual = CalibrationSettings()
@@ -266,7 +285,7 @@ def calibrator_of(
         IdentificationError: a setting does not fit the robot.
     """
     length, angle = settings.prior_length, settings.prior_angle
-    usual = CLASSES[settings.robot_class] if settings.robot_class else RobotClass.from_robot(robot)
+    usual = _class_of(settings, robot)
     zeros = max(angle, usual.usual.joint_offset) if usual is HOBBY else angle
     geometric = GeometricCalibrator(
         robot,

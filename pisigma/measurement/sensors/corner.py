@@ -250,12 +250,31 @@ def with_fixed_intrinsics(measurements: Measurements, length: float, angle: floa
         length: standard deviation of the additional noise of each coordinate [m].
         angle: standard deviation of the additional noise of the rotation about each axis [rad].
     """
+    added = np.diag([length**2] * 3 + [angle**2] * 3)
+    noisy = with_pose_noise(measurements, np.broadcast_to(added, (measurements.rows, 6, 6)))
+    if noisy is measurements:
+        return measurements
+    others = {
+        name: values
+        for name, values in noisy.readings.items()
+        if name not in (INTRINSICS_COLUMN, SCALE_COLUMN)
+    }
+    return replace(noisy, readings=others)
+
+
+def with_pose_noise(measurements: Measurements, covariance: Float64[np.ndarray, "rows 6 6"]) -> Measurements:
+    """Return rows of images with additional noise of their poses; rows of other sensors are not changed.
+
+    Args:
+        measurements: the rows.
+        covariance: covariance of the additional noise of (position [m], rotation vector [rad]) of every row, in the
+            axes of the row's frame.
+    """
     texts = measurements.readings.get(WEIGHT_COLUMN)
     if not isinstance(texts, tuple):
         return measurements
-    added = np.diag([length**2] * 3 + [angle**2] * 3)
     weights = []
-    for text in texts:
+    for text, added in zip(texts, covariance, strict=True):
         numbers = numbers_in(text, WEIGHTS)
         if numbers:
             W = np.zeros((6, 6))
@@ -263,9 +282,4 @@ def with_fixed_intrinsics(measurements: Measurements, length: float, angle: floa
             lower = np.linalg.cholesky(np.linalg.inv(W.T @ W) + added)
             text = weight_text(np.linalg.inv(lower))
         weights.append(text)
-    others = {
-        name: values
-        for name, values in measurements.readings.items()
-        if name not in (INTRINSICS_COLUMN, SCALE_COLUMN)
-    }
-    return replace(measurements, readings={**others, WEIGHT_COLUMN: tuple(weights)})
+    return replace(measurements, readings={**measurements.readings, WEIGHT_COLUMN: tuple(weights)})
