@@ -96,5 +96,7 @@ for _feature in (
 
 if __name__ == "__main__":
     from pisigma.robot.kernels.build import build
+    from pisigma.robot.kernels.machine_code import build_object
 
     build()
+    build_object()

@@ -18,6 +18,8 @@ from pisigma.robot.kernels.forms import KernelForms
 
 FILE = Path(__file__).parent / "kernels.ll.zlib"
 """One line of JSON and the compressed code; `python -m pisigma.joint_correction.registry` writes it."""
+OBJECT = Path(__file__).parent / "kernels.x86-64-v3.o.zlib"
+"""The code as machine code for Linux on x86-64-v3, in the same form and written by the same command."""
 
 _PYTHON = frozenset(
     ("__init__.py", "array_kinematics.py", "build.py", "description_file.py", "machine_code.py")
@@ -61,30 +63,54 @@ def write_ready(code: str, forms: KernelForms, **made_with: str) -> None:
         forms: features and closed forms that the code evaluates.
         made_with: versions of the compilers.
     """
-    stated = {"sources": source_hash(), "forms": dataclasses.asdict(forms), **made_with}
-    header = json.dumps(stated, sort_keys=True)
-    FILE.write_bytes(header.encode() + b"\n" + zlib.compress(code.encode(), 9))
+    _write(FILE, code.encode(), forms=dataclasses.asdict(forms), **made_with)
+
+
+def write_object(code: bytes, **made_with: str) -> None:
+    """Write the machine code of the current intermediate code.
+
+    Args:
+        code: object file.
+        made_with: versions of the compilers.
+    """
+    _write(OBJECT, code, intermediate_sha256=hashlib.sha256(FILE.read_bytes()).hexdigest(), **made_with)
+
+
+def _write(file: Path, code: bytes, **stated: Any) -> None:
+    header = json.dumps({"sources": source_hash(), **stated}, sort_keys=True)
+    file.write_bytes(header.encode() + b"\n" + zlib.compress(code, 9))
 
 
 def ready_forms() -> KernelForms | None:
     """Return the forms that the stored code evaluates; None if it is missing or belongs to other sources."""
-    header, _ = _content()
+    header, _ = _content(FILE)
     return None if header is None else KernelForms(**{kind: tuple(n) for kind, n in header["forms"].items()})
 
 
 def read_ready() -> str | None:
     """Return the stored intermediate code; None if it is missing or damaged, or if the sources have changed."""
-    header, code = _content()
+    header, code = _content(FILE)
     try:
         return None if header is None else zlib.decompress(code).decode()
     except (ValueError, zlib.error):
         return None
 
 
-def _content() -> tuple[dict[str, Any] | None, bytes]:
-    """Return the parsed first line of the file, if it belongs to the current sources, and the compressed code."""
+def read_object() -> bytes | None:
+    """Return the stored machine code; None if it is missing, damaged or not that of the intermediate code."""
+    header, code = _content(OBJECT)
     try:
-        stated, _, code = FILE.read_bytes().partition(b"\n")
+        if header is None or header["intermediate_sha256"] != hashlib.sha256(FILE.read_bytes()).hexdigest():
+            return None
+        return zlib.decompress(code)
+    except (KeyError, OSError, zlib.error):
+        return None
+
+
+def _content(file: Path) -> tuple[dict[str, Any] | None, bytes]:
+    """Return the parsed first line of a file, if it belongs to the current sources, and the compressed code."""
+    try:
+        stated, _, code = file.read_bytes().partition(b"\n")
         header = json.loads(stated)
         return (header, code) if header["sources"] == source_hash() else (None, b"")
     except (OSError, ValueError, KeyError, TypeError):
@@ -105,6 +131,10 @@ _LIFETIME = re.compile(r"^.*@llvm\.lifetime\..*\n", re.MULTILINE)
 """Pattern of lifetime hints of stack memory, which LLVM 20 and 22 write differently."""
 _MANGLED = re.compile(r"(?<=[@\"])_ZN[\w.$]+")
 """Pattern of function names that numba mangles with the types of all arguments."""
+_COMMENT = re.compile(r" *;[^\n\"]*$", re.MULTILINE)
+_FUNCTION = re.compile(r"^define[\s\S]*?^}$", re.MULTILINE)
+_LOCAL = re.compile(r"(?<=%)(?:\"[^\"]+\"|[\w.$-]+)|^(?:\"[^\"]+\"|[\w.$-]+)(?=:)", re.MULTILINE)
+"""Pattern of the names of values and blocks in a function."""
 
 
 def intermediate_code() -> str:
@@ -139,7 +169,17 @@ def intermediate_code() -> str:
     for pattern in (_MACHINE, _NEWER, _LIFETIME):
         text = pattern.sub("", text)
     names = {name: f"f{index}" for index, name in enumerate(dict.fromkeys(_MANGLED.findall(text)))}
-    return _MANGLED.sub(lambda found: names[found[0]], text)
+    return with_short_names(_MANGLED.sub(lambda found: names[found[0]], text))
+
+
+def with_short_names(text: str) -> str:
+    """Shorten the names of values and blocks, and leave comments out, which takes a fifth of the compressed bytes."""
+
+    def shortened(function: re.Match[str]) -> str:
+        names: dict[str, str] = {}
+        return _LOCAL.sub(lambda one: names.setdefault(one[0].strip('"'), f"v{len(names):x}"), function[0])
+
+    return _FUNCTION.sub(shortened, _COMMENT.sub("", text))
 
 
 def build() -> None:

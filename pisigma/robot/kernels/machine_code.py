@@ -24,9 +24,11 @@ from pisigma.robot.kernels.build import (
     ARGUMENTS,
     ENTRY,
     intermediate_code,
+    read_object,
     read_ready,
     ready_forms,
     source_hash,
+    write_object,
 )
 from pisigma.robot.kernels.forms import KernelForms
 
@@ -35,6 +37,10 @@ _ALLOWED |= {"memcpy", "memset"}
 """Mathematical functions of the C library that are available in every process."""
 _OPTIONS = "speed 3, vectors up to 256 bits, internal linkage"
 """Options of `optimised_object` that affect the code; part of the cache key."""
+_PROCESSOR = "x86-64-v3"
+"""Processor of the machine code in the package, which every x86-64 processor with AVX2 can run."""
+_FEATURES = ("avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe", "xsave")
+"""Features that x86-64-v3 adds to x86-64."""
 _PATIENCE = 2.0
 """Delay of the notice on compilation [s]; cached kernels load much faster."""
 _COMPILING = "pisigma: preparing the inverse kinematics for this processor, once, in some seconds ...\n"
@@ -69,8 +75,8 @@ def load_kernels(wanted: KernelForms = _NOTHING) -> Callable[..., int]:
     It has two more arguments before those of `run`: a `Said`, into which -1 or the result of `kernels.solve_poses` is
     written, and `IGNORED` for exceptions, which are never raised.
 
-    Machine code is compiled in some seconds at the first use on a machine, and read from a file afterwards. On a
-    terminal a notice explains the delay.
+    On Linux and processors with AVX2, the package contains the machine code. Otherwise it is compiled in some seconds
+    at the first use on a machine, and read from a file afterwards; on a terminal a notice explains the delay.
 
     Args:
         wanted: forms that the kernels have to evaluate.
@@ -93,7 +99,8 @@ def load_kernels(wanted: KernelForms = _NOTHING) -> Callable[..., int]:
 def _load(forms: KernelForms) -> Callable[..., int]:
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
-    code = _code(forms, _native_machine(), "kernels")
+    stored = read_object() if forms == _ready_forms() and _runs_stored_code() else None
+    code = stored or _code(forms, _native_machine(), "kernels")
     engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _native_machine())
     engine.add_object_file(llvm.ObjectFileRef.from_data(code))
     engine.finalize_object()
@@ -101,6 +108,24 @@ def _load(forms: KernelForms) -> Callable[..., int]:
     kinds = [ctypes.c_void_p if kind == "p" else ctypes.c_int64 for kind in ARGUMENTS]
     prototype = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_void_p, ctypes.c_void_p, *kinds)
     return prototype(engine.get_function_address(ENTRY))
+
+
+def _runs_stored_code() -> bool:
+    """Return whether this process can run the machine code in the package."""
+    if not (sys.platform == "linux" and llvm.get_process_triple().startswith("x86_64")):
+        return False
+    features = llvm.get_host_cpu_features()
+    return all(features.get(name) for name in _FEATURES)
+
+
+def build_object() -> None:
+    """Compile the intermediate code in the package to machine code, and write it into the package."""
+    code = read_ready()
+    assert code is not None, "the intermediate code is built first"
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    machine = target_machine("x86_64-unknown-linux-gnu", _PROCESSOR)
+    write_object(optimised_object(code, machine), llvmlite=llvmlite.__version__)
 
 
 def _code(forms: KernelForms, machine: Any, use: str) -> bytes:

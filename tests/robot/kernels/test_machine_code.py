@@ -22,6 +22,29 @@ def test_the_intermediate_code_is_that_of_the_sources():
     )
 
 
+def test_the_stored_machine_code_is_that_of_the_intermediate_code(tmp_path, monkeypatch):
+    assert build.read_object() is not None, "run python -m pisigma.joint_correction.registry"
+    whole = build.OBJECT.read_bytes()
+    monkeypatch.setattr(build, "OBJECT", tmp_path / "kernels.o.zlib")
+    for wrong in (whole[:-3], b"", whole.replace(b'_sha256": "', b'_sha256": "0')):
+        build.OBJECT.write_bytes(wrong)
+        assert build.read_object() is None
+
+
+@pytest.mark.parametrize("lacking", ["avx2", "fma"])
+def test_other_processors_compile_the_code_themselves(monkeypatch, lacking):
+    features = {**dict.fromkeys(machine_code._FEATURES, True), lacking: False}
+    monkeypatch.setattr(machine_code.llvm, "get_host_cpu_features", lambda: features)
+    assert not machine_code._runs_stored_code()
+
+
+def test_short_names_keep_the_code():
+    head = 'define i64 @f(i64 %"a.b", i64 %c) {\n'
+    body = 'B1.i:  ; preds\n  %.3 = add i64 %"a.b", %c\n  br label %B2\n\nB2:\n  ret i64 %.3\n}\n'
+    short = "v2:\n  %v3 = add i64 %v0, %v1\n  br label %v4\n\nv4:\n  ret i64 %v3\n}\n"
+    assert build.with_short_names(head + body) == "define i64 @f(i64 %v0, i64 %v1) {\n" + short
+
+
 def test_the_hash_covers_every_kernel_and_no_comment(tmp_path, monkeypatch):
     files = {path.name for path in build.source_files()}
     assert {"newton.py", "kernels.py", "layout.py", "tolerances.py", "status.py"} <= files
@@ -140,10 +163,12 @@ def test_the_key_depends_on_everything_that_the_code_depends_on(monkeypatch):
             assert machine_code._key(KernelForms()) != key, name
 
 
-def test_loading_kernels_on_a_fresh_cache_needs_no_compiler(tmp_path):
-    """As on a new machine without numba, from a copy of the package without machine code."""
+@pytest.mark.parametrize("stored", [True, False])
+def test_loading_kernels_on_a_fresh_cache_needs_no_compiler(tmp_path, stored):
+    """As on a new machine without numba, from a copy of the package with and without its machine code."""
     package = Path(build.__file__).parents[2]
-    shutil.copytree(package, tmp_path / "pisigma", ignore=shutil.ignore_patterns("__pycache__", "catalogue"))
+    left_out = ("__pycache__", "catalogue", *([] if stored else [build.OBJECT.name]))
+    shutil.copytree(package, tmp_path / "pisigma", ignore=shutil.ignore_patterns(*left_out))
     script = (
         "import sys\nfor name in ('numba', 'torch'):\n    sys.modules[name] = None\n"
         "from pisigma.robot.kernels.machine_code import load_kernels\nload_kernels()\n"
@@ -153,7 +178,8 @@ def test_loading_kernels_on_a_fresh_cache_needs_no_compiler(tmp_path):
     done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     folder = tmp_path / "pisigma" / "robot" / "kernels" / "__pycache__"
-    assert [path.suffix for path in folder.iterdir() if path.suffix == ".o"] == [".o"]
+    compiled = not (stored and machine_code._runs_stored_code())
+    assert [path.suffix for path in folder.glob("*.o")] == [".o"] * compiled
 
 
 def test_the_code_names_its_compilers():
