@@ -87,13 +87,13 @@ def _row_height(x: Float64[np.ndarray, " rows"], y: Float64[np.ndarray, " rows"]
 
 
 def save_figure(figure: Figure, path: Path) -> None:
-    """Write a figure as PNG of 256 colours, which is small, without changing matplotlib's global state."""
+    """Write a figure as PNG of 64 colours, which is small, without changing matplotlib's global state."""
     canvas = FigureCanvasAgg(figure)
     figure.set_dpi(120)
     canvas.draw()  # type: ignore[no-untyped-call]
     pixels = np.asarray(canvas.buffer_rgba())  # type: ignore[no-untyped-call]
     image = Image.fromarray(pixels).convert("RGB")
-    image.quantize(256).save(path)
+    image.quantize(64).save(path, optimize=True)
 
 
 def set_margins(
