@@ -90,7 +90,7 @@ def against_bound(
         errors.append(found.estimates - true)
         stated.append(found.covariance.diagonal())
         noise[seed % rows] += OFF * direction / np.linalg.norm(direction)
-        named += [one.row for one in fit(noise).wrong] == [seed % rows]
+        named += fit(noise).wrong == (seed % rows,)
     ratio = np.sqrt((np.square(errors).mean(0) / bound).mean())
     printed = np.sqrt((np.mean(stated, 0) / bound).mean())
     print(
@@ -106,7 +106,7 @@ def small_jobs() -> None:
 
     def tool(missed: np.ndarray) -> FrameFit:
         moved = (J @ torch.from_numpy(missed)[..., None])[..., 0]
-        return fit_frames(NOMINAL, Measurements(q=q + moved, socket=("point",) * len(q)), "tool", {})
+        return fit_frames(NOMINAL, Measurements(q=q + moved, socket=("point",) * len(q)), "tool")
 
     R = forward_kinematics(NOMINAL, q)[:, :3, :3].numpy()
     X = np.concatenate([R, np.tile(-np.eye(3), (len(q), 1, 1))], 2).reshape(-1, 6)
@@ -118,7 +118,7 @@ def small_jobs() -> None:
 
     def base(missed: np.ndarray) -> FrameFit:
         rows = Measurements(q=points, position=torch.from_numpy(positions(BASE) + missed))
-        return fit_frames(tipped, rows, "base", {})
+        return fit_frames(tipped, rows, "base")
 
     steps = 1e-6 * np.eye(6)
     X = np.stack([(positions(BASE + s) - positions(BASE - s)).ravel() / 2e-6 for s in steps], 1)
@@ -222,7 +222,7 @@ def hand_eye(seeds: int, images: int) -> None:
         camera = stated_camera(rng)
         rows = image_measurements(seen, camera, BOARD, False, REPEATABILITY)
         robots = opencv_robots(seen, camera) if hasattr(cv2, "calibrateHandEye") else {}
-        robots["pisigma, drawn arm"] = fit_frames(NOMINAL, rows, "hand-eye", {}).solved.geometry.robot
+        robots["pisigma, drawn arm"] = fit_frames(NOMINAL, rows, "hand-eye").solved.geometry.robot
         robots["pisigma, arm calibrated along"] = GeometricCalibrator(NOMINAL).fit(rows).robot
         for name, robot in robots.items():
             off = (
@@ -256,9 +256,7 @@ def causes(seeds: int) -> None:
             seen = replace(seen, q=q + torch.from_numpy(moved.get(kind, np.zeros(6))))
             camera = stated_camera(rng, 15.0 if kind == "camera" else 1.0)
             rows = image_measurements(seen, camera, BOARD, False, REPEATABILITY)
-            first = [
-                one.name for one in misfit_causes(fit_frames(NOMINAL, rows, "hand-eye", {})) if one.named
-            ]
+            first = [one.name for one in misfit_causes(fit_frames(NOMINAL, rows, "hand-eye")) if one.named]
             named[first[0] if first else "nothing"] += 1
         print(
             f"{kind} wrong: named {', '.join(f'{name} {count}' for name, count in named.most_common())} of {seeds}"

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from pisigma.estimation.cholesky import covariance_factor
 from pisigma.estimation.drift import compressed_columns, evidence_coordinates, evidence_gains
+from pisigma.estimation.orthonormal_columns import orthonormal_columns
 
 SIZES = torch.logspace(-3, 1.5, 28, dtype=torch.float64)
 """Sizes of a cause relative to its scale, all equally probable."""
@@ -84,8 +85,8 @@ class FitResiduals:
             is_stated: whether the noise of the other values is stated.
             causes: derivatives with respect to the unknowns of every cause at size 1.
         """
-        U, singular, _ = torch.linalg.svd(fitted / fitted.norm(dim=0).clamp(min=1e-300), full_matrices=True)
-        N = U[:, int((singular > 1e-9 * singular.max()).sum()) :].t()
+        U = orthonormal_columns(fitted)
+        N = torch.linalg.qr(U, mode="complete")[0][:, U.shape[1] :].t()
         A = N @ known
         columns = {name: compressed_columns(N @ Z) for name, Z in causes.items()}
         return FitResiduals(N @ y, A @ A.t(), N[:, exact], is_stated, columns)

@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
 from pisigma.estimation.held_out import SINGULAR
+from pisigma.estimation.orthonormal_columns import orthonormal_columns
 
 LEVEL = 1e-3
 """Probability, over all rows of a data set, of calling a row wrong although none is."""
@@ -54,8 +55,7 @@ def most_deviating_row(
     """
     from scipy.stats import f as f_distribution  # here: imports half a second of scipy
 
-    U, singular, _ = torch.linalg.svd(X / X.norm(dim=0).clamp(min=1e-300), full_matrices=False)
-    U = U[:, singular > SINGULAR * singular.max()]
+    U = orthonormal_columns(X)
     total, freedom = float(y.square().sum()), len(y) - U.shape[1]
     worst: RowTest | None = None
     numbers = torch.unique(row[~exact]).tolist()

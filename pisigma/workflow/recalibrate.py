@@ -1,7 +1,6 @@
 """Recalibrate a model with few new rows."""
 
 import datetime
-import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -41,8 +40,7 @@ from pisigma.robot.description import Robot
 from pisigma.validation.checks.check import MOVES, Move
 from pisigma.validation.checks.wrong_rows import FilteredRows, without_wrong_rows
 from pisigma.validation.gate import check_rows
-from pisigma.validation.held_out.calibration_validation import pose_errors_of
-from pisigma.validation.held_out.contradicting_row import ContradictingRowFigures
+from pisigma.validation.held_out.contradicting_row import ContradictingRowFigures, contradicting_rows
 from pisigma.validation.held_out.distillation_summary import ParentFigures
 from pisigma.validation.held_out.few_rows import fit_if_better
 from pisigma.validation.held_out.frames.fitted_frames import fitted_kinds
@@ -190,7 +188,7 @@ def _adapted(
     if wrong:  # they have biased the first adaptation
         right = rows.select(torch.tensor([row for row in left if row not in wrong]))
         adaptation = adapt(recalibration_problem(parent, posterior, right, elsewhere))
-    return right, adaptation, _outliers(adaptation, rows, sorted((*far, *wrong)))
+    return right, adaptation, contradicting_rows(adaptation, rows, sorted((*far, *wrong)))
 
 
 def _kept(
@@ -232,23 +230,6 @@ def _kept_model(
     if choice.kept == "old":
         adaptation = adapt(adaptation.problem.with_fixed_arm(), adaptation.drift.noise)
     return recalibrated_model(parent, adaptation, rows)
-
-
-def _outliers(
-    adaptation: Adaptation, rows: Measurements, wrong: Sequence[int]
-) -> tuple[ContradictingRowFigures, ...]:
-    """Return the rows that were left out as wrong, with their residuals for a calibration with the other rows."""
-    errors = pose_errors_of(adaptation, rows)
-    sizes = {"residual_mm": (errors.position, 1e3), "residual_deg": (errors.rotation, math.degrees(1.0))}
-    outliers = []
-    for row in wrong:
-        off = {
-            name: float(those[row]) * factor
-            for name, (those, factor) in sizes.items()
-            if those is not None and math.isfinite(those[row])
-        }
-        outliers.append(ContradictingRowFigures(row=row, place=rows.place(row), **off))
-    return tuple(outliers)
 
 
 def _believable(choice: CandidateChoice, robot: Robot) -> bool:

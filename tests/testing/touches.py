@@ -17,14 +17,20 @@ NOISE = 5e-5
 DOWN = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
 
 
-def touching_joints(count: int, tilt: float = 0.7, axis: int | None = None) -> Tensor:
-    """Return joint values `(count, 6)` [rad] that hold the tip on the point, tilted about all axes or about one."""
+def touching_joints(
+    count: int, tilt: float = 0.7, axis: int | None = None, places: Tensor | None = None
+) -> Tensor:
+    """Return joint values `(count, 6)` [rad] that hold the tip on a point, tilted about all axes or about one.
+
+    With places `(count, 3)` [m], every row has a point of its own.
+    """
     robot, rng, chosen = Robot.load("ur5"), np.random.default_rng(0), list[Tensor]()
     solver = closed_form_solver(robot)
     assert solver is not None
     while len(chosen) < count:
         turn = rng.uniform(-tilt, tilt, 3) * (1 if axis is None else np.eye(3)[axis])
-        T = transform(rotation_from_vector(torch.from_numpy(turn)) @ DOWN, POINT)
+        place = POINT if places is None else places[len(chosen)].double()
+        T = transform(rotation_from_vector(torch.from_numpy(turn)) @ DOWN, place)
         branches = solver.solve(T @ invert(transform_from_xyzrpy(torch.from_numpy(TIP)))).q
         reached = branches[torch.isfinite(branches).all(-1)]
         if len(reached):

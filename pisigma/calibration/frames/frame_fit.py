@@ -1,9 +1,8 @@
 """Fit base, tool or both to few rows with the arm as given: standard errors, what is not determined, wrong rows."""
 
-import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from types import MappingProxyType
 from typing import Literal
 
 import numpy as np
@@ -11,13 +10,23 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from pisigma.calibration.frames.undetermined import (
+    FrameDirections,
+    Frames,
+    hold_undetermined,
+    values_before,
+)
 from pisigma.calibration.frames.whitened_values import WhitenedValues
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.calibration.geometric.identifiability.observability import direction_in_words
+from pisigma.calibration.geometric.identifiability.sufficiency import floating_frames
+from pisigma.calibration.geometric.problem.held_directions import LARGEST_DEVIATION
+from pisigma.calibration.geometric.problem.least_squares import SolutionStatus
 from pisigma.calibration.geometric.problem.parameters import Parameter
 from pisigma.calibration.geometric.result import SolvedCalibration
-from pisigma.estimation.leave_one_out import RowTest, most_deviating_row
+from pisigma.estimation.leave_one_out import most_deviating_row
 from pisigma.estimation.loss import SquaredLoss
+from pisigma.files.errors import IdentificationError, Place
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import Robot
 
@@ -25,29 +34,10 @@ FrameChoice = Literal["tool", "base", "hand-eye"]
 
 MAX_WRONG_SHARE = 0.25
 """Largest share of wrong rows: of four that disagree it is not known which one is wrong."""
-UNDETERMINED = 1e-9
-"""Information of a direction over that of the best determined one below which the rows do not determine it."""
-INVOLVED = 0.05
-"""Component of an undetermined direction above which its parameter has no standard error."""
-
-
-@dataclass(frozen=True)
-class WrongRow:
-    """A row that was left out, because the other rows contradict it.
-
-    Attributes:
-        row: number in the measurements, from 0.
-        place: file and line.
-        distance: length of the error of the row under the fit to all other rows [m]; NaN if no length was measured.
-        angle: angle of the same [rad]; NaN if it has none.
-        probability: probability of an error of this size, or larger, of any row without a wrong one.
-    """
-
-    row: int
-    place: str
-    distance: float
-    angle: float
-    probability: float
+HARDLY_DETERMINED = 1.0
+"""Standard deviation [mm or mrad] above which a direction is reported, and above which the undetermined directions
+leave a coordinate without a standard error."""
+NO_FRAMES: Frames = MappingProxyType({})
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,11 +46,13 @@ class WeakDirection:
 
     Attributes:
         words: the combination, in units of 1 mm and 1 mrad (0.057 deg).
-        deviation: its standard deviation in these units; infinite if the rows do not determine it.
+        deviation: its standard deviation in these units; infinite if the rows contain no information on it.
+        held: whether it has its value before, because the rows do not determine it.
     """
 
     words: str
     deviation: float
+    held: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,96 +64,83 @@ class FrameFit:
         solved: the problem of the rows that were used, with its solution.
         rows: all rows.
         used: numbers of the rows that were used.
-        wrong: rows that were left out, in the order in which they were found.
+        wrong: numbers of the rows that were left out, in the order in which they were found.
+        bases: bases before by frame; the others are those of the robot.
+        tools: tools before by target; the others are those of the robot.
     """
 
     only: FrameChoice
     solved: SolvedCalibration
     rows: Measurements
     used: tuple[int, ...]
-    wrong: tuple[WrongRow, ...]
-
-    @cached_property
-    def candidates(self) -> list[int]:
-        """Indices of the parameters that were to be fitted: bases and tools, then points and zeros of sensors."""
-        space, problem = self.solved.problem.space, self.solved
-        turned = any(sensor.turning for sensor in problem.problem.sensors)
-        bases = list(space.indices_of("base")) if self.only != "tool" else []
-        tools = list(space.indices_of("tool")) if self.only != "base" else []
-        return [
-            *bases,
-            *(i for k, i in enumerate(tools) if turned or k % 6 < 3),
-            *problem.setup.free_unknowns,
-        ]
+    wrong: tuple[int, ...]
+    bases: Frames
+    tools: Frames
 
     @property
     def frames(self) -> list[int]:
         """Indices of the coordinates of bases and tools that were to be fitted."""
-        unknowns = set(self.solved.setup.free_unknowns)
-        return [index for index in self.candidates if index not in unknowns]
+        return _frames(self.solved)
 
     @cached_property
     def values(self) -> WhitenedValues:
-        """Measured values at the solution, linear in `candidates` in the user's coordinates."""
-        values = WhitenedValues.at_solution(self.solved, self.candidates)
-        index = torch.tensor(self.candidates)
-        change = self.solved.geometry.coordinate_jacobian[index[:, None], index]
-        return WhitenedValues(
-            values.X @ torch.linalg.pinv(change),
-            values.joints,
-            values.y,
-            values.row,
-            values.exact,
-            values.sensors,
-        )
+        """Measured values at the solution, linear in the directions that were fitted (see `basis`)."""
+        values = WhitenedValues.at_solution(self.solved, self.solved.problem.active.tolist())
+        return replace(values, X=values.X @ self.basis)
 
     @cached_property
-    def _directions(self) -> tuple[Float64[Tensor, " frames"], Float64[Tensor, "frames frames"], Tensor]:
-        """Return the information of the frames along its eigenvectors, in units of usual errors, and these units."""
-        X, count = self.values.X, len(self.frames)
-        unit = torch.from_numpy(self.solved.problem.space.usual_errors[self.candidates])
-        X = X * unit
-        others = X[:, count:]
-        if others.shape[1]:
-            U, singular, _ = torch.linalg.svd(others, full_matrices=False)
-            U = U[:, singular > 1e-12 * singular.max()]
-            X = X - U @ (U.t() @ X)
-        values, vectors = torch.linalg.eigh(X[:, :count].t() @ X[:, :count])
-        return values, vectors, unit[:count]
+    def basis(self) -> Float64[Tensor, "active fitted"]:
+        """The directions that were fitted, in the coordinates of the problem: all except those that were held."""
+        problem = self.solved.problem
+        if problem.held is None:
+            return torch.diag(problem.step_scale)
+        V = problem.held.directions
+        orthonormal: Tensor = torch.linalg.qr(V, mode="complete")[0][:, V.shape[1] :]
+        return problem.step_scale[:, None] * orthonormal
 
-    @cached_property
+    @property
     def covariance(self) -> Float64[np.ndarray, "frames frames"]:
-        """Covariance of `frames` by the noise of the rows, the arm taken as exact [m and rad].
+        """Covariance of `frames` by the noise of the rows, the arm taken as exact [m² or rad²].
 
-        The noise is that of the residuals. Directions that the rows do not determine have the covariance 0.
+        The noise is that of the residuals. Directions that the rows do not determine have a standard deviation of at
+        most 1 m or 1 rad.
         """
-        values, vectors, unit = self._directions
-        known = values > UNDETERMINED * values.max()
-        root = vectors[:, known] * values[known].rsqrt() * unit[:, None]
-        covariance: np.ndarray = (root @ root.t()).numpy()
+        covariance: np.ndarray = self.solved.covariance[np.ix_(self.frames, self.frames)]
         return covariance
 
     @cached_property
     def weak_directions(self) -> tuple[WeakDirection, ...]:
-        """Directions with a standard deviation of more than 1 mm or 1 mrad, the weakest first."""
-        values, vectors, _ = self._directions
-        names = [self.solved.problem.space.names[i] for i in self.frames]
-        largest = float(values.max())
+        """Directions that were held, and those with a standard deviation of more than 1 mm or 1 mrad, weakest first."""
+        names = [parameter.name for parameter in self.parameters]
+        vectors, deviation = self._directions
         return tuple(
-            WeakDirection(
-                direction_in_words(vector, names),
-                math.inf if value <= UNDETERMINED * largest else value**-0.5,
-            )
-            for value, vector in zip(values.tolist(), vectors.t(), strict=True)
-            if value < max(1.0, UNDETERMINED * largest)
+            WeakDirection(direction_in_words(vector, names), size, number < self._held)
+            for number, (vector, size) in enumerate(zip(vectors.t(), deviation.tolist(), strict=True))
+            if number < self._held or size > HARDLY_DETERMINED
         )
 
     @property
     def undetermined(self) -> frozenset[int]:
-        """Indices of the coordinates that are part of a direction that the rows do not determine."""
-        values, vectors, _ = self._directions
-        lost = vectors[:, values <= UNDETERMINED * values.max()].norm(dim=1) > INVOLVED
-        return frozenset(index for index, yes in zip(self.frames, lost.tolist(), strict=True) if yes)
+        """Indices of the coordinates that are uncertain because of a direction that the rows do not determine."""
+        vectors, deviation = self._directions
+        held = vectors[:, : self._held] * deviation[: self._held].clamp(max=LARGEST_DEVIATION)
+        uncertain = (held.norm(dim=1) > HARDLY_DETERMINED).tolist()
+        return frozenset(index for index, yes in zip(self.frames, uncertain, strict=True) if yes)
+
+    @property
+    def _held(self) -> int:
+        """Number of directions that were held."""
+        held = self.solved.problem.held
+        return 0 if held is None else held.directions.shape[1]
+
+    @cached_property
+    def _directions(self) -> tuple[Float64[Tensor, "frames frames"], Float64[Tensor, " frames"]]:
+        """Return unit vectors in the user's coordinates and their standard deviations in mm and mrad, weakest first."""
+        found, held = FrameDirections.at_solution(self.solved, self.frames), self.solved.problem.held
+        if held is not None:  # with the deviation that was judged
+            found = replace(found, deviation=torch.cat([held.deviation, found.deviation[self._held :]]))
+        vectors, length = found.in_user_coordinates(self.solved)
+        return vectors[self.frames], found.deviation * length
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -174,55 +153,107 @@ class FrameFit:
         values: np.ndarray = self.solved.geometry.values_of(self.solved.problem.space).numpy()[self.frames]
         return values
 
+    @property
+    def before(self) -> Float64[np.ndarray, " frames"]:
+        """Their values before [m or rad]."""
+        values = values_before(self.solved.problem.space, self.bases, self.tools)
+        before: np.ndarray = values.numpy()[self.frames]
+        return before
+
 
 def fit_frames(
-    robot: Robot, rows: Measurements, only: FrameChoice, bases: Mapping[str, Float64[np.ndarray, " 6"]]
+    robot: Robot,
+    rows: Measurements,
+    only: FrameChoice,
+    bases: Frames = NO_FRAMES,
+    tools: Frames = NO_FRAMES,
 ) -> FrameFit:
     """Fit base, tool or both by least squares, without the rows that all others contradict.
 
-    The arm is not fitted. A row is wrong if its error under the fit to the other rows is improbable (F-test of the
-    deleted residual, see `most_deviating_row`).
+    The arm is not fitted. Directions that the rows do not determine keep their values before, see `hold_undetermined`.
+    A row is wrong if its error under the fit to the other rows is improbable (F-test of the deleted residual, see
+    `most_deviating_row`).
 
     Args:
         robot: robot with the arm as given, and the base or tool that is not fitted.
         rows: touches, positions, poses or images; sockets are points at unknown positions.
         only: what to fit; the tool's orientation only if rows have orientations.
-        bases: bases of named frames that are not fitted, if they are not that of the robot.
+        bases: bases of named frames, if they are not that of the robot.
+        tools: tools of named targets, if they are not that of the robot.
 
     Raises:
-        IdentificationError: there are too few rows.
+        IdentificationError: there are too few rows, several frames or targets whose known base or tool is not stated,
+            or a base without rows at stated positions.
         PoseError: the joint values do not fit the robot.
     """
+    bases = {name: bases[name] for name in set(rows.frame) & set(bases)}
+    if only == "tool":
+        _refuse_several("frame", set(rows.frame), bases, rows)
+    if only == "base":
+        _refuse_several("target", set(rows.target), {}, rows)
+        robot = robot.with_geometry(tool=tools.get(rows.target[0], robot.tool))
     turned = bool({"pose", "rotation"} & set(rows.kinds))
     calibrator = GeometricCalibrator(
         robot,
         free=(),
         base="fixed" if only == "tool" else "free",
         tool="fixed" if only == "base" else "free" if turned else "position",
+        elimination="none",
         prior=None,
         loss=SquaredLoss(),
         frames={name: tuple(base) for name, base in bases.items()} if only == "tool" else {},
     )
-    used, wrong = list(range(rows.rows)), list[WrongRow]()
-    fit = FrameFit(only, calibrator.solve(rows), rows, tuple(used), ())
-    while len(wrong) + 1 <= MAX_WRONG_SHARE * rows.rows:
-        values = fit.values
-        tested = most_deviating_row(values.X, values.y, values.row, values.exact)
-        if tested is None or not tested.is_wrong:
-            break
-        number = used[int(fit.solved.setup.rows[tested.row])]
+    used, wrong = list(range(rows.rows)), list[int]()
+    while True:
+        free = calibrator.solve(rows.select(torch.tensor(used)) if wrong else rows)
+        if only != "tool" and (floating := floating_frames(free.setup)):
+            raise IdentificationError(
+                expected="rows at stated positions, which determine the base",
+                value=", ".join(sorted(rows.kinds)),
+                at=Place(rows.source),
+                option="only",
+                remedy=f"measure positions or poses{f' in frame {floating[0]}' if floating[0] else ''}, or fit the "
+                "tool only (--only tool)",
+            )
+        solved = hold_undetermined(free, _frames(free), bases, tools)
+        fit = FrameFit(only, solved, rows, tuple(used), tuple(wrong), bases, tools)
+        if (number := _wrong_row(fit)) is None:
+            return fit
         used.remove(number)
-        fit = FrameFit(only, calibrator.solve(rows.select(torch.tensor(used))), rows, tuple(used), ())
-        wrong.append(_wrong_row(fit, number, tested))
-    return FrameFit(only, fit.solved, rows, tuple(used), tuple(wrong))
+        wrong.append(number)
 
 
-def _wrong_row(fit: FrameFit, number: int, tested: RowTest) -> WrongRow:
-    """Return a row that was left out, with its error under the fit to all other rows."""
-    row = fit.rows.select(torch.tensor([number]))
-    errors = fit.solved.result().errors_of(row)
-    size = {"m": math.nan, "rad": math.nan}
-    for name, error in errors.items():
-        if bool(torch.isfinite(error).all()):
-            size["rad" if name == "rotation" else "m"] = float(error.norm())
-    return WrongRow(number, fit.rows.place(number), size["m"], size["rad"], tested.probability)
+def _frames(solved: SolvedCalibration) -> list[int]:
+    """Return the indices of the free coordinates of bases and tools."""
+    unknowns = set(solved.setup.free_unknowns)
+    return [index for index in solved.problem.active.tolist() if index not in unknowns]
+
+
+def _refuse_several(column: str, names: set[str], known: Frames, rows: Measurements) -> None:
+    """Refuse rows of several frames or targets whose bases or tools are not fitted and not known.
+
+    Raises:
+        IdentificationError: there are several names, not all of which are known.
+    """
+    if len(names) > 1 and not names <= set(known):
+        raise IdentificationError(
+            expected=f"rows of one {column}",
+            value=sorted(names),
+            at=Place(rows.source, column=column),
+            option="only",
+            remedy=f"give a file for each {column}",
+        )
+
+
+def _wrong_row(fit: FrameFit) -> int | None:
+    """Return the number of the row that the others contradict; None if there is none, or too many are wrong."""
+    if (
+        len(fit.wrong) + 1 > MAX_WRONG_SHARE * fit.rows.rows
+        or fit.solved.solution.status == SolutionStatus.EXACT
+    ):
+        return None
+    values = fit.values
+    tested = most_deviating_row(values.X, values.y, values.row, values.exact)
+    if tested is None or not tested.is_wrong:
+        return None
+    return fit.used[int(fit.solved.setup.rows[tested.row])]

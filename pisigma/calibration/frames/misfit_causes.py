@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from pisigma.calibration.frames.arm_uncertainty import ArmUncertainty
 from pisigma.calibration.frames.frame_fit import FrameFit
 from pisigma.calibration.frames.whitened_values import WhitenedValues
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
@@ -44,9 +45,7 @@ CAUSES = {
 """What every cause is about."""
 
 
-def misfit_causes(
-    fit: FrameFit, arm_root: Float64[Tensor, "arm directions"] | None = None
-) -> tuple[Cause, ...]:
+def misfit_causes(fit: FrameFit, uncertainty: ArmUncertainty | None = None) -> tuple[Cause, ...]:
     """Compare the possible causes of the residuals of a hand-eye calibration.
 
     The cause "joint noise" stands for errors of the joint readings that differ from row to row: noise, backlash, or a
@@ -54,8 +53,7 @@ def misfit_causes(
 
     Args:
         fit: base and tool that were fitted with the arm as given.
-        arm_root: root of the covariance of the arm's parameters, if a calibration states it; the arm is a cause if its
-            errors are larger.
+        uncertainty: uncertainty of the arm, if a calibration states it; the arm is a cause if its errors are larger.
 
     Returns:
         The causes, those that the evidence names first; none with fewer than `MIN_ROWS` poses.
@@ -67,11 +65,11 @@ def misfit_causes(
     robot = fit.solved.problem.space.robot
     calibrator = GeometricCalibrator(robot, free=(), prior=None, loss=SquaredLoss())
     solved = calibrator.solve(without_stated_priors(rows, counted))
-    return _residuals(solved, rows, arm_root).compare()
+    return _residuals(solved, fit, rows, uncertainty).compare()
 
 
 def _residuals(
-    solved: SolvedCalibration, rows: Measurements, arm_root: Float64[Tensor, "arm directions"] | None
+    solved: SolvedCalibration, fit: FrameFit, rows: Measurements, uncertainty: ArmUncertainty | None
 ) -> FitResiduals:
     """Return the residuals with the stated intrinsics, linear in everything that may cause them."""
     space, setup = solved.problem.space, solved.setup
@@ -91,8 +89,8 @@ def _residuals(
             sizes = [_usual_error(kind, space.names[unknowns[k]]) for k in chosen]
             causes[kind] = X_unknowns[:, chosen] * torch.tensor(sizes, dtype=torch.float64)
     known = X_unknowns * _stated_deviations(solved, rows)
-    if arm_root is not None:
-        known = torch.cat([known, X_arm @ arm_root], 1)
+    if uncertainty is not None:
+        known = torch.cat([known, uncertainty.spread(solved, fit.used, {*frames, *unknowns})], 1)
     return FitResiduals.from_fit(
         y=unit * (values.y + X_unknowns @ moved),
         fitted=unit[:, None] * X_frames,

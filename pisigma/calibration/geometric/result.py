@@ -101,21 +101,35 @@ class SolvedCalibration:
     @cached_property
     def covariance(self) -> Float64[np.ndarray, "parameters parameters"]:
         """Covariance of all parameters in the user's coordinates (SI); 0 for parameters that were not free."""
-        change = self.geometry.coordinate_jacobian[:, self.problem.active.cpu()]
-        covariance: np.ndarray = (change @ covariance_of(self.refined.normal).cpu() @ change.mT).numpy()
+        change, (own, held) = self._coordinate_change, self._covariances
+        covariance: np.ndarray = (change @ (own + held @ held.mT) @ change.mT).numpy()
         return covariance
 
     @cached_property
     def root(self) -> Float64[Tensor, "parameters directions"]:
         """Root `R` of the covariance `R R^T` of all parameters in the user's coordinates."""
-        covariance = covariance_of(self.refined.normal).cpu()
+        covariance, held = self._covariances
         # Eigenvectors of the correlation matrix, because eigenvectors of the covariance would mix metres and radians.
         scale = covariance.diagonal().clamp(min=0.0).sqrt()
         inverse = torch.where(scale > 0, 1 / scale, 0.0)
         values, axes = torch.linalg.eigh(covariance * inverse * inverse[:, None])
         half = scale[:, None] * axes * values.clamp(min=0.0).sqrt()
-        root: Tensor = self.geometry.coordinate_jacobian[:, self.problem.active.cpu()] @ half
+        root: Tensor = self._coordinate_change @ torch.cat([half, held], 1)
         return root
+
+    @property
+    def _coordinate_change(self) -> Float64[Tensor, "parameters active"]:
+        return self.geometry.coordinate_jacobian[:, self.problem.active.cpu()]
+
+    @property
+    def _covariances(self) -> tuple[Float64[Tensor, "active active"], Float64[Tensor, "active held"]]:
+        """Return the covariance of what was estimated, and a root of that of what was held."""
+        estimated, held, scale = (
+            covariance_of(self.refined.normal).cpu(),
+            self.problem.held,
+            self.problem.step_scale,
+        )
+        return estimated, scale.new_zeros(len(scale), 0).cpu() if held is None else held.root(scale.cpu())
 
 
 @dataclass(frozen=True, eq=False)

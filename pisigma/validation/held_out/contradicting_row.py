@@ -1,6 +1,11 @@
 """Rows that were left out because they contradict the others."""
 
+import math
+from collections.abc import Sequence
+
 from pisigma.files.yaml_file import Section
+from pisigma.measurement.dataset import Measurements
+from pisigma.validation.held_out.calibration_validation import ErrorPredictor, pose_errors_of
 
 
 class ContradictingRowFigures(Section):
@@ -27,3 +32,29 @@ class ContradictingRowFigures(Section):
             f"{self.place} was left out: it deviates by {missed} from its prediction by the others; "
             "measure it again."
         )
+
+
+def contradicting_rows(
+    result: ErrorPredictor, rows: Measurements, wrong: Sequence[int]
+) -> tuple[ContradictingRowFigures, ...]:
+    """Return the figures of rows that were left out.
+
+    Args:
+        result: calibration with the other rows.
+        rows: all rows.
+        wrong: numbers of the rows that were left out.
+
+    Raises:
+        IdentificationError: such a row has a frame, target or anchor that was not calibrated.
+    """
+    errors = pose_errors_of(result, rows)
+    sizes = {"residual_mm": (errors.position, 1e3), "residual_deg": (errors.rotation, math.degrees(1.0))}
+    figures = []
+    for row in wrong:
+        off = {
+            name: float(those[row]) * factor
+            for name, (those, factor) in sizes.items()
+            if those is not None and math.isfinite(those[row])
+        }
+        figures.append(ContradictingRowFigures(row=row, place=rows.place(row), **off))
+    return tuple(figures)

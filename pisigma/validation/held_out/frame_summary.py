@@ -3,13 +3,13 @@
 import math
 from typing import Literal
 
-from pisigma.calibration.frames.frame_fit import FrameFit, WrongRow
+from pisigma.calibration.frames.frame_fit import FrameFit
 from pisigma.calibration.frames.misfit_causes import size_text
 from pisigma.estimation.alternatives import Cause
 from pisigma.files.yaml_file import Section
 from pisigma.measurement.sensors.sensor import SHOWN_UNITS
 from pisigma.validation.held_out.calibration_summary import NoiseFigures, noise_figures
-from pisigma.validation.held_out.contradicting_row import ContradictingRowFigures
+from pisigma.validation.held_out.contradicting_row import ContradictingRowFigures, contradicting_rows
 from pisigma.validation.held_out.distillation_summary import ParentFigures
 from pisigma.validation.held_out.summary import AbstractSummary
 
@@ -91,20 +91,23 @@ def coordinate_figures(fit: FrameFit, arm_variance: tuple[float, ...]) -> tuple[
         fit: the fit.
         arm_variance: variance of every coordinate by the uncertainty of the arm [m² or rad²].
     """
-    lost, before = fit.undetermined, {one.name: one.nominal for one in fit.solved.result().parameters}
+    lost, variances = fit.undetermined, fit.covariance.diagonal()
     figures = []
-    for number, parameter in enumerate(fit.parameters):
+    for number, (parameter, before, estimate) in enumerate(
+        zip(fit.parameters, fit.before, fit.estimates, strict=True)
+    ):
         unit, factor = SHOWN_UNITS[parameter.unit]
         known = fit.frames[number] not in lost
-        variance = float(fit.covariance[number, number])
         figures.append(
             CoordinateFigures(
                 name=parameter.name,
                 unit=unit,
-                nominal=before[parameter.name] * factor,
-                estimated=float(fit.estimates[number]) * factor,
-                standard_error=math.sqrt(variance + arm_variance[number]) * factor if known else None,
-                by_noise=math.sqrt(variance) * factor if known else None,
+                nominal=float(before) * factor,
+                estimated=float(estimate) * factor,
+                standard_error=math.sqrt(variances[number] + arm_variance[number]) * factor
+                if known
+                else None,
+                by_noise=math.sqrt(variances[number]) * factor if known else None,
             )
         )
     return tuple(figures)
@@ -113,11 +116,16 @@ def coordinate_figures(fit: FrameFit, arm_variance: tuple[float, ...]) -> tuple[
 def weak_direction_sentences(fit: FrameFit) -> tuple[str, ...]:
     """Return what the rows hardly determine, one sentence each."""
     return tuple(
-        f"the rows do not determine {one.words} (in mm and mrad); it keeps its value before, measure other orientations"
-        if math.isinf(one.deviation)
+        f"the rows do not determine {one.words} (in mm and mrad; {_deviation_text(one.deviation)}); it keeps its value "
+        "before, measure other orientations"
+        if one.held
         else f"the rows determine {one.words} (in mm and mrad) only to {one.deviation:.2g}"
         for one in fit.weak_directions
     )
+
+
+def _deviation_text(deviation: float) -> str:
+    return "no information" if math.isinf(deviation) else f"standard deviation {deviation:.2g}"
 
 
 def _cause_figures(cause: Cause) -> CauseFigures:
@@ -130,11 +138,14 @@ def _cause_figures(cause: Cause) -> CauseFigures:
     )
 
 
-def wrong_row_figures(wrong: WrongRow) -> ContradictingRowFigures:
-    """Return the figures of a row that was left out."""
-    sizes = {"residual_mm": wrong.distance * 1e3, "residual_deg": math.degrees(wrong.angle)}
-    known = {name: size for name, size in sizes.items() if math.isfinite(size)}
-    return ContradictingRowFigures(row=wrong.row, place=wrong.place, **known)
+def _rms(fit: FrameFit, quantity: Literal["m", "rad"]) -> float | None:
+    """Return the RMS length of the residuals of all sensors of a quantity [m or rad]; None without such sensors."""
+    sensors = [
+        one for one in fit.solved.result().noise if one.quantity == quantity and one.sensor != "corner"
+    ]
+    rows = sum(one.values / one.components for one in sensors)
+    squares = sum(one.rms**2 * one.values / one.components for one in sensors)
+    return math.sqrt(squares / rows) if rows else None
 
 
 def frame_summary(
@@ -153,8 +164,8 @@ def frame_summary(
         parent: model whose arm was used.
         warnings: warnings, one sentence each.
     """
-    noise = fit.solved.result().noise
-    rms = {one.quantity: one.rms for one in noise if one.sensor != "corner"}
+    result = fit.solved.result()
+    lengths, angles = _rms(fit, "m"), _rms(fit, "rad")
     summary = FrameSummary(
         only=fit.only,
         rows=fit.rows.rows,
@@ -162,14 +173,14 @@ def frame_summary(
         weak_directions=weak_direction_sentences(fit),
         noise=tuple(
             noise_figures(one.sensor, one.sigma, one.unit, values=one.values, used_by_parameters=one.used)
-            for one in noise
+            for one in result.noise
         ),
-        outliers=tuple(map(wrong_row_figures, fit.wrong)),
+        outliers=contradicting_rows(result, fit.rows, fit.wrong),
         warnings=warnings,
     )
     return summary.with_figures(
         parent=parent,
         causes=tuple(map(_cause_figures, causes)) or None,
-        rms_mm=rms["m"] * 1e3 if "m" in rms else None,
-        rms_deg=math.degrees(rms["rad"]) if "rad" in rms else None,
+        rms_mm=None if lengths is None else lengths * 1e3,
+        rms_deg=None if angles is None else math.degrees(angles),
     )

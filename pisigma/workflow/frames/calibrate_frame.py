@@ -63,7 +63,8 @@ def calibrate_frame(
     Args:
         robot: robot as drawn (a `Robot`, catalogue name or robot file), or a calibrated model (an object that has one,
             or its folder).
-        data: measurements, or CSV files of them. For a tool, rows of one socket are touches of one unknown point.
+        data: measurements, or CSV files of them, without those of the set "test". For a tool, rows of one socket are
+            touches of one unknown point.
         only: "tool" (with the base of the robot or model), "base" (with its tool) or "hand-eye" (both).
         cameras: cameras and boards, for files of detected board corners.
 
@@ -81,7 +82,7 @@ def calibrate_frame(
     check_choice(IdentificationError, "only", only, CHOICES)
     model, parent = _model_of(robot)
     arm = _drawn(robot) if model is None else model.robot
-    rows = read_rows(data, arm, cameras)
+    rows, _ = read_rows(data, arm, cameras).split_sets()
     found = frames_of_robot(arm, rows, only) if model is None else frames_of_model(model, rows, only)
     summary = frame_summary(found.fit, found.arm_variance, found.causes, parent, row_warnings(arm, rows))
     summary = summary.with_figures(

@@ -31,7 +31,7 @@ def causes_of(kind: str, seed: int) -> tuple[Cause, ...]:
         images = replace(cell.images, q=q + torch.from_numpy(moved.get(kind, np.zeros(6))))
         camera = CAMERA.with_intrinsics(CAMERA.intrinsics + off)
         rows = image_measurements(images, camera, board, False, NOISE.repeatability)
-        return misfit_causes(fit_frames(cell.nominal, rows, "hand-eye", {}))
+        return misfit_causes(fit_frames(cell.nominal, rows, "hand-eye"))
 
 
 @pytest.mark.parametrize("kind", ["arm", "joint zeros", "joint noise", "camera", "board"])

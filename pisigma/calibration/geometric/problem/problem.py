@@ -1,6 +1,6 @@
 """Calibration as a least-squares problem, with normal equations that are summed over chunks of poses."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 
@@ -8,11 +8,13 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
+from pisigma.calibration.geometric.problem.held_directions import HeldDirections
 from pisigma.calibration.geometric.problem.least_squares import (
     AbstractLeastSquares,
     Linearisation,
     covariance_of,
 )
+from pisigma.calibration.geometric.problem.motion_memory import MotionMemory
 from pisigma.calibration.geometric.problem.noise import (
     SensorContribution,
     SensorView,
@@ -42,32 +44,6 @@ CONVERGENCE_TOLERANCE = 1e-2
 """Relative change of noise and prior scales between points at convergence."""
 
 
-class MotionMemory:
-    """Cache of the tool motion at the last point, which rank analysis and search both need.
-
-    The inputs of the motion are compared by identity; therefore points must be replaced, not changed in place.
-    """
-
-    def __init__(self) -> None:
-        self._made_from: tuple[object, ...] = ()
-        self._motion: ToolMotion | None = None
-
-    def motion(self, made_from: tuple[object, ...], make: Callable[[], ToolMotion]) -> ToolMotion:
-        """Return the cached motion if it was computed from the same objects, otherwise a new motion.
-
-        Args:
-            made_from: the objects from which the motion is computed.
-            make: function that computes the motion.
-        """
-        same = len(made_from) == len(self._made_from) and all(
-            one is other for one, other in zip(made_from, self._made_from, strict=True)
-        )
-        if not same or self._motion is None:
-            self._made_from, self._motion = made_from, None  # release memory before more is allocated
-            self._motion = make()
-        return self._motion
-
-
 @dataclass(frozen=True, eq=False)
 class CalibrationProblem(AbstractLeastSquares[Tensor]):
     """Least-squares problem of a calibration: rows, sensors, free parameters and their prior.
@@ -87,6 +63,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         pairs: number of pairs of rows that are measured together, which come first.
         stated: conditions stated in the rows (see `JointState`), for corrections that depend on them.
         prior_sizes: "stated": prior scales are 1; "widened": at least 1; "estimated": estimated without bounds.
+        held: directions along which the search does not move, because the rows do not determine them.
         memory: cache of the last motion, shared by problems that differ only in free parameters or prior.
     """
 
@@ -104,6 +81,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
     pairs: int = 0
     stated: Mapping[str, Tensor] = field(default_factory=dict)
     prior_sizes: PriorSizes = "widened"
+    held: HeldDirections | None = None
     memory: MotionMemory = field(default_factory=MotionMemory, repr=False)
 
     @cached_property
@@ -131,8 +109,9 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         return self.space.prior_groups.to(active.device)[nonzero, active]
 
     def with_active(self, active: Sequence[int]) -> "CalibrationProblem":
-        """Return the problem with other free parameters."""
-        return replace(self, active=torch.tensor(sorted(active), dtype=torch.int64, device=self.q.device))
+        """Return the problem with other free parameters, and without held directions."""
+        indices = torch.tensor(sorted(active), dtype=torch.int64, device=self.q.device)
+        return replace(self, active=indices, held=None)
 
     def without_prior(self) -> "CalibrationProblem":
         """Return the problem without a prior."""
@@ -319,6 +298,8 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         normal, descent = self._data_equations(view)
         normal.diagonal().add_(precision)
         descent.sub_(pull)
+        if self.held is not None:
+            normal, descent = self.held.restrict(normal, descent, self.step_scale)
         costs = [
             self.loss_for_sensor(sensor).cost(part.distance / view.scales[k], sensor.components).sum()
             for k, (sensor, part) in enumerate(zip(self.sensors, view.contributions, strict=True))

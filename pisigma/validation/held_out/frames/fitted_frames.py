@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
+from pisigma.estimation.orthonormal_columns import orthonormal_columns
 from pisigma.files.errors import MeasurementError, Place
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import groups_to_keep_whole, numbers_of_names
@@ -32,8 +33,6 @@ FrameKind = Literal["base", "tool"]
 
 MIN_CONFIGURATIONS = 6
 """Different joint vectors that a frame or a target needs: 18 values for the 9 parameters of base and tool."""
-DETERMINED = 1e-9
-"""Singular value over the largest one below which the rows do not determine a direction."""
 
 
 def fitted_kinds(fit_frame: bool, fit_tool: bool) -> tuple[FrameKind, ...]:
@@ -115,8 +114,7 @@ def errors_in_fitted_frames(
     measured = MeasuredPoses.from_tensors(known.position, known.rotation, LEVER_SHARE * model.robot.reach)
     fit, columns = fit_frames(T[usable], measured, rows, fitted)
     T = T.index_put((usable.nonzero()[:, 0],), fit)
-    U, size, _ = torch.linalg.svd(columns.flatten(0, 1), full_matrices=False)
-    leverage = U[:, size > DETERMINED * size.max()].square().sum(-1).view(-1, 2, 3).sum((0, 2)).tolist()
+    leverage = orthonormal_columns(columns.flatten(0, 1)).square().sum(-1).view(-1, 2, 3).sum((0, 2)).tolist()
     errors = ErrorVectors.from_prediction(measurements, T)
     turned = rows.select(measured.has_rotation.nonzero()[:, 0])
     return ErrorVectors(

@@ -1,0 +1,60 @@
+"""Errors of measured values by the uncertainty of a model: of its arm, its joint correction and what is not fitted."""
+
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from pisigma.calibration.frames.whitened_values import WhitenedValues
+from pisigma.calibration.geometric.problem.parameters import Parameter
+from pisigma.calibration.geometric.result import SolvedCalibration
+from pisigma.calibration.hybrid.uncertainty import PositionUncertainty
+from pisigma.measurement.conditions import JointState
+from pisigma.measurement.dataset import Measurements
+
+
+@dataclass(frozen=True, eq=False)
+class ArmUncertainty:
+    """Uncertainty of a model, for fits of frames with its arm as given.
+
+    Attributes:
+        known: the posterior of the model.
+        rows: rows of the fit with the joint values as commanded.
+    """
+
+    known: PositionUncertainty
+    rows: Measurements
+
+    def spread(
+        self, solved: SolvedCalibration, used: Collection[int], fitted: Collection[int]
+    ) -> Float64[Tensor, "values directions"]:
+        """Return a root of the covariance of the measured values, in standard deviations of their noise.
+
+        Args:
+            solved: fit of some rows.
+            used: numbers of these rows.
+            fitted: indices of the parameters that were fitted, whose uncertainty in the model does not matter.
+        """
+        root, fit_space = self.known.root, solved.problem.space
+        positions = positions_by_key(self.known.space.parameters)
+        pairs = [
+            (index, positions[key])
+            for key, index in positions_by_key(fit_space.parameters).items()
+            if index not in fitted and key in positions
+        ]
+        values = WhitenedValues.at_solution(solved, [index for index, _ in pairs])
+        rows = self.rows.select(torch.tensor(list(used))).select(solved.setup.rows)
+        weights = values.weight_columns(self.known.features, JointState.from_measurements(rows))
+        parameters = len(self.known.space.parameters)
+        of_parameters = values.X @ root[[number for _, number in pairs]]
+        spread: Tensor = of_parameters + weights @ root[parameters:]
+        return spread
+
+
+def positions_by_key(parameters: tuple[Parameter, ...]) -> dict[tuple[str, str, str], int]:
+    """Return the position of every parameter by group, owner and column, which do not depend on the other owners."""
+    return {
+        (one.group, one.owner, one.name.rsplit("_", 1)[-1]): number for number, one in enumerate(parameters)
+    }
