@@ -29,6 +29,7 @@ _NAMES = {
     "robot.description": "Robot",
     "measurement.sensors.registry": "Measurements register_sensor",
     "workflow.cell.cell": "Cell",
+    "workflow.arms.calibrate_arms": "Arm ArmsCalibration calibrate_arms",
     "workflow.calibrate": "Calibration calibrate",
     "workflow.frames.calibrate_frame": "FrameCalibration calibrate_frame",
     "workflow.compare": "ComparedModels compare",

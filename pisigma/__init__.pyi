@@ -20,6 +20,9 @@ from pisigma.robot.description import Robot as Robot
 from pisigma.robot.kernels.array_kinematics import forward_kinematics as forward_kinematics
 from pisigma.robot.kernels.array_kinematics import joint_jacobian as joint_jacobian
 from pisigma.robot.kinematics.status import Status as Status
+from pisigma.workflow.arms.calibrate_arms import Arm as Arm
+from pisigma.workflow.arms.calibrate_arms import ArmsCalibration as ArmsCalibration
+from pisigma.workflow.arms.calibrate_arms import calibrate_arms as calibrate_arms
 from pisigma.workflow.calibrate import Calibration as Calibration
 from pisigma.workflow.calibrate import calibrate as calibrate
 from pisigma.workflow.cell.cell import Cell as Cell

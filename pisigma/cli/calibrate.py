@@ -62,6 +62,7 @@ Only = Annotated[
         metavar="FRAME", help="Fit only the tool, base or hand-eye transform; ROBOT may be a model."
     ),
 ]
+NOT_STORED = "no model was stored, because the result must not be trusted, for the reasons above."
 ARM_AS_GIVEN = "with --only, the arm is used as given and no row is held out"
 
 
@@ -88,11 +89,15 @@ def calibrate(
     and writes no folder if the result must not be trusted.
     """
     from pisigma.files.output_folder import check_folder
+    from pisigma.lifetime.cell.layout import is_cell_of_arms
     from pisigma.reporting.calibration_text import calibration_text
     from pisigma.robot.description import Robot
     from pisigma.robot.robot_file import robot_file
     from pisigma.workflow import calibrate as workflow
 
+    if is_cell_of_arms(robot):
+        refuse_with_cell(DATA=data, __out=out, __base=base, __tip=tip, __prior=prior, __only=only)
+        return _calibrate_arms(Path(robot), settings, accept_implausible, verbose, as_json)
     if (cell := cell_at(robot)) is not None:
         refuse_with_cell(DATA=data, __out=out, __base=base, __tip=tip, __prior=prior)
         if only is not None:
@@ -175,6 +180,28 @@ def _print_frame(
         print_result(text, verbose, [] if cell is None else next_step_lines(cell.status()))
 
 
+def _calibrate_arms(
+    cell: Path,
+    settings: StatedSettings[CalibrationSettings],
+    accept_implausible: bool,
+    verbose: bool,
+    as_json: bool,
+) -> None:
+    """Calibrate the arms of a cell, store their models and bases there, and print them."""
+    from pisigma.reporting.arms_text import arms_text
+    from pisigma.workflow.arms.arms_cell import calibrate_arms_of_cell
+
+    with progress_of("calibrate") as progress:
+        found, folder = calibrate_arms_of_cell(cell, progress, accept_implausible, **settings.values)
+    if as_json:
+        print_json({"folder": folder and str(folder), **found.to_json()})
+    else:
+        summaries = {name: one.summary for name, one in found.calibrations.items()}
+        print_result(arms_text(found.summary, summaries, found.warnings, folder, found.seconds), verbose)
+    if folder is None:
+        raise AcceptanceError(NOT_STORED)
+
+
 def _calibrate_cell(
     cell: "Cell",
     settings: StatedSettings[CalibrationSettings],
@@ -203,6 +230,4 @@ def _calibrate_cell(
         text = calibration_text(calibration.summary, folder, calibration.seconds)
         print_result(text, verbose, [*wrap_lines(remark), *next_step_lines(cell.status())])
     if entry is None:
-        raise AcceptanceError(
-            "no model was stored, because the result must not be trusted, for the reasons above."
-        )
+        raise AcceptanceError(NOT_STORED)

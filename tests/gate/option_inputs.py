@@ -14,6 +14,7 @@ from testing.identified import hybrid_model
 from testing.lerobot_arm import DATA_SETS, SO101, so101_model
 from testing.models import hand_made_model, joints_around, no_type_checker
 from testing.simulated_arm import simulate
+from testing.two_arms import UR5, measured_positions
 from testing.urdf import UrdfJoint, urdf_text
 
 from pisigma.joint_correction.conditions import ConditionFeatures
@@ -34,6 +35,7 @@ def prepare(folder: Path) -> None:
     with no_type_checker():
         _rows(folder)
         _sockets(folder)
+        _arms(folder)
         _corners(folder)
         _images(folder)
         _models(folder)
@@ -107,6 +109,16 @@ def _rows(folder: Path) -> None:
         (folder / "moved.csv").read_text().splitlines(True)[1:]
     )
     (folder / "moved.csv").write_text(lines)
+
+
+def _arms(folder: Path) -> None:
+    """Write a cell of two arms that were measured in the same frames."""
+    (folder / "arms" / "sessions").mkdir(parents=True)
+    lines = ["arms:"]
+    for number, name in enumerate(("left", "right")):
+        measured_positions(number, 0).write_csv(folder / "arms" / "sessions" / f"{name}.csv", UR5)
+        lines.append(f"  {name}: {{robot: ur5, sessions: [sessions/{name}.csv]}}")
+    (folder / "arms" / "cell.yaml").write_text("\n".join(lines) + "\n")
 
 
 def _sockets(folder: Path) -> None:

@@ -6,7 +6,7 @@ from functools import lru_cache
 import numpy as np
 import torch
 
-from pisigma.calibration.frames.arm_bases import ArmPosterior
+from pisigma.calibration.frames.shared_objects import ArmPosterior, uncertainty_of
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.calibration.geometric.result import CalibrationResult
 from pisigma.estimation.loss import SquaredLoss
@@ -95,7 +95,7 @@ def own_fit(number: int, seed: int, sensor: str) -> CalibrationResult:
 
 def posterior(name: str, fit: CalibrationResult) -> ArmPosterior:
     """Return the posterior of an arm."""
-    return ArmPosterior(name, fit.solved.problem.space, fit.solved.geometry, fit.solved.root)
+    return ArmPosterior(name, uncertainty_of(fit))
 
 
 def posteriors(seed: int, sensor: str) -> tuple[ArmPosterior, ArmPosterior]:

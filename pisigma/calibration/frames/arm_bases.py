@@ -1,6 +1,5 @@
 """Bases of several arms relative to each other, from what the fits of the arms have in common."""
 
-import itertools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -10,8 +9,7 @@ from jaxtyping import Float64
 from scipy.stats import chi2
 from torch import Tensor
 
-from pisigma.calibration.geometric.problem.parameters import ParameterSpace
-from pisigma.calibration.geometric.problem.setup import IdentifiedGeometry
+from pisigma.calibration.frames.shared_objects import ArmPosterior, SharedObject, find_shared_objects
 from pisigma.estimation.equalities import ConditionedUnknowns, condition_on_equalities
 from pisigma.files.errors import IdentificationError
 from pisigma.robot.frame_fits import MeasuredPoses, best_base
@@ -31,73 +29,6 @@ MAX_ITERATIONS, CONVERGENCE_TOLERANCE = 20, 1e-12
 MIN_POINTS = 3
 COLLINEAR = 1e-3
 """Second singular value of points over the first one below which they are on a line, which determines no rotation."""
-
-
-@dataclass(frozen=True, eq=False)
-class ArmPosterior:
-    """Normal distribution of the parameters of an arm.
-
-    Attributes:
-        name: name of the arm.
-        space: its parameters, with the bases of its measuring frames and the unknowns of its sensors.
-        geometry: their most probable values.
-        root: root `R` of the covariance `R R^T`, whose first rows are those of the parameters [m and rad].
-    """
-
-    name: str
-    space: ParameterSpace
-    geometry: IdentifiedGeometry
-    root: Float64[Tensor, "unknowns directions"]
-
-    @cached_property
-    def values(self) -> Float64[Tensor, " parameters"]:
-        """Values of all parameters [m or rad]."""
-        return self.geometry.values_of(self.space)
-
-    def base_rows(self, frame: str) -> range:
-        """Return the indices of the base in a frame."""
-        first = self.space.indices_of("base").start + 6 * self.space.frames.index(frame)
-        return range(first, first + 6)
-
-    @cached_property
-    def shared_objects(self) -> dict[tuple[str, str], tuple[str, tuple[int, ...]]]:
-        """Frame and indices of the parameters of everything that another arm could have measured too.
-
-        These are named frames in which the base was calibrated, and points at positions that were estimated: sockets
-        and anchors. For a frame, the parameters are those of the base.
-        """
-        found = {
-            ("frame", frame): (frame, tuple(self.base_rows(frame)))
-            for frame in self.space.frames
-            if frame and bool(self.root[list(self.base_rows(frame))].any())
-        }
-        for group in self.space.unknowns:
-            first, size = self.space.indices_of(group.name).start, len(group.columns)
-            for number, (owner, frame) in enumerate(zip(group.owners, group.frames, strict=False)):
-                rows = tuple(range(first + size * number, first + size * (number + 1)))
-                if group.has_point and bool(self.root[list(rows)].any()):
-                    found[group.name, owner] = frame, rows
-        return found
-
-
-@dataclass(frozen=True)
-class SharedObject:
-    """A frame or a point that several arms measured.
-
-    Attributes:
-        kind: "frame" or the group of the sensor's unknowns, such as "socket".
-        name: its name in the rows of all of these arms.
-        arms: numbers of the arms.
-    """
-
-    kind: str
-    name: str
-    arms: tuple[int, ...]
-
-    @property
-    def key(self) -> tuple[str, str]:
-        """Kind and name."""
-        return self.kind, self.name
 
 
 @dataclass(frozen=True)
@@ -194,16 +125,6 @@ class ArmBases:
 def closures(count: int | Tensor) -> Float64[Tensor, " equations"]:
     """Return the standard deviations of the equations."""
     return torch.full((int(count),), CLOSURE, dtype=torch.float64)
-
-
-def find_shared_objects(arms: Sequence[ArmPosterior]) -> tuple[SharedObject, ...]:
-    """Return what two or more arms measured under one name: frames in which they are calibrated, and points."""
-    keys = dict.fromkeys(itertools.chain.from_iterable(arm.shared_objects for arm in arms))
-    found = (
-        SharedObject(*key, tuple(k for k, arm in enumerate(arms) if key in arm.shared_objects))
-        for key in keys
-    )
-    return tuple(one for one in found if len(one.arms) > 1)
 
 
 def fit_arm_bases(arms: Sequence[ArmPosterior]) -> ArmBases:

@@ -20,6 +20,14 @@ def is_cell(path: str | os.PathLike[str]) -> bool:
     return (Path(path) / CELL_FILE).is_file()
 
 
+def is_cell_of_arms(path: str | os.PathLike[str]) -> bool:
+    """Return whether a folder is a cell whose file lists several arms."""
+    file = Path(path) / CELL_FILE
+    return file.is_file() and any(
+        line.startswith("arms:") for line in file.read_text("utf-8", errors="replace").splitlines()
+    )
+
+
 def newest_plan(path: str | os.PathLike[str]) -> Path:
     """Return the newest plan of a cell; a path that is not a cell is returned unchanged.
 

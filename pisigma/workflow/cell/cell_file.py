@@ -16,7 +16,7 @@ from pisigma.files.setting import attributes_of, build_settings, by_key, flat_se
 from pisigma.files.setting_values import checked_values
 from pisigma.files.yaml_file import Section, place_of_key, read_yaml, yaml_text
 from pisigma.lifetime.cell.facts import CellFacts
-from pisigma.lifetime.cell.layout import CELL_FILE
+from pisigma.lifetime.cell.layout import CELL_FILE, is_cell_of_arms
 from pisigma.lifetime.cell.status import VERIFICATION_POSES, plans_check
 from pisigma.planning.plan_settings import PlanSettings
 from pisigma.planning.surroundings.arm_in_surroundings import ArmInSurroundings
@@ -153,9 +153,17 @@ class CellFile:
         """Read the file of a cell, and check the settings of every step.
 
         Raises:
-            PlanningError: the file is missing or not a valid `cell.yaml`; the message names file, line and key.
+            PlanningError: the file is missing or not a valid `cell.yaml`; the message names file, line and key. Or it
+                lists several arms.
             PisigmaError: a setting of a step is not valid.
         """
+        if is_cell_of_arms(folder):
+            raise PlanningError(
+                "the cell has several arms",
+                expected="a cell of one robot",
+                at=place_of_key(folder / CELL_FILE, ("arms",)),
+                remedy="calibrate them with `pisigma calibrate`, then use the models and files of one arm",
+            )
         return CellFile._checked(folder / CELL_FILE)
 
     @staticmethod

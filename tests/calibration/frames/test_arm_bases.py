@@ -9,15 +9,24 @@ from scipy.optimize import OptimizeResult, least_squares
 from testing.closeness import assert_close
 from testing.models import no_type_checker
 from testing.refusals import refused
-from testing.two_arms import BASES, FRAMES, FREE, TOOL, UR5, own_fit, pose_of, posterior, posteriors
+from testing.two_arms import BASES, FRAMES, FREE, TOOL, UR5, own_fit, pose_of, posterior, posteriors, true_arm
 
 from pisigma.calibration.frames.arm_bases import fit_arm_bases
+from pisigma.calibration.frames.tool_to_tool import Postures, tool_to_tool_deviation
 from pisigma.calibration.geometric.result import CalibrationResult
 from pisigma.files.errors import IdentificationError
+from pisigma.measurement.conditions import JointState
+from pisigma.measurement.dataset import Measurements
+from pisigma.robot import Robot
 from pisigma.robot.kernels.array_kinematics import forward_kinematics
 from pisigma.robot.se3 import invert, pose_error, rotation_from_vector, rotation_vector, transform
 
 SOCKETS = 6
+
+
+def fitted_arm(fit: CalibrationResult) -> Robot:
+    """Return the calibrated arm with its base at the origin."""
+    return fit.robot.with_geometry(base=np.zeros(6))
 
 
 def predicted(fit: CalibrationResult, arm: np.ndarray, in_frame: np.ndarray) -> np.ndarray:
@@ -106,12 +115,36 @@ def test_base_is_found_within_its_errors(sensor):
 
 def test_frame_that_moved_between_the_arms_is_named():
     left, right = posteriors(2, "sockets")
-    moved = {name: point.copy() for name, point in right.geometry.unknowns["socket"].items()}
+    geometry = right.uncertainty.geometry
+    moved = {name: point.copy() for name, point in geometry.unknowns["socket"].items()}
     moved["plate/2"] += [1e-3, 0.0, 0.0]
-    shifted = replace(right, geometry=replace(right.geometry, unknowns={"socket": moved}))
+    shifted = replace(
+        right,
+        uncertainty=replace(right.uncertainty, geometry=replace(geometry, unknowns={"socket": moved})),
+    )
     assert fit_arm_bases((left, right)).disagreements == ()
     worst, *_ = fit_arm_bases((left, shifted)).disagreements
     assert worst.shared.name == "plate/2"
+
+
+def test_vector_between_the_tools_is_known_as_stated():
+    rng, errors, stated = np.random.default_rng(0), [], []
+    q = [torch.from_numpy(rng.uniform(-2, 2, (100, 6))) for _ in BASES]
+    postures = tuple(Postures(JointState.from_measurements(Measurements(q=one)), one) for one in q)
+    for seed in range(6):
+        found = fit_arm_bases(posteriors(seed, "hall"))
+        tools = [
+            [pose[:3, :3] @ p + pose[:3, 3] for p in forward_kinematics(robot, own.numpy())[:, :3, 3]]
+            for number, own in enumerate(q)
+            for pose, robot in (
+                (found.T_first_base[number].numpy(), fitted_arm(own_fit(number, seed, "hall"))),
+                (pose_of(BASES[number]).numpy(), true_arm(number, seed)),
+            )
+        ]
+        between = np.array(tools[2]) - tools[0] - (np.array(tools[3]) - tools[1])
+        errors.append(np.square(between).sum(1).mean())
+        stated.append(tool_to_tool_deviation(found, 0, 1, postures) ** 2)
+    assert_close(np.sqrt(np.mean(errors) / np.mean(stated)), 1.0, atol=0.25)
 
 
 def test_three_arms_are_connected_through_the_second_one():

@@ -1,0 +1,168 @@
+"""Figures of several arms: bases relative to each other, what the arms share, and whether they agree on it."""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from pisigma.calibration.frames.arm_bases import ArmBases, Disagreement
+from pisigma.calibration.frames.tool_to_tool import Postures, tool_to_tool_deviation
+from pisigma.files.yaml_file import Section
+from pisigma.robot.se3 import xyzrpy_from_transform
+from pisigma.validation.held_out.diagnostic import Diagnostic
+
+Six = tuple[float, float, float, float, float, float]
+
+
+class ArmBaseFigures(Section):
+    """Base of an arm in the base of another one.
+
+    Attributes:
+        arm: name of the arm.
+        in_base_of: name of the other arm.
+        x_mm: position of the base along x [mm].
+        y_mm: position along y [mm].
+        z_mm: position along z [mm].
+        roll_deg: rotation about z, the first of three [deg].
+        pitch_deg: rotation about the new y axis [deg].
+        yaw_deg: rotation about the new x axis [deg].
+        standard_errors: standard errors of a shift of the base along x, y, z [mm] and of a rotation about x, y, z
+            [deg], the axes of the other arm's base.
+        covariance: covariance of the same six [mm and deg].
+        tool_to_tool_mm: RMS standard deviation of the vector from the tool of the other arm to that of this one [mm],
+            over pairs of measured postures.
+    """
+
+    arm: str
+    in_base_of: str
+    x_mm: float
+    y_mm: float
+    z_mm: float
+    roll_deg: float
+    pitch_deg: float
+    yaw_deg: float
+    standard_errors: Six
+    covariance: tuple[Six, Six, Six, Six, Six, Six]
+    tool_to_tool_mm: float
+
+
+class SharedFigures(Section):
+    """Something that several arms measured under one name.
+
+    Attributes:
+        kind: "frame", "socket" or "anchor".
+        name: its name.
+        arms: names of the arms.
+        distance_mm: largest distance between its positions by two arms [mm]; 0 if it only served to find the bases.
+    """
+
+    kind: str
+    name: str
+    arms: tuple[str, ...]
+    distance_mm: float
+
+
+class ModelFile(Section):
+    """Model folder of an arm.
+
+    Attributes:
+        name: name of the arm and of its folder next to `frames.yaml`.
+        robot: name of the robot.
+        sha256: hash of the folder, see `pisigma.files.model_files.model_hash`; empty before it is written.
+    """
+
+    name: str
+    robot: str
+    sha256: str = ""
+
+
+class ArmsSummary(Section):
+    """All figures of several arms, as in `frames.yaml`.
+
+    Attributes:
+        arms: the arms with their models.
+        bases: base of every arm in that of every arm before it.
+        shared: what the arms share.
+        misfit: sum of the squared differences between the arms in units of their standard deviations.
+        redundancy: number of independent differences, those that the bases do not absorb.
+        probability: probability of a larger misfit of arms without faults.
+        diagnostics: what the arms disagree on.
+    """
+
+    arms: tuple[ModelFile, ...]
+    bases: tuple[ArmBaseFigures, ...]
+    shared: tuple[SharedFigures, ...]
+    misfit: float
+    redundancy: int
+    probability: float
+    diagnostics: tuple[Diagnostic, ...] = ()
+
+    def to_json(self) -> dict[str, Any]:
+        """Return all figures as JSON values, by name."""
+        return self.model_dump(mode="json")
+
+
+def base_figures(found: ArmBases, first: int, second: int, postures: tuple[Postures, ...]) -> ArmBaseFigures:
+    """Return the base of the second arm in that of the first one; `postures` are those of every arm."""
+    T, covariance = found.relative(first, second)
+    shown = np.array([1e3] * 3 + [math.degrees(1)] * 3)
+    in_mm_and_deg = covariance.numpy() * shown * shown[:, None]
+    names = ("x_mm", "y_mm", "z_mm", "roll_deg", "pitch_deg", "yaw_deg")
+    values = dict(zip(names, (xyzrpy_from_transform(T).numpy() * shown).tolist(), strict=True))
+    return ArmBaseFigures(
+        arm=found.arms[second].name,
+        in_base_of=found.arms[first].name,
+        standard_errors=tuple(np.sqrt(in_mm_and_deg.diagonal()).tolist()),
+        covariance=tuple(map(tuple, in_mm_and_deg.tolist())),
+        tool_to_tool_mm=tool_to_tool_deviation(found, first, second, postures) * 1e3,
+        **values,
+    )
+
+
+def disagreement_diagnostic(found: ArmBases, one: Disagreement) -> Diagnostic:
+    """Return the finding that arms disagree on the place of something that they share."""
+    names = " and ".join(f"'{found.arms[number].name}'" for number in one.shared.arms)
+    remedy = (
+        "check that it was not moved between the measurements of the arms, that its name is right in all rows, and "
+        "the rows of both arms"
+    )
+    return Diagnostic(
+        kind="arms",
+        severity="implausible",
+        cause=one.shared.kind,
+        sentence=(
+            f"Arms {names} place {one.shared.kind} '{one.shared.name}' {one.distance * 1e3:.3g} mm apart, which is "
+            f"improbable (probability {one.probability:.1g}); {remedy}."
+        ),
+        values={"name": one.shared.name, "distance_mm": one.distance * 1e3, "probability": one.probability},
+        remedy=remedy,
+    )
+
+
+def arms_summary(found: ArmBases, robots: tuple[str, ...], postures: tuple[Postures, ...]) -> ArmsSummary:
+    """Gather the figures of arms.
+
+    Args:
+        found: the arms with their bases.
+        robots: names of their robots.
+        postures: postures of every arm.
+    """
+    names = [arm.name for arm in found.arms]
+    count = len(names)
+    return ArmsSummary(
+        arms=tuple(ModelFile(name=name, robot=robot) for name, robot in zip(names, robots, strict=True)),
+        bases=tuple(base_figures(found, a, b, postures) for b in range(count) for a in range(b)),
+        shared=tuple(
+            SharedFigures(
+                kind=one.kind,
+                name=one.name,
+                arms=tuple(names[number] for number in one.arms),
+                distance_mm=distance * 1e3,
+            )
+            for one, distance in zip(found.shared, found.distances, strict=True)
+        ),
+        misfit=found.conditioned.misfit,
+        redundancy=found.conditioned.redundancy,
+        probability=found.probability,
+        diagnostics=tuple(disagreement_diagnostic(found, one) for one in found.disagreements),
+    )

@@ -1,0 +1,207 @@
+"""Calibrate several arms that measured the same things, and find their bases relative to each other."""
+
+import os
+import re
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from pisigma.calibration.frames.arm_bases import ArmBases, fit_arm_bases
+from pisigma.calibration.frames.shared_objects import ArmPosterior, uncertainty_of
+from pisigma.calibration.frames.tool_to_tool import Postures
+from pisigma.calibration.geometric.initial_guess.initial_guess import randomly_chosen_rows
+from pisigma.files.errors import AcceptanceError, IdentificationError, OutputError, Place
+from pisigma.files.model_files import model_hash
+from pisigma.files.output_file import write_atomically, write_failure
+from pisigma.files.progress import Progress
+from pisigma.files.scratch import FOLDER, scratch_beside
+from pisigma.files.yaml_file import yaml_text
+from pisigma.measurement.camera.corner_file import MeasurementFiles
+from pisigma.measurement.conditions import JointState
+from pisigma.measurement.dataset import Measurements
+from pisigma.model.calibrated_model import corrected_joints
+from pisigma.robot.description import Robot
+from pisigma.validation.held_out.arms_summary import ArmsSummary, arms_summary
+from pisigma.validation.held_out.trained_calibrations import geometric_result
+from pisigma.workflow.calibrate import Calibration, calibrate
+from pisigma.workflow.settings.calibration import CalibrationSettings
+
+FRAMES_FILE = "frames.yaml"
+"""File with the bases of the arms relative to each other, next to the folders of their models."""
+MAX_POSTURES = 200
+"""Number of postures of every arm at which the distances between tools are judged."""
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
+
+
+@dataclass(frozen=True)
+class Arm:
+    """An arm and its rows.
+
+    Attributes:
+        name: name of the arm: letters, digits, "_" and "-".
+        robot: the nominal robot, or its catalogue name or robot file.
+        data: measurements, or CSV files of them. What other arms measured too has the same name in their rows: a board,
+            jig or instrument in the column `frame`, sockets in `socket`, anchors in `anchor`.
+        settings: settings of its calibration.
+    """
+
+    name: str
+    robot: Robot | str | os.PathLike[str]
+    data: Measurements | MeasurementFiles
+    settings: CalibrationSettings = field(default_factory=CalibrationSettings)
+
+
+@dataclass(frozen=True, eq=False)
+class ArmsCalibration:
+    """Result of `calibrate_arms`.
+
+    Attributes:
+        calibrations: calibration of every arm, by its name.
+        bases: bases of the arms, with covariances in SI units.
+        summary: figures of the bases.
+        seconds: computing time [s].
+    """
+
+    calibrations: dict[str, Calibration]
+    bases: ArmBases
+    summary: ArmsSummary
+    seconds: float
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Warnings of the arms, one sentence each, after the names of the arms."""
+        return tuple(
+            f"{name}: {sentence}" for name, one in self.calibrations.items() for sentence in one.warnings
+        )
+
+    @property
+    def trusted(self) -> bool:
+        """Whether no check found an arm implausible, and the arms agree on what they share."""
+        return not self.summary.diagnostics and all(one.trusted for one in self.calibrations.values())
+
+    def to_json(self) -> dict[str, Any]:
+        """Return all figures as JSON values, in mm and deg."""
+        return {
+            "seconds": round(self.seconds, 3),
+            **self.summary.to_json(),
+            "models": {name: one.to_json() for name, one in self.calibrations.items()},
+        }
+
+    def save(
+        self, folder: str | os.PathLike[str], command: str | None = None, accept_implausible: bool = False
+    ) -> ArmsSummary:
+        """Write a folder with the model folder of every arm and `frames.yaml`, completely or not at all.
+
+        Args:
+            folder: folder to write; it must not exist, or must be empty.
+            command: command that made the models, for their cards. None: the Python calls.
+            accept_implausible: also write a result that must not be trusted; `frames.yaml` and the cards say why.
+
+        Returns:
+            The figures as written, with the hashes of the models.
+
+        Raises:
+            AcceptanceError: an arm is implausible, or the arms disagree.
+            OutputError: the folder is not empty, or cannot be written.
+        """
+        if not (self.trusted or accept_implausible):
+            raise AcceptanceError(
+                "the result must not be trusted and was not written",
+                at=Place(folder),
+                remedy="correct what the diagnostics name, or accept implausible results explicitly "
+                "(accept_implausible, --accept-implausible)",
+            )
+        target = Path(os.path.realpath(folder))
+        try:
+            target.parent.mkdir(parents=True, exist_ok=True)
+            with scratch_beside(target, FOLDER) as scratch:
+                scratch.chmod(0o755)
+                summary = self._write(scratch, command, accept_implausible)
+                if target.exists() and (not target.is_dir() or any(target.iterdir())):
+                    raise OutputError(
+                        "the output exists",
+                        expected="a new or empty folder",
+                        at=Place(folder),
+                        remedy="choose another folder",
+                    )
+                os.replace(scratch, target)
+        except OSError as problem:
+            raise write_failure(folder, problem) from None
+        return summary
+
+    def _write(self, folder: Path, command: str | None, accept_implausible: bool) -> ArmsSummary:
+        written = []
+        for entry, (name, one) in zip(self.summary.arms, self.calibrations.items(), strict=True):
+            one.save(folder / name, command=command, accept_implausible=accept_implausible)
+            written.append(entry.model_copy(update={"sha256": model_hash(folder / name)}))
+        summary = self.summary.model_copy(update={"arms": tuple(written)})
+        write_atomically(folder / FRAMES_FILE, yaml_text(summary.to_json()))
+        return summary
+
+
+def posterior_of(name: str, calibration: Calibration) -> ArmPosterior:
+    """Return the posterior of a calibrated arm: that of its model, or of its geometric calibration."""
+    known = calibration.model.uncertainty
+    return ArmPosterior(name, known or uncertainty_of(geometric_result(calibration.result)))
+
+
+def postures_of(calibration: Calibration) -> Postures:
+    """Return the postures of some rows of a calibration, in random order."""
+    rows = calibration.rows.select(randomly_chosen_rows(calibration.rows.rows, MAX_POSTURES))
+    arm = calibration.model.hybrid
+    return Postures(
+        JointState.from_measurements(rows), rows.q if arm is None else corrected_joints(arm, rows)
+    )
+
+
+def calibrate_arms(arms: Sequence[Arm], progress: Progress = lambda what: None) -> ArmsCalibration:
+    """Calibrate every arm with its own rows, and find the bases of the arms relative to each other.
+
+    Every arm is calibrated as by `calibrate`. The bases then follow from what the arms share, see `fit_arm_bases`.
+    The models are those of the arms' own rows: what an arm could learn from another one is used for the bases only.
+
+    Args:
+        arms: two or more arms.
+        progress: called with the current step.
+
+    Returns:
+        The calibrated arms; `save` writes a model folder for each, and `frames.yaml`.
+
+    Raises:
+        RobotError: a robot is unknown.
+        MeasurementError: rows cannot be read, or cannot be split as the settings say.
+        IdentificationError: rows do not determine the free parameters, or the arms do not share enough; or a name is
+            not valid.
+    """
+    started = time.perf_counter()
+    _check_names([arm.name for arm in arms])
+    found = {}
+    for arm in arms:
+
+        def of_arm(what: str, name: str = arm.name) -> None:
+            progress(f"{name}: {what}")
+
+        found[arm.name] = calibrate(arm.robot, arm.data, arm.settings, of_arm)
+    bases = fit_arm_bases([posterior_of(name, one) for name, one in found.items()])
+    robots = tuple(one.model.robot.name for one in found.values())
+    summary = arms_summary(bases, robots, tuple(map(postures_of, found.values())))
+    return ArmsCalibration(found, bases, summary, time.perf_counter() - started)
+
+
+def _check_names(names: Sequence[str]) -> None:
+    """Refuse fewer than two arms, and names that are not valid or appear twice.
+
+    Raises:
+        IdentificationError: see above.
+    """
+    if len(names) < 2:
+        raise IdentificationError(
+            expected="two or more arms", value=len(names), option="arms", remedy="use `calibrate` for one arm"
+        )
+    for number, name in enumerate(names):
+        if not _NAME.fullmatch(name) or name in names[:number]:
+            raise IdentificationError(
+                expected='different names of letters, digits, "_" and "-"', value=name, option="arms"
+            )
