@@ -48,13 +48,17 @@ class BackgroundProcess:
                 function, and is raised.
 
         Raises:
-            EndedError: the process was closed meanwhile, or died.
+            EndedError: the process was closed meanwhile, died, or was ended by an exception such as an interruption
+                during an earlier call.
         """
+        request = pickle.dumps((work, progress is not None))
         with self._lock:
-            self._send((loaded_plugins(), pickle.dumps((work, progress is not None))))
-            while (answer := self._receive())[0] == "progress":
-                self._report(progress or (lambda what: None), answer[1])
-        kind, value = answer
+            kind, pickled, stopped = self._answer(
+                (loaded_plugins(), request), progress or (lambda what: None)
+            )
+        if stopped is not None:
+            raise stopped
+        value = pickle.loads(pickled)
         if kind == "error":
             raise value
         return value  # type: ignore[no-any-return]
@@ -67,29 +71,43 @@ class BackgroundProcess:
             self._answers.close()
             self._requests.close()
 
-    def _report(self, progress: Progress, what: str) -> None:
-        """Report progress; if that raises, end the function in the process first."""
+    def _answer(self, request: Any, progress: Progress) -> tuple[str, bytes, BaseException | None]:
+        """Send a request, report progress, and return the answer and the exception that `progress` raised."""
+        stopped, answered = None, False
         try:
-            progress(what)
-        except BaseException:
-            self._send(False)
-            self._receive()
-            raise
-        self._send(True)
+            self._send(request)
+            while (answer := self._receive())[0] == "progress":
+                try:
+                    progress(pickle.loads(answer[1]))
+                except BaseException as problem:
+                    stopped = problem
+                self._send(stopped is None)
+            answered = True
+        finally:
+            if not answered:
+                self._process.kill()  # a later call would take the answer to this one for its own
+        return *answer, stopped
 
     def _send(self, value: Any) -> None:
         try:
-            pickle.dump(value, self._requests)
+            self._requests.write(pickle.dumps(value))
             self._requests.flush()
         except (OSError, ValueError):
-            raise EndedError from None
+            raise self._ended() from None
 
-    def _receive(self) -> tuple[str, Any]:
+    def _receive(self) -> tuple[str, bytes]:
         try:
-            answer: tuple[str, Any] = pickle.load(self._answers)
+            answer: tuple[str, bytes] = pickle.load(self._answers)
         except (EOFError, OSError, ValueError, pickle.UnpicklingError):
-            raise EndedError from None
+            raise self._ended() from None
         return answer
+
+    def _ended(self) -> EndedError:
+        status = self._process.poll()
+        return EndedError(
+            "the background process ended before it returned a result"
+            f"{'' if status is None else f' (exit status {status})'}"
+        )
 
 
 def serve() -> None:
@@ -98,14 +116,14 @@ def serve() -> None:
     requests, answers = sys.stdin.buffer, os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # what functions print must not get among the answers
 
-    def answer(kind: str, value: Any) -> None:
-        answers.write(pickle.dumps((kind, value)))
+    def answer(kind: str, pickled: bytes) -> None:
+        answers.write(pickle.dumps((kind, pickled)))
         answers.flush()
 
     def report(what: str) -> None:
-        answer("progress", what)
+        answer("progress", pickle.dumps(what))
         if not pickle.load(requests):
-            raise EndedError
+            raise _StoppedError
 
     with contextlib.suppress(EOFError, OSError):
         while True:
@@ -113,7 +131,21 @@ def serve() -> None:
             try:
                 plugins.load()
                 work, reports = pickle.loads(pickled)
-                found = "result", work(progress=report) if reports else work()
-            except Exception as problem:
-                found = "error", problem
+                found = "result", pickle.dumps(work(progress=report) if reports else work())
+            except (Exception, _StoppedError) as problem:
+                found = "error", _pickled_error(problem)
             answer(*found)
+
+
+class _StoppedError(BaseException):
+    """The other process does not need the result; no function takes it for an error that it can handle."""
+
+
+def _pickled_error(problem: BaseException) -> bytes:
+    """Return an exception as bytes, or its text if it cannot be pickled."""
+    try:
+        pickled = pickle.dumps(problem)
+        pickle.loads(pickled)
+    except Exception:
+        return pickle.dumps(RuntimeError(f"{type(problem).__name__}: {problem}"))
+    return pickled

@@ -1,6 +1,7 @@
 """A process that computes for this one: results, errors, progress, and an end at any time."""
 
 import math
+import pickle
 import threading
 import time
 from functools import partial
@@ -37,6 +38,72 @@ def test_progress_that_raises_ends_the_function_only(process):
     with pytest.raises(KeyError):
         process.compute(REPORTS, stop)
     assert process.compute(partial(math.hypot, 3, 4)) == 5
+
+
+class Source:
+    """The function `work` of a source text, because the process cannot import modules of tests."""
+
+    def __init__(self, text):
+        self.text = text
+
+    def __call__(self, **given):
+        raise AssertionError("it runs in the process only")
+
+    def __reduce__(self):
+        return eval, (f"(lambda names: exec({self.text!r}, names) or names['work'])({{}})",)
+
+
+STUBBORN = Source("""
+def work(progress):
+    for what in ("a", "b", "c"):
+        try:
+            progress(what)
+        except Exception:
+            pass
+    return "earlier"
+""")
+UNUSUAL = Source("""
+class UnusualError(Exception):
+    def __init__(self, first, second):
+        super().__init__(f"{first} and {second}")
+
+def work():
+    raise UnusualError("one", "two")
+""")
+
+
+def test_no_result_is_that_of_an_earlier_function(process):
+    def stop(what):
+        raise KeyError(what)
+
+    with pytest.raises(KeyError):
+        process.compute(STUBBORN, stop)
+    assert process.compute(partial(math.hypot, 3, 4)) == 5
+
+
+def test_results_and_errors_that_cannot_be_pickled_are_errors(process):
+    with pytest.raises(TypeError):
+        process.compute(threading.Lock)
+    with pytest.raises(RuntimeError, match="UnusualError"):
+        process.compute(UNUSUAL)
+    with pytest.raises((AttributeError, pickle.PicklingError)):
+        process.compute(lambda: 1)
+    assert process.compute(partial(math.hypot, 3, 4)) == 5
+
+
+def test_an_interrupted_call_ends_the_process(monkeypatch):
+    process = BackgroundProcess()
+    with monkeypatch.context() as patch:
+
+        def interrupted():
+            raise KeyboardInterrupt
+
+        patch.setattr(process, "_receive", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            process.compute(partial(math.hypot, 3, 4))
+    with pytest.raises(EndedError, match="ended before"):
+        process.compute(partial(math.hypot, 6, 8))
+    process.close()
 
 
 def test_what_it_prints_is_not_taken_for_an_answer(process):
