@@ -11,10 +11,15 @@ from scipy.stats import t as student
 
 from pisigma.files.errors import MeasurementError
 from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.robot.robot_class import RobotClass
+from pisigma.robot.se3 import wrap_to_pi
 
-Moved = Literal["leader", "follower", "unknown"]
+Verdict = Literal["different", "same", "unknown"]
+Moved = Literal["leader", "follower", "both", "unknown"]
 FALSE_ALARMS = 1e-3
 """Probability that a joint of a pair of arms without differences is named."""
+MISSED = 0.025
+"""Probability that a joint whose difference is as large as the tolerance is found to be the same."""
 TOLERANCE = math.radians(0.5)
 """Smallest difference that is named [rad]: backlash and gravity shift the means of servos by such angles."""
 BLOCKS, MIN_ROWS = 20, 10
@@ -22,6 +27,8 @@ BLOCKS, MIN_ROWS = 20, 10
 CERTAIN = 5.0
 """Log odds above which the arm that moved is named."""
 ITERATIONS = 10
+SMALLEST_NOISE = 1e-6
+"""Smallest standard deviation of positions [m], which keeps directions without information regular."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,16 +50,18 @@ class JointDifference:
 
     Attributes:
         joint: name of the joint.
-        value: follower minus leader [rad].
+        value: follower minus leader [rad], in (-pi, pi].
         standard_error: its standard error [rad].
-        differs: whether it is significant and larger than the tolerance.
-        moved: the arm whose zero moved, if the joint differs; "unknown" without measured positions that show it.
+        verdict: "different" if the difference is significant and larger than the tolerance, "same" if it is smaller
+            than the tolerance with a confidence of 97.5 %, else "unknown": more rows would show it.
+        moved: the arm whose zero moved, if the joint is different; "both" if the measured positions of an arm exclude
+            that only one moved, "unknown" if they do not show it.
     """
 
     joint: str
     value: float
     standard_error: float
-    differs: bool
+    verdict: Verdict
     moved: Moved | None
 
 
@@ -61,8 +70,9 @@ def estimate_zero_changes(
 ) -> ZeroChanges:
     """Fit changes of all zeros of an arm to measured positions of its tool; base and tool are those of the model.
 
-    The covariance is estimated from the residuals of every row (White 1980), because the noise of servos depends on
-    the posture.
+    The prior standard deviation of a change is pi, which remains where the positions do not show a zero. The
+    covariance is estimated from the residuals of every row (White 1980), because the noise of servos depends on the
+    posture.
 
     Args:
         model: calibrated model of the arm.
@@ -70,27 +80,65 @@ def estimate_zero_changes(
         position: measured positions of its tool [m] in the frame of the model.
 
     Raises:
-        MeasurementError: there are not enough rows.
+        MeasurementError: the arrays do not belong to this arm or to each other, there are fewer than 10 rows, or no
+            changes of zeros explain the positions.
     """
-    rows, joints = q.shape
-    if 3 * rows < 3 * joints:
+    rows, joints = len(q), model.robot.dof
+    if q.shape != (rows, joints) or position.shape != (rows, 3):
         raise MeasurementError(
-            expected=f"at least {joints} rows with positions", value=rows, option="position"
+            expected=f"rows of {joints} joint values and of 3 coordinates",
+            value=f"{q.shape} and {position.shape}",
+            option="q, position",
         )
-    values = torch.zeros(joints, dtype=torch.float64)
-    measured = torch.from_numpy(np.array(position))
+    _check_rows(q, "q")
+    _check_rows(position, "position")
+    values, measured = torch.zeros(joints, dtype=torch.float64), torch.from_numpy(np.array(position))
+    weight = torch.eye(joints, dtype=torch.float64) / math.pi**2
     for _ in range(ITERATIONS):
         there = torch.from_numpy(np.array(q)) + values
         J = model.jacobian(there)[:, :3]
         residual = measured - model.forward(there)[:, :3, 3]
-        inverse = torch.linalg.pinv((J.mT @ J).sum(0), hermitian=True)
-        values = values + inverse @ (J.mT @ residual[..., None]).sum(0)[:, 0]
-    score = (J.mT @ residual[..., None])[..., 0]
+        variance = residual.square().sum() / max(3 * rows - joints, 1) + SMALLEST_NOISE**2
+        inverse = torch.linalg.inv((J.mT @ J).sum(0) + variance * weight)
+        score = (J.mT @ residual[..., None])[..., 0]
+        values = values + inverse @ (score.sum(0) - variance * weight @ values)
+    _check_explained(model, math.sqrt(3 * float(variance)))
     scale = 3 * rows / max(3 * rows - joints, 1)
-    covariance = scale * inverse @ (score.mT @ score) @ inverse
-    # Directions that the positions do not show have no covariance in the pseudo-inverse: they are unknown.
-    hidden = torch.eye(joints, dtype=torch.float64) - inverse @ (J.mT @ J).sum(0)
-    return ZeroChanges(values.numpy(), (covariance + math.pi**2 * hidden @ hidden.mT).numpy())
+    covariance = inverse @ (scale * score.mT @ score + variance**2 * weight) @ inverse
+    return ZeroChanges(values.numpy(), covariance.numpy())
+
+
+def _check_rows(rows: Float64[np.ndarray, "rows columns"], option: str) -> None:
+    """Check that there are enough rows of numbers.
+
+    Raises:
+        MeasurementError: there are not.
+    """
+    if len(rows) < MIN_ROWS or not np.isfinite(rows).all():
+        finite = int(np.isfinite(rows).all(1).sum())
+        raise MeasurementError(
+            expected=f"at least {MIN_ROWS} rows, all of numbers",
+            value=f"{finite} of {len(rows)}",
+            option=option,
+        )
+
+
+def _check_explained(model: CalibratedModel, rms: float) -> None:
+    """Check that the positions fit the arm with other zeros, up to errors [m] that robots of its class have.
+
+    Raises:
+        MeasurementError: they do not.
+    """
+    limit = RobotClass.from_robot(model.robot).remaining * model.robot.reach
+    if rms > limit:
+        raise MeasurementError(
+            "no changes of the joint zeros explain the positions",
+            expected=f"residuals below {limit * 1e3:.2g} mm RMS",
+            value=f"{rms * 1e3:.3g} mm",
+            option="position",
+            remedy="give positions in m in the frame of the model, and the joint values of the same rows in rad; "
+            "calibrate this arm again if they are right",
+        )
 
 
 def compare_paired_arms(
@@ -108,7 +156,7 @@ def compare_paired_arms(
     teleoperation do not show differences, because the follower is commanded to the joint values of the leader.
 
     Args:
-        leader: its joint values [rad], in the order of their recording.
+        leader: its joint values [rad] of revolute joints, in the order of their recording; full turns do not matter.
         follower: those of the follower.
         names: names of the joints.
         leader_zeros: changes of the leader's zeros since its calibration, see `estimate_zero_changes`.
@@ -128,34 +176,57 @@ def compare_paired_arms(
             value=f"{leader.shape} and {follower.shape}",
             option="leader, follower",
         )
-    if len(leader) < MIN_ROWS or not np.isfinite(leader).all() or not np.isfinite(follower).all():
-        raise MeasurementError(
-            expected=f"at least {MIN_ROWS} rows of numbers", value=len(leader), option="leader"
-        )
-    blocks = np.array_split(follower - leader, min(BLOCKS, len(leader) // 2))
+    _check_rows(leader, "leader")
+    _check_rows(follower, "follower")
+    difference = follower - leader
+    center = np.angle(np.exp(1j * difference).mean(0))
+    difference = center + wrap_to_pi(torch.from_numpy(difference - center)).numpy()
+    blocks = np.array_split(difference, min(BLOCKS, len(leader) // 2))
     means = np.array([block.mean(0) for block in blocks])
     error = means.std(0, ddof=1) / math.sqrt(len(blocks))
-    limit = float(student.isf(FALSE_ALARMS / len(names) / 2, len(blocks) - 1))
+    freedom = len(blocks) - 1
+    limit = float(student.isf(FALSE_ALARMS / len(names) / 2, freedom))
     found = []
     for index, name in enumerate(names):
         value, sigma = float(means[:, index].mean()), float(error[index])
-        differs = abs(value) > max(limit * sigma, tolerance)
-        odds = _log_odds(value, sigma, index, leader_zeros, follower_zeros)
-        moved: Moved = "unknown" if abs(odds) < CERTAIN else "follower" if odds > 0 else "leader"
-        found.append(JointDifference(name, value, sigma, differs, moved if differs else None))
+        verdict: Verdict = "unknown"
+        if abs(value) > max(limit * sigma, tolerance):
+            verdict = "different"
+        elif abs(value) + float(student.isf(MISSED, freedom)) * sigma < tolerance:
+            verdict = "same"
+        changes = [_change(zeros, index) for zeros in (leader_zeros, follower_zeros)]
+        moved = _moved(value, sigma, changes, limit, tolerance) if verdict == "different" else None
+        found.append(JointDifference(name, value, sigma, verdict, moved))
     return tuple(found)
 
 
-def _log_odds(
-    value: float, sigma: float, index: int, leader: ZeroChanges | None, follower: ZeroChanges | None
-) -> float:
-    """Return the log odds that the follower's zero moved, not the leader's.
+def _change(zeros: ZeroChanges | None, index: int) -> tuple[float, float] | None:
+    """Return the change of the zero of a joint [rad] and its variance [rad²]; None if it was not measured."""
+    return None if zeros is None else (float(zeros.values[index]), float(zeros.covariance[index, index]))
 
-    The follower's zero has to move by -value or the leader's by value to explain the difference.
+
+def _moved(
+    value: float, sigma: float, changes: list[tuple[float, float] | None], limit: float, tolerance: float
+) -> Moved:
+    """Return the arm whose zero moved, from the changes of the leader's and the follower's zero.
+
+    The leader's zero has to change by `value`, or the follower's by `-value`, to explain the difference; the zero of
+    the other arm did not change then. An explanation is excluded if a measured change deviates from it as far as a
+    difference that is named.
     """
-    total = 0.0
-    for arm, sign in ((follower, -1.0), (leader, 1.0)):
-        if arm is not None:
-            change, variance = float(arm.values[index]), float(arm.covariance[index, index]) + sigma**2
-            total -= sign * (change**2 - (change - sign * value) ** 2) / (2 * variance)
-    return total
+    arms: tuple[Moved, Moved] = ("leader", "follower")
+    misfit, excluded = {}, {}
+    for arm, expected in zip(arms, ((value, 0.0), (0.0, -value)), strict=True):
+        gaps = [
+            (change[0] - there, change[1] + sigma**2)
+            for change, there in zip(changes, expected, strict=True)
+            if change is not None
+        ]
+        misfit[arm] = sum(gap**2 / variance for gap, variance in gaps)
+        excluded[arm] = any(abs(gap) > max(limit * math.sqrt(variance), tolerance) for gap, variance in gaps)
+    likely: Moved = min(arms, key=lambda arm: misfit[arm])
+    if all(excluded.values()):
+        return "both"
+    return (
+        "unknown" if excluded[likely] or abs(misfit["leader"] - misfit["follower"]) < 2 * CERTAIN else likely
+    )
