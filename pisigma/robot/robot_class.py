@@ -7,7 +7,7 @@ from typing import Final, Literal
 
 from pisigma.robot.description import Robot
 
-ClassName = Literal["industrial", "cobot", "hobby"]
+ClassName = Literal["industrial", "cobot", "hobby", "servo"]
 
 COBOT_MAKERS: Final = (
     "Franka",
@@ -18,17 +18,8 @@ COBOT_MAKERS: Final = (
     "Techman",
     "Neuromeka",
 )
-HOBBY_MAKERS: Final = (
-    "TheRobotStudio",
-    "Alexander Koch",
-    "Enactic",
-    "Trossen",
-    "ROBOTIS",
-    "Niryo",
-    "AR4",
-    "Elephant Robotics",
-    "Dobot",
-)
+HOBBY_MAKERS: Final = ("Enactic", "Niryo", "AR4", "Dobot")
+SERVO_MAKERS: Final = ("TheRobotStudio", "Alexander Koch", "Trossen", "ROBOTIS", "Elephant Robotics")
 
 
 @dataclass(frozen=True)
@@ -107,6 +98,8 @@ class RobotClass:
             return UNIVERSAL_ROBOTS
         if robot.maker.startswith(COBOT_MAKERS):
             return COBOT
+        if robot.maker.startswith(SERVO_MAKERS):
+            return SERVO
         return HOBBY if robot.maker.startswith(HOBBY_MAKERS) else INDUSTRIAL
 
     def allows(self, sizes: Sequence[tuple[int, float]]) -> bool:
@@ -155,16 +148,25 @@ other robots cannot distinguish."""
 HOBBY: Final = replace(
     COBOT,
     name="hobby",
-    usual=GeometricSizes(joint_offset=0.1, length=1e-3, no_length=1e-3, between_axes=5e-3),
-    largest=GeometricSizes(joint_offset=0.3, length=20e-3, no_length=20e-3, between_axes=20e-3),
+    usual=GeometricSizes(joint_offset=30e-3, length=1e-3, no_length=1e-3, between_axes=5e-3),
+    largest=GeometricSizes(joint_offset=100e-3, length=20e-3, no_length=20e-3, between_axes=20e-3),
     change=ChangeLimits(joint_zero=0.3, length=0.02, angle=0.1),
+    remaining=7.5e-3,
+)
+"""Arms without a reliable zero: built by hobbyists or in a laboratory, surgical arms with potentiometers, and old arms
+that were reassembled. Their zeros are wrong by 20 to 50 mrad."""
+
+SERVO: Final = replace(
+    HOBBY,
+    name="servo",
+    usual=replace(HOBBY.usual, joint_offset=0.1),
+    largest=replace(HOBBY.largest, joint_offset=0.3),
     remaining=0.04,
     joint_repeatability=math.radians(0.5),
 )
-"""Arms without a reliable zero: built by hobbyists or in a laboratory, surgical arms with potentiometers, old arms that
-were reassembled, and arms of servos. Zeros of reassembled arms are wrong by 20 to 50 mrad, those of servo arms, which
-are set by eye in the middle of the range, by up to 17 deg (huggingface/lerobot, issue 3758). Servos repeat to 0.3 to
-2 deg, of which 2 deg move the tool of an SO-101 by 4 % of its reach."""
+"""Arms of servos, whose zeros are set by eye in the middle of the range and are wrong by up to 17 deg
+(huggingface/lerobot, issue 3758). Servos repeat to 0.3 to 2 deg, of which 2 deg move the tool of an SO-101 by 4 % of
+its reach."""
 
-CLASSES: Final[dict[str, RobotClass]] = {one.name: one for one in (INDUSTRIAL, COBOT, HOBBY)}
+CLASSES: Final[dict[str, RobotClass]] = {one.name: one for one in (INDUSTRIAL, COBOT, HOBBY, SERVO)}
 """Classes of robots by name, in the order of increasing errors."""

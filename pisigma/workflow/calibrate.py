@@ -26,7 +26,7 @@ from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.geometric_model import model_of_calibration, with_hybrid
 from pisigma.reporting.cards import CardTexts, write_calibration_card
 from pisigma.robot.description import Robot
-from pisigma.robot.robot_class import CLASSES, HOBBY, RobotClass
+from pisigma.robot.robot_class import CLASSES, SERVO, RobotClass
 from pisigma.validation.checks.backlash import unstated_backlash
 from pisigma.validation.checks.check import CheckedCalibration
 from pisigma.validation.checks.registry import diagnostics_of
@@ -286,7 +286,7 @@ def calibrator_of(
     """
     length, angle = settings.prior_length, settings.prior_angle
     usual = _class_of(settings, robot)
-    zeros = max(angle, usual.usual.joint_offset) if usual is HOBBY else angle
+    zeros = max(angle, usual.usual.joint_offset) if usual is SERVO else angle
     geometric = GeometricCalibrator(
         robot,
         free=settings.free,

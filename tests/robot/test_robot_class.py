@@ -4,11 +4,18 @@ import pytest
 
 from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.robot import Robot
-from pisigma.robot.robot_class import COBOT, INDUSTRIAL, UNIVERSAL_ROBOTS, RobotClass
+from pisigma.robot.robot_class import COBOT, HOBBY, INDUSTRIAL, SERVO, UNIVERSAL_ROBOTS, RobotClass
 
 
 @pytest.mark.parametrize(
-    ("name", "expected"), [("ur10", UNIVERSAL_ROBOTS), ("fanuc_r2000", INDUSTRIAL), ("rb5", COBOT)]
+    ("name", "expected"),
+    [
+        ("ur10", UNIVERSAL_ROBOTS),
+        ("fanuc_r2000", INDUSTRIAL),
+        ("rb5", COBOT),
+        ("openarm_left", HOBBY),
+        ("so101", SERVO),
+    ],
 )
 def test_the_maker_determines_the_class(name: str, expected: RobotClass) -> None:
     assert RobotClass.from_robot(Robot.load(name)) is expected

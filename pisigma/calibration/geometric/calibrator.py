@@ -78,8 +78,8 @@ class GeometricCalibrator:
         socket_sigma: standard deviation of the distances between sockets [m].
         loss: `HampelLoss()` reduces the weight of outliers, down to 0; `SquaredLoss()` does not.
         maximum_iterations: maximum number of steps.
-        robot_class: "industrial", "cobot" or "hobby", which limits the errors; None to derive it from the manufacturer
-            and the data.
+        robot_class: "industrial", "cobot", "hobby" or "servo", which limits the errors; None to derive it from the
+            manufacturer and the data.
     """
 
     robot: Robot

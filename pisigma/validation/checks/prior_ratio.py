@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 
 from pisigma.calibration.geometric.prior_ratio import PriorRatio
 from pisigma.calibration.geometric.problem.prior_sizes import PriorGroup
-from pisigma.robot.robot_class import CLASSES, HOBBY, RobotClass
+from pisigma.robot.robot_class import CLASSES, SERVO, RobotClass
 from pisigma.validation.checks.check import CheckedCalibration
 from pisigma.validation.checks.setup_fault import setup_diagnostics
 from pisigma.validation.held_out.diagnostic import Diagnostic
@@ -122,7 +122,7 @@ def _consequence(ratio: PriorRatio, usual: RobotClass, possible: RobotClass | No
         )
     if possible is None:
         return (
-            f"which no robot of {'class ' + usual.name if usual.name != 'hobby' else 'any class'} has; check that this "
+            f"which no robot of {'class ' + usual.name if usual is not SERVO else 'any class'} has; check that this "
             "robot was measured, the units, and the order and directions of the joints, or give a wider prior if such "
             "errors are expected"
         )
@@ -148,7 +148,7 @@ def check_joint_zero(checked: CheckedCalibration) -> Iterator[Diagnostic]:
     if setup_diagnostics(checked.robot, checked.rows):
         return
     usual = checked.robot_class
-    far = usual.largest.joint_offset if usual is HOBBY else FAR
+    far = usual.largest.joint_offset if usual is SERVO else FAR
     for one in checked.geometric.parameters:
         joint = one.name.removeprefix("theta_")
         if joint == one.name or not one.free or abs(one.change) - CERTAIN * one.standard_error < far:

@@ -11,7 +11,7 @@ from pisigma.calibration.geometric.identifiability.plausibility import IMPLAUSIB
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.sensors.registry import SENSORS
 from pisigma.robot.frame_fits import best_base_and_tool
-from pisigma.robot.robot_class import HOBBY
+from pisigma.robot.robot_class import SERVO
 from pisigma.validation.checks.check import FITTED, CheckedCalibration, RowsUnderModel
 from pisigma.validation.checks.rounding import joint_rounding
 from pisigma.validation.held_out.diagnostic import Diagnostic
@@ -43,14 +43,15 @@ def check_unexplained(checked: CheckedCalibration) -> Iterator[Diagnostic]:
     reach = checked.robot.reach * 1e3
     usual = checked.robot_class
     far = left > usual.remaining * reach
-    if far or (left > LARGE * reach and nominal < HARDLY * left):
+    large = LARGE if usual is not SERVO else usual.remaining
+    if far or (left > large * reach and nominal < HARDLY * left):
         what = "rows of the calibration" if checked.validation is None else "held-out rows"
-        healthy = LARGE if usual is not HOBBY else usual.remaining
         yield Diagnostic(
             kind="unexplained",
             severity="implausible",
             sentence=f"The errors of the {what} are {left:.3g} mm RMS ({nominal:.3g} mm for the nominal robot), but "
-            f"robots of this size have less than {healthy * reach:.2g} mm after a calibration"
+            f"robots of class {usual.name} and this size have less than "
+            f"{(usual.remaining if far else large) * reach:.2g} mm after a calibration"
             f"{'' if far else ', and calibration hardly helped'}. Mixed populations, a moved frame or tool, joint "
             "values that were logged too early or rounded, and a scale do not explain them; check the sensor, and "
             "what else differs between the rows.",

@@ -106,8 +106,8 @@ class CalibrationSettings:
         free: parameters to identify: identifiable, joint_offsets, or names such as a_2,theta_3.
         prior_length: prior standard deviation of length errors [m] (0: no prior).
         prior_angle: prior standard deviation of angle errors [rad] (0: no prior).
-        robot_class: expected size of the geometric errors: industrial, cobot or hobby (also for old and surgical arms).
-            None: from the maker and the data.
+        robot_class: expected size of the geometric errors: industrial, cobot, hobby (also for old and surgical arms)
+            or servo (arms of servos). None: from the maker and the data.
         robust: down-weight outliers.
         features: features of the joint correction to try, such as gravity,lines,series. None: all that apply.
         gravity: direction of gravity in the robot's base frame, such as 0,0,-1. None: found from the data.

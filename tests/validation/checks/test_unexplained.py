@@ -11,6 +11,7 @@ from testing.outside_arm import ARMS, OutsideArm
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot
+from pisigma.robot.robot_class import HOBBY, SERVO
 from pisigma.validation.checks.prior_ratio import check_joint_zero
 from pisigma.validation.checks.unexplained import check_unexplained
 
@@ -24,6 +25,18 @@ def test_errors_of_unknown_cause_are_implausible(name):
     assert [one.severity for one in check_unexplained(check)] == ["implausible"]
     stated = replace(rows, sigma_position=torch.full((100,), 5e-3 * arm.robot.reach, dtype=torch.float64))
     assert list(check_unexplained(checked(GeometricCalibrator(arm.robot), stated))) == []
+
+
+def test_errors_of_servos_are_plausible_for_arms_of_servos_only():
+    arm = OutsideArm(ARMS[0], 3)
+    off = np.random.default_rng(0).normal(0, 15e-3, arm.q.shape)
+    rows, found = arm.measured(logged=arm.q + off), {}
+    for maker in ("Niryo", "TheRobotStudio"):
+        check = checked(GeometricCalibrator(replace(arm.robot, maker=maker)), rows)
+        found[maker] = [one.values["rms_mm"] / (check.robot.reach * 1e3) for one in check_unexplained(check)]
+    (share,) = found.pop("Niryo")
+    assert HOBBY.remaining < share < SERVO.remaining
+    assert found == {"TheRobotStudio": []}
 
 
 @pytest.mark.parametrize("name", ARMS)

@@ -10,7 +10,7 @@ from pisigma.lifetime.recalibration.movement import Movement
 from pisigma.robot.description import Robot
 from pisigma.robot.robot_class import CLASSES, RobotClass
 
-MAKERS = {"industrial": "FANUC", "cobot": "Franka", "hobby": "Niryo"}
+MAKERS = {"industrial": "FANUC", "cobot": "Franka", "hobby": "Niryo", "servo": "TheRobotStudio"}
 KINDS = {
     "joint 2": "joint_zero",
     "joint 3": "joint_zero",
