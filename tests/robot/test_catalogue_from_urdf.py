@@ -62,6 +62,8 @@ def test_tool_poses_are_those_of_the_urdf_file(name):
 
 
 PUBLISHED = yaml.safe_load((Path(__file__).parent / "published_joints.yaml").read_text())
+AS_IN_LEROBOT = {"so100": ([-1, 1, 1, 1, 1], np.deg2rad([0, 100.2676, -89.99965, -37.24225, 0]))}
+"""Directions, and joint values of the description [rad] where the catalogue's are 0."""
 ROUNDED = 3e-5
 """Deviation [m, and of rotation matrices] that right angles written with five digits cause."""
 
@@ -69,6 +71,12 @@ ROUNDED = 3e-5
 def random_joint_values(name, count=20):
     low, high = pisigma.Robot.load(name).limits.T
     return np.random.default_rng(0).uniform(low, high, (count, len(low)))
+
+
+def published_values(name, q):
+    """Return the joint values of the description."""
+    directions, middle = AS_IN_LEROBOT.get(name, (1, 0))
+    return q * directions + middle
 
 
 def published_pose(joints, q):
@@ -86,8 +94,20 @@ def published_pose(joints, q):
 @pytest.mark.parametrize("name", PUBLISHED)
 def test_arms_have_the_poses_of_their_published_descriptions(name):
     q = random_joint_values(name)
-    poses = np.array([published_pose(PUBLISHED[name], values) for values in q])
+    poses = np.array([published_pose(PUBLISHED[name], values) for values in published_values(name, q)])
     assert_close(pisigma.forward_kinematics(pisigma.Robot.load(name), q)[:, :3], poses[:, :3], atol=ROUNDED)
+
+
+def test_joints_of_an_so100_turn_about_the_axes_of_an_so101():
+    """LeRobot drives both alike; they look along other axes of their bases, and their ranges differ by some degrees."""
+    axes = []
+    for name in ("so100", "so101"):
+        robot = pisigma.Robot.load(name)
+        T = pisigma.forward_kinematics(robot, np.vstack([np.zeros(5), 1e-4 * np.eye(5)]))
+        ahead = Rotation.from_euler("z", -np.arctan2(T[0, 1, 3], T[0, 0, 3])).as_matrix()
+        turned = T[1:, :3, :3] @ T[0, :3, :3].T
+        axes.append(Rotation.from_matrix(turned).as_rotvec() @ ahead.T / 1e-4)
+    assert_close(axes[0], axes[1], atol=0.15)
 
 
 def published_urdf(name, joints):
@@ -119,12 +139,17 @@ def test_pinocchio_computes_the_poses_of_the_published_descriptions(tmp_path, re
         path = tmp_path / f"{name}.urdf"
         path.write_text(published_urdf(name, joints))
         requests.append(
-            {"file": str(path), "base": "root", "tool": "tip", "q": random_joint_values(name).tolist()}
+            {
+                "file": str(path),
+                "base": "root",
+                "tool": "tip",
+                "q": published_values(name, random_joint_values(name)).tolist(),
+            }
         )
     script = str(repository / "benchmarks" / "urdf_peers.py")
     run = subprocess.run(
         [python, script, "pinocchio"], input=json.dumps(requests), capture_output=True, text=True, check=True
     )
-    for name, request, answer in zip(PUBLISHED, requests, json.loads(run.stdout), strict=True):
-        poses = pisigma.forward_kinematics(pisigma.Robot.load(name), request["q"])
+    for name, answer in zip(PUBLISHED, json.loads(run.stdout), strict=True):
+        poses = pisigma.forward_kinematics(pisigma.Robot.load(name), random_joint_values(name))
         assert_close(poses[:, :3], np.array(answer["poses"])[:, :3], atol=ROUNDED)

@@ -10,7 +10,7 @@ from pisigma.deployment.export.export_format import Exported, ExportFormat, Expo
 from pisigma.deployment.export.geometry import offset_remarks
 from pisigma.deployment.export.joint_offsets import fit_joint_offsets, offset_sentences
 from pisigma.files.errors import OutputError, Place
-from pisigma.measurement.foreign.lerobot_motors import TICKS, Motor, motors_text, read_motors
+from pisigma.measurement.foreign.lerobot_motors import DAMIAO, TICKS, Motor, motors_text, read_motors
 
 README = "README.md"
 NOT_EXPRESSED = (
@@ -57,8 +57,15 @@ def with_offsets(motors: Mapping[str, Motor], offsets: Mapping[str, float], file
         file: file of the motors, for messages.
 
     Raises:
-        OutputError: a joint has no motor, or see `with_offset`.
+        OutputError: a joint has no motor or no zero in the file, or see `with_offset`.
     """
+    if any(DAMIAO.fullmatch(name) for name in offsets):
+        raise OutputError(
+            "the zeros of OpenArm's motors are not in the calibration file",
+            at=Place(file),
+            option="--like",
+            remedy="correct the frames of policies and data sets with pisigma.LeRobotCorrection instead",
+        )
     if missing := sorted(set(offsets) - set(motors)):
         raise OutputError(
             expected=f"motors named {', '.join(offsets)}, as the joints of the robot",

@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from typing import Any, Literal, get_args
@@ -14,6 +15,8 @@ LeRobotUnits = Literal["degrees", "normalized"]
 """LeRobot's `use_degrees=true`, and its values of -100 to 100 over the range of a motor."""
 TICKS = 4096
 """Positions per turn of the 12-bit encoders of Feetech STS3215, Dynamixel XL330 and XL430 servos."""
+DAMIAO = re.compile(r"joint_\d+")
+"""Names of OpenArm's motors, which send degrees themselves; their zero is set in the motor, not by a range."""
 NORMALIZED = 200.0
 """Length of the interval from -100 to 100."""
 
@@ -91,7 +94,8 @@ def radians_per_unit(units: LeRobotUnits, name: str, motors: Mapping[str, Motor]
     """Return the rotation [rad] of a joint per unit of its recorded value.
 
     LeRobot converts ticks to degrees with 360 / 4095, although a turn has 4096 ticks, so that its degrees are 0.02 %
-    too large; values of -100 to 100 span the range of the motor (`_normalize` in its `motors_bus.py`, 0.3 to 0.6).
+    too large, except those of OpenArm (`DAMIAO`); values of -100 to 100 span the range of the motor (`_normalize` in
+    its `motors_bus.py`, 0.3 to 0.6).
 
     Args:
         units: units of the values.
@@ -103,7 +107,7 @@ def radians_per_unit(units: LeRobotUnits, name: str, motors: Mapping[str, Motor]
     """
     check_choice(MeasurementError, "units", units, get_args(LeRobotUnits))
     if units == "degrees":
-        return math.radians(1) * (TICKS - 1) / TICKS
+        return math.radians(1) * (1.0 if DAMIAO.fullmatch(name) else (TICKS - 1) / TICKS)
     if motors is None or name not in motors:
         raise MeasurementError(
             f"the scale of the normalized values of '{name}' is its range in ticks, which is not known",

@@ -1,6 +1,7 @@
 """LeRobot's calibration file: read and written to the digit, with corrected zeros and ranges within the old ones."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,9 +11,10 @@ from testing.refusals import refused
 
 from pisigma.deployment.export.export_format import ExportRequest
 from pisigma.deployment.export.registry import export_model
-from pisigma.deployment.lerobot.calibration_file import with_offset
+from pisigma.deployment.lerobot.calibration_file import with_offset, with_offsets
 from pisigma.files.errors import MeasurementError, OutputError, Place
-from pisigma.measurement.foreign.lerobot_motors import Motor, motors_text, read_motors
+from pisigma.measurement.foreign.lerobot_motors import Motor, motors_text, radians_per_unit, read_motors
+from pisigma.robot import Robot
 
 MOTOR = Motor(id=1, drive_mode=0, homing_offset=-12, range_min=1000, range_max=3000)
 
@@ -65,6 +67,18 @@ def test_export_needs_the_file_of_this_arm(model_folder, calibration, tmp_path):
     with refused(OutputError, option="--like", file="follower.json"):
         export_model("lerobot", ExportRequest(model_folder, out, like=calibration))
     assert not out.exists()
+
+
+def test_zeros_that_are_in_the_motors_are_refused():
+    motors = {"joint_1": Motor(1, 0, 0, -90, 90)}
+    with refused(OutputError, option="--like", file="openarm.json"):
+        with_offsets(motors, {"joint_1": 0.1}, Path("openarm.json"))
+
+
+def test_degrees_of_servos_have_4095_ticks_per_turn_and_those_of_openarm_are_exact():
+    for robot, scale in (("openarm_left", 1.0), ("so101", 4095 / 4096)):
+        for axis in Robot.load(robot).axes:
+            assert_close(radians_per_unit("degrees", axis.name, None), np.deg2rad(scale), rtol=1e-12)
 
 
 @pytest.mark.parametrize(
