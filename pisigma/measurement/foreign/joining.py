@@ -18,6 +18,7 @@ from pisigma.measurement.foreign.conversion import ConvertedRows
 from pisigma.measurement.foreign.quantities import KEYS, is_measured, joints_of
 from pisigma.measurement.foreign.time_stamps import (
     ambiguous_date,
+    check_restarts,
     date_of,
     day_first,
     has_open_date,
@@ -218,12 +219,10 @@ def _number_of(name: str) -> str:
 
 def _by_time(measured: ConvertedRows, joints: ConvertedRows, within: float) -> Int64[np.ndarray, " rows"]:
     times, logged = _times(measured, joints), _times(joints, measured)
+    check_restarts(times, within, measured.source, measured.lines)
+    check_restarts(logged, within, joints.source, joints.lines)
     order = np.argsort(logged, kind="stable")
-    after = (
-        np.clip(np.searchsorted(logged[order], times), 1, len(order) - 1)
-        if len(order) > 1
-        else np.zeros(len(times), dtype=np.int64)
-    )
+    after = np.clip(np.searchsorted(logged[order], times), min(1, len(order) - 1), len(order) - 1)
     before = np.maximum(after - 1, 0)  # the nearest stamp is one of the two neighbours in the sorted log
     nearer = np.abs(logged[order][after] - times) < np.abs(logged[order][before] - times)
     partner = order[np.where(nearer, after, before)]

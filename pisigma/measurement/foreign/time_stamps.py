@@ -5,6 +5,9 @@ import re
 from collections.abc import Sequence
 from datetime import UTC, datetime
 
+import numpy as np
+from jaxtyping import Float64
+
 from pisigma.files.errors import MeasurementError, Place
 
 _DATE = re.compile(r"(\d{1,4})([./-])(\d{1,2})\2(\d{1,4})(?:$|[ T,]+(.*))")
@@ -80,6 +83,34 @@ def ambiguous_date(at: Place, text: str) -> MeasurementError:
         at=at,
         remedy="write dates as 2026-03-02 or 02.03.2026",
     )
+
+
+def check_restarts(
+    times: Float64[np.ndarray, " rows"], within: float, source: str, lines: Sequence[int]
+) -> None:
+    """Check that rows close in time are of one recording, because the wrong recording could be joined otherwise.
+
+    Args:
+        times: time stamps in the order of the file [s].
+        within: largest difference of time stamps that are joined [s].
+        source: the file.
+        lines: lines of its rows.
+
+    Raises:
+        MeasurementError: time stamps restart, and the same times occur before and after.
+    """
+    restarts = np.diff(times, prepend=times[:1]) < -within
+    order = np.argsort(times, kind="stable")
+    close = np.diff(times[order]) <= within
+    if (close & (np.diff(np.cumsum(restarts)[order]) != 0)).any():
+        row = int(restarts.argmax())
+        raise MeasurementError(
+            "time stamps restart, so that rows of several recordings have the same times",
+            expected="time stamps of one clock",
+            value=f"{times[row]:g} s after {times[row - 1]:g} s",
+            at=Place(source, lines[row]),
+            remedy="join one recording after the other, or join by point; those of LeRobot restart in every episode",
+        )
 
 
 def _is_open(match: re.Match[str]) -> bool:

@@ -1,5 +1,7 @@
 """Joining of joint logs and lists of measurements by name, order and time, and rows without a partner."""
 
+from dataclasses import replace
+
 import pytest
 from testing.refusals import refused
 
@@ -63,6 +65,19 @@ def test_the_nearest_time_stamp_is_joined():
     assert [(row.file, row.line) for row in joined.unmatched] == [("points", 4), ("log", 4)]
     with refused(MeasurementError, file="points and log", expected="time stamps within 0.2 s of each other"):
         join_rows(rows("points", time=("11:00:02.1",), x_mm=("1",)), log, "time", 0.2)
+
+
+def test_recordings_whose_times_restart_are_refused_if_they_overlap():
+    measured = rows("points", time=("1.0", "2.0"), x_mm=("1", "2"))
+    log = rows("log", time=("1.0", "2.0", "3.0", "1.1", "2.1"), q1_deg=("1", "2", "3", "4", "5"))
+    for first, second in (
+        (measured, log),
+        (replace(log, cells={"x_mm": log.cells["q1_deg"]} | log.cells), log),
+    ):
+        with refused(MeasurementError, file="log", line=5):
+            join_rows(first, second, "time", within=0.2)
+    later = rows("log", time=("5.0", "6.0", "1.0", "2.0"), q1_deg=("5", "6", "1", "2"))
+    assert join_rows(measured, later, "time").rows.cells["q1_deg"] == ("1", "2")
 
 
 def test_joints_that_move_during_a_measurement():
