@@ -9,8 +9,17 @@ import numpy as np
 from pisigma.deployment.export.export_format import Exported, ExportFormat, ExportRequest, model_facts
 from pisigma.deployment.export.geometry import offset_remarks
 from pisigma.deployment.export.joint_offsets import fit_joint_offsets, offset_sentences
-from pisigma.files.errors import OutputError, Place
-from pisigma.measurement.foreign.lerobot_motors import DAMIAO, TICKS, Motor, motors_text, read_motors
+from pisigma.files.errors import MeasurementError, OutputError, Place
+from pisigma.measurement.foreign.lerobot_motors import (
+    DAMIAO,
+    TICKS,
+    Motor,
+    check_values,
+    motors_text,
+    radians_per_unit,
+    read_motors,
+)
+from pisigma.model.calibrated_model import CalibratedModel
 
 README = "README.md"
 NOT_EXPRESSED = (
@@ -21,6 +30,8 @@ NOT_EXPRESSED = (
     "The directions of the joints (drive_mode) are unchanged: LeRobot ignores drive_mode for degrees.",
     "The file holds for use_degrees=true. Values of -100 to 100 have another scale with another range: correct the "
     "frames of such policies and data sets with pisigma.LeRobotCorrection instead.",
+    "The file holds for the calibration file with which the rows of the model were recorded: LeRobot's calibration "
+    "sets other zeros, so calibrate again after it.",
     "Use either this file or corrected frames, not both: the correction would be applied twice.",
 )
 
@@ -82,10 +93,32 @@ def with_offsets(motors: Mapping[str, Motor], offsets: Mapping[str, float], file
     }
 
 
+def _check_rows(model: CalibratedModel, motors: Mapping[str, Motor], file: Path) -> None:
+    """Check that the joint values of the calibration are possible with this calibration file.
+
+    Raises:
+        OutputError: they are not, so that the zeros of the model are those of another file.
+    """
+    names = [axis.name for axis in model.robot.axes]
+    recorded = model.starts.numpy() / np.array([radians_per_unit("degrees", name, None) for name in names])
+    try:
+        check_values(recorded, "degrees", names, motors, file)
+    except MeasurementError as problem:
+        raise OutputError(
+            "the model was calibrated with joint values that are not possible with this file",
+            expected=problem.expected,
+            value=problem.value,
+            at=Place(file, column=problem.column),
+            option="--like",
+            remedy="give the file with which the rows of the calibration were recorded",
+        ) from None
+
+
 def _write(request: ExportRequest) -> Exported:
     assert request.like is not None  # see `_check`
     motors = read_motors(request.like)
     model = request.load()
+    _check_rows(model, motors, request.like)
     fitted = fit_joint_offsets(model)
     offsets = dict(zip([axis.name for axis in fitted.robot.axes], fitted.values.tolist(), strict=True))
     text = motors_text(with_offsets(motors, offsets, request.like))

@@ -43,6 +43,7 @@ class LeRobotCorrection:
         offset: offset of every value of a frame [its unit], 0 for values that are not joints.
         lost: the joint offsets with what they leave out.
         prefix: start of the names of this arm, such as "left_".
+        motors: the arm's calibration file, by name of the motor; None if it is not known.
         version: name, SHA-256 and offsets of the model, as written to the metadata of data sets.
     """
 
@@ -54,6 +55,7 @@ class LeRobotCorrection:
     offset: Float64[np.ndarray, " values"]
     lost: JointOffsets
     prefix: str
+    motors: Mapping[str, Motor] | None
     version: dict[str, Any]
 
     @staticmethod
@@ -95,6 +97,7 @@ class LeRobotCorrection:
             offset,
             lost,
             prefix,
+            motors,
             _version(Path(model), robot, units, lost, motors),
         )
 

@@ -17,7 +17,7 @@ from pisigma.files.input_file import read_text
 from pisigma.files.output_file import write_failure
 from pisigma.files.scratch import FOLDER, scratch_beside
 from pisigma.measurement.foreign.lerobot_dataset import LeRobotDataset, read_table
-from pisigma.measurement.foreign.lerobot_motors import LeRobotUnits
+from pisigma.measurement.foreign.lerobot_motors import LeRobotUnits, check_values
 
 if TYPE_CHECKING:
     import pyarrow
@@ -66,8 +66,8 @@ def correct_lerobot_dataset(
         prefix: start of the names of this arm.
 
     Raises:
-        MeasurementError: the data set cannot be read, this arm was corrected already, or its values are not those of
-            the robot.
+        MeasurementError: the data set cannot be read, this arm was corrected already, its values are not those of the
+            robot, or they are not possible in these units.
         ModelError: the folder is not a model.
         OutputError: the new folder exists or cannot be written.
         ImportError: pyarrow is not installed.
@@ -146,7 +146,12 @@ def _write_copy(source: LeRobotDataset, corrections: dict[str, LeRobotCorrection
     frames = 0
     for file, table in source.tables():
         for key, correction in corrections.items():
-            values = correction.true_values(source.frames(table, key, file))
+            recorded = source.frames(table, key, file)
+            names = [axis.name for axis in correction.model.robot.axes]
+            check_values(
+                recorded[:, list(correction.joints)], correction.units, names, correction.motors, file
+            )
+            values = correction.true_values(recorded)
             table = _with_column(table, key, values.reshape(-1))
         parquet.write_table(table, folder / file.relative_to(source.folder))
         frames += len(table)

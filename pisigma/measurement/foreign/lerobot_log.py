@@ -9,7 +9,12 @@ import numpy as np
 from pisigma.files.errors import MeasurementError
 from pisigma.files.output_file import check_output, write_atomically
 from pisigma.measurement.foreign.lerobot_dataset import STATE, LeRobotDataset, joint_motors
-from pisigma.measurement.foreign.lerobot_motors import LeRobotUnits, radians_per_unit, read_motors
+from pisigma.measurement.foreign.lerobot_motors import (
+    LeRobotUnits,
+    check_values,
+    radians_per_unit,
+    read_motors,
+)
 
 
 @dataclass(frozen=True)
@@ -63,8 +68,8 @@ def read_joint_log(
         prefix: start of the names of this arm, such as "left_" of a pair.
 
     Raises:
-        MeasurementError: the data set cannot be read, has no joint values of this arm, or the units of its values are
-            not stated.
+        MeasurementError: the data set cannot be read, has no joint values of this arm, the units of its values are not
+            stated, or the values are not possible in these units.
         ImportError: pyarrow is not installed.
     """
     if units is None:
@@ -88,7 +93,9 @@ def read_joint_log(
     scale = np.rad2deg([radians_per_unit(units, motor, known) for motor in motors])
     rows = []
     for file, table in source.tables():
-        values = source.frames(table, STATE, file)[:, columns].astype(np.float64) * scale
+        recorded = source.frames(table, STATE, file)[:, columns].astype(np.float64)
+        check_values(recorded, units, tuple(motors), known, file)
+        values = recorded * scale
         keys = (table.column(name).to_pylist() for name in ("episode_index", "frame_index", "timestamp"))
         for episode, frame, seconds, joints in zip(*keys, values.tolist(), strict=True):
             image = f"episode-{episode:06d}-frame-{frame:06d}"

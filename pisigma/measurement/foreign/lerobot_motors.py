@@ -4,9 +4,12 @@ import json
 import math
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from typing import Any, Literal, get_args
+
+import numpy as np
+from jaxtyping import Float
 
 from pisigma.files.errors import MeasurementError, Place, check_choice
 from pisigma.files.input_file import read_text
@@ -17,6 +20,8 @@ TICKS = 4096
 """Positions per turn of the 12-bit encoders of Feetech STS3215, Dynamixel XL330 and XL430 servos."""
 DAMIAO = re.compile(r"joint_\d+")
 """Names of OpenArm's motors, which send degrees themselves; their zero is set in the motor, not by a range."""
+BEYOND_RANGE = 10.0
+"""Largest angle by which a motor leaves the range that was recorded for it by hand [deg]."""
 NORMALIZED = 200.0
 """Length of the interval from -100 to 100."""
 
@@ -88,6 +93,44 @@ def _motor(entry: Any, at: Place, keys: list[str]) -> Motor:
 def motors_text(motors: Mapping[str, Motor]) -> str:
     """Write motors as LeRobot's calibration file."""
     return json.dumps({name: asdict(motor) for name, motor in motors.items()}, indent=4)
+
+
+def check_values(
+    values: Float[np.ndarray, "frames joints"],
+    units: LeRobotUnits,
+    names: Sequence[str],
+    motors: Mapping[str, Motor] | None,
+    source: str | os.PathLike[str],
+) -> None:
+    """Check that recorded values are possible in their units and with this calibration file.
+
+    LeRobot limits normalized values to -100 to 100, and a motor leaves its recorded range by little.
+
+    Args:
+        values: values as recorded.
+        units: their units.
+        names: names of the motors.
+        motors: the arm's calibration file; None if it is not known.
+        source: file of the values, for messages.
+
+    Raises:
+        MeasurementError: a value is not possible.
+    """
+    for name, column in zip(names, values.T, strict=True):
+        limit, remedy = NORMALIZED / 2, "state units=degrees if they are degrees"
+        if units == "degrees":
+            if motors is None or name not in motors or DAMIAO.fullmatch(name):
+                continue
+            limit = (motors[name].range_max - motors[name].range_min) / 2 * 360 / (TICKS - 1) + BEYOND_RANGE
+            remedy = "give the calibration file with which the values were recorded"
+        largest = float(np.abs(column).max(initial=0.0))
+        if largest > limit:
+            raise MeasurementError(
+                expected=f"{units} values of '{name}' within -{limit:.4g} to {limit:.4g}",
+                value=float(f"{largest:.6g}"),
+                at=Place(source, column=name),
+                remedy=remedy,
+            )
 
 
 def radians_per_unit(units: LeRobotUnits, name: str, motors: Mapping[str, Motor] | None) -> float:

@@ -69,6 +69,14 @@ def test_export_needs_the_file_of_this_arm(model_folder, calibration, tmp_path):
     assert not out.exists()
 
 
+def test_a_file_whose_ranges_the_rows_of_the_model_leave_is_refused(model_folder, calibration, tmp_path):
+    document = json.loads(calibration.read_text())
+    document["elbow_flex"] |= {"range_min": 1900, "range_max": 2100}
+    calibration.write_text(json.dumps(document))
+    with refused(OutputError, option="--like", file="follower.json", column="elbow_flex"):
+        export_model("lerobot", ExportRequest(model_folder, tmp_path / "new", like=calibration))
+
+
 def test_zeros_that_are_in_the_motors_are_refused():
     motors = {"joint_1": Motor(1, 0, 0, -90, 90)}
     with refused(OutputError, option="--like", file="openarm.json"):

@@ -11,7 +11,7 @@ from pisigma.files.errors import MeasurementError
 from pisigma.measurement.foreign.joining import join_joints
 from pisigma.measurement.foreign.lerobot_dataset import joint_motors
 from pisigma.measurement.foreign.lerobot_log import read_joint_log
-from pisigma.measurement.foreign.lerobot_motors import motors_text
+from pisigma.measurement.foreign.lerobot_motors import check_values, motors_text
 
 
 def recorded(layout):
@@ -59,3 +59,16 @@ def test_only_positions_of_joints_are_taken(names, prefix, expected):
 def test_values_of_two_arms_need_a_prefix():
     with refused(MeasurementError, option="prefix"):
         joint_motors(("left_a.pos", "right_a.pos"))
+
+
+def test_values_that_are_not_possible_in_their_units_are_refused():
+    names, values = ("elbow_flex",), np.array([[5.0], [-100.5]])
+    half = (SO101["elbow_flex"].range_max - SO101["elbow_flex"].range_min) / 2 * 360 / 4095
+    check_values(values, "degrees", names, None, "a.parquet")
+    check_values(np.array([[half + 5.0]]), "degrees", names, SO101, "a.parquet")
+    for recorded, units, motors in (
+        (values, "normalized", SO101),
+        (np.array([[-half - 15.0]]), "degrees", SO101),
+    ):
+        with refused(MeasurementError, file="a.parquet", column="elbow_flex"):
+            check_values(recorded, units, names, motors, "a.parquet")
