@@ -9,6 +9,7 @@ from jaxtyping import Float, Float64, Int64
 from torch import Tensor
 
 from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.groups import groups_of_equal_joints, numbers_of_names
 
 CONDITIONS = ("payload_kg", "temperature_c")
 """Columns of conditions that any row of a measurement file may contain."""
@@ -21,6 +22,8 @@ APPROACH = "approach"
 TORQUE = "torque"
 """Key of `JointState.stated`: `(*batch, dof)`, measured torques of the drives [Nm; N for prismatic joints]; NaN if not
 given."""
+TORQUE_STEP = 0.2
+"""Difference of torques, over their standard deviation in all rows, that is another load of the arm."""
 MIN_MOTION = 1e-3
 """[rad or m] Smaller motions of a joint need not take up the play of its gear."""
 
@@ -78,48 +81,59 @@ def conditions_of(measurements: Measurements, names: Sequence[str]) -> Float64[T
 
 
 def repeat_key(measurements: Measurements) -> Float64[Tensor, "rows _key"]:
-    """Return the values that repeats of a pose have in common: joint values, payload and approach (0 if not given).
+    """Return the values that repeats of a pose have in common: joint values, payload, approach (0 if not given), load.
 
-    The payload is included if every row states one and it varies.
+    The payload is included if every row states one and it varies. The load is the difference of the torques from those
+    of the first row at these values, in steps of `TORQUE_STEP`; smaller differences are noise.
     """
     loaded = tuple(name for name in stated_conditions(measurements) if name == "payload_kg")
     columns = [measurements.q, conditions_of(measurements, loaded)]
     if measurements.approach is not None:
         columns.append(measurements.approach.nan_to_num(0.0))
+    if measurements.torque is not None:
+        torque = measurements.torque.nan_to_num(0.0)
+        group = groups_of_equal_joints(torch.cat(columns, 1))
+        first = torch.full_like(group, len(group)).scatter_reduce(
+            0, group, torch.arange(len(group), device=group.device), "amin"
+        )
+        step = TORQUE_STEP * torque.std(0, correction=0).clamp(min=MIN_SPREAD)
+        columns.append(((torque - torque[first[group]]) / step).round())
     return torch.cat(columns, 1)
+
+
+def order_of_rows(measurements: Measurements) -> Int64[np.ndarray, " rows"]:
+    """Return the rows in the order in which they were measured: file after file, in the order of their lines."""
+    file = numbers_of_names(measurements.origin or ("",) * measurements.rows).numpy()
+    return np.lexsort((np.array(measurements.line), file))
 
 
 def motions_between_rows(
     measurements: Measurements,
 ) -> tuple[Float64[np.ndarray, "rows dof"], Float64[np.ndarray, "rows dof"]]:
-    """Compute the motions [rad or m] from the previous row, and from the next row back; 0 at the ends of a file."""
-    q = measurements.q.cpu().numpy()
-    order = _order_of_files(measurements)
-    origin = np.array(measurements.origin or ("",) * len(q))[order]
-    step = np.diff(q[order], axis=0) * (origin[1:] == origin[:-1])[:, None]
-    none = np.zeros((1, q.shape[1]))
+    """Compute the motions [rad or m] from the previous row, and from the next row back.
+
+    They are NaN if they are not known: at the ends of a file, and next to rows of the file that were left out.
+    """
+    q, order = measurements.q.cpu().numpy(), order_of_rows(measurements)
+    file = np.array(measurements.origin or ("",) * len(q))[order]
+    left_out = np.sort(np.array([row.line for row in measurements.left_out], dtype=np.int64))
+    passed = np.searchsorted(left_out, np.array(measurements.line, dtype=np.int64)[order])
+    follows = (file[1:] == file[:-1]) & (passed[1:] == passed[:-1])
+    step = np.where(follows[:, None], np.diff(q[order], axis=0), np.nan)
+    unknown = np.full((1, q.shape[1]), np.nan)
     before, after = np.empty_like(q), np.empty_like(q)
-    before[order], after[order] = np.concatenate([none, step]), np.concatenate([-step, none])
+    before[order], after[order] = np.concatenate([unknown, step]), np.concatenate([-step, unknown])
     return before, after
 
 
 def approach_by_order(measurements: Measurements) -> Float64[Tensor, "rows dof"]:
     """Return the direction of approach of every joint if the rows were measured in the order of their file.
 
-    It is that of the joint's last motion by more than `MIN_MOTION`; NaN before its first one in a file.
+    It is that of the joint's last motion by more than `MIN_MOTION`; NaN if this is not known (`motions_between_rows`).
     """
     motion = motions_between_rows(measurements)[0]
-    direction = np.where(np.abs(motion) > MIN_MOTION, np.sign(motion), np.nan)
-    approach, last, file = np.empty_like(direction), direction[0], ""
-    for row in _order_of_files(measurements):
-        origin = measurements.origin[row] if measurements.origin else ""
-        last = np.where(np.isnan(direction[row]), np.nan if origin != file else last, direction[row])
-        approach[row], file = last, origin
+    approach, last = np.empty_like(motion), np.full(motion.shape[1], np.nan)
+    for row in order_of_rows(measurements):
+        last = np.where(np.abs(motion[row]) <= MIN_MOTION, last, np.sign(motion[row]))
+        approach[row] = last
     return torch.from_numpy(approach).to(measurements.q.device)
-
-
-def _order_of_files(measurements: Measurements) -> Int64[np.ndarray, " rows"]:
-    """Return the rows in the order of their lines; those of several files follow one another."""
-    if measurements.origin:
-        return np.arange(measurements.rows)
-    return np.argsort(np.array(measurements.line), kind="stable")

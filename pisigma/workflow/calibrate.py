@@ -17,7 +17,6 @@ from pisigma.files.model_files import HELD_OUT_CSV
 from pisigma.files.progress import Progress
 from pisigma.joint_correction.registry import plugin_features
 from pisigma.measurement.camera.corner_file import MeasurementFiles, read_rows
-from pisigma.measurement.conditions import approach_by_order
 from pisigma.measurement.dataset import Measurements, with_new_frames
 from pisigma.measurement.joint_range import row_warnings, with_limits_of_rows
 from pisigma.measurement.sensors.socket import PairOfSockets, matching_sockets
@@ -27,7 +26,7 @@ from pisigma.model.geometric_model import model_of_calibration, with_hybrid
 from pisigma.reporting.cards import CardTexts, write_calibration_card
 from pisigma.robot.description import Robot
 from pisigma.robot.robot_class import CLASSES, SERVO, RobotClass
-from pisigma.validation.checks.backlash import unstated_backlash
+from pisigma.validation.checks.backlash import with_sides_of_order
 from pisigma.validation.checks.check import CheckedCalibration
 from pisigma.validation.checks.registry import diagnostics_of
 from pisigma.validation.checks.row_order import explain_refusal
@@ -132,20 +131,21 @@ def calibrate(
     measurements = read_rows(data, nominal, settings.cameras)
     measurements = with_new_frames(measurements, settings.new_frame_at)
     beyond, nominal = row_warnings(nominal, measurements), with_limits_of_rows(nominal, measurements)
-    training, test_rows = measurements.split_sets()
+    training = measurements.split_sets()[0]
     splitting = Splitting(settings.split, settings.seed, settings.folds, settings.hold_out)
     splits = splitting.split(training, settings.repeats, settings.train_rows)
     distances = matching_sockets(settings.socket_distances, training.socket or ())
     calibrator = calibrator_of(settings, nominal, distances)
     training = _with_joint_repeatability(training, calibrator, _class_of(settings, nominal))
     drawn = None if settings.train_rows is None else draw_rows(training, settings.train_rows, settings.seed)
-    rows, backlash = training if drawn is None else training.select(drawn), None
-    if measurements.approach is None:
-        approach = replace(measurements, approach=approach_by_order(measurements)).split_sets()[0].approach
-        sided = replace(training, approach=approach)
-        sided_rows = sided if drawn is None else sided.select(drawn)
-        backlash = unstated_backlash(geometric_of(calibrator), sided_rows)
-        training, rows = (training, rows) if backlash is None else (sided, sided_rows)
+
+    def calibrated(every: Measurements) -> Measurements:
+        some = replace(training, approach=every.split_sets()[0].approach)
+        return some if drawn is None else some.select(drawn)
+
+    measurements, backlash = with_sides_of_order(geometric_of(calibrator), measurements, calibrated)
+    sided, test_rows = measurements.split_sets()
+    training, rows = replace(training, approach=sided.approach), calibrated(measurements)
     faulty = any(one.severity == "implausible" for one in setup_diagnostics(nominal, rows))
     if faulty:
         calibrator, splits = geometric_of(calibrator), []
@@ -167,9 +167,8 @@ def calibrate(
         _description("geometric" if faulty else settings.model, nominal),
         "Validated on rows of the same measurement only, not on other days, payloads or temperatures.",
     )
-    found = () if backlash is None else (backlash,)
     calibration = compose_calibration(
-        calibrator, result, rows, summary, texts, validation, test, training, found=found
+        calibrator, result, rows, summary, texts, validation, test, training, found=backlash
     )
     return replace(calibration, settings=settings, seconds=time.perf_counter() - started)
 

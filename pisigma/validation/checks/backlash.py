@@ -1,12 +1,14 @@
 """Check whether the residuals depend on the direction from which every joint came: unstated backlash."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.files.errors import IdentificationError
+from pisigma.measurement.conditions import approach_by_order
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import Robot
 from pisigma.robot.kinematics.jacobian import joint_jacobian
@@ -36,7 +38,7 @@ def find_backlash(rows: OrderedRows, measurements: Measurements) -> LostMotion |
 
     `s_j` is the sign of the joint's last motion. With friction the joint stays behind (b_j < 0); without it, inertia
     carries it through the play when the drive stops. Joints are added one by one while the odds grow, at the cost of
-    one more parameter (Schwarz 1978, Annals of Statistics 6(2)) and of the choice.
+    one more parameter (`OrderedRows.evidence_of`) and of the choice.
 
     Args:
         rows: residuals of a calibration.
@@ -49,12 +51,10 @@ def find_backlash(rows: OrderedRows, measurements: Measurements) -> LostMotion |
         return None
     assert measurements.approach is not None
     approach = measurements.approach.nan_to_num(0.0).cpu().numpy()[rows.number]
-    left = rows.without_parameters(rows.clipped.ravel())
-    moved = (rows.joint_derivative * approach[:, None]).reshape(len(left), -1)
+    moved = (rows.joint_derivative * approach[:, None]).reshape(-1, approach.shape[1])
     free = rows.without_parameters(moved)
     possible = np.flatnonzero((free**2).sum(0) > 1e-12 * (moved**2).sum(0)).tolist()
-    best, freedom = None, rows.degrees_of_freedom
-    spare = max(rows.values - rows.effective_parameters, 1.0)
+    best = None
     for count in range(1, len(possible) + 1):
         earlier = () if best is None else tuple(best.play)
         found = []
@@ -62,17 +62,37 @@ def find_backlash(rows: OrderedRows, measurements: Measurements) -> LostMotion |
             if joint in earlier:
                 continue
             joints = (*earlier, joint)
-            half = np.linalg.lstsq(free[:, joints], left, rcond=None)[0]
-            ratio = max(float(((left - free[:, joints] @ half) ** 2).sum() / (left @ left)), 1e-12)
-            cost = count * math.log(max(freedom, 2.0)) / 2 + math.log(math.comb(len(possible), count))
-            factor = math.sqrt(spare / max(spare - count, 1.0) / ratio)
-            play = dict(zip(joints, (2 * np.abs(half)).tolist(), strict=True))
-            found.append(LostMotion(play, factor, -freedom / 2 * math.log(ratio) - cost))
+            effect = rows.evidence_of(free[:, joints])
+            play = dict(zip(joints, (2 * np.abs(effect.sizes)).tolist(), strict=True))
+            choice = math.log(math.comb(len(possible), count))
+            found.append(LostMotion(play, effect.factor, effect.log_bayes_factor - choice))
         better = max(found, key=lambda one: one.log_bayes_factor, default=None)
         if better is None or (best is not None and better.log_bayes_factor <= best.log_bayes_factor):
             break
         best = better
     return best
+
+
+def with_sides_of_order(
+    calibrator: GeometricCalibrator,
+    rows: Measurements,
+    calibrated: Callable[[Measurements], Measurements] = lambda rows: rows,
+) -> tuple[Measurements, tuple[Diagnostic, ...]]:
+    """State the directions of the last motions in rows without directions of approach, if these matter.
+
+    Args:
+        calibrator: a geometric calibrator of the robot.
+        rows: all rows of the files, because the last motion follows from the row before.
+        calibrated: returns those of the rows that decide whether the directions matter.
+
+    Returns:
+        The rows, and the finding of `unstated_backlash`; the unchanged rows and nothing without a finding.
+    """
+    if rows.approach is not None:
+        return rows, ()
+    sided = replace(rows, approach=approach_by_order(rows))
+    found = unstated_backlash(calibrator, calibrated(sided))
+    return (rows, ()) if found is None else (sided, (found,))
 
 
 def unstated_backlash(calibrator: GeometricCalibrator, rows: Measurements) -> Diagnostic | None:

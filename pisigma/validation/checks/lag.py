@@ -4,6 +4,8 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+import numpy as np
+
 from pisigma.calibration.hybrid.search import CLEARLY
 from pisigma.measurement.conditions import motions_between_rows
 from pisigma.measurement.dataset import Measurements
@@ -69,21 +71,11 @@ def find_lag(rows: OrderedRows, measurements: Measurements) -> Lag | None:
     """
     if len(rows.residual) < MIN_ROWS:
         return None
-    left = rows.without_parameters(rows.clipped.ravel())
-    spare = max(rows.values - rows.effective_parameters, 1.0)
     found = []
     for before, motion in zip((True, False), motions_between_rows(measurements), strict=True):
-        z = (rows.joint_derivative @ motion[rows.number][..., None]).ravel()
-        # The part of the lag that the calibration could not absorb, which alone affects the residuals (Frisch-Waugh).
+        z = (rows.joint_derivative @ np.nan_to_num(motion[rows.number])[..., None]).reshape(-1, 1)
         free = rows.without_parameters(z)
-        information = float(free @ free)
-        if information <= 1e-12 * float(z @ z):
-            continue
-        share = float(free @ left) / information
-        # Share of the squares that remain with the lag, and log Bayes factor by Schwarz's criterion for one parameter.
-        ratio = max(1 - share**2 * information / float(left @ left), 1e-12)
-        gain = (
-            -rows.degrees_of_freedom / 2 * math.log(ratio) - math.log(max(rows.degrees_of_freedom, 2.0)) / 2
-        )
-        found.append(Lag(before, share, math.sqrt(spare / max(spare - 1, 1.0) / ratio), gain))
+        if (free**2).sum() > 1e-12 * (z**2).sum():
+            effect = rows.evidence_of(free)
+            found.append(Lag(before, float(effect.sizes[0]), effect.factor, effect.log_bayes_factor))
     return max(found, key=lambda lag: lag.log_bayes_factor, default=None)

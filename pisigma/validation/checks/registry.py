@@ -1,12 +1,9 @@
 """Registry of all checks of calibrations and of rows."""
 
-from dataclasses import replace
-
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.files.errors import IdentificationError, ImplausibleError
-from pisigma.measurement.conditions import approach_by_order
 from pisigma.measurement.dataset import Measurements
-from pisigma.validation.checks.backlash import unstated_backlash
+from pisigma.validation.checks.backlash import with_sides_of_order
 from pisigma.validation.checks.camera import check_camera
 from pisigma.validation.checks.check import Check, CheckedCalibration, RowCheck
 from pisigma.validation.checks.lag import check_lag
@@ -71,16 +68,11 @@ def diagnostics_of_rows(calibrator: GeometricCalibrator, rows: Measurements) -> 
         ImplausibleError: no calibration error explains the rows.
         IdentificationError: the rows cannot belong to this robot.
     """
-    backlash = None
-    if rows.approach is None:
-        with_sides = replace(rows, approach=approach_by_order(rows))
-        backlash = unstated_backlash(calibrator, with_sides)
-        rows = rows if backlash is None else with_sides
+    rows, backlash = with_sides_of_order(calibrator, rows)
     try:
         results = fit_compared_calibrations(calibrator, rows)
     except ImplausibleError:
         raise
     except IdentificationError:
         return ()
-    found = diagnostics_of(CheckedCalibration(calibrator, rows, results))
-    return found if backlash is None else (*found, backlash)
+    return (*diagnostics_of(CheckedCalibration(calibrator, rows, results)), *backlash)

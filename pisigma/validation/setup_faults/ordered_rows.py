@@ -2,9 +2,10 @@
 
 import contextlib
 import hashlib
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -20,7 +21,7 @@ from pisigma.joint_correction.backlash import Backlash
 from pisigma.joint_correction.feature import AbstractFeature
 from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.joint_correction.gravity_torques import GravityTorques
-from pisigma.measurement.conditions import APPROACH
+from pisigma.measurement.conditions import APPROACH, order_of_rows
 
 MAX_ROWS = 4_000
 """Largest number of rows that are used, drawn from all rows."""
@@ -105,8 +106,7 @@ class OrderedRows:
             return None
         measured = torch.stack(present).any(0).nonzero()[:, 0].cpu()
         some = measured[randomly_chosen_rows(len(measured), MAX_ROWS)]
-        line = np.zeros(data.rows) if data.origin else np.array(data.line)  # several files are concatenated
-        some = some[np.lexsort((rows[some].numpy(), line[rows[some]]))]
+        some = some[np.argsort(np.argsort(order_of_rows(data))[rows[some]])]
         problem = replace(solved.problem, pairs=0).select(some)
         whole, every = slice(0, len(some)), torch.arange(len(problem.space.parameters))
         motion = problem.motion(solved.refined.point, whole, every)
@@ -223,6 +223,27 @@ class OrderedRows:
         return left
 
     @cached_property
+    def unexplained(self) -> Float64[np.ndarray, " values"]:
+        """Clipped residuals after fitting the parameters and the series of joint errors."""
+        return self.without_parameters(self.clipped.ravel())
+
+    def evidence_of(self, columns: Float64[np.ndarray, "values sizes"]) -> "Effect":
+        """Fit further columns to the unexplained residuals (Frisch-Waugh).
+
+        The Bayes factor is that of Schwarz's criterion (1978, Annals of Statistics 6(2)).
+
+        Args:
+            columns: derivatives of the values with respect to the sizes, after `without_parameters`.
+        """
+        left, count = self.unexplained, columns.shape[1]
+        sizes = np.linalg.lstsq(columns, left, rcond=None)[0]
+        ratio = max(float(((left - columns @ sizes) ** 2).sum() / (left @ left)), 1e-12)
+        spare = max(self.values - self.effective_parameters, 1.0)
+        freedom = self.degrees_of_freedom
+        odds = -freedom / 2 * math.log(ratio) - count * math.log(max(freedom, 2.0)) / 2
+        return Effect(sizes, math.sqrt(spare / max(spare - count, 1.0) / ratio), odds)
+
+    @cached_property
     def effective_parameters(self) -> float:
         """Effective number of parameters and weights."""
         return float((self.jacobian * (self.jacobian @ self.covariance)).sum())
@@ -238,6 +259,20 @@ class OrderedRows:
         """Degrees of freedom after the calibration, with at most one pose per configuration."""
         count = len(self.residual) if self.configuration is None else int(self.configuration.max()) + 1
         return min(self.values, VALUES_PER_POSE * count) - self.effective_parameters
+
+
+class Effect(NamedTuple):
+    """An effect that residuals contain in addition to the parameters of the calibration.
+
+    Attributes:
+        sizes: fitted sizes.
+        factor: ratio of the errors without and with the effect [1].
+        log_bayes_factor: logarithm of the odds of the effect against none.
+    """
+
+    sizes: Float64[np.ndarray, " sizes"]
+    factor: float
+    log_bayes_factor: float
 
 
 def inverse_of(normal: Float64[np.ndarray, "unknowns unknowns"]) -> Float64[np.ndarray, "unknowns unknowns"]:

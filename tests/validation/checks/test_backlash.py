@@ -11,8 +11,9 @@ from testing.outside_arm import OutsideArm
 
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.calibration.hybrid.calibrator import HybridCalibrator
-from pisigma.measurement.conditions import approach_by_order
-from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.conditions import approach_by_order, motions_between_rows
+from pisigma.measurement.dataset import Measurements, join
+from pisigma.measurement.fields import UnusableRow
 from pisigma.model.accuracy import deviation_of_rows
 from pisigma.model.geometric_model import model_of_calibration, with_hybrid
 from pisigma.robot import Robot
@@ -83,6 +84,40 @@ def test_a_joint_keeps_its_side_until_it_moves_and_files_are_apart():
     rows = Measurements(q.repeat(2, 1), torch.zeros(8, 3).double(), origin=("a",) * 4 + ("b",) * 4)
     one = [[np.nan, np.nan], [1, np.nan], [1, -1], [-1, -1]]
     np.testing.assert_array_equal(approach_by_order(rows).numpy(), one + one)
+
+
+def test_sides_follow_the_lines_of_every_file_and_are_unknown_after_a_row_that_was_left_out():
+    q = torch.tensor([[0.0], [0.3], [0.3], [0.1], [0.4]], dtype=torch.float64)
+    rows = Measurements(q, torch.zeros(5, 3).double(), line=(2, 3, 4, 6, 7), source="a.csv")
+    expected = np.array([[np.nan], [1], [1], [-1], [1]])
+    files = replace(rows, origin=("a.csv",) * 5), replace(rows, source="b.csv", origin=("b.csv",) * 5)
+    order = torch.tensor([7, 2, 0, 9, 4, 6, 1, 3, 8, 5])
+    shuffled = join(files).select(order)
+    np.testing.assert_array_equal(approach_by_order(shuffled).numpy(), np.tile(expected, (2, 1))[order])
+    gap = replace(rows, left_out=(UnusableRow(5, "broken"),))
+    expected[3] = np.nan
+    np.testing.assert_array_equal(approach_by_order(gap).numpy(), expected)
+    backward = motions_between_rows(gap)[1]
+    np.testing.assert_array_equal(np.isnan(backward[:, 0]), [False, False, True, False, True])
+
+
+def test_residuals_of_several_files_are_in_the_order_of_their_lines():
+    robot, rows, _ = with_backlash("scara", 3)
+    two = join([rows.select(torch.arange(50)), replace(rows.select(torch.arange(50, 100)), source="b.csv")])
+    shuffled = two.select(torch.randperm(100, generator=torch.Generator().manual_seed(1)))
+    ordered = OrderedRows.from_result(GeometricCalibrator(robot).fit(shuffled))
+    sorted_q = shuffled.q[torch.from_numpy(ordered.number)]
+    first = rows.q[:50] if shuffled.origin[0] == "rows.csv" else rows.q[50:]
+    assert_close(sorted_q[:50], first, atol=0.0)
+
+
+def test_rows_of_the_test_set_are_judged_with_the_same_sides_as_the_calibration():
+    robot, rows, _ = with_backlash("scara", 3)
+    marked = replace(rows, split=tuple("test" if k % 5 == 4 else "train" for k in range(rows.rows)))
+    made = calibrate(robot, marked, CalibrationSettings(features=("backlash",), folds=0))
+    stated = calibrate(robot, sided(marked), CalibrationSettings(features=("backlash",), folds=0))
+    assert any(one.kind == "backlash" for one in made.summary.diagnostics)
+    assert_close(made.summary.test.hybrid.rms_mm, stated.summary.test.hybrid.rms_mm, rtol=1e-9)
 
 
 def test_the_predicted_accuracy_contains_the_play_if_no_side_is_stated():
