@@ -33,7 +33,6 @@ class Backlash(AbstractFeature):
     """
 
     name = "backlash"
-    additional_inputs = (APPROACH,)
     compiled = CompiledForm(add_backlash)
     group_names = ("backlash",)
 
@@ -58,11 +57,11 @@ class Backlash(AbstractFeature):
             return torch.zeros_like(state.q)[..., None]
         return approach.to(state.q).nan_to_num(0.0).expand(state.q.shape)[..., None]
 
-    def unstated_deviation(
+    def unstated_root(
         self, state: JointState, weight: Float64[Tensor, "dof columns"]
-    ) -> Float[Tensor, "*batch dof"]:
+    ) -> Float[Tensor, "*batch dof sources"]:
         """Return half the backlash where the side is not stated: the joint stops on one of the sides."""
-        return weight[:, 0].abs() * (1 - self.columns(state)[..., 0].abs())
+        return torch.diag_embed(weight[:, 0] * (1 - self.columns(state)[..., 0].abs()))
 
     def add_onnx(self, graph: OnnxGraph, weight: Float64[np.ndarray, "dof columns"], q: str) -> str:
         """Add the graph input `approach` and the correction; see `AbstractFeature.add_onnx`."""

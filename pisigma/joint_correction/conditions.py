@@ -48,7 +48,6 @@ class ConditionFeatures(AbstractFeature):
 
     name = "conditions"
     section = ConditionSection
-    additional_inputs = ("payload_kg", "temperature_c")
     usually_zero = True
 
     def __init__(

@@ -54,8 +54,6 @@ class AbstractFeature(ABC):
         robot: the nominal robot.
         name: name of the feature in recipes and models.
         section: class of the feature's section in the description of a model.
-        additional_inputs: names in `JointState.stated` of the row data that the feature requires in addition to the
-            joint values.
         compiled: compiled form for the kernels, which get the numbers of `pack`; None if the feature has no compiled
             form.
         usually_zero: whether the correction is 0 if only joint values are stated, so that kernels and graphs may
@@ -70,7 +68,6 @@ class AbstractFeature(ABC):
 
     name: ClassVar[str]
     section: ClassVar[type[FeatureSection]] = FeatureSection
-    additional_inputs: ClassVar[tuple[str, ...]] = ()
     compiled: ClassVar[CompiledForm | None] = None
     usually_zero: ClassVar[bool] = False
     used: Bool[Tensor, "dof columns"]
@@ -99,16 +96,16 @@ class AbstractFeature(ABC):
             state: joint values [rad or m], and further data of the rows.
         """
 
-    def unstated_deviation(
+    def unstated_root(
         self, state: JointState, weight: Float64[Tensor, "dof columns"]
-    ) -> Float[Tensor, "*batch dof"]:
-        """Return the standard deviation of the correction [rad or m] by row data that are not stated.
+    ) -> Float[Tensor, "*batch dof sources"]:
+        """Return a root R of the covariance R R^T of the corrections [rad or m] by row data that are not stated.
 
         Args:
             state: joint states; see `columns`.
             weight: weights of the columns.
         """
-        return torch.zeros_like(state.q)
+        return state.q.new_zeros((*state.q.shape, 0))
 
     @classmethod
     def candidates(

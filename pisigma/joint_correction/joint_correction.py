@@ -58,11 +58,6 @@ class JointCorrection(nn.Module):
         self.register_buffer("fixed", torch.ones(robot.dof, factors, dtype=torch.float64))
 
     @property
-    def additional_inputs(self) -> tuple[str, ...]:
-        """Names in `JointState.stated` of the row data that the features require in addition to joint values."""
-        return tuple(dict.fromkeys(name for feature in self.features for name in feature.additional_inputs))
-
-    @property
     def is_periodic(self) -> bool:
         """Whether the correction is the same after full turns of revolute joints."""
         pairs = zip(self.features, self.linear, strict=True)
@@ -95,12 +90,13 @@ class JointCorrection(nn.Module):
             return total
         return total + sum_of_products(self.factors(state.q), self.orders)
 
-    def unstated_deviation(self, state: JointState) -> Float[Tensor, "*batch dof"]:
-        """Compute the standard deviation of the corrections [rad or m] by row data that are not stated."""
-        variance = torch.zeros_like(state.q)
-        for feature, weight in zip(self.features, self.linear, strict=True):
-            variance = variance + feature.unstated_deviation(state, weight.detach().to(state.q)).square()
-        return variance.sqrt()
+    def unstated_root(self, state: JointState) -> Float[Tensor, "*batch dof sources"]:
+        """Compute a root R of the covariance R R^T of the corrections [rad or m] by row data that are not stated."""
+        roots = [
+            feature.unstated_root(state, weight.detach().to(state.q))
+            for feature, weight in zip(self.features, self.linear, strict=True)
+        ]
+        return torch.cat([state.q.new_zeros((*state.q.shape, 0)), *roots], -1)
 
     def factors(self, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch dof factors"]:
         """Compute the factors of the product units of all joints."""

@@ -1,5 +1,6 @@
 """Deflection of compliant joints by measured torques."""
 
+import math
 from collections.abc import Sequence
 from typing import Literal
 
@@ -13,13 +14,14 @@ from pisigma.joint_correction.gravity_torques import Direction, GravityTorques
 from pisigma.measurement.conditions import TORQUE, JointState
 from pisigma.robot.description import Robot
 
-MIN_ROWS = 12
-"""Rows with a torque of a joint that its model of gravity torques needs."""
+MIN_ROWS = 30
+"""Rows with a torque of a joint that its model of gravity torques needs: about twice the number of masses and centres
+of mass that the torque of a joint of a six-axis arm depends on."""
 MIN_TORQUE = 1e-6
 """[Nm or N] A joint whose torque varies less has no deflection that could be identified."""
-RIDGE = 1e-6
-"""Share of the mean square of the columns that is added to the normal equations of the modelled torques, because some
-masses cannot be distinguished."""
+RIDGES = (1e-6, 1e-4, 1e-2, 1.0)
+"""Shares of the mean square of the columns that are added to the normal equations of the modelled torques, because some
+masses cannot be distinguished; the one with the smallest left-out errors is used."""
 
 
 class TorqueSection(FeatureSection):
@@ -29,7 +31,7 @@ class TorqueSection(FeatureSection):
     gravity: Direction
     scale: tuple[float, ...]
     model: tuple[tuple[float, ...], ...]
-    deviation: tuple[float, ...]
+    covariance: tuple[tuple[float, ...], ...]
 
 
 class JointTorques(AbstractFeature):
@@ -41,8 +43,8 @@ class JointTorques(AbstractFeature):
 
     Where no torque is stated, τ_j is the modelled gravity torque `Σ_m g_jm m_jm`, with the columns g of
     `GravityTorques`, and m fitted to the measured torques of the calibration (ridge regression). A payload that differs
-    from the mean of the calibration is not a part of it; `unstated_deviation` contains the spread of the measured
-    torques about the modelled ones.
+    from the mean of the calibration is not a part of it; `unstated_root` contains the differences of measured torques
+    from modelled ones, each modelled without its own row. They are correlated, because a payload loads several joints.
 
     Source: Dumas, Caro, Garnier and Furet, Robotics and Computer-Integrated Manufacturing 27(4), 2011, 881-888: joint
     stiffness from torques; measured torques instead of modelled ones are our choice.
@@ -51,12 +53,11 @@ class JointTorques(AbstractFeature):
         gravity: direction of gravity in the frame of the robot's first row.
         scale: s_j [Nm or N]; 0 for joints without measured torques.
         model: m_jm [Nm or N].
-        deviation: RMS difference of measured and modelled torques per joint [Nm or N].
+        covariance: mean products of these differences of two joints [Nm or N, squared].
     """
 
     name = "torques"
     section = TorqueSection
-    reads = (TORQUE,)
     group_names = ("torques",)
     usual_sizes = (3e-4,)
 
@@ -66,25 +67,26 @@ class JointTorques(AbstractFeature):
         gravity: Direction,
         scale: Sequence[float],
         model: Sequence[Sequence[float]],
-        deviation: Sequence[float],
+        covariance: Sequence[Sequence[float]],
     ) -> None:
         """Create the feature with one weight per joint with measured torques.
 
         Raises:
-            ValueError: the numbers of joints do not agree, or a scale or deviation is negative.
+            ValueError: the numbers of joints do not agree, or a scale or variance is negative.
         """
         super().__init__(robot)
         self._torques = GravityTorques(robot, gravity)
         self.gravity = self._torques.gravity
-        self.scale, self.deviation = tuple(scale), tuple(deviation)
-        self.model = tuple(tuple(row) for row in model)
-        expected = (robot.dof, robot.dof, *(4 * robot.dof,) * robot.dof)
-        if (len(self.scale), len(self.deviation), *map(len, self.model)) != expected or min(
-            *self.scale, *self.deviation
-        ) < 0:
+        self.scale = tuple(scale)
+        self.model, self.covariance = (tuple(tuple(row) for row in rows) for rows in (model, covariance))
+        shapes = (np.shape(self.scale), np.shape(self.model), np.shape(self.covariance))
+        if (
+            shapes != ((robot.dof,), (robot.dof, 4 * robot.dof), (robot.dof, robot.dof))
+            or min(*self.scale, *np.diag(self.covariance)) < 0
+        ):
             raise ValueError(
-                f"expected scales, deviations and models of the torques of {robot.dof} joints, got {self.scale}, "
-                f"{self.deviation} and {len(self.model)} models."
+                f"expected scales, models and covariances of the torques of {robot.dof} joints, got shapes {shapes} "
+                f"and the scales {self.scale}."
             )
         self.used = torch.tensor(self.scale)[:, None] > 0
         self.group = torch.zeros(robot.dof, 1, dtype=torch.int64)
@@ -98,25 +100,23 @@ class JointTorques(AbstractFeature):
         if torque is None:
             return ()
         columns = GravityTorques(robot, options.gravity).columns(state)
-        scale, model, deviation = [], torch.zeros(robot.dof, 4 * robot.dof, dtype=torch.float64), []
+        scale, model = [0.0] * robot.dof, torch.zeros(robot.dof, 4 * robot.dof, dtype=torch.float64)
+        missed = torch.zeros_like(torque)
         for joint, measured in enumerate(torque.t()):
             rows = torch.isfinite(measured)
             y, X = measured[rows], columns[rows, joint]
-            varies = int(rows.sum()) >= MIN_ROWS and float(y.std()) > MIN_TORQUE
-            scale.append(float(y.std()) if varies else 0.0)
-            if varies:
-                ridge = RIDGE * X.square().sum(0).mean().clamp(min=1e-12)
-                normal = X.T @ X + ridge * torch.eye(X.shape[1]).to(X)
-                model[joint] = torch.linalg.solve(normal, X.T @ y).cpu()
-            deviation.append(float((y - X @ model[joint].to(X)).square().mean().sqrt()) if varies else 0.0)
+            if len(y) >= MIN_ROWS and float(y.std()) > MIN_TORQUE:
+                scale[joint] = float(y.std())
+                masses, left_out = min((_fit(X, y, ridge) for ridge in RIDGES), key=lambda fit: fit[1].norm())
+                model[joint], missed[rows, joint] = masses.cpu(), left_out / math.sqrt(len(y))
         if not any(scale):
             return ()
-        return (JointTorques(robot, options.gravity, scale, model.tolist(), deviation),)
+        covariance = (missed.T @ missed).tolist()
+        return (JointTorques(robot, options.gravity, scale, model.tolist(), covariance),)
 
     def columns(self, state: JointState) -> Float[Tensor, "*batch dof columns"]:
         """Return the torques, stated or modelled, over their scale."""
-        q = state.q
-        modelled = (self._torques.columns(state) * q.new_tensor(self.model)).sum(-1)
+        q, modelled = state.q, self.modelled(state)
         stated = state.stated.get(TORQUE)
         torque = modelled
         if stated is not None:
@@ -124,16 +124,21 @@ class JointTorques(AbstractFeature):
             torque = torch.where(torch.isfinite(stated), stated, modelled)
         return (torque * self._per_scale(q))[..., None]
 
-    def unstated_deviation(
+    def modelled(self, state: JointState) -> Float[Tensor, "*batch dof"]:
+        """Return the modelled gravity torques [Nm or N]; 0 for joints without measured torques."""
+        return (self._torques.columns(state) * state.q.new_tensor(self.model)).sum(-1)
+
+    def unstated_root(
         self, state: JointState, weight: Float64[Tensor, "dof columns"]
-    ) -> Float[Tensor, "*batch dof"]:
-        """Return the deflection by the RMS difference of measured and modelled torques where none is stated."""
+    ) -> Float[Tensor, "*batch dof sources"]:
+        """Return the deflections by the differences of measured and modelled torques where none are stated."""
         q = state.q
-        deviation = (weight[:, 0].to(q) * self._per_scale(q)).abs() * q.new_tensor(self.deviation)
+        variance, directions = torch.linalg.eigh(q.new_tensor(self.covariance))
+        compliance = weight[:, 0].to(q) * self._per_scale(q)
+        root = compliance[:, None] * directions * variance.clamp(min=0).sqrt()
         stated = state.stated.get(TORQUE)
-        if stated is None:
-            return deviation.expand(q.shape)
-        return torch.where(torch.isfinite(stated.to(q).expand(q.shape)), 0.0, deviation)
+        known = torch.zeros_like(q) if stated is None else torch.isfinite(stated.to(q).expand(q.shape)).to(q)
+        return root * (1 - known)[..., None]
 
     def gravity_weights(
         self, weight: Float64[Tensor, "dof columns"]
@@ -145,8 +150,23 @@ class JointTorques(AbstractFeature):
         self, weight: Float64[Tensor, "dof columns"], torques: Float64[np.ndarray, " dof"]
     ) -> Float64[Tensor, " dof"]:
         """Return the deflections of the joints [rad or m] by torques [Nm or N]."""
-        return weight[:, 0] * self._per_scale(weight) * weight.new_tensor(torques)
+        return -self.compliances(weight) * weight.new_tensor(torques)
+
+    def compliances(self, weight: Float64[Tensor, "dof columns"]) -> Float64[Tensor, " dof"]:
+        """Return the compliances of the joints [rad/Nm or m/N]; 0 for joints without measured torques."""
+        return -weight[:, 0] * self._per_scale(weight)
 
     def _per_scale(self, like: Tensor) -> Float[Tensor, " dof"]:
         """Return 1 / s_j; 0 for joints without measured torques."""
         return like.new_tensor([1 / scale if scale else 0.0 for scale in self.scale])
+
+
+def _fit(
+    X: Float64[Tensor, "rows columns"], y: Float64[Tensor, " rows"], ridge: float
+) -> tuple[Float64[Tensor, " columns"], Float64[Tensor, " rows"]]:
+    """Return the masses of a ridge regression, and the differences of every row from a fit without this row."""
+    penalty = ridge * X.square().sum(0).mean().clamp(min=1e-12)
+    solved = torch.linalg.solve(X.T @ X + penalty * torch.eye(X.shape[1]).to(X), X.T)
+    leverage = (X * solved.T).sum(1)
+    masses = solved @ y
+    return masses, (y - X @ masses) / (1 - leverage).clamp(min=1e-9)

@@ -147,7 +147,8 @@ class PositionUncertainty:
         columns = self.columns(state, q_moved, frame, target)[:, :3]
         variance: Tensor = self.covariance_root.left_multiply(columns).square().sum(-1)
         if correction is not None:
-            unstated = columns[..., joint_columns(self.space)] * correction.unstated_deviation(state)[:, None]
+            joints = columns[..., joint_columns(self.space)] * columns.new_tensor(self.space.robot.directions)
+            unstated = joints @ correction.unstated_root(state)
             variance = variance + unstated.square().sum(-1)
         return variance.sqrt()
 

@@ -9,13 +9,16 @@ import torch
 from testing.closeness import assert_close
 from testing.refusals import refused
 
+from pisigma.calibration.geometric.problem.setup import number_repeats
 from pisigma.calibration.hybrid.calibrator import HybridCalibrator
 from pisigma.calibration.hybrid.result import HybridResult
 from pisigma.deployment.export.onnx_model import export_onnx
 from pisigma.files.errors import MeasurementError, ModelError
+from pisigma.joint_correction.feature import FeatureOptions
 from pisigma.joint_correction.gravity_torques import GravityTorques
-from pisigma.measurement.conditions import JointState
-from pisigma.measurement.dataset import Measurements
+from pisigma.joint_correction.joint_torques import JointTorques
+from pisigma.measurement.conditions import JointState, repeat_key
+from pisigma.measurement.dataset import Measurements, join
 from pisigma.measurement.joint_range import row_warnings
 from pisigma.model.accuracy import deviation_of_rows
 from pisigma.model.calibrated_model import CalibratedModel
@@ -130,6 +133,33 @@ def test_invalid_torques_are_refused(tmp_path):
     file.write_text("q1_deg,q2_deg,x_mm,y_mm,z_mm,tau_3\n0,0,1,2,3,4\n", encoding="utf-8")
     with refused(MeasurementError, value=3):
         Measurements.read_csv(file)
+
+
+def test_the_differences_from_modelled_torques_are_those_of_other_rows_and_correlated():
+    rows, other = measured(40, 1), measured(300, 2)
+    options = FeatureOptions((), (0.0, 0.0, -1.0), 40)
+    (feature,) = JointTorques.candidates(ROBOT, options, JointState.from_measurements(rows))
+    covariance = torch.tensor(feature.covariance).double()
+    missed = other.torque - feature.modelled(JointState(other.q))
+    ratio = covariance.diagonal()[1:4].sqrt() / missed[:, 1:4].square().mean(0).sqrt()
+    assert bool(((ratio > 0.6) & (ratio < 1.7)).all())
+    assert_close(
+        torch.corrcoef(missed[:, 1:3].T)[0, 1],
+        covariance[1, 2] / covariance[1:3, 1:3].diag().prod().sqrt(),
+        atol=0.3,
+    )
+    assert JointTorques.candidates(ROBOT, options, JointState.from_measurements(measured(20, 3))) == ()
+
+
+def test_rows_with_another_load_are_not_repeats_of_a_pose_and_noise_of_torques_is_not_a_load():
+    poses = measured(20, 3)
+    rows = join([poses, poses, poses])
+    noise = 0.01 * poses.torque.std(0) * torch.from_numpy(np.random.default_rng(0).normal(size=(20, 6)))
+    loaded = poses.torque + torch.tensor([0.0, 30.0, 10.0, 0.0, 0.0, 0.0], dtype=torch.float64)
+    rows = dataclasses.replace(rows, torque=torch.cat([poses.torque, poses.torque + noise, loaded]))
+    key = number_repeats(repeat_key(rows)).view(3, 20)
+    assert bool((key[0] == key[1]).all())
+    assert not bool((key[0] == key[2]).any())
 
 
 def test_without_torques_nothing_is_tried():
