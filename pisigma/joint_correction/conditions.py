@@ -9,7 +9,13 @@ from jaxtyping import Float, Float64
 from pydantic import Field
 from torch import Tensor
 
-from pisigma.joint_correction.feature import AbstractFeature, FeatureOptions, FeatureSection, scaled_joints
+from pisigma.joint_correction.feature import (
+    AbstractFeature,
+    Feature,
+    FeatureOptions,
+    FeatureSection,
+    scaled_joints,
+)
 from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.joint_correction.gravity_torques import Direction, GravityTorques
 from pisigma.joint_correction.joint_correction import JointCorrection
@@ -154,14 +160,9 @@ def at_conditions(
         The correction without `ConditionFeatures`, and the remaining offset of every joint [rad or m].
     """
     robot = correction.robot
-    kept: list[tuple[AbstractFeature, Tensor]] = []
-    learned, weight = learned_conditions(correction), scaled
-    assert learned is not None
-    for feature, values in zip(correction.features, correction.linear, strict=True):
-        if feature is learned:
-            weight = values.detach()
-        else:
-            kept.append((feature, values.detach().clone()))
+    kept, found = _without(correction, ConditionFeatures)
+    assert found is not None
+    learned, weight = found
     count = len(learned.names)
     shift, sine, cosine = (weight[:, : 3 * count].view(-1, count, 3) * scaled[:, None]).sum(1).unbind(1)
     slides = ~torch.tensor(robot.revolute)
@@ -182,7 +183,7 @@ def at_conditions(
 
 def with_modelled_torques(correction: JointCorrection) -> JointCorrection:
     """Reduce a correction to one without `JointTorques`, which is the same where no torques are stated."""
-    kept, torques = _without_torques(correction)
+    kept, torques = _without(correction, JointTorques)
     if torques is not None:
         feature, values = torques
         falling = GravityTorques(correction.robot, feature.gravity)
@@ -199,7 +200,7 @@ def at_torques(
     Returns:
         The correction, and the remaining offset of every joint [rad or m].
     """
-    kept, learned = _without_torques(correction)
+    kept, learned = _without(correction, JointTorques)
     assert learned is not None
     feature, values = learned
     return _with_features(correction, kept), feature.deflections(values, torques)
@@ -214,12 +215,14 @@ _Kept = list[tuple[AbstractFeature, Tensor]]
 """Features with their weights."""
 
 
-def _without_torques(correction: JointCorrection) -> tuple[_Kept, tuple[JointTorques, Tensor] | None]:
-    """Return copies of all weights, those of `JointTorques` apart."""
+def _without(
+    correction: JointCorrection, kind: type[Feature]
+) -> tuple[_Kept, tuple[Feature, Float64[Tensor, "dof columns"]] | None]:
+    """Return copies of all weights, those of the feature of a class apart."""
     kept: _Kept = []
     learned = None
     for feature, values in zip(correction.features, correction.linear, strict=True):
-        if isinstance(feature, JointTorques):
+        if isinstance(feature, kind):
             learned = feature, values.detach()
         else:
             kept.append((feature, values.detach().clone()))
@@ -238,7 +241,7 @@ def _with_features(correction: JointCorrection, kept: _Kept) -> JointCorrection:
 
 
 def _weights_of(
-    kept: list[tuple[AbstractFeature, Tensor]],
+    kept: _Kept,
     wanted: AbstractFeature,
     fits: Callable[[AbstractFeature], bool],
 ) -> Float64[Tensor, "dof columns"]:

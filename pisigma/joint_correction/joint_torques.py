@@ -135,10 +135,11 @@ class JointTorques(AbstractFeature):
         q = state.q
         variance, directions = torch.linalg.eigh(q.new_tensor(self.covariance))
         compliance = weight[:, 0].to(q) * self._per_scale(q)
-        root = compliance[:, None] * directions * variance.clamp(min=0).sqrt()
+        root: Tensor = compliance[:, None] * directions * variance.clamp(min=0).sqrt()
         stated = state.stated.get(TORQUE)
         known = torch.zeros_like(q) if stated is None else torch.isfinite(stated.to(q).expand(q.shape)).to(q)
-        return root * (1 - known)[..., None]
+        root = root * (1 - known)[..., None]
+        return root
 
     def gravity_weights(
         self, weight: Float64[Tensor, "dof columns"]

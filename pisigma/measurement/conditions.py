@@ -1,4 +1,4 @@
-"""Conditions of a measurement in addition to the joint values: payload, temperature and direction of approach."""
+"""Conditions of a measurement in addition to the joint values: payload, temperature, approach and torques."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -12,7 +12,7 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import groups_of_equal_joints, numbers_of_names
 
 CONDITIONS = ("payload_kg", "temperature_c")
-"""Columns of conditions that any row of a measurement file may contain."""
+"""Columns of conditions with one number per row."""
 MIN_SPREAD = 1e-9
 """Smallest range of a condition [kg or deg C] over which its effect can be identified."""
 APPROACH = "approach"
@@ -34,8 +34,8 @@ class JointState:
 
     Attributes:
         q: joint values [rad or m].
-        stated: conditions `(*batch,)` [kg, deg C] and `APPROACH` `(*batch, dof)` by name. A missing entry or NaN
-            stands for the mean condition.
+        stated: `CONDITIONS` `(*batch,)` [kg, deg C], `APPROACH` and `TORQUE` `(*batch, dof)` by name. A missing entry
+            or NaN stands for the mean condition, the middle of the backlash, or a modelled torque.
     """
 
     q: Float[Tensor, "*batch dof"]
@@ -74,9 +74,9 @@ def stated_conditions(measurements: Measurements) -> tuple[str, ...]:
 
 def conditions_of(measurements: Measurements, names: Sequence[str]) -> Float64[Tensor, "rows _conditions"]:
     """Return the conditions of every row [kg, deg C]; NaN if a row does not state one."""
-    columns = {"payload_kg": measurements.payload, "temperature_c": measurements.temperature}
+    stated = JointState.from_measurements(measurements).stated
     missing = torch.full((measurements.rows,), torch.nan, dtype=torch.float64, device=measurements.q.device)
-    stacked = [values if (values := columns[name]) is not None else missing for name in names]
+    stacked = [stated.get(name, missing) for name in names]
     return torch.stack(stacked, 1) if stacked else missing.new_zeros((measurements.rows, 0))
 
 

@@ -17,7 +17,8 @@ from pisigma.joint_correction.conditions import (
     learned_conditions,
     learned_torques,
 )
-from pisigma.measurement.conditions import conditions_of
+from pisigma.joint_correction.joint_torques import JointTorques
+from pisigma.measurement.conditions import JointState, conditions_of
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.rules import TEMPERATURES
 from pisigma.model.calibrated_model import CalibratedModel
@@ -28,6 +29,10 @@ _BEYOND = {
     "temperature_c": "the correction stays that of the nearest measured temperature",
 }
 """Clause about the extrapolation of a model outside the measured values of a condition."""
+MIN_TORQUES = 5
+"""Rows with a torque of a joint from which its sign and unit are compared with the calibration."""
+MAX_TORQUE_RATIO = 5.0
+"""Largest ratio of measured to modelled torques, or of modelled to measured ones, that another load explains."""
 
 
 def under_stated_conditions(
@@ -106,7 +111,7 @@ def under_stated_torques(model: CalibratedModel, torques_nm: Sequence[float]) ->
 
 
 def condition_warnings(model: CalibratedModel, rows: Measurements | None = None) -> tuple[str, ...]:
-    """Return a warning for every condition outside the range of the calibration.
+    """Return a warning for every condition outside the range of the calibration, and for torques unlike those of it.
 
     Args:
         model: model of any kind; only a hybrid learns the effect of conditions.
@@ -136,18 +141,50 @@ def _torque_warning(model: CalibratedModel, rows: Measurements | None) -> tuple[
     learned = None if model.hybrid is None else learned_torques(model.hybrid.correction)
     if learned is None:
         return ()
+    unlike: tuple[str, ...] = ()
     which = "no joint torques are stated"
     if rows is not None:
         needed = torch.tensor([scale > 0 for scale in learned.scale])
         missing = rows.rows
         if rows.torque is not None:
             missing = int(rows.torque[:, needed].isnan().any(1).sum())
+            unlike = _unlike_torques(model.name, learned, rows)
         if not missing:
-            return ()
+            return unlike
         which = f"{missing} of {rows.rows} rows do not state all joint torques (columns tau_1, ...)"
     return (
+        *unlike,
         f"{which}, but {model.name} was calibrated with measured ones: gravity torques modelled from the joint values "
         "are used, with the mean load of the calibration. The predicted accuracy includes their deviation.",
+    )
+
+
+def _unlike_torques(name: str, learned: JointTorques, rows: Measurements) -> tuple[str, ...]:
+    """Return a warning about torques with another sign or unit than those of the calibration.
+
+    Measured torques are compared with the modelled ones of joints that gravity loads more than differences of the load.
+    """
+    assert rows.torque is not None
+    modelled, unlike = learned.modelled(JointState(rows.q)), list[str]()
+    for joint, (tau, model, row) in enumerate(
+        zip(rows.torque.t(), modelled.t(), learned.covariance, strict=True)
+    ):
+        stated = torch.isfinite(tau)
+        size = float(model[stated].square().sum())
+        if (
+            int(stated.sum()) < MIN_TORQUES
+            or size <= 9 * row[joint] * int(stated.sum())
+            or not learned.scale[joint]
+        ):
+            continue
+        ratio = float(tau[stated] @ model[stated]) / size
+        if not 1 / MAX_TORQUE_RATIO <= ratio <= MAX_TORQUE_RATIO:
+            unlike.append(f"{ratio:.2g} times those in column tau_{joint + 1}")
+    if not unlike:
+        return ()
+    return (
+        f"expected torques with the sign and unit of the calibration of {name}, got {', '.join(unlike)}; convert the "
+        "columns tau_1, ... of the rows.",
     )
 
 

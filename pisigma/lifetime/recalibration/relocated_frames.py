@@ -49,6 +49,7 @@ def relocated_frames(
     if all(group.size < MIN_MOVE for group in unmoved.groups if group.what.startswith(("base", "tool"))):
         return frozenset()
     tried = {frozenset[FrameKey](): unmoved.log_evidence}
-    with suppress(IdentificationError):  # too few rows to determine these
-        tried |= {owners: evidence(owners) for owners in (bases, tools, bases | tools) if owners}
+    for owners in filter(None, (bases, tools, bases | tools)):
+        with suppress(IdentificationError):  # too few rows to determine these
+            tried[owners] = evidence(owners)
     return max(tried, key=lambda owners: tried[owners])

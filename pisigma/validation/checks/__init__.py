@@ -9,6 +9,7 @@
 | Are single rows wrong? | | robust loss of the calibration | `wrong_rows` |
 | Were joint values logged too early, or rounded? | | `lag`, `rounding` | |
 | Do gears have backlash that the rows do not state? | | `backlash` (before the calibration) | |
+| Do measured torques have the sign of the drives? | | `torques` | `model.stated_conditions` |
 | Are all lengths wrong by one factor? | `setup_fault.check_position_size` | `scale` | `scale` |
 | Do large errors remain that nothing explains? | | `unexplained` | `unexplained` |
 

@@ -17,6 +17,7 @@ from pisigma.validation.checks.search import check_few_rows, check_search
 from pisigma.validation.checks.setup_fault import check_setup_fault, check_setup_of_rows
 from pisigma.validation.checks.stated_noise import check_stated_noise
 from pisigma.validation.checks.temperature import check_temperature
+from pisigma.validation.checks.torques import check_torques
 from pisigma.validation.checks.unexplained import check_residual, check_unexplained, check_unexplained_rows
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.held_out.trained_calibrations import fit_compared_calibrations
@@ -37,6 +38,7 @@ CHECKS: tuple[Check, ...] = (
     check_unexplained,
     check_few_rows,
     check_temperature,
+    check_torques,
     check_camera,
 )
 """Checks of a calibration, in the order in which their findings are printed."""

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import json
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from testing.refusals import refused
 from pisigma.calibration.geometric.problem.setup import number_repeats
 from pisigma.calibration.hybrid.calibrator import HybridCalibrator
 from pisigma.calibration.hybrid.result import HybridResult
-from pisigma.deployment.export.onnx_model import export_onnx
+from pisigma.deployment.export.onnx_model import export_onnx, onnx_remarks
 from pisigma.files.errors import MeasurementError, ModelError
 from pisigma.joint_correction.feature import FeatureOptions
 from pisigma.joint_correction.gravity_torques import GravityTorques
@@ -24,10 +25,12 @@ from pisigma.model.accuracy import deviation_of_rows
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import load_model, save_model
 from pisigma.model.geometric_model import model_of_hybrid
-from pisigma.model.inverse.corrected_ik import CorrectedIK
+from pisigma.model.inverse.corrected_ik import CorrectedIK, load
 from pisigma.model.stated_conditions import condition_warnings, under_stated_torques
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.validation.checks.check import CheckedCalibration
+from pisigma.validation.checks.torques import check_torques
 
 ROBOT = Robot.load("ur5")
 COMPLIANCE = np.array([0.0, 2e-5, 2e-5, 5e-5, 5e-5, 5e-5])
@@ -149,6 +152,39 @@ def test_the_differences_from_modelled_torques_are_those_of_other_rows_and_corre
         atol=0.3,
     )
     assert JointTorques.candidates(ROBOT, options, JointState.from_measurements(measured(20, 3))) == ()
+
+
+def test_rows_with_torques_of_another_sign_or_unit_are_named():
+    test = measured(100, 2, 0.0)
+    assert condition_warnings(model(), test) == ()
+    for factor in (-1.0, 1e3, 1e-3):
+        assert len(condition_warnings(model(), dataclasses.replace(test, torque=factor * test.torque))) == 1
+
+
+@pytest.mark.parametrize(
+    ("joints", "cause"), [((1,), "mixed_signs"), (range(6), "opposite_sign"), ((), None)]
+)
+def test_negative_compliances_are_named(joints, cause):
+    signs = torch.ones(6, dtype=torch.float64)
+    signs[list(joints)] = -1
+    rows = dataclasses.replace(measured(60, 1), torque=measured(60, 1).torque * signs)
+    calibrator = HybridCalibrator(ROBOT, features=("torques",), products=False)
+    result = calibrator.fit(rows)
+    found = [*check_torques(CheckedCalibration(calibrator.geometric, rows, {"hybrid": result}))]
+    assert [one.cause for one in found] == ([cause] if cause else [])
+    if cause == "mixed_signs":
+        assert found[0].values["joints"] == (2,)
+
+
+def test_a_folder_states_that_torques_are_modelled(tmp_path):
+    save_model(model(), tmp_path)
+    loaded = load(tmp_path)
+    assert "model" not in vars(loaded)  # the kernels are enough
+    assert loaded.warnings == condition_warnings(model())
+    onnx = pytest.importorskip("onnx")
+    metadata = {one.key: one.value for one in onnx.load_from_string(export_onnx(model())).metadata_props}
+    assert json.loads(metadata["warnings"]) == [*loaded.warnings]
+    assert set(loaded.warnings) <= set(onnx_remarks(model()))
 
 
 def test_rows_with_another_load_are_not_repeats_of_a_pose_and_noise_of_torques_is_not_a_load():

@@ -11,7 +11,7 @@ from testing.linearised import with_directions
 from testing.models import hand_made_model
 from testing.refusals import refused
 
-from pisigma.files.errors import ModelError
+from pisigma.files.errors import IdentificationError, ModelError
 from pisigma.lifetime.recalibration.adaptation import Adaptation, adapt
 from pisigma.lifetime.recalibration.movement import significant_movements
 from pisigma.lifetime.recalibration.recalibrated_model import recalibrated_model
@@ -76,6 +76,18 @@ def test_a_moved_instrument_is_found(moved):
     assert rms(errors) < 1.5 * rms_of(model, rows_after_change(300, 50, noise=0.0))
     whats = [one.what for one in significant_movements(adaptation)]
     assert whats == [*(["joint 3"] if any(moved) else []), "base", "base"]
+
+
+def test_a_moved_instrument_is_found_if_a_moved_tool_cannot_be_determined(monkeypatch):
+    model, rows = original_model(), rows_after_change(12, 2, base=SHIFTED)
+
+    def undetermined(model, posterior, rows, relocated):
+        if ("tool", "") in relocated:
+            raise IdentificationError(expected="more rows", value=rows.rows)
+        return recalibration_problem(model, posterior, rows, relocated)
+
+    monkeypatch.setitem(relocated_frames.__globals__, "recalibration_problem", undetermined)
+    assert relocated_frames(model, ModelPosterior.from_model(model), rows) == {("base", "")}
 
 
 def test_adapting_row_by_row_agrees_with_all_rows_at_once():
