@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import numpy as np
 import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
@@ -12,12 +13,17 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel, known_names
 
 
-def position_accuracy(model: CalibratedModel, q: Float[Tensor, "*batch dof"]) -> Float64[Tensor, "*batch"]:
+def position_accuracy(
+    model: CalibratedModel,
+    q: Float[Tensor, "*batch dof"],
+    approach: Float64[np.ndarray, "*batch dof"] | None = None,
+) -> Float64[Tensor, "*batch"]:
     """Compute the standard deviation of the tool's predicted position [m], `sqrt(σx² + σy² + σz²)`.
 
     Args:
         model: calibrated model; the position is the position of its first target in its first frame.
         q: commanded joint values [rad or m].
+        approach: +1 or -1 for the direction of approach of every joint, 0 if it is not known; None for all joints.
 
     Returns:
         The standard deviation of every pose; NaN where a joint value is NaN, and everywhere if the model has no
@@ -32,12 +38,17 @@ def position_accuracy(model: CalibratedModel, q: Float[Tensor, "*batch dof"]) ->
             torch.full((len(rows),), model.conditions.get(name, torch.nan), dtype=torch.float64)
             for name in CONDITIONS
         )
+        sides = None
+        if approach is not None:
+            stated = torch.tensor(np.where(approach == 0, np.nan, approach)).expand(q.shape)
+            sides = stated.reshape(flat.shape)[rows]
         at = Measurements(
             q=flat[rows],
             frame=(frame,) * len(rows),
             target=(target,) * len(rows),
             payload=payload,
             temperature=temperature,
+            approach=sides,
         )
         result[rows] = deviation_of_rows(model, at).norm(dim=-1)
     return result.reshape(q.shape[:-1])

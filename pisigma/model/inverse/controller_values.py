@@ -70,10 +70,10 @@ class ControllerValues:
             branch: name of the only branch that may be used, or None.
             options: further options of `CorrectedIK.__call__`.
         """
+        sides = options.get("approach")
         if self.coupling.passive:
-            return self._solve_passive(T, near, owner)
-        if (sides := options.get("approach")) is not None:
-            options["approach"] = self.coupling.approach_to_dh(np.asarray(sides, dtype=np.float64))
+            return self._solve_passive(T, near, owner).with_approach(sides)
+        options = self._with_dh_approach(options)
         near_rows = None if near is None else self.coupling.to_dh(np.asarray(near, dtype=np.float64))
         first = self.ik(T, near=near_rows, branch=branch, **options)
         q, outside = self._inside(np.asarray(as_array(first.q)), near_rows)
@@ -81,28 +81,35 @@ class ControllerValues:
             self._other_branches(pose_array(T)[0], q, outside, near_rows, options)
         if not np.array_equal(q, as_array(first.q), equal_nan=True):
             first = self.ik(T, near=np.nan_to_num(q), branch=branch, **options)
-        return self._answer(first, owner)
+        return self._answer(first, owner).with_approach(sides)
 
     def all_branches(self, T: Any, owner: Any, **options: Any) -> Solution:
         """Find the controller's values on every branch; see `CorrectedIK.all_branches`."""
+        sides = options.get("approach")
         if self.coupling.passive:
-            return self._solve_passive(T[..., None, :, :], None, owner)
-        every = self.ik.all_branches(T, **options)
+            return self._solve_passive(T[..., None, :, :], None, owner).with_approach(sides, of_branches=True)
+        every = self.ik.all_branches(T, **self._with_dh_approach(options))
         q, _ = self._inside(np.asarray(as_array(every.q)), None)
-        return self._answer(replace(every, q=every.q * 0 + _as(q, every.q)), owner)
+        answer = self._answer(replace(every, q=every.q * 0 + _as(q, every.q)), owner)
+        return answer.with_approach(sides, of_branches=True)
 
     def forward(self, q: Any, approach: Any) -> Any:
         """Compute poses at the controller's values; see `CorrectedIK.forward`."""
-        sides = None if approach is None else self.coupling.approach_to_dh(approach)
-        return self.ik.forward(self._to_dh(q), approach=sides)
+        return self.ik.forward(self._to_dh(q), **self._with_dh_approach({"approach": approach}))
 
     def jacobian(self, q: Any) -> Any:
         """Compute the Jacobian with respect to the controller's values; see `CorrectedIK.jacobian`."""
         return self.ik.jacobian(self._to_dh(q)) @ _as(self.coupling.derivative(as_array(q)), q)
 
-    def accuracy(self, q: Any) -> Any:
+    def accuracy(self, q: Any, approach: Any = None) -> Any:
         """Predict the accuracy at the controller's values; see `CorrectedIK.accuracy`."""
-        return self.ik.accuracy(self._to_dh(q))
+        return self.ik.accuracy(self._to_dh(q), **self._with_dh_approach({"approach": approach}))
+
+    def _with_dh_approach(self, options: dict[str, Any]) -> dict[str, Any]:
+        """Return options with the directions of approach of the joints instead of the controller's axes."""
+        if (sides := options.get("approach")) is None:
+            return options
+        return {**options, "approach": self.coupling.approach_to_dh(np.asarray(sides, dtype=np.float64))}
 
     def _to_dh(self, q: Any) -> Any:
         return self.coupling.to_dh(q if is_tensor(q) else np.asarray(q, dtype=np.float64))

@@ -42,7 +42,7 @@ class CorrectedIK(AbstractInverse):
         limits: `(dof, 2)` joint limits [rad or m].
         revolute: `(dof,)` mask of the revolute joints.
         closed_form: whether the nominal robot has a closed-form inverse, so that all branches are known.
-        warnings: warnings about conditions given to `under` that are outside the range of the calibration.
+        warnings: warnings about conditions given to `under` outside the range of the calibration, and modelled torques.
         controller: conversion to the controller's values for coupled joints; None without coupled joints.
     """
 
@@ -88,7 +88,7 @@ class CorrectedIK(AbstractInverse):
         ik.name, ik.branches, ik.joints = kernels.name, kernels.branches, kernels.joints
         ik.order = tuple(int(index) for index in form.order)
         ik.limits, ik.revolute = arms.limits, np.asarray(arms.revolute, dtype=bool)
-        ik.warnings, ik.controller = (), None
+        ik.warnings, ik.controller = kernels.warnings, None
         ik.closed_form = bool(kernels.description.forms.closed_forms)
         ik._read, ik.compiled = read, kernels
         return ik
@@ -174,7 +174,7 @@ class CorrectedIK(AbstractInverse):
             solution = (kernels or self.numeric).solve_batch(
                 T, near=near, branch=branch, throw=throw, approach=approach, single=single, axes=axes
             )
-        return self._like(tensor, solution, axes)
+        return self._like(tensor, solution, axes).with_approach(approach)
 
     def all_branches(self, T_base_tool: Any, *, approach: Any = None) -> Solution:
         """Find solutions on every branch, as `(*batch, branches)`; see `__call__` and `for_task`.
@@ -187,7 +187,7 @@ class CorrectedIK(AbstractInverse):
         T, single, tensor = pose_array(T_base_tool)
         route = self.compiled or self.numeric
         every = route.all_branches(T, approach=approach, single=single, axes=self.task_axes)
-        return self._like(tensor, every, self.task_axes)
+        return self._like(tensor, every, self.task_axes).with_approach(approach, of_branches=True)
 
     def path(
         self, T_base_tool: Any, *, near: Any = None, branch: str | None = None
@@ -231,7 +231,8 @@ class CorrectedIK(AbstractInverse):
         if kernels is None:
             return call_with_tensors(self.model.forward, q)
         values = np.asarray(q, dtype=np.float64)
-        T = kernels.forward(values.reshape(-1, values.shape[-1]), approach=_flat(approach))[0]
+        sides = None if approach is None else np.reshape(approach, (-1, np.shape(approach)[-1]))
+        T = kernels.forward(values.reshape(-1, values.shape[-1]), approach=sides)[0]
         return T.reshape(*values.shape[:-1], 4, 4)
 
     def jacobian(self, q: Any) -> Any:
@@ -265,13 +266,17 @@ class CorrectedIK(AbstractInverse):
 
         return CorrectedIK(under_stated_conditions(self.model, payload_kg, temperature_c))
 
-    def accuracy(self, q: Any) -> Any:
-        """Predict the standard deviation [m] of the tool's position at joint values `(*batch, dof)`."""
+    def accuracy(self, q: Any, *, approach: Any = None) -> Any:
+        """Predict the standard deviation [m] of the tool's position at joint values `(*batch, dof)`; see `__call__`.
+
+        It includes half the backlash of joints whose direction of approach is not stated.
+        """
         from pisigma.model.accuracy import position_accuracy
 
+        approach = checked_approach(approach)
         if self.controller is not None:
-            return self.controller.accuracy(q)
-        return call_with_tensors(partial(position_accuracy, self.model), q)
+            return self.controller.accuracy(q, approach)
+        return call_with_tensors(partial(position_accuracy, self.model, approach=approach), q)
 
     def to_pytorch_kinematics(self) -> "pytorch_kinematics.SerialChain":
         """Return the geometry as a chain of pytorch-kinematics; see `CalibratedModel.to_pytorch_kinematics`."""
@@ -350,11 +355,6 @@ class CorrectedIK(AbstractInverse):
         from pisigma.model.inverse.pose_gradients import as_tensors
 
         return as_tensors(solution, poses, self.model if poses.requires_grad else None, self, axes)
-
-
-def _flat(values: Any) -> Any:
-    """Return approach directions with flattened batch axes."""
-    return None if values is None else np.asarray(values).reshape(-1, np.shape(values)[-1])
 
 
 def load(folder: str | os.PathLike[str]) -> CorrectedIK:

@@ -72,7 +72,7 @@ class AbstractInverse(ABC):
         """Compute the geometric Jacobian of the calibrated arm at joint values q [rad or m]."""
 
     @abstractmethod
-    def accuracy(self, q: Any) -> Any:
+    def accuracy(self, q: Any, *, approach: Any = None) -> Any:
         """Predict the standard deviation of the tool's position [m]."""
 
     @abstractmethod
@@ -108,6 +108,8 @@ class Solution:
         owner: solver that found the solution and predicts its accuracy.
         ignored_axes: axes of the tool that affect neither the status nor the residuals: those that the task ignores or
             that an arm with fewer than six joints cannot control; see `kinematics.task_axes.TaskAxes`.
+        approach: `(*batch, dof)`: direction of approach that the call stated for every joint, as an array; None if it
+            stated none.
     """
 
     q: Any
@@ -120,6 +122,7 @@ class Solution:
     domain_measure: Any
     owner: AbstractInverse | None = None
     ignored_axes: tuple[str, ...] = ()
+    approach: Any = None
 
     @property
     def correction(self) -> Any:
@@ -137,7 +140,9 @@ class Solution:
 
         It is computed with torch in float64 at the first access.
         """
-        return np.full(np.shape(self.status), np.nan) if self.owner is None else self.owner.accuracy(self.q)
+        if self.owner is None:
+            return np.full(np.shape(self.status), np.nan)
+        return self.owner.accuracy(self.q, approach=self.approach)
 
     @property
     def sentences(self) -> tuple[str, ...]:
@@ -146,7 +151,20 @@ class Solution:
 
     def select(self, index: Any) -> "Solution":
         """Return the solutions at an index of the first batch axes."""
-        return self.map(lambda values: values[index])
+        chosen = self.map(lambda values: values[index])
+        return chosen if self.approach is None else replace(chosen, approach=self.approach[index])
+
+    def with_approach(self, approach: Any, of_branches: bool = False) -> "Solution":
+        """Return the solutions for directions of approach.
+
+        Args:
+            approach: `(*batch, dof)` or `(dof,)`; None if not stated.
+            of_branches: whether the solutions have an axis of branches after the batch axes.
+        """
+        if approach is None:
+            return self
+        stated = approach[..., None, :] if of_branches and np.ndim(approach) > 1 else approach
+        return replace(self, approach=np.broadcast_to(stated, self.q.shape))
 
     def map(self, change: Callable[..., Any], *others: "Solution") -> "Solution":
         """Return the solutions after applying a function, which must keep the joint axis last, to all values.

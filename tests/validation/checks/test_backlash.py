@@ -16,6 +16,7 @@ from pisigma.measurement.dataset import Measurements, join
 from pisigma.measurement.fields import UnusableRow
 from pisigma.model.accuracy import deviation_of_rows
 from pisigma.model.geometric_model import model_of_calibration, with_hybrid
+from pisigma.model.inverse.corrected_ik import CorrectedIK
 from pisigma.robot import Robot
 from pisigma.validation.checks.backlash import unstated_backlash
 from pisigma.validation.checks.lag import check_lag
@@ -132,6 +133,15 @@ def test_the_predicted_accuracy_contains_the_play_if_no_side_is_stated():
     assert_close(
         (unstated.square() - stated.square()).sum(1).sqrt(), play.square().sum((1, 2)).sqrt(), rtol=0.02
     )
+    ik, q = CorrectedIK(model), rows.q[20:60].numpy()
+    T, approach = ik.forward(q), sided(rows).approach[20:60].numpy()
+    for solution in (ik(T, near=q, approach=approach), ik.all_branches(T, approach=approach)):
+        assert_close(solution.accuracy, ik.accuracy(solution.q, approach=solution.approach), rtol=1e-12)
+        assert_close(solution.select(0).accuracy, solution.accuracy[0], rtol=1e-12)
+    first = ik(T[0], near=q[0], approach=approach[0])
+    row = replace(sided(rows).select(torch.tensor([20])), q=torch.from_numpy(first.q)[None])
+    assert_close(first.accuracy, deviation_of_rows(model, row).norm(), rtol=1e-9)
+    assert float(first.accuracy) < float(ik(T[0], near=q[0]).accuracy)
 
 
 def test_a_calibration_learns_the_backlash_and_reports_it():
