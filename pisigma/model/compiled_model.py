@@ -12,6 +12,7 @@ from pisigma.joint_correction.conditions import with_modelled_torques
 from pisigma.joint_correction.feature import angle_per_joint_value, scaled_joints
 from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.model.stated_conditions import condition_warnings
 from pisigma.model.stored_starts import StoredStarts, middle_of_starts
 from pisigma.network.correction_network import JointGroup
 from pisigma.network.inputs import POSE_INPUTS
@@ -46,7 +47,13 @@ def save_compiled(model: CalibratedModel, file: str | os.PathLike[str], belongs_
     description, branches = describe_as_arrays(model)
     joints = [joint.name for joint in model.robot.joints]
     write_description(
-        file, description, branches=branches, joints=joints, name=model.name, belongs_to=belongs_to
+        file,
+        description,
+        branches=branches,
+        joints=joints,
+        name=model.name,
+        belongs_to=belongs_to,
+        warnings=condition_warnings(model),
     )
 
 

@@ -11,6 +11,8 @@ from pisigma.cli.arguments import complete_model
 from pisigma.cli.output import print_json, print_line
 from pisigma.cli.settings_options import takes_settings
 from pisigma.deployment.serve.settings import ServeSettings
+from pisigma.files.errors import OutputError
+from pisigma.files.setting import flat_settings
 
 if TYPE_CHECKING:
     from pisigma.deployment.serve.models import ServedModels
@@ -39,11 +41,12 @@ def serve(
 
     Prints one JSON line with its ports when it is ready. SIGHUP reloads models whose folders have changed. If a cell's
     model in use changes, later requests are answered with the new one. With --rsi, the model at the start corrects the
-    joints of a KUKA controller in every cycle; a fault ends the stream with status 2.
+    joints of a KUKA controller in every cycle, also after SIGHUP; a fault ends the stream with status 2.
     """
     from pisigma.deployment.serve.server import Server
 
     if settings.rsi is not None:
+        _check_rsi_alone(settings, models, pin)
         _stream(settings, settings.rsi, model)
         return
 
@@ -52,8 +55,8 @@ def serve(
 
     served = _load(model, models, pin)
     server = Server(served, settings)
-    for problem in served.problems:
-        report(problem)
+    for sentence in (*served.problems, *served.warnings):
+        report(sentence)
     for name in (signal.SIGTERM, signal.SIGINT):
         signal.signal(name, lambda *_: server.stop())
     if hasattr(signal, "SIGHUP"):
@@ -85,6 +88,32 @@ def _load(model: Path | None, models: Path | None, pin: bool) -> "ServedModels":
     return ServedModels(model_folders(models), within=models)
 
 
+_ALSO_OF_RSI = ("rsi", "rsi_max_correction")
+"""Settings that a stream over RSI uses."""
+
+
+def _check_rsi_alone(settings: ServeSettings, models: Path | None, pin: bool) -> None:
+    """Refuse options of other protocols, which a stream over RSI would not use.
+
+    Raises:
+        OutputError: such an option is given.
+    """
+    usual = ServeSettings()
+    stated = [
+        one.spelling
+        for one in flat_settings(ServeSettings)
+        if one.field not in _ALSO_OF_RSI and getattr(settings, one.field) != getattr(usual, one.field)
+    ]
+    stated += [name for name, value in (("--models", models), ("--pin", pin)) if value]
+    if stated:
+        raise OutputError(
+            "expected no options of other protocols",
+            value=", ".join(stated),
+            option="--rsi",
+            remedy="serve other protocols in a second process",
+        )
+
+
 def _stream(settings: ServeSettings, file: Path, model: Path | None) -> None:
     """Correct the joints of a KUKA controller over RSI."""
     from pisigma.deployment.export.rsi import RsiAddress
@@ -95,10 +124,13 @@ def _stream(settings: ServeSettings, file: Path, model: Path | None) -> None:
     if model is None:
         raise typer.BadParameter("expected a model folder or a cell", param_hint="'MODEL'")
     folder, warnings = checked_model_folder(model, "serve")
-    for warning in warnings:
+    ik = load(folder)
+    for warning in (*warnings, *ik.warnings):
         print_line(warning, to_stderr=True)
-    server = RsiServer(load(folder), RsiAddress.read(file), math.degrees(settings.rsi_max_correction))
+    server = RsiServer(ik, RsiAddress.read(file), math.degrees(settings.rsi_max_correction))
     for name in (signal.SIGTERM, signal.SIGINT):
         signal.signal(name, lambda *_: server.stop())
+    if hasattr(signal, "SIGHUP"):
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)  # the model at the start corrects until the end
     print_json({"rsi_port": server.port})
     server.run(lambda line: print_line(line, to_stderr=True))

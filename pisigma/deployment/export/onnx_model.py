@@ -9,7 +9,7 @@ import numpy as np
 
 from pisigma.calibration.hybrid.arm import HybridArm, JointCoverage
 from pisigma.deployment.export.export_format import Exported, ExportFormat, ExportRequest, model_facts
-from pisigma.deployment.export.geometry import HYBRID
+from pisigma.deployment.export.geometry import HYBRID, condition_remarks
 from pisigma.files.errors import ModelError
 from pisigma.files.model_files import model_hash
 from pisigma.joint_correction.conditions import learned_conditions, with_modelled_torques
@@ -18,6 +18,7 @@ from pisigma.joint_correction.onnx_chain import add_roll_pitch_yaw
 from pisigma.joint_correction.onnx_graph import OnnxGraph, import_onnx
 from pisigma.joint_correction.shared_features import add_unit_inputs
 from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.model.stated_conditions import condition_warnings
 from pisigma.network.correction_network import CorrectionNetwork, JointGroup
 from pisigma.network.inputs import POSE_INPUTS
 from pisigma.network.pi_sigma import PiSigma
@@ -193,6 +194,7 @@ def onnx_remarks(model: CalibratedModel) -> tuple[str, ...]:
         "The graph corrects joint values for forward kinematics: the pose is that of the hybrid geometry (--format "
         "urdf or dh --geometry hybrid), not of the geometric fit, at q + correction. To convert nominal to commanded "
         "joint values, export a model of `pisigma distill`.",
+        *condition_remarks(model),
     )
 
 
@@ -264,6 +266,8 @@ def _metadata(model: CalibratedModel, computes: str, sha256: str) -> dict[str, s
     learned = None if arm is None else learned_conditions(arm.correction)
     if learned is not None:
         values["usual_conditions"] = dict(zip(learned.names, learned.mean, strict=True))
+    if arm is not None:
+        values["warnings"] = condition_warnings(model)
     return {key: value if isinstance(value, str) else json.dumps(value) for key, value in values.items()}
 
 

@@ -309,7 +309,7 @@ def _forward(model: ServedModel, request: dict[str, Any]) -> tuple[str, dict[str
     x, y, z, *angles = xyzrpy_of(model.ik.forward(q, approach=approach))
     values: dict[str, Any] = {"pose": [x * 1e3, y * 1e3, z * 1e3, *map(math.degrees, angles)]}
     if read_flag(request, "accuracy"):
-        values["accuracy_mm"] = _millimetres(model.ik.accuracy(q))
+        values["accuracy_mm"] = _millimetres(model.ik.accuracy(q, approach=approach))
     return "forward", values
 
 
@@ -322,6 +322,7 @@ def _model_record(model: ServedModel) -> dict[str, Any]:
         "units": ["deg" if is_revolute else "mm" for is_revolute in model.ik.revolute],
         "limits": [[_or_none(bound) for bound in bounds] for bounds in per_unit.round(9).tolist()],
         "branches": model.ik.branches,
+        "warnings": model.ik.warnings,
     }
 
 

@@ -257,6 +257,11 @@ class ServedModels:
         return self._models[index]
 
     @property
+    def warnings(self) -> tuple[str, ...]:
+        """Warnings of the models, such as about torques that are modelled, with the names of the models."""
+        return tuple(f"{model.name}: {one}" for model in self._models for one in model.ik.warnings)
+
+    @property
     def is_refused(self) -> bool:
         """Whether exports that are active on the controller of the cell forbid the use of any model."""
         return self._in_use is not None and bool(self._in_use.findings.refusal)

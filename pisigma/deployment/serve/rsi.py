@@ -19,6 +19,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
@@ -101,7 +102,8 @@ class RsiAnswers:
         check_six_axes(ik.model)
         self._kernels, self._limit = _kernels(ik), max_correction_deg
         attributes = " ".join(f'{axis}="%.6f"' for axis in AXES)
-        self._form = f'<Sen Type="{sender}"><AKorr {attributes}/><IPOC>%d</IPOC></Sen>'
+        kind = quoteattr(sender).replace("%", "%%")
+        self._form = f"<Sen Type={kind}><AKorr {attributes}/><IPOC>%d</IPOC></Sen>"
         self.counts, self.finished = RsiCounts(), False
         self._first: int | None = None
         self._last, self._cycle, self._leaving = 0, MAX_CYCLE_MS, False
@@ -126,8 +128,9 @@ class RsiAnswers:
         self._weight = min(max(self._weight, 0.0), 1.0)
         share = self._weight * self._weight * (3 - 2 * self._weight)  # without a jump of the speed
         sent = tuple(share * value for value in wanted)
-        if max(map(lambda new, old: abs(new - old), sent, self._sent)) > MAX_STEP_DEG * max(cycles, 1):
-            raise _fault("a change of the correction per cycle of at most", f"{MAX_STEP_DEG} deg", wanted)
+        change = tuple((new - old) / max(cycles, 1) for new, old in zip(sent, self._sent, strict=True))
+        if max(map(abs, change)) > MAX_STEP_DEG:
+            raise _fault("a change of the correction per cycle of at most", f"{MAX_STEP_DEG} deg", change)
         self._sent = sent
         self.finished = self._leaving and self._weight == 0
         self.counts.answered += 1
@@ -192,10 +195,10 @@ def _kernels(ik: CorrectedIK) -> CompiledIK:
     return ik.compiled
 
 
-def _fault(expected: str, limit: str, correction: tuple[float, ...]) -> RequestError:
+def _fault(expected: str, limit: str, values: tuple[float, ...]) -> RequestError:
     return RequestError(
         expected=f"{expected} {limit}",
-        value=", ".join(f"{axis} {value:.4f}" for axis, value in zip(AXES, correction, strict=True)),
+        value=", ".join(f"{axis} {value:.4f}" for axis, value in zip(AXES, values, strict=True)),
         option="AKorr",
         remedy="check that the joints of the controller have the zeros and directions of the robot description, and "
         "avoid singularities",

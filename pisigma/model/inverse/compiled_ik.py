@@ -38,6 +38,7 @@ class CompiledIK:
         branches: names of the branches.
         joints: names of the joints.
         belongs_to: SHA-256 of the model folder with the same model; "" without a folder.
+        warnings: see `CorrectedIK`.
         task_axes: axes of the tool that are constrained unless a task states others.
     """
 
@@ -48,6 +49,7 @@ class CompiledIK:
         joints: Sequence[str],
         name: str = "model",
         belongs_to: str = "",
+        warnings: Sequence[str] = (),
     ) -> None:
         """Make the inverse kinematics of a description from `model.compiled_model.describe_as_arrays`.
 
@@ -58,7 +60,7 @@ class CompiledIK:
         self._packed = pack(description, name, kernel_forms(description.forms))
         self._address = address_of(self._packed)
         self.branches, self.joints = tuple(branches), tuple(joints)
-        self.name, self.belongs_to = name, belongs_to
+        self.name, self.belongs_to, self.warnings = name, belongs_to, tuple(warnings)
         self._none = np.zeros((0, len(self.joints)))
         self._row = ctypes.c_double * (2 * len(self.joints) + 5)
         whole = description.network.used and not description.forms.closed_forms
@@ -132,7 +134,7 @@ class CompiledIK:
         row = np.frombuffer(memoryview(out))
         position, rotation, measure, status, index = row[2 * dof :].tolist()
         joints = row[:dof], row[dof : 2 * dof], int(index), self.branches, int(status)
-        return Solution(*joints, position, rotation, measure, owner, task.ignored)
+        return Solution(*joints, position, rotation, measure, owner, task.ignored, approach)
 
     def solve_packed(self, T_base_tool: bytes, near: bytes) -> list[float]:
         """Find corrected joint values for one pose given as bytes, for example received from a network socket.

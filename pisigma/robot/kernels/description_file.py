@@ -14,8 +14,8 @@ from pisigma.files.errors import ModelError, Place
 from pisigma.robot.kernels.arrays import PARTS, Description
 from pisigma.robot.kernels.forms import KernelForms
 
-FORMAT = 6
-_NAMES = ("branches", "joints", "name", "belongs_to")
+FORMAT = 7
+_NAMES = ("branches", "joints", "name", "belongs_to", "warnings")
 _FIELDS = [(part, field) for part, kind in PARTS.items() for field in kind._fields]
 
 
@@ -27,8 +27,9 @@ def write_description(
     joints: Any,
     name: str,
     belongs_to: str = "",
+    warnings: Any = (),
 ) -> None:
-    """Write a description, and the names of branches, joints and model, as `.npz`; see `CompiledIK`.
+    """Write a description, names of branches, joints and model, and warnings, as `.npz`; see `CompiledIK`.
 
     All numbers are in two arrays, because reading many arrays takes a new process more time.
     """
@@ -44,6 +45,7 @@ def write_description(
         "joints": joints,
         "name": name,
         "belongs_to": belongs_to,
+        "warnings": warnings,
         "forms": dataclasses.asdict(description.forms),
         "shapes": shapes,
     }
@@ -58,7 +60,7 @@ def write_description(
 
 
 def read_description(file: str | os.PathLike[str]) -> tuple[Description, dict[str, Any]]:
-    """Return the description in a file of `write_description`, and the names by kind.
+    """Return the description in a file of `write_description`, and the names and warnings by kind.
 
     Raises:
         ModelError: the file is missing, truncated, foreign, changed or has another format.

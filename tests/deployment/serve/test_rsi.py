@@ -4,6 +4,7 @@ import json
 import math
 import os
 import re
+import signal
 import socket
 import subprocess
 import sys
@@ -13,6 +14,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from lxml import etree
 from testing.closeness import assert_close
 from testing.identified import geometric_model
 from testing.refusals import refused
@@ -20,6 +22,7 @@ from testing.refusals import refused
 from pisigma.deployment.export.rsi import RsiAddress, rsi_configuration
 from pisigma.deployment.serve.rsi import RAMP_MS, RsiAnswers, RsiServer
 from pisigma.files.errors import OutputError, RequestError
+from pisigma.model.folder.model_folder import save_model
 from pisigma.model.inverse.corrected_ik import CorrectedIK
 from pisigma.robot.kinematics.forward import forward_kinematics
 
@@ -125,10 +128,38 @@ def test_corrections_and_changes_above_the_limits_end_the_stream(ik, answers):
     with refused(RequestError, option="AKorr", expected=f"corrections of at most {largest * 0.99:g} deg"):
         stream.answer(packet(START, 0))
     far = START * np.array([1, 1, -1, 1, -1, 1])
-    with refused(
-        RequestError, option="AKorr", expected="a change of the correction per cycle of at most 0.05 deg"
-    ):
-        answers.answer(packet(far, NEXT))
+    before = correction(answers.answer(packet(START, NEXT)), NEXT)
+    after = np.array(RsiAnswers(ik, "pisigma", 1.0)._correction(far.tolist()))
+    with pytest.raises(RequestError) as refusal:
+        answers.answer(packet(far, NEXT + 4))
+    assert refusal.value.expected == "a change of the correction per cycle of at most 0.05 deg"
+    stated = [float(value) for value in re.findall(r"A\d (\S+?)(?:,|$)", refusal.value.value)]
+    assert_close(stated, after - before, atol=1e-4)
+
+
+def test_the_sender_is_written_as_xml(ik):
+    answer = RsiAnswers(ik, '50 % of "A&B"', 1.0).answer(packet(START, 0))
+    assert etree.fromstring(answer).get("Type") == '50 % of "A&B"'
+
+
+def test_sighup_does_not_end_a_stream_and_other_options_are_refused(tmp_path):
+    (tmp_path / "ur10").mkdir()
+    save_model(geometric_model("ur10"), tmp_path / "ur10")
+    configuration = tmp_path / "rsi.xml"
+    with controller_at("127.0.0.1") as free:
+        port = free.getsockname()[1]
+    configuration.write_text(rsi_configuration("127.0.0.1", port))
+    command = [sys.executable, "-m", "pisigma", "serve", str(tmp_path / "ur10"), "--rsi", str(configuration)]
+    for option in (["--pin"], ["--port", "5000"], ["--models", str(tmp_path)]):
+        run = subprocess.run([*command, *option], capture_output=True, check=False)
+        assert run.returncode == 2
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as serving:
+        assert json.loads(serving.stdout.readline()) == {"rsi_port": port}
+        serving.send_signal(signal.SIGHUP)
+        with controller_at("127.0.0.1") as controller:
+            assert np.abs(ask(controller, port, 1000)).max() == 0
+        serving.terminate()
+        assert serving.wait(30) == 0
 
 
 def test_lost_packets_are_counted(answers):

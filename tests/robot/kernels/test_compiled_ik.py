@@ -301,5 +301,5 @@ def test_invalid_files_are_rejected(arms, tmp_path):
         with refused(ModelError, file=file):
             CompiledIK.load(file)
     np.savez(tmp_path / "other.npz", q=np.zeros(3))
-    with refused(ModelError, file="other.npz", expected="format 6", value=None):
+    with refused(ModelError, file="other.npz", expected="format 7", value=None):
         CompiledIK.load(tmp_path / "other.npz")
