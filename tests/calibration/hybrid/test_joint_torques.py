@@ -14,6 +14,7 @@ from pisigma.calibration.geometric.problem.setup import number_repeats
 from pisigma.calibration.hybrid.calibrator import HybridCalibrator
 from pisigma.calibration.hybrid.result import HybridResult
 from pisigma.deployment.export.onnx_model import export_onnx, onnx_remarks
+from pisigma.deployment.serve.models import ServedModels
 from pisigma.files.errors import MeasurementError, ModelError
 from pisigma.joint_correction.feature import FeatureOptions
 from pisigma.joint_correction.gravity_torques import GravityTorques
@@ -181,6 +182,8 @@ def test_a_folder_states_that_torques_are_modelled(tmp_path):
     loaded = load(tmp_path)
     assert "model" not in vars(loaded)  # the kernels are enough
     assert loaded.warnings == condition_warnings(model())
+    (warning,) = ServedModels([tmp_path]).warnings
+    assert warning.endswith(loaded.warnings[0])
     onnx = pytest.importorskip("onnx")
     metadata = {one.key: one.value for one in onnx.load_from_string(export_onnx(model())).metadata_props}
     assert json.loads(metadata["warnings"]) == [*loaded.warnings]

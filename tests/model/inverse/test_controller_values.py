@@ -92,6 +92,28 @@ def test_jacobian_and_accuracy_take_the_controllers_values(ik, q):
     assert np.shape(ik.accuracy(q[:3])) == (3,)
 
 
+def test_directions_of_approach_are_converted_to_those_of_the_joints(ik, q, monkeypatch):
+    sides, solver, stated = np.array([1.0, -1.0, 1.0, 1.0, -1.0, 1.0]), ik.controller.ik, []
+    expected, T = ik.controller.coupling.approach_to_dh(sides), ik.forward(q[0])
+    assert not np.array_equal(expected, sides)
+    for name in ("__call__", "all_branches", "forward", "accuracy"):
+        unpatched = getattr(CorrectedIK, name)
+
+        def recorded(self, *values, unpatched=unpatched, **options):
+            if self is solver and "approach" in options:
+                stated.append(options["approach"])
+            return unpatched(self, *values, **options)
+
+        monkeypatch.setattr(CorrectedIK, name, recorded)
+    for solution in (ik(T, near=q[0], approach=sides), ik.all_branches(T, approach=sides)):
+        assert_close(np.broadcast_to(sides, solution.q.shape), solution.approach)
+        assert np.shape(solution.accuracy) == np.shape(solution.status)
+    ik.forward(q[0], approach=sides)
+    assert len(stated) >= 5
+    for values in stated:
+        assert_close(values, np.broadcast_to(expected, np.shape(values)))
+
+
 def test_tensors_have_gradients_through_the_map(ik, q):
     T = torch.from_numpy(ik.forward(q[:2])).requires_grad_()
     solution = ik(T, near=q[:2])
