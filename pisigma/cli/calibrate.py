@@ -101,7 +101,7 @@ def calibrate(
     if (cell := cell_at(robot)) is not None:
         refuse_with_cell(DATA=data, __out=out, __base=base, __tip=tip, __prior=prior)
         if only is not None:
-            return _calibrate_frame_of_cell(cell, only, verbose, as_json)
+            return _calibrate_frame_of_cell(cell, only, accept_implausible, verbose, as_json)
         return _calibrate_cell(cell, settings, accept_implausible, verbose, as_json)
     if not data or out is None:
         raise typer.BadParameter(f"expected {'--out DIR' if data else 'DATA'}, or a cell instead of a robot")
@@ -110,7 +110,18 @@ def calibrate(
     check_folder(out, overwrite, inputs=(robot_file(robot), prior, *data, *seen_by))
     if only is not None:
         return _calibrate_frame(
-            context, only, robot, base, tip, data, chosen, out, overwrite, verbose, as_json
+            context,
+            only,
+            robot,
+            base,
+            tip,
+            data,
+            chosen,
+            out,
+            accept_implausible,
+            overwrite,
+            verbose,
+            as_json,
         )
     nominal = Robot.load(robot, base, tip)
     if prior is not None:
@@ -139,6 +150,7 @@ def _calibrate_frame(
     data: list[Path],
     settings: CalibrationSettings,
     out: Path,
+    accept_implausible: bool,
     overwrite: bool,
     verbose: bool,
     as_json: bool,
@@ -151,16 +163,22 @@ def _calibrate_frame(
     settings.check_unused(ARM_AS_GIVEN)
     arm = robot if is_model(Path(robot)) else Robot.load(robot, base, tip)
     calibration = calibrate_frame(arm, data, only, settings.cameras)
-    with saved_model_folder(calibration, out, False, overwrite, command=command_line(context)) as folder:
+    command = command_line(context)
+    with saved_model_folder(calibration, out, accept_implausible, overwrite, command=command) as folder:
         _print_frame(calibration, folder, verbose, as_json)
 
 
-def _calibrate_frame_of_cell(cell: "Cell", only: FrameChoice, verbose: bool, as_json: bool) -> None:
+def _calibrate_frame_of_cell(
+    cell: "Cell", only: FrameChoice, accept_implausible: bool, verbose: bool, as_json: bool
+) -> None:
     """Calibrate base, tool or both with the newest session of a cell, store the model there, and print it."""
     from pisigma.workflow.frames.cell_frames import calibrate_frame_of_cell
 
-    calibration, entry = calibrate_frame_of_cell(cell, only)
-    _print_frame(calibration, cell.model_folder(entry.name), verbose, as_json, cell)
+    calibration, entry = calibrate_frame_of_cell(cell, only, accept_implausible)
+    folder = None if entry is None else cell.model_folder(entry.name)
+    _print_frame(calibration, folder, verbose, as_json, cell)
+    if entry is None:
+        raise AcceptanceError(NOT_STORED)
 
 
 def _print_frame(

@@ -127,12 +127,17 @@ def _verdict(summary: FrameSummary, folder: Path | None, warnings: int) -> Verdi
     accuracy = " and ".join(f"{rounded(value, 0)} {unit}" for unit, value in worst.items() if value > 0)
     lost = [one.name for one in summary.coordinates if one.standard_error is None]
     arm = "of the model" if summary.parent else "as drawn"
-    trust = "yes" if not warnings and not summary.weak_directions else "with caution"
     cautions = [count_text(warnings, "warning")] if warnings else []
     cautions += [f"{', '.join(lost)} not determined"] if lost else []
+    trust = "yes" if not warnings and not summary.weak_directions else "with caution"
+    trust += f" ({', '.join(cautions)})." if cautions else "."
     follow = f"verify with other poses: `pisigma verify {folder} ROWS.csv`." if folder else "write the model."
-    return Verdict(
-        f"largest standard error {accuracy or 'unknown'}, with the arm {arm}.",
-        f"{trust}{f' ({chr(44).join(cautions)})' if cautions else ''}.",
-        "measure more orientations, because some coordinates are not determined." if lost else follow,
-    )
+    if lost:
+        follow = "measure more orientations, because some coordinates are not determined."
+    for one in summary.diagnostics:
+        if one.severity == "implausible":
+            unwritten = "; no model was written" if folder is None else ""
+            trust = f"no: {one.sentence}"
+            follow = f"correct what is named above and calibrate again{unwritten}."
+            break
+    return Verdict(f"largest standard error {accuracy or 'unknown'}, with the arm {arm}.", trust, follow)

@@ -3,18 +3,22 @@
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 
+import torch
+
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.files.errors import IdentificationError, Place
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.model.frame_model import FittedFrames
 from pisigma.model.model_posterior import FLEET_PRIOR
 from pisigma.robot.description import Robot
-from pisigma.validation.checks.check import Move, RowsUnderModel
+from pisigma.validation.checks.check import CheckedCalibration, Move, RowsUnderModel
 from pisigma.validation.checks.other_robot import other_robot_diagnostics
 from pisigma.validation.checks.other_sensors import diagnose_lengths
 from pisigma.validation.checks.registry import ROW_CHECKS, diagnostics_of_rows
 from pisigma.validation.checks.row_order import new_setup_refusal
 from pisigma.validation.checks.setup_fault import check_position_size, joint_columns, setup_diagnostics
+from pisigma.validation.checks.unexplained import check_residual
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.held_out.frames.fitted_frames import FrameKind
 from pisigma.validation.setup_faults.setup_fault import SetupFault
@@ -100,6 +104,41 @@ def check_rows_by_model(
     if judged is None:
         return RowVerdict()
     return RowVerdict(_until_implausible(check(judged) for check in ROW_CHECKS), judged)
+
+
+def check_rows_of_frames(
+    rows: Measurements, against: Robot | CalibratedModel, found: FittedFrames
+) -> tuple[Diagnostic, ...]:
+    """Check rows to which base, tool or both were fitted, without those that the others contradict.
+
+    The rows are checked against the nominal robot, if its arm was used, and against the model with the fitted frames;
+    then the residuals are compared with the reach.
+
+    Args:
+        rows: the rows.
+        against: the nominal robot or the model whose arm was used.
+        found: the fitted frames.
+
+    Returns:
+        The findings; those that make the rows implausible come first.
+    """
+    used = torch.tensor(found.fit.used)
+    result, some = found.fit.solved.result(), rows.select(used)
+    results = {"nominal": result, "geometric": result}
+    kinds: dict[str, tuple[FrameKind, ...]] = {
+        "tool": ("tool",),
+        "base": ("base",),
+        "hand-eye": ("base", "tool"),
+    }
+    checked = CheckedCalibration(GeometricCalibrator(result.robot), found.fit.rows.select(used), results)
+
+    def findings() -> Iterator[Iterable[Diagnostic]]:
+        if isinstance(against, Robot):
+            yield check_rows(some, against).diagnostics
+        yield check_rows_by_model(some, found.model, kinds[found.fit.only]).diagnostics
+        yield check_residual(checked)
+
+    return _until_implausible(findings())
 
 
 def _until_implausible(checks: Iterable[Iterable[Diagnostic]]) -> tuple[Diagnostic, ...]:

@@ -1,6 +1,7 @@
 """`pisigma calibrate --only`: tool, base and hand-eye of robots, models and cells."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -101,3 +102,100 @@ def test_tool_of_a_cell_is_stored_as_its_model(run, folder):
     (entry,) = pisigma.Cell.open(cell).history.models()
     assert figures["model"].endswith(entry.name)
     assert entry.remark.startswith("tool")
+
+
+BASE = np.array([0.5, 0.1, 0.2, 0.3, 0.1, -0.1])
+
+
+def points(count: int) -> Measurements:
+    """Return measured positions of the flange of a UR5 on a base."""
+    q = torch.from_numpy(np.random.default_rng(1).uniform(-2, 2, (count, 6)))
+    return Measurements(q=q, position=forward_kinematics(UR5.with_geometry(base=BASE), q)[:, :3, 3])
+
+
+def sign(rows: Measurements) -> Measurements:
+    """Reverse the sign of the third joint."""
+    return replace(rows, q=rows.q * torch.tensor([1, 1, -1, 1, 1, 1]))
+
+
+def shuffled(rows: Measurements) -> Measurements:
+    """Exchange the joint values of rows."""
+    return replace(rows, q=rows.q.roll(1, 0))
+
+
+def stretched(rows: Measurements) -> Measurements:
+    """Make all positions 3 % larger."""
+    assert rows.position is not None
+    return replace(rows, position=1.03 * rows.position)
+
+
+@pytest.mark.parametrize(
+    ("fault", "count", "cause"),
+    [
+        (None, 4, None),
+        (None, 8, None),
+        (sign, 8, ("setup_fault", "joint_sign")),
+        (shuffled, 4, ("residual", "position")),
+        (stretched, 5, ("implausible_errors", "")),
+    ],
+)
+def test_faults_of_the_rows_make_the_result_implausible(fault, count, cause):
+    rows = points(count) if fault is None else fault(points(count))
+    found = pisigma.calibrate_frame(UR5, rows, "base")
+    assert found.trusted == (fault is None)
+    assert [(one.kind, one.cause) for one in found.diagnostics[:1]] == ([] if cause is None else [cause])
+
+
+def test_implausible_result_is_written_only_if_it_is_accepted(run, refuses, tmp_path):
+    shuffled(points(4)).write_csv(tmp_path / "points.csv", UR5)
+    out = tmp_path / "moved"
+    asked = ("calibrate", "ur5", tmp_path / "points.csv", "--only", "base", "--out", out)
+    assert run(*asked).exit_code == 3
+    assert not out.exists()
+    printed = run(*asked, "--accept-implausible", "--json")
+    assert printed.exit_code == 0, printed.output
+    assert json.loads(printed.stdout)["diagnostics"][0]["severity"] == "implausible"
+    assert "**Implausible.**" in (out / "README.md").read_text()
+
+
+def test_implausible_result_is_not_stored_in_a_cell(run, tmp_path):
+    cell = tmp_path / "cell"
+    assert run("new", "ur5", "--out", cell).exit_code == 0
+    shuffled(points(4)).write_csv(tmp_path / "points.csv", UR5)
+    assert run("import", tmp_path / "points.csv", "--cell", cell).exit_code == 0
+    assert run("calibrate", cell, "--only", "base").exit_code == 3
+    assert not pisigma.Cell.open(cell).history.models()
+    assert run("calibrate", cell, "--only", "base", "--accept-implausible").exit_code == 0
+    assert len(pisigma.Cell.open(cell).history.models()) == 1
+
+
+def test_rows_of_the_test_set_are_not_fitted():
+    rows = points(8)
+    assert rows.position is not None
+    position = rows.position + torch.tensor([0.0] * 6 + [0.1] * 2)[:, None]
+    marked = replace(rows, position=position, split=("train",) * 6 + ("test",) * 2)
+    found = pisigma.calibrate_frame(UR5, marked, "base")
+    assert found.summary.rows == 6
+    assert_close(found.fit.estimates, BASE, atol=1e-9)
+    assert not found.fit.wrong
+
+
+def test_residuals_of_all_sensors_of_lengths_are_counted():
+    """Positions with errors of 0.3 mm and touches without errors, in equal numbers."""
+    rows = points(10)
+    assert rows.position is not None
+    position, touched = rows.position.clone(), torch.arange(10) >= 5
+    axis = tuple("xyz"[k % 3] if touch else "" for k, touch in enumerate(touched.tolist()))
+    touch = torch.where(touched, position[torch.arange(10), torch.arange(10) % 3], torch.nan)
+    position += 3e-4 * torch.from_numpy(np.random.default_rng(0).choice([-1, 1], (10, 3)))
+    position[touched] = torch.nan
+    found = pisigma.calibrate_frame(
+        UR5,
+        replace(rows, position=position, touch=touch, touch_axis=axis, frame=("jig",) * 10),
+        "base",
+    )
+    by_sensor = {one.sensor: one.rms for one in found.fit.solved.result().noise}
+    expected = np.sqrt((by_sensor["position"] ** 2 + by_sensor["touch"] ** 2) / 2) * 1e3
+    assert found.summary.rms_mm is not None
+    assert_close(found.summary.rms_mm, expected, rtol=1e-9)
+    assert found.summary.rms_mm > 0.1

@@ -17,6 +17,8 @@ from pisigma.model.folder.model_folder import HasModel, loaded_model
 from pisigma.model.frame_model import frames_of_model, frames_of_robot
 from pisigma.reporting.derived_cards import write_frame_card
 from pisigma.robot.description import Robot
+from pisigma.validation.checks.row_order import explain_refusal
+from pisigma.validation.gate import check_rows_of_frames
 from pisigma.validation.held_out.distillation_summary import ParentFigures
 from pisigma.validation.held_out.frame_summary import FrameSummary, frame_summary
 from pisigma.workflow.result import AbstractModelResult
@@ -58,7 +60,8 @@ def calibrate_frame(
     """Calibrate base, tool or both with the arm as given, from 4 to 12 touches, positions, poses or images.
 
     The fit is least squares. Standard errors are those of the residuals' noise and, with a model that has a posterior,
-    of its arm. Rows that all others contradict are left out and named.
+    of its arm. Rows that all others contradict are left out and named, and the others are checked, see
+    `pisigma.validation.gate.check_rows_of_frames`; `diagnostics` has the findings.
 
     Args:
         robot: robot as drawn (a `Robot`, catalogue name or robot file), or a calibrated model (an object that has one,
@@ -83,15 +86,21 @@ def calibrate_frame(
     model, parent = _model_of(robot)
     arm = _drawn(robot) if model is None else model.robot
     rows, _ = read_rows(data, arm, cameras).split_sets()
-    found = frames_of_robot(arm, rows, only) if model is None else frames_of_model(model, rows, only)
-    summary = frame_summary(found.fit, found.arm_variance, found.causes, parent, row_warnings(arm, rows))
+    try:
+        found = frames_of_robot(arm, rows, only) if model is None else frames_of_model(model, rows, only)
+    except IdentificationError as refusal:
+        raise explain_refusal(refusal, arm, rows) from refusal
+    diagnostics = check_rows_of_frames(rows, arm if model is None else model, found)
+    warnings = (one.sentence for one in diagnostics if one.severity == "warning")
+    summary = frame_summary(
+        found.fit, found.arm_variance, found.causes, parent, (*row_warnings(arm, rows), *warnings)
+    )
     summary = summary.with_figures(
-        command=f"pisigma.calibrate_frame({arm.name!r}, {rows.file_names!r}, {only!r})"
+        command=f"pisigma.calibrate_frame({arm.name!r}, {rows.file_names!r}, {only!r})",
+        diagnostics=diagnostics,
     )
-    made = found.model
-    return FrameCalibration(
-        replace(made, metrics=summary.to_json()), found.fit, summary, time.perf_counter() - started
-    )
+    made = replace(found.model, metrics=summary.to_json())
+    return FrameCalibration(made, found.fit, summary, time.perf_counter() - started)
 
 
 Source = Robot | CalibratedModel | HasModel | str | os.PathLike[str]

@@ -11,7 +11,9 @@ from pisigma.workflow.cell.new_files import save_new
 from pisigma.workflow.frames.calibrate_frame import FrameCalibration, calibrate_frame
 
 
-def calibrate_frame_of_cell(cell: Cell, only: FrameChoice) -> tuple[FrameCalibration, ModelEntry]:
+def calibrate_frame_of_cell(
+    cell: Cell, only: FrameChoice, accept_implausible: bool = False
+) -> tuple[FrameCalibration, ModelEntry | None]:
     """Calibrate base, tool or both with the newest session and the arm of the model in use, and store the model.
 
     Without a model in use, the newest model of the cell is taken, and without any its robot as drawn. `verify` puts the
@@ -20,9 +22,10 @@ def calibrate_frame_of_cell(cell: Cell, only: FrameChoice) -> tuple[FrameCalibra
     Args:
         cell: the cell.
         only: what to calibrate.
+        accept_implausible: store the model even if it must not be trusted.
 
     Returns:
-        The calibration and the entry of its model.
+        The calibration and the entry of its model; the entry is None if an untrusted model was not stored.
 
     Raises:
         MeasurementError: there is no valid session, or none to which the model was not fitted.
@@ -39,12 +42,18 @@ def calibrate_frame_of_cell(cell: Cell, only: FrameChoice) -> tuple[FrameCalibra
         rows = cell.sessions.as_measured(session)
         seen = cell.sessions.rows_with_model_names(parent, rows, session.day)
         found = calibrate_frame(cell.model_folder(parent.name), seen.rows, only)
+    doubt = "" if found.trusted else found.diagnostics[0].sentence
+    if doubt and not accept_implausible:
+        refused = ("calibrate", "", session.name, "not_trusted", doubt)
+        cell.history.add(Check(*refused, None, False, started))
+        return found, None
     taken = [one.name for one in cell.history.models()]
-    path = save_new(cell.folder / MODELS, partial(found.save), taken)
+    save = partial(found.save, accept_implausible=accept_implausible)
+    path = save_new(cell.folder / MODELS, save, taken)
     events = cell.history.events() if parent is None else ()
     remark = f"{only} calibrated with session '{session.name}'"
     entry = model_entry(events, started, path, [session], remark, found, parent)
-    cell.history.add(
-        entry, Check("calibrate", entry.name, session.name, "trusted", remark, None, False, started)
-    )
+    verdict = "accepted_implausible" if doubt else "trusted"
+    check = Check("calibrate", entry.name, session.name, verdict, doubt or remark, None, False, started)
+    cell.history.add(entry, check)
     return found, entry

@@ -128,12 +128,12 @@ def find_redundancy(
     scale = np.divide(preference, lengths, out=np.zeros_like(lengths), where=lengths > 0)
     triangle, pivots = pivoted_qr(jacobian * scale)
     rank = _rank(triangle / preference[pivots], tolerance)
-    acting = int((lengths > 0).sum())  # the dependent columns are the last pivots
+    chosen, left = pivots[:rank], pivots[rank:]  # dependent columns and columns of zeros, in any order
 
     def named(columns: Int64[np.ndarray, " some"]) -> tuple[str, ...]:
         return tuple(names[np.sort(columns)].tolist())
 
-    chosen, others, silent = pivots[:rank], pivots[rank:acting], pivots[acting:]
+    others, silent = left[lengths[left] > 0], left[lengths[left] == 0]
     return Redundancy(information, rank, tolerance, named(chosen), named(others), named(silent))
 
 

@@ -12,6 +12,7 @@ from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.calibration.geometric.identifiability.pairwise import find_pairwise_redundancy
 from pisigma.calibration.geometric.identifiability.redundancy import find_redundancy, pivoted_qr
 from pisigma.calibration.geometric.problem.information import Information, information
+from pisigma.calibration.geometric.problem.parameters import ParameterSpace
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
@@ -197,3 +198,12 @@ def test_joint_values_come_from_the_limits() -> None:
     robot = Robot.load("panda")
     q = draw_joints(robot, 100, np.random.default_rng(0)).numpy()
     assert ((q >= robot.limits[:, 0]) & (q <= robot.limits[:, 1])).all()
+
+
+def test_column_of_zeros_before_a_dependent_one_has_no_effect():
+    parameters = ParameterSpace(Robot.load("ur5")).parameters[:3]
+    root = np.array([[1.0, 0.0, 1.0, 0.0, 1.0], [0.0, 0.0, 0.0, 1.0, 0.0]])
+    found = find_redundancy(Information(parameters, root, 10, 5), np.zeros(3))
+    names = [parameter.name for parameter in parameters]
+    assert found.no_effect == (names[1],)
+    assert sorted((*found.kept, *found.removed)) == sorted((names[0], names[2]))
