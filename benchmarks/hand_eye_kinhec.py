@@ -71,7 +71,7 @@ def main() -> None:
             rotation=seen[:, :3, :3],
         )
         X, Y = axyb.shah(A, B)
-        fit = fit_frames(nominal, rows, "hand-eye", {})
+        fit = fit_frames(nominal, rows, "hand-eye")
         robots = {
             "shah": robot_of(model, Y, X),
             "shah+lm": robot_of(model, *reversed(axyb.refine_lm_axyb(A, B, X, Y))),
