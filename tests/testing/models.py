@@ -130,12 +130,13 @@ def trained_run(name: str):
 
 @contextmanager
 def no_type_checker() -> Iterator[None]:
-    """Call pisigma without the type checker, like users do; leaving an inner block turns the checker on again."""
+    """Call pisigma without the type checker, like users do."""
+    before = jaxtyping.config.jaxtyping_disable
     jaxtyping.config.update("jaxtyping_disable", True)
     try:
         yield
     finally:
-        jaxtyping.config.update("jaxtyping_disable", False)
+        jaxtyping.config.update("jaxtyping_disable", before)
 
 
 def poses_around(name: str, *batch: int, seed: int = 3) -> torch.Tensor:

@@ -30,14 +30,14 @@ def running(*folders: Path, settings: ServeSettings | None = None, **options) ->
     """Run a server in a thread, which is stopped at the end and has to end then."""
     with no_type_checker():
         server = Server(ServedModels(folders, **options), settings or ServeSettings())
-        thread = threading.Thread(target=server.run, daemon=True)
-        thread.start()
-        try:
-            yield server
-        finally:
-            server.stop()
-            thread.join(10)
-            assert not thread.is_alive()
+    thread = threading.Thread(target=server.run, daemon=True)
+    thread.start()
+    try:
+        yield server
+    finally:
+        server.stop()
+        thread.join(10)
+        assert not thread.is_alive()
 
 
 @contextmanager

@@ -18,4 +18,4 @@ def served(repository: Path) -> Iterator[Server]:
 
 @pytest.fixture(autouse=True)
 def _as_users_do(without_type_checker: None) -> None:
-    """Keep the type checker off: servers that stop switch it on again for the shared one too."""
+    """Answer without the type checker in the threads of the servers."""
