@@ -1,9 +1,12 @@
 """Hybrid calibrations of simulated arms, for tests."""
 
 import functools
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
+import pytest
 import torch
 from testing.models import no_type_checker
 
@@ -17,9 +20,34 @@ from pisigma.simulation import TrueRobot
 from pisigma.simulation.errors.geometric import RandomGeometricDeviation
 from pisigma.simulation.errors.joint_compliance import JointCompliance, LinkMass
 from pisigma.simulation.errors.transmission import Harmonic, TransmissionHarmonics
+from pisigma.validation.checks import other_robot
 
 NOISE = 3e-5
 """Standard deviation of a measured coordinate [m]."""
+
+
+@contextmanager
+def few_choices() -> Iterator[None]:
+    """Try few features in calibrations that state no harmonics, for tests of other subjects; recipes state them."""
+    whole, default = HybridCalibrator.__init__, HybridCalibrator.features
+    few = {"features": ("gravity", "series"), "harmonics": (4, 8), "products": False}
+
+    def with_few(self, robot, **options):
+        if "harmonics" not in options:
+            options = few | {name: value for name, value in options.items() if value != default}
+        whole(self, robot, **options)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(HybridCalibrator, "__init__", with_few)
+        yield
+
+
+@contextmanager
+def few_robots() -> Iterator[None]:
+    """Compare rows with large errors with five robots of the catalogue, as each takes a tenth of a second."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(other_robot, "catalogue", lambda: ("fanuc_r2000", "kiro4", "rb5", "ur10", "ur5"))
+        yield
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import pytest
 from testing.cell_rows import day, measured
+from testing.hybrid import few_choices
 from testing.models import no_type_checker
 from testing.pictures import no_pictures
 
@@ -18,7 +19,7 @@ def used(tmp_path_factory):
     """A cell with a model in use; files that were exported from it are next to its folder."""
     folder = tmp_path_factory.mktemp("cells")
     cell = Cell.create(folder / "cell", "ur10")
-    with no_type_checker(), no_pictures():
+    with no_type_checker(), no_pictures(), few_choices():
         cell.take_in(measured(60, 1), day=day(60))
         cell.calibrate(folds=0)
         cell.take_in(measured(12, 2), day=day(30))

@@ -56,7 +56,7 @@ def test_status_names_every_step_on_the_way(year):
 def test_the_model_is_that_of_the_rows_without_a_cell_to_the_bit(year):
     cell, _, (calibration, entry), _ = year
     rows = Measurements.read_csv(cell.folder / "sessions" / f"{day(60)}.csv", ROBOT)
-    alone = calibrate("ur10", rows, CalibrationSettings(folds=2))
+    alone = calibrate("ur10", rows, CalibrationSettings(folds=0))
     assert np.array_equal(alone.model.identified.dh, calibration.model.identified.dh)
     assert_close(
         load_model(cell.model_folder(entry.name)).identified.dh, alone.model.identified.dh, atol=1e-14
