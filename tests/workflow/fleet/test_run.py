@@ -6,10 +6,9 @@ import sys
 
 import pytest
 from testing.aged import original_model, rows_after_change
-from testing.models import no_type_checker
+from testing.engine_work import PicklingEngine
 from testing.refusals import refused
 
-from pisigma.files.engines.processes import ProcessEngine
 from pisigma.files.errors import PlanningError
 from pisigma.lifetime.fleet.status import FleetStatus
 from pisigma.model.folder.model_folder import load_model
@@ -23,36 +22,49 @@ parquet = pytest.importorskip("pyarrow.parquet", reason="Parquet comes with the 
 ONE_JOB = FleetSettings(jobs=1)
 
 
-class InThisProcess(ProcessEngine):
-    """Works in this process, as the engines have tests of their own."""
-
-    def _chunks(self, work, chunks):
-        for chunk in chunks:
-            yield chunk, [work(item) for item in chunk]
-
-
-@pytest.fixture(autouse=True)
-def in_this_process(monkeypatch):
-    monkeypatch.setattr(workflow, "ProcessEngine", InThisProcess)
-    with no_type_checker():
+@pytest.fixture(scope="module", autouse=True)
+def in_this_process():
+    """Engines have tests of their own."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(workflow, "ProcessEngine", PicklingEngine)
         yield
 
 
-@pytest.fixture
-def plant(tmp_path):
-    """Three cells, of which the file of one is bad."""
+def write_plant(folder):
+    """Write three cells, of which the file of one is bad."""
     for number in range(2):
-        rows_after_change(20, number).write_csv(tmp_path / f"{number}.csv", original_model().robot)
-    (tmp_path / "bad.csv").write_text("q1_deg\nx\n", encoding="utf-8")
-    (tmp_path / "fleet.csv").write_text(
+        rows_after_change(20, number).write_csv(folder / f"{number}.csv", original_model().robot)
+    (folder / "bad.csv").write_text("q1_deg\nx\n", encoding="utf-8")
+    (folder / "fleet.csv").write_text(
         "id,data,date,options\n"
         "r0,0.csv,2026-10-01,model=geometric\n"
         "r1,1.csv,2026-10-01,model=geometric; free=joint_offsets\n"
         "r2,bad.csv,2026-10-01,model=geometric\n",
         encoding="utf-8",
     )
-    new_cells(tmp_path / "fleet.csv", tmp_path / "cells", NewCell("rb5"))
-    return tmp_path / "cells"
+    new_cells(folder / "fleet.csv", folder / "cells", NewCell("rb5"))
+    return folder / "cells"
+
+
+@pytest.fixture
+def plant(tmp_path):
+    return write_plant(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def advanced_once(tmp_path_factory):
+    """The first run of a plant, and a copy of the plant after it."""
+    run = run_fleet(write_plant(tmp_path_factory.mktemp("plant")), ONE_JOB)
+    return run, shutil.copytree(run.results.parent, run.results.parent.with_name("kept"))
+
+
+@pytest.fixture
+def first(advanced_once):
+    """The first run of a plant, which is as it left it."""
+    run, kept = advanced_once
+    shutil.rmtree(run.results.parent)
+    shutil.copytree(kept, run.results.parent)
+    return run
 
 
 def table_of(run):
@@ -60,8 +72,8 @@ def table_of(run):
     return [(row["cell"], row["command"], row["verdict"]) for row in rows], rows
 
 
-def test_an_invalid_file_is_named_and_does_not_affect_the_others(plant):
-    run = run_fleet(plant, ONE_JOB)
+def test_an_invalid_file_is_named_and_does_not_affect_the_others(first):
+    run, plant = first, first.results.parent
     assert (run.cells, run.done, run.unchanged) == (3, 2, 0)
     ((cell, reason),) = run.refused
     assert cell == "r2"
@@ -78,21 +90,20 @@ def test_an_invalid_file_is_named_and_does_not_affect_the_others(plant):
     assert FleetStatus.read(plant).states == {"file_refused": ("r2",), "not_verified": ("r0", "r1")}
 
 
-def test_a_later_call_continues(plant):
-    first = run_fleet(plant, ONE_JOB)
-    content = first.results.read_bytes()
+def test_a_later_call_continues(first):
+    plant, content = first.results.parent, first.results.read_bytes()
     again = run_fleet(plant, ONE_JOB)
     assert (again.unchanged, again.refused) == (2, first.refused)
     assert again.results.read_bytes() == content
-    first.results.unlink()  # parameters are then read from the models
+    again.results.unlink()  # parameters are then read from the models
     assert run_fleet(plant, ONE_JOB).results.read_bytes() == content
     rows_after_change(31, 5).write_csv(plant / "r2" / "sessions" / "2026-10-01.csv", original_model().robot)
     last = run_fleet(plant, ONE_JOB)
     assert (last.unchanged, last.done, last.refused) == (2, 3, ())
 
 
-def test_a_cell_is_calibrated_again_if_its_model_is_gone_or_its_settings_were_edited(plant):
-    first = run_fleet(plant, ONE_JOB)
+def test_a_cell_is_calibrated_again_if_its_model_is_gone_or_its_settings_were_edited(first):
+    plant = first.results.parent
     first.results.unlink()
     (model,) = (plant / "r0" / "models").iterdir()
     shutil.rmtree(model)
