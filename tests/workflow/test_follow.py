@@ -1,6 +1,7 @@
 """Following a growing file."""
 
 import time
+from contextlib import nullcontext
 from types import SimpleNamespace
 
 import pytest
@@ -32,6 +33,7 @@ def test_rows_are_checked_as_they_are_measured_until_the_plan_is_done(tmp_path, 
         time.sleep(seconds)
 
     monkeypatch.setattr("pisigma.workflow.follow.time", SimpleNamespace(sleep=measure_one))
+    monkeypatch.setattr(MeasuringSession, "in_background", lambda session: nullcontext())
     seen, waited, arrived = [], [], []
     with no_type_checker():
         for step in follow(
