@@ -1,0 +1,45 @@
+"""The gallery: every example runs, improves what it shows, and is on the page."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+ROOT = Path(__file__).parent.parent
+EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
+MAX_LINES = 60
+
+
+@pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)
+def test_an_example_runs_and_writes_its_picture(example, tmp_path):
+    assert len(example.read_text(encoding="utf-8").splitlines()) <= MAX_LINES
+    done = subprocess.run(
+        [sys.executable, "-W", "error", str(example)],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    picture = f"{example.stem}.png"
+    for folder in (tmp_path, ROOT / "docs" / "figures" / "gallery"):
+        with Image.open(folder / picture) as image:
+            assert image.size == (400, 300)
+    errors = [float(number) for number in re.findall(r"([0-9.]+) mm (?:RMS|from)", done.stdout)]
+    if example.stem == "touch_jig":
+        errors = [float(number) for number in re.findall(r"[0-9]+[.][0-9]+", done.stdout)]
+    if example.stem == "own_feature":
+        assert "(belt)" in done.stdout
+    else:
+        assert errors[-1] < errors[0] / 4
+
+
+def test_the_page_and_the_first_page_show_every_example():
+    page, first = ((ROOT / "docs" / name).read_text(encoding="utf-8") for name in ("gallery.md", "index.md"))
+    names = {path.stem for path in EXAMPLES}
+    assert len(names) == 12
+    assert set(re.findall(r'^--8<-- "examples/(\w+)[.]py"$', page, re.M)) == names
+    assert set(re.findall(r"figures/gallery/(\w+)[.]png", first)) == names
