@@ -3,12 +3,14 @@
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from jaxtyping import Float, Float64, UInt8
 from scipy.ndimage import gaussian_filter
 
 from pisigma.measurement.camera.board import Board
 from pisigma.measurement.camera.camera import Camera
 from pisigma.measurement.camera.pattern import Pattern, board_pattern
+from pisigma.robot.se3 import rotation_from_vector, transform
 
 NODE_STEP = 16
 """Distance [px] of the nodes at which rays are undistorted; a cubic spline between them is accurate to 1e-4 px."""
@@ -103,6 +105,7 @@ def render_image(
     T_camera_board: Float64[np.ndarray, "4 4"],
     exposure: Exposure,
     rng: np.random.Generator,
+    motion: Float64[np.ndarray, " 6"] | None = None,
 ) -> UInt8[np.ndarray, "height width"]:
     """Render the gray image that a camera takes of a board, without occlusions.
 
@@ -112,20 +115,42 @@ def render_image(
         T_camera_board: pose of the board [m].
         exposure: light and optics.
         rng: random generator of the noise.
+        motion: motion of the board between the first and the last row of the image, which a rolling shutter exposes
+            one after the other: shift [m] and rotation vector [rad], in the axes of the camera. None: the board is at
+            rest. The middle row shows the given pose.
 
     Returns:
         Gray level of every pixel, from 0 to 255.
     """
     gray = np.full((camera.height, camera.width), exposure.background, dtype=np.float32)
-    left, top, right, bottom = _bounds(camera, board, T_camera_board, exposure)
+    moved = [_moved(T_camera_board, motion, np.array([share]))[0] for share in (-0.5, 0.5)]
+    bounds = np.array(
+        [_bounds(camera, board, T, exposure) for T in (moved if motion is not None else moved[:1])]
+    )
+    (left, top), (right, bottom) = bounds[:, :2].min(0).tolist(), bounds[:, 2:].max(0).tolist()
     if left < right and top < bottom:
-        rays = _rays(camera, np.arange(left, right + 1) - 0.5, np.arange(top, bottom + 1) - 0.5)
-        xy, depth = _on_surface(board, T_camera_board, rays)
+        rows = np.arange(top, bottom + 1) - 0.5
+        rays = _rays(camera, np.arange(left, right + 1) - 0.5, rows)
+        xy, depth = _on_surface(board, _moved(T_camera_board, motion, rows / camera.height - 0.5), rays)
         sharp = _reflected(_Surface.from_pattern(board.pattern, exposure), xy)
         gray[top:bottom, left:right] = _blurred(sharp, _blur(camera, exposure, depth[1:, 1:]))
     gray *= _light(camera, exposure)
     gray += exposure.noise * rng.standard_normal(gray.shape, dtype=np.float32)
     return np.clip(np.rint(gray), 0, 255).astype(np.uint8)
+
+
+def _moved(
+    T: Float64[np.ndarray, "4 4"],
+    motion: Float64[np.ndarray, " 6"] | None,
+    share: Float64[np.ndarray, " rows"],
+) -> Float64[np.ndarray, "_rows 4 4"]:
+    """Return a pose after shares of a motion; one pose for all rows if there is no motion."""
+    if motion is None:
+        return T[None]
+    along = torch.from_numpy(share[:, None] * motion)
+    R = rotation_from_vector(along[:, 3:]) @ torch.tensor(T[:3, :3])
+    moved: np.ndarray = transform(R, along[:, :3] + torch.tensor(T[:3, 3])).numpy()
+    return moved
 
 
 def _blur(camera: Camera, exposure: Exposure, depth: np.ndarray) -> np.ndarray:
@@ -172,12 +197,15 @@ def _rays(camera: Camera, u: np.ndarray, v: np.ndarray) -> Float64[np.ndarray, "
 
 
 def _on_surface(
-    board: TrueBoard, T_camera_board: np.ndarray, rays: np.ndarray
+    board: TrueBoard, T_camera_board: Float64[np.ndarray, "_rows 4 4"], rays: np.ndarray
 ) -> tuple[Float64[np.ndarray, "2 v u"], Float64[np.ndarray, "v u"]]:
-    """Return the points at which rays meet the board, in its frame [m], and their depths [m]; `FAR` if they do not."""
-    R, t = T_camera_board[:3, :3], T_camera_board[:3, 3]
-    origin = -R.T @ t
-    along = [R[0, axis] * rays[0] + R[1, axis] * rays[1] + R[2, axis] for axis in range(3)]
+    """Return the points at which rays meet the board, in its frame [m], and their depths [m]; `FAR` if they do not.
+
+    There is one pose of the board for each row of rays, or one for all.
+    """
+    R, t = T_camera_board[:, :3, :3, None], T_camera_board[:, :3, 3, None]
+    origin = [-(R[:, :, axis] * t).sum(1) for axis in range(3)]
+    along = [R[:, 0, axis] * rays[0] + R[:, 1, axis] * rays[1] + R[:, 2, axis] for axis in range(3)]
     facing = np.copysign(np.maximum(np.abs(along[2]), MIN_COSINE), along[2])
     depth = -origin[2] / facing
     for _ in range(SURFACE_ITERATIONS if board.bow else 0):

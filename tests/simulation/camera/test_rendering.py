@@ -77,3 +77,20 @@ def test_corners_are_detected_where_the_camera_projects_them(bow: float):
     assert_close(off.mean(0), np.zeros(2), atol=0.015)
     flat = CAMERA.project(BOARD.corners @ T[:3, :3].T + T[:3, 3])[0]
     assert np.abs(detected.pixels - flat).max() > 0.5, "the stated board lies elsewhere"
+
+
+def test_rows_of_a_rolling_shutter_show_the_board_at_their_own_time():
+    """A board that moves by 3 mm across the image is sheared: a corner moves by its row's share of the motion."""
+    pytest.importorskip("cv2", reason="opencv-python-headless is not installed")
+    from pisigma.measurement.camera.detection.detected_board import DetectedBoard
+    from pisigma.measurement.camera.detection.detector import detect_checkerboard
+
+    camera, T = Camera("straight", 640, 400, 500.0, 500.0, 319.5, 199.5), pose(0.3)
+    shift = np.array([3e-3, 0, 0, 0, 0, 0])
+    image = render_image(camera, FLAT, T, Exposure(focus=0.3), np.random.default_rng(0), shift)
+    detected = detect_checkerboard(image, BOARD)
+    assert isinstance(detected, DetectedBoard)
+    still = camera.project(BOARD.corners @ T[:3, :3].T + T[:3, 3])[0]
+    moved = 500.0 * 3e-3 / 0.3 * (still[:, 1] / camera.height - 0.5)
+    assert np.abs(moved).max() > 0.5
+    assert_close(detected.pixels - still, np.stack([moved, 0 * moved], 1), atol=0.05)
