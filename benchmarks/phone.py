@@ -120,7 +120,7 @@ def visible(arm: Robot, board: Board, rng: np.random.Generator, count: int) -> T
     """Draw joint values [rad] in which the phone sees the whole board, not too obliquely."""
     chosen = torch.empty(0, arm.dof, dtype=torch.float64)
     while len(chosen) < count:
-        q = torch.from_numpy(rng.uniform(*arm.limits.T, (OTHERS, arm.dof)))
+        q = torch.from_numpy(rng.uniform(arm.limits[:, 0], arm.limits[:, 1], (OTHERS, arm.dof)))
         T = forward_kinematics(arm, q)
         inside = torch.from_numpy(project_corners(PHONE, board, T)[1].all(1))
         middle = T[:, :3, 3] + T[:, :3, :3] @ torch.tensor(board.corners.mean(0))
@@ -158,9 +158,9 @@ def opencv(arm: Arm, board: Board, folder: Path) -> CameraFiles:
     pixels = [at.astype(np.float32) for _, at in found]
     none = np.zeros((3, 3)), np.zeros(5)
     _, K, lens, _, _ = cv2.calibrateCamera(points, pixels, (PHONE.width, PHONE.height), *none)
-    values = (K[0, 0], K[1, 1], K[0, 2], K[1, 2], *lens.ravel()[:4])
+    values = np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], *lens.ravel()[:5]])
     phone, stated = folder / "phone.yaml", folder / "board.yaml"
-    phone.write_text(Camera("phone", PHONE.width, PHONE.height, *map(float, values)).to_yaml())
+    phone.write_text(PHONE.with_intrinsics(values).to_yaml())
     lines = [["image", "corner", "u_px", "v_px", *(f"q{joint + 1}_deg" for joint in range(arm.q.shape[1]))]]
     for image, (numbers, at) in enumerate(found):
         q = [f"{value:.6f}" for value in torch.rad2deg(arm.q[image]).tolist()]
@@ -189,7 +189,9 @@ def drawn(
     rays *= (T[:3, 2] @ T[:3, 3]) / (rays @ T[:3, 2])[:, None]
     on_board = (rays - T[:3, 3]) @ T[:3, :2]
     at = ((on_board + board.square) / DOT + MARGIN - 0.5).astype(np.float32).reshape(height * FINER, -1, 2)
-    fine = cv2.remap(sheet, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=110)
+    fine = cv2.remap(
+        sheet, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=110
+    )
     patch = cv2.resize(fine.astype(np.float32), (int(width), int(height)), interpolation=cv2.INTER_AREA)
     image = np.full((PHONE.height + 2 * height, PHONE.width + 2 * width), 110, dtype=np.float32)
     image[top + height : top + 2 * height, left + width : left + 2 * width] = patch

@@ -16,7 +16,7 @@ from pisigma.workflow.settings.images import IntrinsicsSettings
 if TYPE_CHECKING:
     from pisigma.workflow.images.calibrate_camera import CameraCalibration
 
-Images = Annotated[list[Path], typer.Argument(help="Image files of one camera, or folders of them.")]
+Images = Annotated[list[Path], typer.Argument(help="Image files of one camera, folders of them, or videos.")]
 
 
 @takes_settings

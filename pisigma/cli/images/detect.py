@@ -16,7 +16,10 @@ from pisigma.workflow.settings.images import DetectionSettings
 if TYPE_CHECKING:
     from pisigma.workflow.images.detect import DetectedCorners
 
-Images = Annotated[list[Path] | None, typer.Argument(help="Image files, or folders of them.")]
+Images = Annotated[
+    list[Path] | None,
+    typer.Argument(help="Image files, folders of them, or videos with a stop at every pose."),
+]
 BoardFile = Annotated[Path, typer.Option(help="File of the board in the images (YAML).")]
 CameraFile = Annotated[Path | None, typer.Option(help="File of the camera that took the images (YAML).")]
 Out = Annotated[Path | None, typer.Option(help="Corner file to write (.csv).")]

@@ -347,7 +347,18 @@ class JoinedJoints:
     remarks: tuple[str, ...]
 
 
-def join_joints(names: Sequence[str], path: str | os.PathLike[str], within: float) -> JoinedJoints:
+def names_images(path: str | os.PathLike[str]) -> bool:
+    """Return whether a log of joint values names the images; otherwise it contains times.
+
+    Raises:
+        MeasurementError: the file cannot be read.
+    """
+    return "image" in read_table(path).header
+
+
+def join_joints(
+    names: Sequence[str], path: str | os.PathLike[str], within: float, stops: int = 0
+) -> JoinedJoints:
     """Return the joint values at which every image was taken.
 
     Args:
@@ -355,9 +366,11 @@ def join_joints(names: Sequence[str], path: str | os.PathLike[str], within: floa
         path: CSV file with joint values (`q1_deg` and so on) and a column `image` (with or without extension) or
             `time`; further columns are kept if they are columns of measurement files.
         within: largest difference of time stamps [s].
+        stops: number of images that are numbered stops in a video, which have to be all rows of the file; 0 if there
+            is no video.
 
     Raises:
-        MeasurementError: the file cannot be used, or no image has a partner.
+        MeasurementError: the file cannot be used, no image has a partner, or the number of stops is another one.
     """
     table = read_table(path)
     joints = [name for name in table.header if (column := find_column(name)) and column.joint]
@@ -367,6 +380,14 @@ def join_joints(names: Sequence[str], path: str | os.PathLike[str], within: floa
             expected="joint values (q1_deg and so on) and a column image or time",
             value=", ".join(table.header),
             at=table.header_place,
+        )
+    if by == "point" and stops not in (0, len(table.lines)):
+        raise MeasurementError(
+            "the stops in the video cannot be paired with the joint values",
+            expected=f"{len(table.lines)} stops in the video, one per row",
+            value=stops,
+            at=Place(path),
+            remedy="let the arm rest for a second at every pose and nowhere else, or log joint values with times",
         )
     for name in joints:
         number_column(table, name)

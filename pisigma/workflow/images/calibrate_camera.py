@@ -150,7 +150,7 @@ def calibrate_camera(
     """Calibrate the intrinsics of a camera with images of a board, including standard deviations.
 
     Args:
-        images: image files of one size, or folders of image files.
+        images: image files of one size, folders of image files, or videos in which the board rests at every pose.
         board: file of the board; see `Board.load`.
         settings: see `IntrinsicsSettings`.
         progress: called with the name of every image.

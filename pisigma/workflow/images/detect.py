@@ -13,7 +13,8 @@ from pisigma.measurement.camera.board import Board
 from pisigma.measurement.camera.camera import Camera
 from pisigma.measurement.camera.detection.detected_boards import DetectedBoards, predict_boards
 from pisigma.measurement.camera.detection.detector import detect_boards, image_files
-from pisigma.measurement.foreign.joining import JoinedJoints, join_joints
+from pisigma.measurement.camera.detection.video import is_frame
+from pisigma.measurement.foreign.joining import JoinedJoints, join_joints, names_images
 from pisigma.reporting.result_text import Table
 from pisigma.workflow.settings.images import DetectionSettings
 
@@ -105,7 +106,7 @@ def detect(
     """Detect the corners of a board in images.
 
     Args:
-        images: image files, or folders of them.
+        images: image files, folders of them, or videos of an arm that stops at every pose.
         board: file of the board; see `Board.load`.
         camera: file of the camera; see `Camera.load`.
         joints: CSV file of the joint values of the images; see `join_joints`. None: added later.
@@ -115,7 +116,9 @@ def detect(
     Raises:
         MeasurementError: a file cannot be used, the board is symmetric, or no image shows it.
     """
-    files, of_board, of_camera = image_files(images), Board.load(board), Camera.load(camera)
+    of_board, of_camera = Board.load(board), Camera.load(camera)
+    timed = joints is not None and not names_images(joints)
+    files = image_files(images, settings.video_start if timed else None)
     if of_board.is_symmetric:
         raise MeasurementError(
             f"a checkerboard of {of_board.rows} x {of_board.columns} corners is symmetric under a rotation by 180 "
@@ -124,7 +127,8 @@ def detect(
             at=Place(board),
             remedy="use a board with an odd sum of rows and columns, or a ChArUco board",
         )
-    joined = None if joints is None else join_joints([file.stem for file in files], joints, settings.within)
+    names, stops = [file.stem for file in files], sum(map(is_frame, files))
+    joined = None if joints is None else join_joints(names, joints, settings.within, stops)
     detected = detect_boards(files, of_board, settings.most_blur, progress)
     result = DetectedCorners(
         predict_boards(detected, of_camera, of_board), joined, (of_camera.name, of_board.name)

@@ -22,6 +22,13 @@ from pisigma.measurement.camera.detection.detected_board import (
 )
 from pisigma.measurement.camera.detection.detected_boards import BoardImage
 from pisigma.measurement.camera.detection.markers import detect_apriltags, detect_charuco
+from pisigma.measurement.camera.detection.video import (
+    frame_path,
+    is_frame,
+    is_video,
+    read_frame,
+    still_frames,
+)
 
 MIN_PIECE = 3
 """Smallest number of rows and columns of corners of a piece of a board that is recognised."""
@@ -82,14 +89,26 @@ ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".webp")
 """File name extensions of the images in a folder that are read."""
 
 
-def image_files(paths: Sequence[str | os.PathLike[str]]) -> tuple[Path, ...]:
+def image_files(
+    paths: Sequence[str | os.PathLike[str]], video_start: float | None = None
+) -> tuple[Path, ...]:
     """Return all image files in the given files and folders; the files of a folder are sorted by name.
 
+    A video is a folder of its sharp frames at rest; see `still_frames`.
+
+    Args:
+        paths: image files, videos, and folders of image files.
+        video_start: time of the first frame of a video in another clock [s], if frames are named by their time in
+            this clock; None: they are named by the numbers of the stops, from 1.
+
     Raises:
-        MeasurementError: there are no images, or two images have the same name.
+        MeasurementError: there are no images, two images have the same name, or a video has no frame at rest.
     """
     files = list[Path]()
     for path in map(Path, paths):
+        if is_video(path):
+            files += _frames(path, video_start)
+            continue
         inside = sorted(path.iterdir()) if path.is_dir() else ()
         files += [one for one in inside if one.suffix.lower() in ENDINGS] if path.is_dir() else [path]
     if not files:
@@ -108,6 +127,16 @@ def image_files(paths: Sequence[str | os.PathLike[str]]) -> tuple[Path, ...]:
                 remedy="give every image a different name",
             )
     return tuple(files)
+
+
+def _frames(video: Path, start: float | None) -> list[Path]:
+    """Return the frames at rest of a video; see `image_files`."""
+    frames = still_frames(video)
+    names = (
+        f"{number:04d}" if start is None else f"{start + one.time:.3f}"
+        for number, one in enumerate(frames, 1)
+    )
+    return [frame_path(video, one, name) for one, name in zip(frames, names, strict=True)]
 
 
 def detect_boards(
@@ -168,13 +197,15 @@ def detect_board(path: Path, board: Board, max_blur: float) -> BoardImage:
 
 
 def read_image(path: str | os.PathLike[str]) -> Image:
-    """Return the gray values of an image file in any format that OpenCV reads.
+    """Return the gray values of an image file in any format that OpenCV reads, or of a frame of a video.
 
     The orientation in its metadata is ignored, because the intrinsics are those of the sensor.
 
     Raises:
         MeasurementError: the file cannot be read or is not an image.
     """
+    if is_frame(Path(path)):
+        return read_frame(Path(path))
     content = np.frombuffer(read_input(path, MeasurementError), dtype=np.uint8)
     try:
         image = cv2.imdecode(content, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
