@@ -14,7 +14,7 @@ from pisigma.measurement.camera.camera import Camera
 from pisigma.measurement.camera.detection.detected_boards import DetectedBoards, predict_boards
 from pisigma.measurement.camera.detection.detector import detect_boards, image_files
 from pisigma.measurement.camera.detection.video import is_frame
-from pisigma.measurement.foreign.joining import JoinedJoints, join_joints, names_images
+from pisigma.measurement.foreign.image_joints import JoinedJoints, join_joints, names_images
 from pisigma.reporting.result_text import Table
 from pisigma.workflow.settings.images import DetectionSettings
 

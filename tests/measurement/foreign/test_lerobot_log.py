@@ -8,7 +8,7 @@ from testing.lerobot_arm import DATA_SETS, MOTORS, RANGES, SO101
 from testing.refusals import refused
 
 from pisigma.files.errors import MeasurementError
-from pisigma.measurement.foreign.joining import join_joints
+from pisigma.measurement.foreign.image_joints import join_joints
 from pisigma.measurement.foreign.lerobot_dataset import joint_motors
 from pisigma.measurement.foreign.lerobot_log import read_joint_log
 from pisigma.measurement.foreign.lerobot_motors import check_values, motors_text

@@ -8,7 +8,7 @@ from testing.closeness import assert_close
 from testing.refusals import refused
 
 from pisigma.files.errors import MeasurementError
-from pisigma.measurement.foreign.joining import join_joints
+from pisigma.measurement.foreign.image_joints import join_joints
 
 cv2 = pytest.importorskip("cv2", reason="opencv-python-headless is not installed")
 

@@ -6,7 +6,7 @@ import pytest
 from testing.refusals import refused
 
 from pisigma.files.errors import MeasurementError
-from pisigma.measurement.foreign.joining import join_joints
+from pisigma.measurement.foreign.image_joints import join_joints
 
 
 def log(folder: Path, text: str) -> Path:
