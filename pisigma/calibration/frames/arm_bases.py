@@ -23,7 +23,7 @@ from pisigma.robot.se3 import (
 
 CLOSURE = 1e-9
 """Standard deviation [m or rad] to which frames and points that two arms share are the same, for rounding errors."""
-FALSE_ALARMS = 1e-3
+FALSE_ALARMS = 1e-4
 """Probability that arms without faults are said to disagree."""
 MAX_ITERATIONS, CONVERGENCE_TOLERANCE = 20, 1e-12
 MIN_POINTS = 3
