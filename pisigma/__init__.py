@@ -30,6 +30,7 @@ _NAMES = {
     "measurement.sensors.registry": "Measurements register_sensor",
     "workflow.cell.cell": "Cell",
     "workflow.arms.calibrate_arms": "Arm ArmsCalibration calibrate_arms",
+    "workflow.arms.find_moved_arms": "ArmsMovement find_moved_arms",
     "workflow.calibrate": "Calibration calibrate",
     "workflow.frames.calibrate_frame": "FrameCalibration calibrate_frame",
     "workflow.compare": "ComparedModels compare",

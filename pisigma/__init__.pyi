@@ -23,6 +23,8 @@ from pisigma.robot.kinematics.status import Status as Status
 from pisigma.workflow.arms.calibrate_arms import Arm as Arm
 from pisigma.workflow.arms.calibrate_arms import ArmsCalibration as ArmsCalibration
 from pisigma.workflow.arms.calibrate_arms import calibrate_arms as calibrate_arms
+from pisigma.workflow.arms.find_moved_arms import ArmsMovement as ArmsMovement
+from pisigma.workflow.arms.find_moved_arms import find_moved_arms as find_moved_arms
 from pisigma.workflow.calibrate import Calibration as Calibration
 from pisigma.workflow.calibrate import calibrate as calibrate
 from pisigma.workflow.cell.cell import Cell as Cell

@@ -35,21 +35,27 @@ class FittedFrames:
     Attributes:
         fit: the fit.
         model: model with the fitted frames.
-        arm_variance: variance of every fitted coordinate by the uncertainty of the arm [m² or rad²].
+        arm_root: root of the covariance of the fitted coordinates by the uncertainty of the arm [m and rad], in the
+            directions of the root of the model whose arm was used.
         causes: possible causes of the residuals of a hand-eye calibration; see `misfit_causes`.
     """
 
     fit: FrameFit
     model: CalibratedModel
-    arm_variance: tuple[float, ...]
+    arm_root: Float64[Tensor, "frames directions"]
     causes: tuple[Cause, ...]
+
+    @property
+    def arm_variance(self) -> tuple[float, ...]:
+        """Variance of every fitted coordinate by the uncertainty of the arm [m² or rad²]."""
+        return tuple(self.arm_root.square().sum(1).tolist())
 
 
 def frames_of_robot(robot: Robot, rows: Measurements, only: FrameChoice) -> FittedFrames:
     """Fit frames with the arm of a robot as drawn; for the errors see `fit_frames`."""
     fit = fit_frames(robot, rows, only)
     model = model_of_calibration(robot.name, robot, fit.solved.result(), rows)
-    return FittedFrames(fit, replace(model, kind=KIND), (0.0,) * len(fit.frames), misfit_causes(fit))
+    return FittedFrames(fit, replace(model, kind=KIND), torch.zeros(len(fit.frames), 0), misfit_causes(fit))
 
 
 def frames_of_model(model: CalibratedModel, rows: Measurements, only: FrameChoice) -> FittedFrames:
@@ -89,7 +95,7 @@ def frames_of_model(model: CalibratedModel, rows: Measurements, only: FrameChoic
     return FittedFrames(
         fit,
         replace(_with_frames(model, fit, rows), uncertainty=uncertainty),
-        tuple(arm_root.square().sum(1).tolist()),
+        arm_root,
         misfit_causes(fit, known),
     )
 

@@ -102,3 +102,23 @@ def posteriors(seed: int, sensor: str) -> tuple[ArmPosterior, ArmPosterior]:
     """Return the posteriors of both arms."""
     left, right = (posterior(name, own_fit(k, seed, sensor)) for k, name in enumerate(("left", "right")))
     return left, right
+
+
+def rows_now(number: int, seed: int, bump: torch.Tensor, body: str, rows: int = 8) -> Measurements:
+    """Return new positions of an arm in the frame "hall", after a motion in the base of the first arm.
+
+    Args:
+        number: the arm.
+        seed: seed of the arms, as in `true_arm`.
+        bump: the motion, a transform.
+        body: what moved: "left", "right" or "hall".
+        rows: number of positions.
+    """
+    rng = np.random.default_rng([seed, number, 3])
+    base, hall = pose_of(BASES[number]), pose_of(FRAMES["hall"])
+    base = bump @ base if body == ("left", "right")[number] else base
+    hall = bump @ hall if body == "hall" else hall
+    moved = true_arm(number, seed).with_geometry(base=xyzrpy_from_transform(invert(hall) @ base).numpy())
+    q = torch.from_numpy(rng.uniform(-2.2, 2.2, (rows, 6)))
+    position = forward_kinematics(moved, q)[:, :3, 3] + torch.from_numpy(rng.normal(0, NOISE, (rows, 3)))
+    return Measurements(q=q, position=position, frame=("hall",) * rows)

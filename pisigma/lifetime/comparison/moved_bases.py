@@ -1,0 +1,220 @@
+"""Which base of several arms, or which frame that they share, was moved: their poses now against those of before."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from jaxtyping import Float64
+from scipy.stats import f as fisher
+from torch import Tensor
+
+from pisigma.calibration.frames.shared_objects import ArmPosterior
+from pisigma.files.errors import IdentificationError
+from pisigma.model.frame_model import FittedFrames
+from pisigma.robot.se3 import invert, rotation_from_vector, rotation_vector, skew, transform_from_xyzrpy
+
+FALSE_ALARMS = 1e-3
+"""Probability that arms and frames that did not move are said to have moved."""
+CERTAIN = 5.0
+"""Difference of log likelihoods above which one moved body is a better explanation than another one."""
+
+
+@dataclass(frozen=True, eq=False)
+class ArmBefore:
+    """An arm before and now.
+
+    Attributes:
+        posterior: posterior of its model.
+        T_first_base: its base in the base of the first arm, at the time of its model.
+        now: its bases now, fitted with the arm of the model.
+    """
+
+    posterior: ArmPosterior
+    T_first_base: Float64[Tensor, "4 4"]
+    now: FittedFrames
+
+    @property
+    def frames(self) -> tuple[str, ...]:
+        """Frames in which the base was measured before and now."""
+        return tuple(
+            name for name in self.now.fit.solved.geometry.bases if name in self.posterior.space.frames
+        )
+
+    @property
+    def freedom(self) -> float:
+        """Number of values from which the noise now was estimated, minus the parameters fitted to them."""
+        return sum(one.values - one.used for one in self.now.fit.solved.result().noise)
+
+    def displacement(self, frame: str) -> tuple[Float64[Tensor, " 6"], Float64[Tensor, "6 directions"]]:
+        """Return the displacement of the base relative to a frame, with a root of its covariance.
+
+        Returns:
+            Translation [m] and rotation vector [rad] of the rigid motion that moves the base before onto the base now,
+            in the coordinates of the first arm's base before; and their derivatives along the directions of the root
+            of the model, followed by those of the noise now.
+        """
+        before = self.posterior.values[list(self.posterior.base_rows(frame))]
+        now = torch.from_numpy(self.now.fit.solved.geometry.bases[frame].copy())
+        T_first_frame = self.T_first_base @ invert(transform_from_xyzrpy(before))
+
+        def motion(bases: Tensor) -> Tensor:
+            T_now, T_before = transform_from_xyzrpy(bases)
+            D = T_first_frame @ T_now @ invert(T_before) @ invert(T_first_frame)
+            return torch.cat([D[:3, 3], rotation_vector(D[:3, :3])])
+
+        both = torch.stack([now, before])
+        J = torch.func.jacrev(motion)(both)
+        fit = self.now.fit
+        names = [one.name for one in fit.parameters]
+        own = [k for k, one in enumerate(fit.parameters) if one.owner == frame and one.group == "base"]
+        assert len(own) == 6, names
+        arm = J[:, 0] @ self.now.arm_root[own]
+        arm = arm + J[:, 1] @ self.posterior.root[list(self.posterior.base_rows(frame))]
+        noise = J[:, 0] @ fit.solved.root[[fit.frames[k] for k in own]]
+        return motion(both), torch.cat([arm, noise], 1)
+
+
+@dataclass(frozen=True, eq=False)
+class MovedBody:
+    """An arm or a frame that may have moved.
+
+    Attributes:
+        kind: "arm" (its base) or "frame".
+        name: its name.
+        shift: shift of its origin along the axes of the first arm's base [m].
+        rotation: rotation about these axes [rad].
+        covariance: covariance of both [m and rad].
+        log_likelihood: log likelihood if it alone moved, relative to none having moved.
+    """
+
+    kind: str
+    name: str
+    shift: Float64[Tensor, " 3"]
+    rotation: Float64[Tensor, " 3"]
+    covariance: Float64[Tensor, "6 6"]
+    log_likelihood: float
+
+
+@dataclass(frozen=True, eq=False)
+class MovedBases:
+    """What moved between the calibration of arms and new rows.
+
+    Attributes:
+        probability: probability of differences this large if nothing moved.
+        bodies: arms and frames, the best explanation first; each as if it alone had moved.
+        is_one_body: whether the motion of the first one explains the differences; otherwise more than one moved.
+    """
+
+    probability: float
+    bodies: tuple[MovedBody, ...]
+    is_one_body: bool
+
+    @cached_property
+    def named(self) -> tuple[MovedBody, ...]:
+        """The body whose motion explains the differences best; several if they cannot be distinguished, or none."""
+        if self.probability >= FALSE_ALARMS:
+            return ()
+        best = self.bodies[0].log_likelihood
+        return tuple(one for one in self.bodies if one.log_likelihood > best - CERTAIN)
+
+
+def find_moved_bases(arms: Sequence[ArmBefore]) -> MovedBases:
+    """Find the arm's base or the frame that was moved since the arms were calibrated.
+
+    The bases now are fitted with the arms as calibrated, so that errors of an arm, which shift its base before and now
+    alike, cancel; this is contained in the covariance. Under every hypothesis, one body moved by an unknown rigid
+    motion. The noise is estimated from few rows, so differences are compared with an F distribution with its degrees of
+    freedom.
+
+    Args:
+        arms: the arms, each measured now in one or more frames of before.
+
+    Raises:
+        IdentificationError: an arm was not measured in a frame of before.
+    """
+    owners, motions, roots = [], [], []
+    for number, arm in enumerate(arms):
+        if not arm.frames:
+            raise IdentificationError(
+                expected=f"rows of arm '{arm.posterior.name}' in a frame of its calibration",
+                value=", ".join(arm.now.fit.solved.geometry.bases),
+                remedy="use the same names in the column 'frame'",
+            )
+        for frame in arm.frames:
+            motion, root = arm.displacement(frame)
+            owners.append((number, frame))
+            motions.append(motion)
+            roots.append(root)
+    covariance = _joint_covariance(owners, roots)
+    y = torch.cat(motions)
+    L = torch.linalg.cholesky(covariance)
+    white = torch.linalg.solve_triangular(L, y[:, None], upper=False)[:, 0]
+    freedom = min(arm.freedom for arm in arms)
+    square = float(white.square().sum())
+    probability = float(fisher.sf(square / len(y), len(y), freedom))
+    bodies = [
+        _if_moved(arms, owners, body, L, white)
+        for body in dict.fromkeys(
+            [("arm", arm.posterior.name) for arm in arms] + [("frame", frame) for _, frame in owners]
+        )
+    ]
+    bodies.sort(key=lambda one: -one.log_likelihood)
+    rest, count = square - 2 * bodies[0].log_likelihood, len(y) - 6
+    is_one = count == 0 or float(fisher.sf(rest / count, count, freedom)) >= FALSE_ALARMS
+    return MovedBases(probability, tuple(bodies), is_one)
+
+
+def _joint_covariance(
+    owners: Sequence[tuple[int, str]], roots: Sequence[Float64[Tensor, "6 directions"]]
+) -> Float64[Tensor, "motions motions"]:
+    """Return the covariance of all motions; those of one arm have directions in common."""
+    covariance = torch.zeros(6 * len(owners), 6 * len(owners), dtype=torch.float64)
+    for i, (one, _) in enumerate(owners):
+        for k, (other, _) in enumerate(owners):
+            if one == other:
+                covariance[6 * i : 6 * i + 6, 6 * k : 6 * k + 6] = roots[i] @ roots[k].mT
+    return covariance
+
+
+def _if_moved(
+    arms: Sequence[ArmBefore],
+    owners: Sequence[tuple[int, str]],
+    body: tuple[str, str],
+    L: Float64[Tensor, "motions motions"],
+    white: Float64[Tensor, " motions"],
+) -> MovedBody:
+    """Return the motion of a body if it alone moved: of a frame, the arms see the opposite motion."""
+    kind, name = body
+    signs = [
+        (1.0 if arms[number].posterior.name == name else 0.0)
+        if kind == "arm"
+        else (-1.0 if frame == name else 0.0)
+        for number, frame in owners
+    ]
+    eye = torch.eye(6, dtype=torch.float64)
+    G = torch.linalg.solve_triangular(L, torch.cat([sign * eye for sign in signs]), upper=False)
+    Q, R = torch.linalg.qr(G)
+    explained = Q.mT @ white
+    inverse = torch.linalg.inv(R)
+    motion = inverse @ explained
+    origin = _origin(arms, owners, body)
+    turn = rotation_from_vector(motion[3:])
+    J = eye.clone()
+    J[:3, 3:] = -skew(origin)
+    shift = turn @ origin + motion[:3] - origin
+    covariance = J @ inverse @ inverse.mT @ J.mT
+    return MovedBody(kind, name, shift, motion[3:], covariance, float(explained.square().sum()) / 2)
+
+
+def _origin(
+    arms: Sequence[ArmBefore], owners: Sequence[tuple[int, str]], body: tuple[str, str]
+) -> Float64[Tensor, " 3"]:
+    """Return the origin of an arm's base or of a frame in the base of the first arm [m]."""
+    kind, name = body
+    if kind == "arm":
+        arm = next(arm for arm in arms if arm.posterior.name == name)
+        return arm.T_first_base[:3, 3]
+    arm = next(arms[number] for number, frame in owners if frame == name)
+    before = arm.posterior.values[list(arm.posterior.base_rows(name))]
+    return (arm.T_first_base @ invert(transform_from_xyzrpy(before)))[:3, 3]
