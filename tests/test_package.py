@@ -47,6 +47,8 @@ ROOMS = (
 PACKAGE = Path(pisigma.__file__).parent
 MODULES = sorted(PACKAGE.rglob("*.py"))
 TESTS = Path(__file__).parent
+MAX_WHEEL = 2 * 2**20
+"""Largest size of the wheel [byte]."""
 MAX_LINES, MAX_FILES = 400, 20
 """Maximum length of a file, and number of files in a folder."""
 
@@ -259,7 +261,8 @@ def wheel(repository, tmp_path_factory) -> Path:
     return found
 
 
-def test_the_wheel_contains_only_the_package(wheel):
+def test_the_wheel_contains_only_the_package_and_is_small(wheel):
+    assert wheel.stat().st_size <= MAX_WHEEL
     names = zipfile.ZipFile(wheel).namelist()
     assert {name.split("/")[0] for name in names} == {"pisigma", f"pisigma-{pisigma.__version__}.dist-info"}
     shipped = {name for name in names if name.startswith("pisigma/")}

@@ -8,17 +8,17 @@ loads the code compiles and vectorises it for its processor.
 import dataclasses
 import hashlib
 import json
+import lzma
 import re
 import sys
-import zlib
 from pathlib import Path
 from typing import Any
 
 from pisigma.robot.kernels.forms import KernelForms
 
-FILE = Path(__file__).parent / "kernels.ll.zlib"
+FILE = Path(__file__).parent / "kernels.ll.xz"
 """One line of JSON and the compressed code; `python -m pisigma.joint_correction.registry` writes it."""
-OBJECT = Path(__file__).parent / "kernels.x86-64-v3.o.zlib"
+OBJECT = Path(__file__).parent / "kernels.x86-64-v3.o.xz"
 """The code as machine code for Linux on x86-64-v3, in the same form and written by the same command."""
 
 _PYTHON = frozenset(
@@ -78,7 +78,7 @@ def write_object(code: bytes, **made_with: str) -> None:
 
 def _write(file: Path, code: bytes, **stated: Any) -> None:
     header = json.dumps({"sources": source_hash(), **stated}, sort_keys=True)
-    file.write_bytes(header.encode() + b"\n" + zlib.compress(code, 9))
+    file.write_bytes(header.encode() + b"\n" + lzma.compress(code, preset=9 | lzma.PRESET_EXTREME))
 
 
 def ready_forms() -> KernelForms | None:
@@ -91,8 +91,8 @@ def read_ready() -> str | None:
     """Return the stored intermediate code; None if it is missing or damaged, or if the sources have changed."""
     header, code = _content(FILE)
     try:
-        return None if header is None else zlib.decompress(code).decode()
-    except (ValueError, zlib.error):
+        return None if header is None else lzma.decompress(code).decode()
+    except (ValueError, EOFError, lzma.LZMAError):
         return None
 
 
@@ -102,8 +102,8 @@ def read_object() -> bytes | None:
     try:
         if header is None or header["intermediate_sha256"] != hashlib.sha256(FILE.read_bytes()).hexdigest():
             return None
-        return zlib.decompress(code)
-    except (KeyError, OSError, zlib.error):
+        return lzma.decompress(code)
+    except (KeyError, OSError, EOFError, lzma.LZMAError):
         return None
 
 

@@ -25,7 +25,7 @@ def test_the_intermediate_code_is_that_of_the_sources():
 def test_the_stored_machine_code_is_that_of_the_intermediate_code(tmp_path, monkeypatch):
     assert build.read_object() is not None, "run python -m pisigma.joint_correction.registry"
     whole = build.OBJECT.read_bytes()
-    monkeypatch.setattr(build, "OBJECT", tmp_path / "kernels.o.zlib")
+    monkeypatch.setattr(build, "OBJECT", tmp_path / "kernels.o.xz")
     for wrong in (whole[:-3], b"", whole.replace(b'_sha256": "', b'_sha256": "0')):
         build.OBJECT.write_bytes(wrong)
         assert build.read_object() is None
@@ -64,7 +64,7 @@ def test_the_hash_covers_every_kernel_and_no_comment(tmp_path, monkeypatch):
 
 
 def test_code_of_other_sources_or_damaged_code_is_not_used(tmp_path, monkeypatch):
-    monkeypatch.setattr(build, "FILE", tmp_path / "kernels.ll.zlib")
+    monkeypatch.setattr(build, "FILE", tmp_path / "kernels.ll.xz")
     assert build.read_ready() is None
     build.write_ready("define", KernelForms(("series",), ("scara",)), numba="1")
     assert (build.read_ready(), build.ready_forms()) == ("define", KernelForms(("series",), ("scara",)))
