@@ -1,0 +1,142 @@
+"""Run the methods on the folds of a series, one process a fit, and compare the predictions with the held-out rows."""
+
+import hashlib
+import json
+import os
+import signal
+import subprocess
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from shared_benchmark.public_series import Series
+from shared_benchmark.rows import Method, Prediction, Rows, Task
+from shared_benchmark.scores import RowErrors, errors_between_sockets, row_errors
+from shared_benchmark.series import series_of
+from shared_benchmark.splits import SEED, Fold, folds_of
+
+LIMIT_S = 300
+"""Largest time of the processor for a fit [s], with one thread."""
+PATIENCE = 6
+"""Factor on the limit after which a fit that waits for other programs is ended."""
+REPOSITORY = Path(__file__).parents[2]
+PACKAGE = Path(__file__).parent
+
+Fit = dict[str, Any]
+"""What is stored of a fit, by column."""
+
+
+def code_hash(method: Method) -> str:
+    """Return the SHA-256 of the files that decide what a method predicts."""
+    files = {PACKAGE / "rows.py", *_with_imports(PACKAGE / "methods" / f"{method.name}.py")}
+    if "pisigma" in method.packages:
+        files |= set((REPOSITORY / "pisigma").rglob("*.py"))
+    digest = hashlib.sha256()
+    for path in sorted(files):
+        digest.update(path.relative_to(REPOSITORY).as_posix().encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()
+
+
+def _with_imports(path: Path) -> set[Path]:
+    """Return a file of `methods/` and the shared files that it imports."""
+    text = path.read_text(encoding="utf-8")
+    shared = [other for other in path.parent.glob("_[a-z]*.py") if f"methods.{other.stem} import" in text]
+    return {path}.union(*map(_with_imports, shared))
+
+
+def predict(task: Task, method: str, python: str) -> tuple[Fit, Prediction | None]:
+    """Fit and predict in a new process; a crash or an overrun is a status."""
+    paths = [str(REPOSITORY / "benchmarks"), str(REPOSITORY)]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": "1"}
+    environment |= {"OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+    with tempfile.TemporaryDirectory() as folder:
+        given, out = Path(folder) / "task.npz", Path(folder) / "prediction.npz"
+        task.save(given)
+        command = [python, str(PACKAGE / "worker.py"), method, str(given), str(out), str(LIMIT_S)]
+        try:
+            done = subprocess.run(
+                command,
+                env=environment,
+                capture_output=True,
+                text=True,
+                check=False,
+                timeout=PATIENCE * LIMIT_S,
+            )
+        except subprocess.TimeoutExpired:
+            return {"status": f"over {LIMIT_S} s"}, None
+        if done.returncode in (-signal.SIGXCPU, -signal.SIGKILL):
+            return {"status": f"over {LIMIT_S} s"}, None
+        if done.returncode:
+            last = (done.stderr.strip().splitlines() or [""])[-1]
+            return {"status": f"failed: exit status {done.returncode}: {last[:100]}"}, None
+        fit: Fit = json.loads(done.stdout.strip().splitlines()[-1])
+        fit["versions"] = json.dumps(fit.get("versions", {}))
+        if fit["status"] != "done":
+            return fit, None
+        with np.load(out) as stored:
+            return fit, Prediction(stored["T"], stored["sigma"])
+
+
+def fits_of(
+    series: Series, split: str, method: Method, python: str, folds: int | None = None
+) -> Iterator[tuple[Fit, RowErrors | None]]:
+    """Run a method on the folds of a split.
+
+    After an overrun the other folds of the split are not tried.
+
+    Args:
+        series: the series.
+        split: name of the split.
+        method: the method.
+        python: its Python.
+        folds: number of folds to run, from the first; None for all.
+    """
+    key = {"series": series.name, "split": split, "method": method.name}
+    hashes = {
+        "data_sha256": series.sha256,
+        "split_sha256": series.splits[split],
+        "code_sha256": code_hash(method),
+        "seed": SEED,
+    }
+    overrun = False
+    for number, fold in enumerate(folds_of(series, split)[:folds]):
+        base = {**key, "fold": number, "train_rows": len(fold.train), **hashes}
+        if series.measured not in method.measured:
+            yield {**base, "status": f"does not use rows of the kind '{series.measured}'"}, None
+            return
+        if overrun:
+            yield {**base, "status": "not tried after an overrun"}, None
+            continue
+        task, test, test_series = make_task(series, split, fold)
+        fit, prediction = predict(task, method.name, python)
+        overrun = fit["status"].startswith("over ")
+        if prediction is None:
+            yield {**base, **fit}, None
+            continue
+        numbers = np.arange(len(test.q)) if split == "session" else fold.test
+        errors = row_errors(test_series, prediction, test, numbers, split == "session")
+        distance = errors_between_sockets(prediction, test, test_series.known_distances(test))
+        yield (
+            {**base, **fit, "distance_mm": distance},
+            errors,
+        )
+
+
+def make_task(series: Series, split: str, fold: Fold) -> tuple[Task, Rows, Series]:
+    """Return what a method gets, the held-out rows with their measurements, and the series of these."""
+    rows, arm = series.rows(), series.arm
+    train, test, test_series = rows.select(fold.train), rows.select(fold.test), series
+    if split == "session":
+        assert series.other_session is not None
+        test_series = series_of(series.other_session)
+        test = test_series.rows()
+    direction = np.array([0.0 if row.type == "fixed" else row.direction for row in arm.rows])
+    known = series.known_distances(train)
+    return (
+        Task(series.name, arm.dh, direction, train, test.without_measurements(), known, SEED),
+        test,
+        test_series,
+    )

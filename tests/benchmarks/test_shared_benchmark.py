@@ -1,0 +1,141 @@
+"""The benchmark of calibration: fixed splits, methods in their own processes, stored results and the page."""
+
+import dataclasses
+import importlib
+import sys
+from types import ModuleType
+
+import numpy as np
+import pytest
+from testing.closeness import assert_close
+from testing.refusals import refused
+
+from pisigma.files.errors import MeasurementError
+
+RNG = np.random.default_rng(0)
+
+
+@pytest.fixture(scope="module")
+def module(repository):
+    """Function that imports a module of the benchmark, which is not part of the package."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(repository / "benchmarks"))
+        yield lambda name: importlib.import_module(f"shared_benchmark.{name}")
+        for name in [name for name in sys.modules if name.partition(".")[0] == "shared_benchmark"]:
+            del sys.modules[name]
+
+
+@pytest.fixture(scope="module")
+def arm_task(module):
+    """A UR5 with errors, whose positions are exact: (task, errors of the held-out rows under a prediction)."""
+    rows, dh = module("rows"), module("methods._dh")
+    nominal = module("series").series_of("ur5_grid").arm.dh
+    direction = np.ones(6)
+    true = nominal + 1e-3 * np.array([1.0, 1.0, 1.0, 1.0, 1.0]) * RNG.standard_normal(nominal.shape)
+    frames = dh.Frames(np.eye(4), {"": np.array([0.03, -0.02, 0.1])}, np.eye(3))
+    q, target = RNG.uniform(-3, 3, (80, 6)), np.full(80, "")
+    position = dh.Geometry(true, direction, frames).poses(rows.Rows(q, target))[:, :3, 3]
+    every = rows.Rows(q, target, position)
+    train, test = every.select(np.arange(60)), every.select(np.arange(60, 80))
+    task = rows.Task("ur5_grid", nominal, direction, train, test.without_measurements(), {}, 0)
+    return task, lambda prediction: np.linalg.norm(prediction.T[:, :3, 3] - test.position, axis=1).max()
+
+
+def test_splits_are_those_of_the_benchmark_and_hold_configurations_out(module, shared_data):
+    """Row numbers have the published hashes, and no configuration is on both sides."""
+    splits, scores = module("splits"), module("scores")
+    for name in module("series").NAMES:
+        series = module("series").series_of(name)
+        assert series.missing() is None
+        group = scores.groups_of(series)
+        for split in series.splits:
+            for fold in splits.folds_of(series, split):
+                assert len(fold.train)
+                assert not set(group[fold.train]) & set(group[fold.test])
+    wrong = dataclasses.replace(series, splits=dict.fromkeys(series.splits, "0"))
+    with refused(MeasurementError):
+        splits.folds_of(wrong, split)
+
+
+def test_a_missing_or_changed_file_is_named(module):
+    series = module("series").series_of("ur5_grid")
+    assert series.url in dataclasses.replace(series, file="nowhere.csv").missing()
+    with refused(MeasurementError):
+        dataclasses.replace(series, file="nowhere.csv").measurements  # noqa: B018
+
+
+def test_least_squares_finds_an_exact_arm(module, arm_task):
+    """The fitted DH parameters predict other poses exactly, the nominal ones do not; a stored task is the same."""
+    task, error = arm_task
+    assert error(module("methods.scipy_dh").fit(task)(task.test)) < 1e-6
+    assert error(module("methods.nominal").fit(task)(task.test)) > 1e-3
+
+
+def test_a_fit_runs_in_its_own_process_and_a_crash_is_a_status(module, arm_task, monkeypatch):
+    task, error = arm_task
+    fits = module("fits")
+    fit, prediction = fits.predict(task, "nominal", sys.executable)
+    assert fit["status"] == "done"
+    assert fit["memory_mb"] > 1
+    assert_close(error(prediction), error(module("methods.nominal").fit(task)(task.test)), rtol=1e-9)
+    assert fits.predict(task, "no_such_method", sys.executable)[0]["status"].startswith(
+        "failed: exit status 1"
+    )
+    few = dataclasses.replace(task, train=task.train.select(np.arange(1)))
+    assert fits.predict(few, "geometric", sys.executable)[0]["status"].startswith("failed: ")
+    monkeypatch.setattr(fits, "LIMIT_S", 1)
+    assert fits.predict(task, "hybrid", sys.executable)[0]["status"] == "over 1 s"
+
+
+def make_errors(scores: ModuleType, scale: float) -> object:
+    error = scale * np.random.default_rng(1).standard_normal((400, 3))
+    return scores.RowErrors(
+        np.arange(400), np.arange(400) // 2, error, np.full((400, 3), scale), np.zeros(400)
+    )
+
+
+def test_scores(module):
+    """The ratio of proportional errors has no uncertainty, and normal errors are covered as stated."""
+    scores = module("scores")
+    one, two = make_errors(scores, 1.0), make_errors(scores, 2.0)
+    assert_close(scores.ratio_interval(two, one), [2.0, 2.0], rtol=1e-12)
+    assert_close(two.rms / one.rms, 2.0, rtol=1e-12)
+    assert_close([one.coverage(0.9), one.coverage(0.95)], [0.9, 0.95], atol=0.02)
+
+
+def test_other_rows_of_a_socket_place_a_row(module):
+    """Two rows of a socket are wrong by their difference, whatever the frame; the distance adds the scale."""
+    rows, scores = module("rows"), module("scores")
+    socket = np.array(["a/0", "a/0", "a/1"])
+    T = np.broadcast_to(np.eye(4), (3, 4, 4)).copy()
+    T[:, 0, 3] = 0.0, 0.002, 0.051
+    held_out = rows.Rows(np.zeros((3, 6)), np.full(3, ""), socket=socket)
+    assert_close(scores.from_other_rows(T[:, :3, 3], held_out)[:, 0], [0.002, -0.002, 0.0], atol=1e-12)
+    distance = scores.errors_between_sockets(rows.Prediction(T), held_out, {("a/0", "a/1"): 0.05})
+    assert_close(distance, 0.0, atol=1e-9)
+
+
+def test_results_of_a_split_replace_those_before(module, tmp_path):
+    store, scores = module("store"), module("scores")
+    fit = {
+        "series": "s",
+        "split": "x",
+        "fold": 0,
+        "status": "done",
+        "train_rows": 3,
+        "seconds": 1.0,
+        "memory_mb": 1.0,
+    }
+    for method, scale in (("b", 1.0), ("a", 1.0), ("a", 2.0)):
+        store.replace(tmp_path, store.tables_of([({**fit, "method": method}, make_errors(scores, scale))]))
+    fits, rows = store.read(tmp_path)
+    assert fits["method"].to_pylist() == ["a", "b"]
+    for method, scale in (("a", 2.0), ("b", 1.0)):
+        found = store.errors_of(rows, "s", "x", method)
+        assert_close(found.rms, make_errors(scores, scale).rms, rtol=1e-6)
+        assert found.group.tolist() == (np.arange(400) // 2).tolist()
+
+
+def test_the_page_is_made_from_the_stored_results(module):
+    page, store = module("page"), module("store")
+    assert page.PAGE.read_text(encoding="utf-8") == page.page_of(page.Results(*store.read(store.RESULTS)))
