@@ -8,11 +8,12 @@ from gate.agreement import disagreements
 from gate.commands import COMMANDS
 from gate.table import MISTAKES, MOVES, Mistake, filtered_rows
 from testing.aged import original_model
+from testing.hybrid import few_choices, few_robots
 
 from pisigma.validation.checks import check as row_check
 from pisigma.validation.gate import check_rows
 
-pytestmark = pytest.mark.usefixtures("without_type_checker")
+pytestmark = pytest.mark.usefixtures("without_type_checker", "quick", "blank_pictures")
 
 EVERYWHERE = (
     "metres named mm",
@@ -22,6 +23,12 @@ EVERYWHERE = (
     "lengths x 1.001",
 )
 """Mistakes of five kinds: a unit, mixed rows, a wrong scale, and others that siblings could judge apart."""
+
+
+@pytest.fixture(scope="module")
+def quick():
+    with few_choices():
+        yield
 
 
 @pytest.mark.parametrize("mistake", MISTAKES, ids=lambda one: one.name)
@@ -54,7 +61,8 @@ def test_wrong_rows_are_named():
 @pytest.mark.parametrize("name", EVERYWHERE)
 def test_commands_agree(name, tmp_path):
     (mistake,) = (one for one in MISTAKES if one.name == name)
-    assert disagreements(mistake, tmp_path) == []
+    with few_robots():
+        assert disagreements(mistake, tmp_path) == []
 
 
 def test_every_command_accepts_right_rows(tmp_path):
