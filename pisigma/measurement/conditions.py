@@ -112,13 +112,12 @@ def motions_between_rows(
 ) -> tuple[Float64[np.ndarray, "rows dof"], Float64[np.ndarray, "rows dof"]]:
     """Compute the motions [rad or m] from the previous row, and from the next row back.
 
-    They are NaN if they are not known: at the ends of a file, and next to rows of the file that were left out.
+    They are NaN if they are not known: at the ends of a file, and next to lines of the file without a row, because a
+    row that was left out or not selected may have been measured there.
     """
     q, order = measurements.q.cpu().numpy(), order_of_rows(measurements)
     file = np.array(measurements.origin or ("",) * len(q))[order]
-    left_out = np.sort(np.array([row.line for row in measurements.left_out], dtype=np.int64))
-    passed = np.searchsorted(left_out, np.array(measurements.line, dtype=np.int64)[order])
-    follows = (file[1:] == file[:-1]) & (passed[1:] == passed[:-1])
+    follows = (file[1:] == file[:-1]) & (np.diff(np.array(measurements.line)[order]) <= 1)
     step = np.where(follows[:, None], np.diff(q[order], axis=0), np.nan)
     unknown = np.full((1, q.shape[1]), np.nan)
     before, after = np.empty_like(q), np.empty_like(q)
