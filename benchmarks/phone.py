@@ -2,7 +2,7 @@
 
     OMP_NUM_THREADS=1 python benchmarks/phone.py [--seeds 4] [--first 0] [--images 40] [--drawn rendered opencv]
 
-The zeros of the true arm are off by 5 to 17 deg, its lengths by 1 mm and its axes by 2.5 mrad; every servo repeats to
+The zeros of the true arm are off by 5 to 17 deg, its lengths by 1 mm and its axes by 5 mrad; every servo repeats to
 0.5 deg. The phone stands 0.6 m in front of the arm. Its intrinsics are unknown and found together with the arm: first
 from the images alone by `calibrate_camera`, then by `calibrate` with intrinsics "free". Images are rendered with lens
 distortion, blur, defocus, uneven light, noise, and a rolling shutter while the arm still moves by 1 mm and 0.2 deg; in
@@ -97,7 +97,7 @@ class Arm:
         dh = nominal.dh.copy()
         dh[:, 0] += np.deg2rad(rng.uniform(5, 17, 5)) * rng.choice([-1, 1], 5)
         dh[:, 1:3] += rng.normal(0, 1e-3, (5, 2))
-        dh[:, 3:] += rng.normal(0, 2.5e-3, (5, 2))
+        dh[:, 3:] += rng.normal(0, 5e-3, (5, 2))
         T_tool_board = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
         T_tool_board[:3, 3] = -T_tool_board[:3, :3] @ torch.tensor(board.corners.mean(0))
         base = invert(phone_in_base()) @ transform_from_xyzrpy(torch.tensor(nominal.base))

@@ -1,6 +1,7 @@
 """Sheets with calibration boards, to be printed at true size."""
 
 import io
+from dataclasses import replace
 
 import numpy as np
 from matplotlib.backends.backend_pdf import FigureCanvasPdf
@@ -9,23 +10,22 @@ from matplotlib.patches import PathPatch
 from matplotlib.path import Path as Outline
 
 from pisigma.files.errors import OutputError
-from pisigma.measurement.camera.board import Board
+from pisigma.measurement.camera.board import RULER, Board
 from pisigma.measurement.camera.pattern import Pattern, board_pattern
 
 PAPERS = {
+    "A4 or Letter": (210.0, 279.4),
     "A4": (210.0, 297.0),
     "A3": (297.0, 420.0),
     "A2": (420.0, 594.0),
     "A1": (594.0, 841.0),
     "A0": (841.0, 1189.0),
 }
-"""Width and height of paper [mm]."""
+"""Width and height of paper [mm]; the first is the part that A4 and Letter have in common."""
 MARGIN = 8.0
 """Margin that printers leave blank along the edges of a sheet [mm]."""
 FOOT = 22.0
 """Height of the space below the board for its text and the ruler [mm]."""
-RULER = 100.0
-"""Length of the line by which the scale of the print is checked [mm]."""
 MM = 1 / 25.4
 """One millimetre [inch]."""
 
@@ -51,7 +51,10 @@ def draw_board_sheet(board: Board) -> tuple[str, Figure]:
         MeasurementError: the dictionary of the board has too few markers.
         ImportError: the markers need OpenCV, which is not installed.
     """
-    pattern = board_pattern(board)
+    wanted = replace(
+        board, square=board.square / board.printed, marker=board.marker / board.printed, printed=1.0
+    )
+    pattern = board_pattern(wanted)
     across, down = 1e3 * (pattern.sheet[2:] - pattern.sheet[:2])
     paper, (width, height) = _paper(board, float(across), float(down))
     figure = Figure(figsize=(width * MM, height * MM))
@@ -65,8 +68,8 @@ def draw_board_sheet(board: Board) -> tuple[str, Figure]:
         [start, start, start, end, end, end], [top, top + 4, top + 2, top + 2, top, top + 4], "k", lw=0.5
     )
     texts = (
-        f"This line is {RULER:g} mm long; if not, print again at 100 %, or state the measured lengths of the board.",
-        f"{board.name}: {_description(board)}. Paper: {paper}. x points right, y down; corner 0 is at the upper left.",
+        f"This line is {RULER:g} mm long; if not, print again at 100 %, or state its length (ruler_mm).",
+        f"{board.name}: {_description(wanted)}. Paper: {paper}. x points right, y down; corner 0 is at the upper left.",
     )
     for number, text in enumerate(texts):
         axes.text(width / 2, top + 8 + 4 * number, text, ha="center", va="center", fontsize=6.5)

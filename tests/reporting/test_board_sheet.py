@@ -9,7 +9,7 @@ from testing.closeness import assert_close
 from testing.refusals import refused
 
 from pisigma.files.errors import OutputError
-from pisigma.measurement.camera.board import Board
+from pisigma.measurement.camera.board import Board, BoardDocument
 from pisigma.reporting.board_sheet import board_pdf, draw_board_sheet
 
 DPI = 100
@@ -19,7 +19,12 @@ MM = DPI / 25.4
 
 @pytest.mark.parametrize(
     ("columns", "square", "paper", "size"),
-    [(7, 20, "A4", (210, 297)), (10, 20, "A4 landscape", (297, 210)), (9, 30, "A3 landscape", (420, 297))],
+    [
+        (7, 20, "A4 or Letter", (210, 279.4)),
+        (10, 20, "A4 or Letter landscape", (279.4, 210)),
+        (11, 21, "A4 landscape", (297, 210)),
+        (9, 30, "A3 landscape", (420, 297)),
+    ],
 )
 def test_the_smallest_paper_is_taken(columns, square, paper, size) -> None:
     title, content = board_pdf(Board("board", 6, columns, square / 1e3))
@@ -53,3 +58,9 @@ def test_corners_are_printed_at_their_true_distances() -> None:
         expected = board.corners[detected.corners, :2] * 1e3 * MM
         shift = (detected.pixels - expected).mean(0)
         assert_close(detected.pixels - shift, expected, atol=0.5)
+
+
+def test_a_measured_ruler_does_not_change_what_is_printed() -> None:
+    stated = BoardDocument(rows=6, columns=7, square_mm=20, ruler_mm=99.0)
+    assert_close(stated.board().square, 0.0198, atol=1e-12)
+    assert board_pdf(stated.board())[1] == board_pdf(Board("board", 6, 7, 0.02))[1]

@@ -90,4 +90,9 @@ def _print_board(board: Path, sheet: Path, as_json: bool) -> None:
     if as_json:
         print_json({"file": str(sheet), "paper": paper})
     else:
-        print_lines([f"Board written to {sheet}; print it on {paper} at 100 % and check the ruler."])
+        print_lines(
+            [
+                f"Board written to {sheet}; print it on {paper} at 100 %, measure the line below the board, and "
+                f"state its length in {board} (ruler_mm) if it is not 100 mm."
+            ]
+        )

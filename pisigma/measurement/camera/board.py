@@ -20,6 +20,8 @@ Dictionary = Literal[
 TagFamily = Literal["tag16h5", "tag25h9", "tag36h10", "tag36h11"]
 TAG_CELLS = {"tag16h5": 6, "tag25h9": 7, "tag36h10": 8, "tag36h11": 8}
 """Number of cells along the side of a tag, including its border."""
+RULER = 100.0
+"""Length of the line by which the scale of a printed board is checked [mm]."""
 Length = Annotated[float, Field(ge=0.2)]
 """Length of a board [mm]; shorter lengths are probably in metres."""
 _LENGTHS: dict[BoardKind, tuple[str, ...]] = {
@@ -39,6 +41,8 @@ class BoardDocument(Section):
         columns: number of columns of inner corners, or of AprilTags.
         square_mm: side of a square of a checkerboard or a ChArUco board [mm].
         square_sigma_mm: standard deviation of the side, common to all squares [mm].
+        ruler_mm: measured length of the line of 100 mm that is printed below the board [mm]; all lengths of the board
+            are scaled by it.
         flatness_mm: flatness tolerance [mm].
         marker_mm: side of the markers of a ChArUco board [mm].
         dictionary: dictionary of the markers of a ChArUco board.
@@ -59,6 +63,7 @@ class BoardDocument(Section):
     spacing_mm: Length | None = None
     family: TagFamily = "tag36h11"
     flatness_mm: float = Field(default=0.0, ge=0)
+    ruler_mm: float = Field(default=RULER, ge=90.0, le=110.0)
 
     @model_validator(mode="after")
     def _lengths_of_kind(self) -> "BoardDocument":
@@ -74,12 +79,13 @@ class BoardDocument(Section):
 
     def board(self) -> "Board":
         """Return the board in SI units."""
-        marker = self.marker_mm or self.tag_mm or 0.0
-        pitch = self.square_mm or marker + (self.spacing_mm or 0.0)
+        printed = self.ruler_mm / RULER
+        marker = (self.marker_mm or self.tag_mm or 0.0) * printed
+        pitch = self.square_mm * printed if self.square_mm else marker + (self.spacing_mm or 0.0) * printed
         names = {"checkerboard": "", "charuco": self.dictionary, "apriltag": self.family}
         lengths = pitch / 1e3, self.kind, marker / 1e3
         scale = None if self.square_sigma_mm is None else self.square_sigma_mm / pitch
-        errors = scale, self.flatness_mm / 1e3
+        errors = scale, self.flatness_mm / 1e3, printed
         return Board(self.name, self.rows, self.columns, *lengths, names[self.kind], *errors)
 
 
@@ -104,6 +110,7 @@ class Board:
         scale_deviation: relative standard deviation of the scale, common to all lengths of the board; None if not
             given.
         flatness: distance between two parallel planes that enclose the surface [m]; 0 for a perfectly flat board.
+        printed: ratio of the printed lengths, which the other attributes state, to those that were to be printed.
     """
 
     name: str
@@ -115,6 +122,7 @@ class Board:
     dictionary: str = ""
     scale_deviation: float | None = None
     flatness: float = 0.0
+    printed: float = 1.0
 
     @staticmethod
     def load(path: str | os.PathLike[str]) -> "Board":
