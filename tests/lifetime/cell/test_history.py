@@ -147,7 +147,7 @@ def _add(path, first):
 
 
 def test_two_processes_lose_nothing(history):
-    context = multiprocessing.get_context("spawn")
+    context = multiprocessing.get_context("fork")
     workers = [context.Process(target=_add, args=(history.path, first)) for first in (0, 50)]
     for worker in workers:
         worker.start()
@@ -302,7 +302,7 @@ def test_an_upgrade_is_complete_or_absent(older):
 
 
 def test_two_processes_upgrade_at_once(older):
-    context = multiprocessing.get_context("spawn")
+    context = multiprocessing.get_context("fork")
     workers = [context.Process(target=_add, args=(older / HISTORY, first)) for first in (0, 50)]
     for worker in workers:
         worker.start()
