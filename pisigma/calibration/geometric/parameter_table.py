@@ -21,6 +21,9 @@ from pisigma.robot.se3 import wrap_to_pi
 
 LOST = 1e-10
 """Eigenvalue of the scaled information (unit diagonal) below which a direction is undetermined."""
+IN_A_SUM = 1e-3
+"""Component of an undetermined direction, relative to the largest one in mm and mrad, above which it contains a
+coordinate of a base."""
 HELD = 0.7
 """Ratio of standard error to prior standard deviation above which the data hardly determine a parameter."""
 
@@ -85,11 +88,14 @@ def parameter_table(
     active = set(problem.active.tolist())
     silent = _without_rows(problem, here.normal.cpu(), findings)
     undetermined = (geometry.coordinate_jacobian[:, silent] != 0).any(1).tolist()
+    sums = _sums_with_bases(problem, findings, geometry)
     rows = []
     columns = (nominal.tolist(), values.tolist(), change.tolist())
     for index, (parameter, before, after, moved) in enumerate(zip(space.parameters, *columns, strict=True)):
         free = index in active or bool(errors[index] > 0)
         remark, label = _remark(parameter.name, free, index in findings.extended, findings.redundancy)
+        if free and label == "identified" and index in sums:
+            remark, label = f"identified only in a sum with {' and '.join(sums[index])}", "in a sum"
         if free and held[index]:
             remark += "; the data hardly determine it, so it stays near its prior value"
             label = "held by the prior" if label == "identified" else f"{label}; prior"
@@ -100,6 +106,32 @@ def parameter_table(
         name, unit = parameter.name, parameter.unit
         rows.append(ParameterEstimate(name, unit, before, after, moved, error, remark, label))
     return tuple(rows)
+
+
+def _sums_with_bases(
+    problem: CalibrationProblem, findings: RankFindings, geometry: IdentifiedGeometry
+) -> dict[int, list[str]]:
+    """Return the removed parameters on which coordinates of bases depend, by the index of the coordinate.
+
+    The dependencies are those in the axes of the robot's base; here they are converted to those of the measuring frame.
+    """
+    space, redundancy = problem.space, findings.redundancy
+    extended = {space.names[index] for index in findings.extended}
+    left = [name for name in redundancy.removed if name not in extended]
+    unchanged = torch.zeros(len(space.parameters), len(left), dtype=torch.float64)
+    for number, name in enumerate(left):
+        unchanged[space.index(name), number] = 1.0
+    for one in redundancy.dependencies:
+        for name, coefficient in zip(one.names[1:], one.coefficients[1:], strict=True):
+            if name in left:
+                unchanged[space.index(one.names[0]), left.index(name)] = -coefficient
+    shift = (geometry.coordinate_jacobian @ unchanged) / torch.from_numpy(space.usual_errors)[:, None]
+    parts = shift.abs() > IN_A_SUM * shift.abs().amax(0, keepdim=True)
+    return {
+        index: [name for name, part in zip(left, parts[index].tolist(), strict=True) if part]
+        for index in space.indices_of("base")
+        if bool(parts[index].any())
+    }
 
 
 def _without_rows(

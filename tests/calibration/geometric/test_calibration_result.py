@@ -132,3 +132,17 @@ def test_intervals_cover_the_truth(poses: bool) -> None:
     ]
     assert len(covered) == 30 * (30 if poses else 27)
     assert 0.91 < np.mean(covered) < 0.99
+
+
+def test_parallel_axes_leave_the_tool_at_its_nominal_height_and_the_base_in_sums():
+    """A base that is tilted in the measuring frame is undetermined along all axes, not only along its own z axis."""
+    tilted = np.array([0.5, 0.2, -0.1, 0.3, 0.1, -0.1])
+    nominal = Robot.load("kiro3").with_geometry(tool=np.array([0.0, 0.01, 0.05, 0.0, 0.0, 0.0]))
+    true = nominal.with_geometry(base=tilted, tool=np.array([0.03, 0.02, 0.11, 0.0, 0.0, 0.0]))
+    q = torch.from_numpy(np.random.default_rng(0).uniform(*np.clip(true.limits, -3, 3).T, (60, 4)))
+    result = GeometricCalibrator(nominal).fit(Measurements(q, forward_kinematics(true, q)[:, :3, 3]))
+    assert_close(result.robot.tool[2], 0.05, atol=1e-9)
+    by_name = {one.name: one for one in result.parameters}
+    for name, value in zip(("base_x", "base_y", "base_z"), tilted, strict=False):
+        assert abs(by_name[name].estimated - value) > 1e-3
+        assert by_name[name].label == "in a sum"

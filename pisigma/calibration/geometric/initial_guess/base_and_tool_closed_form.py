@@ -57,7 +57,7 @@ def base_and_tool_starts(robot: Robot, problem: BaseToolProblem) -> Iterator[Bas
     else:
         starts = starts_from_positions(R_flange, p_flange, position, point, robot.reach)
         if problem.has_rotations:
-            first = start_from_poses(R_flange, p_flange, position, rotation, R_tool)
+            first = start_from_poses(R_flange, p_flange, position, rotation, R_tool, point)
             rest = ((R, p, _mean_turn(R, R_flange, rotation), place) for R, p, place in starts)
             candidates = itertools.chain([first], rest)
         else:
@@ -72,6 +72,7 @@ def start_from_poses(
     position: Float64[Tensor, "rows 3"],
     rotation: Float64[Tensor, "rows 3 3"],
     R_tool_nominal: Float64[Tensor, "3 3"],
+    nominal_point: Float64[Tensor, " 3"],
 ) -> tuple[Float64[Tensor, "3 3"], Float64[Tensor, " 3"], Float64[Tensor, "3 3"], Float64[Tensor, " 3"]]:
     """Solve measured = base · flange · tool for base and tool (robot-world and hand-eye calibration).
 
@@ -104,7 +105,7 @@ def start_from_poses(
             break
     # Take the first of equally good pairs: the nominal tool comes first, then the singular vectors.
     best = int((agreement > agreement.max() - 1e-9).nonzero()[0, 0])
-    p_base, p_tool = _translations(R_base[best], R_flange, p_flange, position)
+    p_base, p_tool = _translations(R_base[best], R_flange, p_flange, position, nominal_point)
     return R_base[best], p_base, Z[best].mT, p_tool
 
 
@@ -125,7 +126,7 @@ def starts_from_positions(
         R_base, p_base [m], point [m].
     """
     if position.shape[0] >= LINEAR_ROWS:
-        yield start_from_products(R_flange, p_flange, position)
+        yield start_from_products(R_flange, p_flange, position, nominal_point)
     along = 0.1 * reach * torch.eye(3).to(position)
     assumed = torch.cat([nominal_point[None], torch.zeros_like(nominal_point)[None], along, -along])
     for point in assumed.unbind():
@@ -137,6 +138,7 @@ def start_from_products(
     R_flange: Float64[Tensor, "rows 3 3"],
     p_flange: Float64[Tensor, "rows 3"],
     position: Float64[Tensor, "rows 3"],
+    nominal_point: Float64[Tensor, " 3"],
 ) -> tuple[Float64[Tensor, "3 3"], Float64[Tensor, " 3"], Float64[Tensor, " 3"]]:
     """Solve `position = R_base (R_flange · point + p_flange) + p_base` for base and point.
 
@@ -149,7 +151,7 @@ def start_from_products(
     regressor = torch.cat([R_flange.flatten(1), p_flange, torch.ones_like(p_flange[:, :1])], 1)
     solution = _least_squares(regressor, position)
     R_base = nearest_rotation(solution[9:12].mT)
-    return R_base, *_translations(R_base, R_flange, p_flange, position)
+    return R_base, *_translations(R_base, R_flange, p_flange, position, nominal_point)
 
 
 def fit_base_to_points(
@@ -214,18 +216,20 @@ def _translations(
     R_flange: Float64[Tensor, "rows 3 3"],
     p_flange: Float64[Tensor, "rows 3"],
     position: Float64[Tensor, "rows 3"],
+    nominal_point: Float64[Tensor, " 3"],
 ) -> tuple[Float64[Tensor, " 3"], Float64[Tensor, " 3"]]:
     """Return the positions of base and tool for a fixed rotation of the base, which is a linear problem.
 
     In the axes of the base, the regressor of a row is `[1 R_flange]`. As rotations are orthogonal, the normal matrix
-    depends only on the mean of R_flange.
+    depends only on the mean of R_flange; with the base eliminated, it is that of the tool. Directions of the tool that
+    the rows do not determine, such as along parallel axes, keep their nominal values.
     """
-    b = position @ R_base - p_flange
-    turns, same = R_flange.mean(0), torch.eye(3).to(position)
-    normal = torch.cat([torch.cat([same, turns], 1), torch.cat([turns.mT, same], 1)])
-    seen = torch.einsum("nij,ni->j", R_flange, b) / len(b)
-    solution = torch.linalg.pinv(normal, rtol=1e-10, hermitian=True) @ torch.cat([b.mean(0), seen])
-    return R_base @ solution[:3], solution[3:]
+    b = position @ R_base - p_flange - R_flange @ nominal_point
+    turns = R_flange.mean(0)
+    normal = torch.eye(3).to(position) - turns.mT @ turns
+    seen = torch.einsum("nij,ni->j", R_flange, b) / len(b) - turns.mT @ b.mean(0)
+    off = torch.linalg.pinv(normal, atol=1e-10, rtol=0.0, hermitian=True) @ seen
+    return R_base @ (b.mean(0) - turns @ off), nominal_point + off
 
 
 def _cube_rotations(like: Tensor) -> Tensor:

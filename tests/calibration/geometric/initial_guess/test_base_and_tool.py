@@ -125,7 +125,8 @@ def test_the_closed_form_of_poses_is_exact_without_polish(generator: torch.Gener
     R = rotation_from_rpy(torch.randn(8, 3, generator=generator, dtype=torch.float64))
     p = torch.randn(8, 3, generator=generator, dtype=torch.float64)
     position = (p + R @ y) @ X.mT + x
-    found = start_from_poses(R, p, position, X @ R @ Y, torch.eye(3, dtype=torch.float64))
+    nominal = torch.zeros(3, dtype=torch.float64)
+    found = start_from_poses(R, p, position, X @ R @ Y, torch.eye(3, dtype=torch.float64), nominal)
     for actual, expected in zip(found, (X, x, Y, y), strict=True):
         assert_close(actual, expected, atol=1e-10)
 
