@@ -55,7 +55,7 @@ def frames_of_robot(robot: Robot, rows: Measurements, only: FrameChoice) -> Fitt
     """Fit frames with the arm of a robot as drawn; for the errors see `fit_frames`."""
     fit = fit_frames(robot, rows, only)
     model = model_of_calibration(robot.name, robot, fit.solved.result(), rows)
-    return FittedFrames(fit, replace(model, kind=KIND), torch.zeros(len(fit.frames), 0), misfit_causes(fit))
+    return FittedFrames(fit, replace(model, kind=KIND), _exact_arm(fit), misfit_causes(fit))
 
 
 def frames_of_model(model: CalibratedModel, rows: Measurements, only: FrameChoice) -> FittedFrames:
@@ -90,7 +90,7 @@ def frames_of_model(model: CalibratedModel, rows: Measurements, only: FrameChoic
     moved = rows if arm is None else replace(rows, q=corrected_joints(arm, rows))
     fit = fit_frames(model.identified, moved, only, bases, tools)
     known = None if model.uncertainty is None else ArmUncertainty(model.uncertainty, rows)
-    arm_root = torch.zeros(len(fit.frames), 0) if known is None else _arm_root(known, fit)
+    arm_root = _exact_arm(fit) if known is None else _arm_root(known, fit)
     uncertainty = None if known is None else _uncertainty(known, fit, arm_root)
     return FittedFrames(
         fit,
@@ -98,6 +98,11 @@ def frames_of_model(model: CalibratedModel, rows: Measurements, only: FrameChoic
         arm_root,
         misfit_causes(fit, known),
     )
+
+
+def _exact_arm(fit: FrameFit) -> Float64[Tensor, "frames directions"]:
+    """Return the root of `_arm_root` for an arm without a stated uncertainty."""
+    return torch.zeros(len(fit.frames), 0, dtype=torch.float64)
 
 
 def _arm_root(known: ArmUncertainty, fit: FrameFit) -> Float64[Tensor, "frames directions"]:
