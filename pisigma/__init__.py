@@ -6,7 +6,7 @@ Names are loaded on first use (PEP 562), so that `import pisigma` is fast.
 from importlib import import_module
 from typing import Any
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 _NAMES = {
     "files.errors": "PisigmaError",

@@ -12,6 +12,7 @@ from types import ModuleType
 from typing import get_args
 
 import pytest
+import tomllib
 import yaml
 from typer.main import get_command
 
@@ -261,6 +262,18 @@ def test_tables_are_those_of_the_classes(monkeypatch: pytest.MonkeyPatch, page: 
     tables = _hook(hook)
     text = _text(DOCS / "reference" / f"{page}.md")
     assert tables.page_with(text, tables.tables()) == text, f"run: python docs/hooks/{hook}.py"
+
+
+def test_the_licence_of_every_dependency_is_stated(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those of other versions may have other dependencies, so only the stated ones are compared."""
+    monkeypatch.syspath_prepend(DOCS / "hooks")
+    licences = _hook("licence_table")
+    page = _text(DOCS / "reference" / "dependencies.md")
+    named = dict(re.findall(r"^\| ([\w-]+) \| ([^|]+) \|", page, flags=re.MULTILINE))
+    for project in licences.PROJECTS.values():
+        stated = tomllib.loads(project.read_text(encoding="utf-8"))["project"]["dependencies"]
+        assert {re.split("[<>=]", one)[0] for one in stated} <= set(named)
+    assert named["numpy"].startswith("BSD-3-Clause")
 
 
 def test_the_table_of_states_has_every_state_of_a_cell() -> None:

@@ -212,6 +212,14 @@ def test_published_metadata_agree(repository):
     for package, extra in EXTRAS.items():
         assert any(wanted.startswith(package) for wanted in project["optional-dependencies"][extra])
         assert not any(wanted.startswith(package) for wanted in project["dependencies"])
+    recipe = yaml.safe_load((repository / "packaging" / "conda" / "recipe.yaml").read_text())
+    assert recipe["context"]["version"] == project["version"]
+    conda = {"torch": "pytorch", "matplotlib": "matplotlib-base"}
+    required = [re.split(r"(?=[<>=])", one, maxsplit=1) for one in project["dependencies"]]
+    assert recipe["requirements"]["run"] == [
+        "python >=3.10",
+        *(f"{conda.get(name, name)} {limits}" for name, limits in required),
+    ]
     hooks = yaml.safe_load((repository / ".pre-commit-config.yaml").read_text())["repos"][0]["hooks"]
     assert [hook["entry"].split()[0] for hook in hooks] == ["ruff", "ruff", "mypy"]
 
