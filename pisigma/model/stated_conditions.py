@@ -92,10 +92,12 @@ def under_stated_torques(model: CalibratedModel, torques_nm: Sequence[float]) ->
         torques_nm: torques of all drives at the pose [Nm; N for prismatic joints], see `JointTorques`.
 
     Raises:
-        ModelError: the model did not learn the effect of torques, or a torque is missing or not finite.
+        ModelError: the model did not learn the effect of torques, or a torque is missing, not finite, or larger than
+            any load explains.
     """
     arm = model.hybrid
-    if arm is None or learned_torques(arm.correction) is None:
+    learned = None if arm is None else learned_torques(arm.correction)
+    if arm is None or learned is None:
         raise ModelError(
             f"model '{model.name}' did not learn the effect of joint torques",
             option="torques_nm",
@@ -105,6 +107,18 @@ def under_stated_torques(model: CalibratedModel, torques_nm: Sequence[float]) ->
     if values.shape != (model.robot.dof,) or not np.isfinite(values).all():
         raise ModelError(
             expected=f"{model.robot.dof} finite torques, one per joint", value=torques_nm, option="torques_nm"
+        )
+    usual = learned.modelled(JointState(model.starts.double())).abs().numpy().max(0, initial=0.0)
+    largest = MAX_TORQUE_RATIO * (usual + np.sqrt(np.diag(learned.covariance)))
+    beyond = np.flatnonzero((np.abs(values) > largest) & (np.array(learned.scale) > 0))
+    if len(beyond) and len(model.starts):
+        joint = int(beyond[0])
+        raise ModelError(
+            expected=f"a torque of joint {joint + 1} up to {largest[joint]:.3g} Nm, {MAX_TORQUE_RATIO:g} times the "
+            "largest of the calibration",
+            value=float(values[joint]),
+            option="torques_nm",
+            remedy="give Nm (N for prismatic joints)",
         )
     correction, shift = at_torques(arm.correction, values)
     return replace(model, hybrid=replace(arm, robot=_shifted(arm.robot, shift), correction=correction))

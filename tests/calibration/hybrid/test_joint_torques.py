@@ -130,6 +130,8 @@ def test_a_file_keeps_the_torques_and_names_other_units(tmp_path):
 def test_invalid_torques_are_refused(tmp_path):
     with refused(ModelError, option="torques_nm"):
         under_stated_torques(model(), [1.0, 2.0])
+    with refused(ModelError, option="torques_nm", value=-61200.0):
+        under_stated_torques(model(), [0.0, -61.2e3, -28.4e3, 0.3, 0.1, 0.0])
     geometric = dataclasses.replace(model(), hybrid=None)
     with refused(ModelError, option="torques_nm"):
         under_stated_torques(geometric, [0.0] * 6)
