@@ -1,13 +1,14 @@
-"""Tests of lifetime check no types: they fit whole calibrations, whose types the tests of those rooms check."""
+"""Tests of lifetime check no types and try few features: the tests of those rooms check both."""
 
 from collections.abc import Iterator
 
 import pytest
+from testing.hybrid import few_choices
 from testing.models import no_type_checker
 
 
 @pytest.fixture(scope="module", autouse=True)
 def quick() -> Iterator[None]:
     """Call pisigma as users do."""
-    with no_type_checker():
+    with no_type_checker(), few_choices():
         yield
