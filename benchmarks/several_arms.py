@@ -1,15 +1,20 @@
-"""Base to base of two UR5s whose wrist cameras see one board, against the Cramér-Rao bound.
+"""Base to base of two UR5s whose wrist cameras see one board, against the Cramér-Rao bound; bumped bases.
 
-    OMP_NUM_THREADS=1 python benchmarks/several_arms.py [--sets 200] [--images 25]
+    OMP_NUM_THREADS=1 python benchmarks/several_arms.py [bound] [bumped] [--sets 200] [--images 25]
 
 Each arm has errors of 0.3 mm and 0.05 deg in every parameter that the images of a UR5 determine; errors that the base
 or the tool absorbs, such as that of the zero of joint 1, are 0, so that the bases have true values. OpenCV projects the
 corners of a board of 9 x 6 corners 30 mm apart, seen from 0.3 to 0.7 m, into cameras of 1920 x 1200 px with exact
 intrinsics; the noise is 0.3 px and the repeatability of the arms 0.02 mm and 0.01 deg. The bound is computed by
 differences of OpenCV's projection, independently of the package's derivatives.
+
+Bumped: the same arms, with 8 new images of each, in 40 cells where nothing moved, and in 20 cells each where the base
+of the left arm, that of the right one or the board moved by 0.5 mm and 0.5 mrad.
 """
 
 import argparse
+from collections import Counter
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -21,7 +26,11 @@ from pisigma.calibration.frames.arm_bases import fit_arm_bases
 from pisigma.calibration.frames.shared_objects import ArmPosterior, uncertainty_of
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.estimation.loss import SquaredLoss
+from pisigma.lifetime.comparison.moved_bases import ArmBefore, find_moved_bases
 from pisigma.measurement.camera.image_rows import image_measurements
+from pisigma.measurement.dataset import Measurements
+from pisigma.model.frame_model import frames_of_model
+from pisigma.model.geometric_model import model_of_calibration
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.row import DH_COLUMNS
@@ -37,6 +46,7 @@ from pisigma.robot.se3 import (
 NOMINAL = Robot.load("ur5")
 SIZES = {"theta": np.deg2rad(0.05), "d": 3e-4, "a": 3e-4, "alpha": np.deg2rad(0.05), "beta": np.deg2rad(0.05)}
 STEP = 1e-6
+ARMS, FEW_IMAGES = ("left", "right"), 8
 
 
 def board_to_base(number: int) -> torch.Tensor:
@@ -109,54 +119,114 @@ def bound(parts: list[np.ndarray], bases: list[np.ndarray]) -> np.ndarray:
     return J @ of_both @ J.T
 
 
-def main() -> None:
-    """Print RMS errors and stated standard errors over the bound."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--sets", type=int, default=200)
-    parser.add_argument("--images", type=int, default=25)
-    arguments = parser.parse_args()
-    rng = np.random.default_rng(0)
-    q = [views(NOMINAL, arguments.images, rng) for _ in range(2)]
-    bases = [xyzrpy_from_transform(board_to_base(number)).numpy() for number in range(2)]
-    drawn = with_values((), np.concatenate([bases[0], ON_FLANGE.numpy()]))
-    seen = image_measurements(
-        projected_images(drawn, q[0], rng), CAMERA, BOARD, False, REPEATABILITY, "fixed"
-    )
-    every = GeometricCalibrator(NOMINAL, prior=None, loss=SquaredLoss()).fit(seen).free
-    free = tuple(name for name in every if not name.startswith(("base", "tool", "board", "camera")))
-    calibrator = GeometricCalibrator(NOMINAL, free=free, prior=None, loss=SquaredLoss())
+def measured(
+    free: tuple[str, ...], values: np.ndarray, q: torch.Tensor, rng: np.random.Generator
+) -> Measurements:
+    """Return the images of an arm as measurements."""
+    images = projected_images(with_values(free, values), q, rng)
+    return image_measurements(images, CAMERA, BOARD, False, REPEATABILITY, "fixed")
+
+
+def determined_parameters(q: torch.Tensor, base: np.ndarray) -> tuple[str, ...]:
+    """Return the parameters of a UR5 that its images determine."""
+    drawn = np.concatenate([base, ON_FLANGE.numpy()])
+    rows = measured((), drawn, q, np.random.default_rng(0))
+    every = GeometricCalibrator(NOMINAL, prior=None, loss=SquaredLoss()).fit(rows).free
+    return tuple(name for name in every if name.split("_")[0] in SIZES)
+
+
+def drawn_values(free: tuple[str, ...], base: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Return random errors of the free parameters, then base and tool."""
     sizes = np.array([SIZES[name.split("_")[0]] for name in free])
+    return np.concatenate([sizes * rng.standard_normal(len(free)), base, ON_FLANGE.numpy()])
+
+
+def compare_with_bound(
+    calibrator: GeometricCalibrator, q: list[torch.Tensor], bases: list[np.ndarray], sets: int
+) -> None:
+    """Print RMS errors and stated standard errors over the bound."""
+    free = tuple(calibrator.free)
     errors, stated, bounds, scores = [], [], [], []
-    for seed in range(arguments.sets):
+    for seed in range(sets):
         rng = np.random.default_rng(seed)
         arms, parts = [], []
-        for number in range(2):
-            values = np.concatenate(
-                [sizes * rng.standard_normal(len(free)), bases[number], ON_FLANGE.numpy()]
-            )
-            images = projected_images(with_values(free, values), q[number], rng)
-            rows = image_measurements(images, CAMERA, BOARD, False, REPEATABILITY, "fixed")
-            arms.append(ArmPosterior(str(number), uncertainty_of(calibrator.fit(rows))))
+        for number, name in enumerate(ARMS):
+            values = drawn_values(free, bases[number], rng)
+            rows = measured(free, values, q[number], rng)
+            arms.append(ArmPosterior(name, uncertainty_of(calibrator.fit(rows))))
             parts.append(bound_of_base(free, values, q[number]))
         T, covariance = fit_arm_bases(arms).relative(0, 1)
-        true = invert(board_to_base(0)) @ board_to_base(1)
-        error = pose_error(true, T)
+        error = pose_error(invert(board_to_base(0)) @ board_to_base(1), T)
         errors.append(error.numpy())
         stated.append(covariance.diagonal().numpy())
         bounds.append(bound(parts, bases).diagonal())
         scores.append(float(error @ torch.linalg.solve(covariance, error)) / 6)
     root = np.sqrt(np.mean(bounds, 0))
-    print(f"{arguments.sets} sets of 2 x {arguments.images} images, {len(free)} free parameters of each arm")
-    print("               x      y      z      about x  about y  about z")
-    for name, values in (
+    print(f"{sets} sets of 2 x {len(q[0])} images, {len(free)} free parameters of each arm")
+    print("                          x        y        z  about x  about y  about z")
+    for what, figures in (
         ("bound [um, urad]", root * 1e6),
         ("RMS error / bound", np.sqrt(np.square(errors).mean(0)) / root),
         ("stated / bound", np.sqrt(np.mean(stated, 0)) / root),
     ):
-        print(f"{name:18}" + "  ".join(f"{value:7.3f}" for value in values))
+        print(f"{what:18}" + "".join(f"{value:9.3f}" for value in figures))
     print(f"mean squared error in units of the stated covariance, per value: {np.mean(scores):.3f}")
+
+
+def find_bumped(
+    calibrator: GeometricCalibrator, q: list[torch.Tensor], bases: list[np.ndarray], still: int
+) -> None:
+    """Print how often nothing, and the body that moved, is named; bodies move in every other cell."""
+    free, named, counts = tuple(calibrator.free), Counter[tuple[str, str]](), Counter[str]()
+    direction = torch.tensor([0.8, 0.0, 0.6], dtype=torch.float64)
+    bump = transform(rotation_from_vector(5e-4 * direction.flip(0)), 5e-4 * direction)
+    later = [views(NOMINAL, FEW_IMAGES, np.random.default_rng(1 + number)) for number in range(2)]
+    for seed in range(still):
+        rng = np.random.default_rng(1000 + seed)
+        values = [drawn_values(free, base, rng) for base in bases]
+        rows = [measured(free, values[k], q[k], rng) for k in range(2)]
+        fits = [calibrator.fit(one) for one in rows]
+        known = [ArmPosterior(name, uncertainty_of(fit)) for name, fit in zip(ARMS, fits, strict=True)]
+        models = [
+            replace(model_of_calibration(arm.name, NOMINAL, fit, one), uncertainty=arm.uncertainty)
+            for arm, fit, one in zip(known, fits, rows, strict=True)
+        ]
+        T = fit_arm_bases(known).T_first_base
+        for body in ("nothing",) if seed % 2 else ("nothing", *ARMS, "board"):
+            now = []
+            for number, arm in enumerate(ARMS):
+                motion = {arm: bump, "board": invert(bump)}.get(body, torch.eye(4, dtype=torch.float64))
+                base = xyzrpy_from_transform(motion @ board_to_base(number)).numpy()
+                there = np.concatenate([values[number][:-12], base, values[number][-6:]])
+                images = measured(free, there, later[number], rng)
+                now.append(frames_of_model(models[number], images, "base"))
+            found = find_moved_bases([ArmBefore(*one) for one in zip(known, T, now, strict=True)])
+            text = " or ".join(one.name for one in found.named) or "nothing"
+            named[body, text if found.is_one_body else f"more than {text}"] += 1
+            counts[body] += 1
+    for (body, text), count in sorted(named.items()):
+        print(f"{body} moved: named {text} in {count} of {counts[body]}")
+
+
+def main() -> None:
+    """Run the comparisons, all or those that are named."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--sets", type=int, default=200)
+    parser.add_argument("--images", type=int, default=25)
+    parser.add_argument("--still", type=int, default=40)
+    parser.add_argument("parts", nargs="*", default=("bound", "bumped"))
+    arguments = parser.parse_args()
+    rng = np.random.default_rng(0)
+    q = [views(NOMINAL, arguments.images, rng) for _ in range(2)]
+    bases = [xyzrpy_from_transform(board_to_base(number)).numpy() for number in range(2)]
+    free = determined_parameters(q[0], bases[0])
+    calibrator = GeometricCalibrator(NOMINAL, free=free, prior=None, loss=SquaredLoss())
+    if "bound" in arguments.parts:
+        compare_with_bound(calibrator, q, bases, arguments.sets)
+    if "bumped" in arguments.parts:
+        find_bumped(calibrator, q, bases, arguments.still)
 
 
 if __name__ == "__main__":

@@ -29,7 +29,7 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.model.folder.model_folder import load_model
 from pisigma.robot.se3 import pose_error, transform_from_xyzrpy
 from pisigma.validation.held_out.arms_summary import ArmsSummary
-from pisigma.workflow.arms.arms_cell import calibrate_arms_of_cell
+from pisigma.workflow.arms.arms_cell import arms_of_cell, calibrate_arms_of_cell
 from pisigma.workflow.arms.calibrate_arms import FRAMES_FILE, Arm, ArmsCalibration, calibrate_arms
 from pisigma.workflow.settings.calibration import CalibrationSettings
 
@@ -137,3 +137,37 @@ def test_faulty_files_are_refused(calibrated, tmp_path, old, new, error, fields)
     (tmp_path / "left.csv").touch()
     with refused(error, **fields):
         calibrate_arms_of_cell(tmp_path)
+
+
+TORSO = """<robot name="torso"><link name="root"/><link name="chest"/>
+<joint name="waist" type="revolute"><origin xyz="0 0 0.5"/><parent link="root"/><child link="chest"/>
+<axis xyz="0 0 1"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint>
+"""
+
+
+def torso_with_arms() -> str:
+    """Return a URDF tree: a waist with a left and a right arm of two joints."""
+    text = TORSO
+    for side, y in (("left", 0.2), ("right", -0.2)):
+        parent = "chest"
+        for number in (1, 2):
+            link = f"{side}_{number}"
+            text += (
+                f'<link name="{link}"/><joint name="{link}_joint" type="revolute"><origin xyz="0.3 {y} 0"/>'
+                f'<parent link="{parent}"/><child link="{link}"/><axis xyz="0 1 0"/>'
+                '<limit lower="-1" upper="1" effort="1" velocity="1"/></joint>\n'
+            )
+            parent = link
+    return text + "</robot>\n"
+
+
+def test_joint_of_two_arms_is_refused_unless_it_is_before_their_base(tmp_path):
+    (tmp_path / "torso.urdf").write_text(torso_with_arms())
+    lines = ["arms:"]
+    for side in ("left", "right"):
+        lines.append(f"  {side}: {{robot: torso.urdf, tip: {side}_2, sessions: [{side}.csv]}}")
+    (tmp_path / "cell.yaml").write_text("\n".join(lines))
+    with refused(PlanningError, value="waist", column="arms.right", line=3):
+        arms_of_cell(tmp_path)
+    (tmp_path / "cell.yaml").write_text("\n".join(lines).replace("tip", "base: chest, tip"))
+    assert [arm.name for arm in arms_of_cell(tmp_path)] == ["left", "right"]

@@ -9,7 +9,7 @@ from pydantic import Field
 
 from pisigma.files.errors import PlanningError
 from pisigma.files.progress import Progress
-from pisigma.files.yaml_file import Section, read_yaml
+from pisigma.files.yaml_file import Section, place_of_key, read_yaml
 from pisigma.lifetime.cell.layout import CELL_FILE, MODELS
 from pisigma.robot.description import Robot
 from pisigma.workflow.arms.calibrate_arms import Arm, ArmsCalibration, calibrate_arms
@@ -55,12 +55,13 @@ def arms_of_cell(folder: str | os.PathLike[str], **changed: Any) -> tuple[Arm, .
         **changed: settings of the calibration that override the file, by its keys.
 
     Raises:
-        PlanningError: `cell.yaml` is not valid, or a file is outside of the cell.
+        PlanningError: `cell.yaml` is not valid, a file is outside of the cell, or two arms of one URDF file share a
+            joint, such as that of a torso.
         PisigmaError: a robot cannot be loaded, or a setting is not valid.
     """
     path = Path(folder) / CELL_FILE
     document = read_yaml(path, ArmsDocument, PlanningError)
-    arms = []
+    arms: list[Arm] = []
     for name, arm in document.arms.items():
         one = CellDocument(
             robot=arm.robot, base=arm.base, tip=arm.tip, camera=arm.camera, calibrate=document.calibrate
@@ -68,8 +69,31 @@ def arms_of_cell(folder: str | os.PathLike[str], **changed: Any) -> tuple[Arm, .
         file = CellFile(path, one)
         rows = [path_inside_cell(Path(folder), session) for session in arm.sessions]
         robot = Robot.load(file.robot, arm.base, arm.tip)
+        for before in arms:
+            _check_joints(path, before, Arm(name, robot, rows), document)
         arms.append(Arm(name, robot, rows, file.settings_of_step("calibrate", **changed)))
     return tuple(arms)
+
+
+def _check_joints(path: Path, first: Arm, second: Arm, document: ArmsDocument) -> None:
+    """Refuse two arms of one tree with a common joint, which would be calibrated twice.
+
+    Raises:
+        PlanningError: see above.
+    """
+    one, other = document.arms[first.name], document.arms[second.name]
+    assert isinstance(first.robot, Robot)
+    assert isinstance(second.robot, Robot)
+    shared = {joint.name for joint in first.robot.joints} & {joint.name for joint in second.robot.joints}
+    if one.robot == other.robot and one.tip != other.tip and shared:
+        raise PlanningError(
+            f"arms '{first.name}' and '{second.name}' share joint '{sorted(shared)[0]}', which would be calibrated "
+            "twice",
+            expected="arms without common joints",
+            value=sorted(shared)[0],
+            at=place_of_key(path, ("arms", second.name)),
+            remedy="keep this joint at rest, and state a link behind it as `base` of both arms",
+        )
 
 
 def calibrate_arms_of_cell(
