@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from pisigma.calibration.geometric.initial_guess.initial_guess import MIN_TURN
 from pisigma.files.errors import IdentificationError
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel, poses_of_rows
@@ -122,20 +123,21 @@ def _fault(model: CalibratedModel, rows: Measurements, free: Collection[str]) ->
 def _moved_most(model: CalibratedModel, rows: Measurements, free: Collection[str]) -> tuple[float, Cause]:
     """Return the smallest errors [m] after moving one joint zero or the tool, and the cause.
 
-    The candidate is chosen with errors linearised at the model, and then fitted by iteration.
+    The joint is chosen with errors linearised at the model; then joint and tool are fitted by iteration.
     """
     dof, fitted = rows.dof, _numbers(rows.dof, free)
     error = _errors(model, rows)
     columns = _columns(model, rows, torch.zeros(dof + 3, dtype=torch.float64), range(dof + 3), error)
-    tried = [[joint] for joint in range(dof)] + ([_numbers(dof, {"tool"})] if "tool" not in free else [])
     b = torch.nan_to_num(error).flatten()
 
     def left(numbers: list[int]) -> float:
         J = columns[:, [*fitted, *numbers]]
-        return float((b - J @ torch.linalg.lstsq(J, b, driver="gelsd").solution).norm())
+        return float((b - J @ _least_squares(J, b)).norm())
 
-    best = min(tried, key=left)
-    after, x = _fitted(model, rows, [*fitted, *best])
+    tried = [min(([joint] for joint in range(dof)), key=left)]
+    tried += [] if "tool" in free else [_numbers(dof, {"tool"})]
+    results = [(*_fitted(model, rows, [*fitted, *numbers]), numbers) for numbers in tried]
+    after, x, best = min(results, key=lambda one: one[0])
     if len(best) > 1:
         clause = f"the tool has moved by {length_text(float(x[best].norm()))}"
         return after, Cause("tool", clause, "check which tool is mounted, or recalibrate the model", 3.0)
@@ -166,10 +168,22 @@ def _fitted(
         least, best = here, x
         if free:
             J = _columns(model, rows, x, free, error)
-            step = torch.linalg.lstsq(J, -torch.nan_to_num(error).flatten(), driver="gelsd").solution
+            step = _least_squares(J, -torch.nan_to_num(error).flatten())
             x = x.index_add(0, torch.tensor(free), step.clamp(-MAX_STEP, MAX_STEP))
     values = int((torch.nan_to_num(error) != 0).sum())
     return least * (values / max(values - len(free), 1)) ** 0.5, best
+
+
+def _least_squares(
+    J: Float64[Tensor, "values free"], b: Float64[Tensor, " values"]
+) -> Float64[Tensor, " free"]:
+    """Solve `J x = b` in least squares; directions that the orientations of the rows hardly determine stay at 0.
+
+    Noise of the rows looks like information on such directions, and would move a tool along them by hundreds of mm.
+    """
+    rows = int((J.view(-1, 3, J.shape[1]) != 0).any(-1).any(-1).sum())
+    solution: Tensor = torch.linalg.pinv(J, atol=MIN_TURN * rows**0.5, rtol=0.0) @ b
+    return solution
 
 
 def _columns(
