@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 from click.testing import CliRunner, Result
+from testing.hybrid import few_choices, few_robots
 from testing.models import hand_made_model, no_type_checker, small_recipe_text
 from testing.refusals import assert_fields, problem_of
 from typer.main import get_command
@@ -30,8 +31,10 @@ def _run(*arguments: object) -> Result:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def without_pictures(blank_pictures: None) -> None:
-    """Commands write blank figures; those of `trained`, made before, are drawn."""
+def quick(blank_pictures: None) -> Iterator[None]:
+    """Commands write blank figures and try few features; figures of `trained`, made before, are drawn."""
+    with few_choices(), few_robots():
+        yield
 
 
 @pytest.fixture(scope="session", autouse=True)

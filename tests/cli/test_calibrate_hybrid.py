@@ -12,7 +12,6 @@ from testing.screens import assert_screen
 from testing.simulated_arm import simulate
 
 import pisigma
-from pisigma.calibration.hybrid.calibrator import HybridCalibrator
 from pisigma.cli.screen import print_result
 from pisigma.files.errors import IdentificationError, MeasurementError, RecipeError
 from pisigma.measurement.dataset import Measurements
@@ -25,20 +24,6 @@ POSITION = {"rms_mm", "mean_mm", "p95_mm", "max_mm"}
 FIGURES = {"joint_corrections.png", "predicted_spread.png", "residuals.png", "correlation.png"}
 FIGURES |= {"held_out_errors.png"}
 TRIAL = {"name", "unknowns", "log_evidence", "left_out", "seconds", "kept"}
-
-
-@pytest.fixture(scope="module", autouse=True)
-def few_choices():
-    """Try few features, so that a calibration takes a second."""
-    whole = HybridCalibrator.__init__
-    few = {"features": ("gravity", "series"), "harmonics": (4, 8), "products": False}
-
-    def with_few(self, robot, **options):
-        whole(self, robot, **(few | options))
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(HybridCalibrator, "__init__", with_few)
-        yield
 
 
 def write(path, measurements, split=None):

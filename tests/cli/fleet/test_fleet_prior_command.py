@@ -3,12 +3,15 @@
 import json
 
 import pytest
+from testing.engine_work import PicklingEngine
 from testing.fleet_robots import NOMINAL, rows_of
 from testing.models import REPOSITORY
 from testing.screens import assert_screen
 
 from pisigma.files.errors import ModelError, PisigmaError
+from pisigma.lifetime.fleet import prior as fleet_prior
 from pisigma.model.folder.model_folder import load_model
+from pisigma.workflow.fleet import run as workflow
 
 pytest.importorskip("pyarrow", reason="Parquet comes with the extra fleet")
 
@@ -31,7 +34,9 @@ def prior(tmp_path_factory, run):
     assert run("new", "rb5", "--from", folder / "in", "--out", cells).exit_code == 0
     (cells / "bad_robot" / "cell.yaml").write_text("robot: robot.yaml\n", encoding="utf-8")
     (cells / "bad_robot" / "robot.yaml").write_text("name: 3\n", encoding="utf-8")
-    made = run("fleet", "prior", cells, "--out", folder / "prior")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fleet_prior, "LINEARISATIONS", 1)
+        made = run("fleet", "prior", cells, "--out", folder / "prior")
     assert made.exit_code == 0, made.output
     return folder, made
 
@@ -78,8 +83,9 @@ def test_what_does_not_go_with_a_prior_is_refused(prior, refuses, tmp_path):
     refuses("fleet", "run", folder / "cells", "--prior", MODEL, error=ModelError)
 
 
-def test_cells_begin_with_it(prior, run):
+def test_cells_begin_with_it(prior, run, monkeypatch):
     folder, _ = prior
+    monkeypatch.setattr(workflow, "ProcessEngine", PicklingEngine)
     cells = folder / "later"
     (folder / "new").mkdir()
     (folder / "few.csv").rename(folder / "new" / "few.csv")
