@@ -1,6 +1,7 @@
 """Shipped models: each folder loads, has its card and figures, and reproduces the numbers of the card."""
 
 import csv
+import re
 from pathlib import Path
 
 import pytest
@@ -17,14 +18,61 @@ from pisigma.workflow.recipes.data import simulate
 from pisigma.workflow.recipes.reader import read_recipe, recipe_hash
 from pisigma.workflow.recipes.recipe import SimulatedData
 
-FOLDERS = sorted(path for path in (Path(__file__).parent.parent / "models").glob("*") if path.is_dir())
+MODELS = Path(__file__).parent.parent / "models"
+FOLDERS = [MODELS / name for name in ("kiro3", "kiro4")]
+"""Models of the paper's robots, which the recipes with the same names train."""
+MEASURED = [MODELS / name for name in ("fanuc_burakov", "panda_platonics", "ur10_landgraf", "ur5_jacobi")]
+"""Models of measured robots, from the commands in training/README.md."""
+MAX_BYTES = 2_000_000
+"""Largest size of a model folder [byte]."""
 SECTIONS = ("Joint errors", "Figures", "Domain", "Not validated", "Use", "Provenance")
 
 each = pytest.mark.parametrize("folder", FOLDERS, ids=lambda path: path.name)
+each_measured = pytest.mark.parametrize("folder", MEASURED, ids=lambda path: path.name)
 
 
-def test_the_models_of_the_paper_are_shipped():
-    assert {"kiro3", "kiro4"} <= {folder.name for folder in FOLDERS}
+def test_only_these_models_are_shipped():
+    shipped = {path for path in MODELS.iterdir() if path.is_dir() and not path.name.startswith("my_")}
+    assert shipped == {*FOLDERS, *MEASURED}
+
+
+@each_measured
+def test_a_measured_model_is_small_and_loads(folder):
+    """Its corrected joint values lead to the poses of held-out rows under the model itself."""
+    assert sum(path.stat().st_size for path in folder.iterdir()) <= MAX_BYTES
+    model, ik = load_model(folder), pisigma.load(folder)
+    assert model.name == ik.name == folder.name
+    assert "compiled" in vars(ik)  # read, not made
+    q = model.starts[:20]
+    T = model.forward(q).numpy()
+    solution = ik(T, near=q.numpy(), throw=False)
+    statuses = set(solution.status.tolist())
+    assert statuses <= {int(pisigma.Status.REACHED), int(pisigma.Status.OUTSIDE_DOMAIN)}
+    assert_close(model.forward(torch.from_numpy(solution.q)), torch.from_numpy(T), atol=1e-9)
+
+
+@each_measured
+def test_a_measured_model_has_the_figures_of_its_held_out_rows(folder):
+    figures = load_model(folder).metrics["cross_validation"]
+    with open(folder / "held_out.csv", encoding="utf-8") as stream:
+        rows = list(csv.DictReader(stream))
+    card = (folder / "README.md").read_text(encoding="utf-8")
+    shown = re.search(r"^\| position, RMS \| mm \| (\S+) \| (\S+) \| (\S+) \|$", card, re.MULTILINE)
+    rtol = 0.1 if "repeats" in figures else 1e-3  # the file has the rows of the first repeat only
+    for name, on_card in zip(("nominal", "geometric", "hybrid"), shown.groups(), strict=True):
+        errors = torch.tensor([float(row[f"{name}_mm"]) for row in rows], dtype=torch.float64)
+        assert_close(errors.square().mean().sqrt(), figures[name]["rms_mm"], rtol=rtol)
+        assert_close(float(on_card), figures[name]["rms_mm"], rtol=2e-3)
+
+
+@each_measured
+def test_the_page_cites_the_data_of_a_measured_model(folder, repository):
+    provenance = load_model(folder).provenance
+    page = (folder.parent / "README.md").read_text(encoding="utf-8")
+    row = next(line for line in page.splitlines() if line.startswith(f"| [{folder.name}]"))
+    assert provenance.data_sha256[:12] in row
+    assert "MIT" in row
+    assert f"--out {folder.name}\n" in (repository / "training" / "README.md").read_text(encoding="utf-8")
 
 
 @each

@@ -41,6 +41,18 @@ held-out random poses of the same region.
 Tests generate this page from the stored results and compare it byte for byte; they also run the small recipes and
 compare their results.
 Times depend on the load of the machine."""
+_MODELS = """\
+## Models of measured robots
+
+The folders of measured robots in [`models`](../models/README.md) come from these commands, each called in the folder of
+its data, whose sources that page cites:
+
+```bash
+pisigma calibrate ur10 series_c_train.csv --out ur10_landgraf
+pisigma calibrate ur5 grid.csv --out ur5_jacobi
+pisigma calibrate fanuc_r2000 positions.csv --folds 6 --out fanuc_burakov
+pisigma calibrate panda panda_3.csv --split placement --set 'socket_distance=*/0,*/1,50' --out panda_platonics
+```"""
 
 
 def page_text(folder: Path) -> str:
@@ -63,7 +75,7 @@ def page_text(folder: Path) -> str:
     for paper in published.papers:
         parts += [f"## {paper.heading}", paper.citation.strip(), _index("table", paper.tables)]
         parts += [_index("figure", paper.figures), *bodies[paper.key]]
-    parts += [f"## {_MEASURED}", *measured_sections(published, results), f"## {_DIFFERENCES}"]
+    parts += [f"## {_MEASURED}", *measured_sections(published, results), _MODELS, f"## {_DIFFERENCES}"]
     for paper in published.papers:
         parts += [f"### {paper.heading.split(':')[-1].strip()}", _listed(paper)]
     return "\n\n".join(parts) + "\n"

@@ -249,7 +249,9 @@ def read_code(path: Path) -> bytes | None:
     try:
         if not _trusted(os.stat(path.parent)):
             return None
-        with open(os.open(path, os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0)), "rb") as stream:
+        # without O_BINARY, Windows would translate line ends, so that the hash would never fit
+        flags = os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0)
+        with open(os.open(path, flags), "rb") as stream:
             status = os.fstat(stream.fileno())
             content = stream.read() if stat.S_ISREG(status.st_mode) and _trusted(status) else b""
     except OSError:

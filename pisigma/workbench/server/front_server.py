@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import errno
+import os
 import socket
 import threading
 from collections.abc import Awaitable, Callable, Mapping
@@ -97,7 +98,8 @@ def _bound(host: str, port: int) -> socket.socket:
             family, kind, _, _, address = socket.getaddrinfo(host, number, type=socket.SOCK_STREAM)[0]
             with contextlib.ExitStack() as unless_bound:
                 bound = unless_bound.enter_context(socket.socket(family, kind))
-                bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                if os.name == "posix":  # on Windows, two servers would share the port
+                    bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
                 bound.bind(address)
                 bound.listen()
                 unless_bound.pop_all()
