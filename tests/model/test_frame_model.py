@@ -93,3 +93,10 @@ def test_direction_that_is_held_is_uncertain_in_the_model():
     assert found.model.uncertainty is not None
     deviation = found.model.uncertainty.deviation(rows)
     assert float(deviation.norm(dim=1).min()) > 0.05
+
+
+def test_large_uncertainty_is_rounded(monkeypatch):
+    monkeypatch.setattr("pisigma.calibration.hybrid.uncertainty.MAX_EXACT_ENTRIES", 0)
+    found = frames_of_model(hybrid(), new_target(hybrid()), "tool")
+    assert found.model.uncertainty is not None
+    assert found.model.uncertainty.covariance_root.rounded is not None
