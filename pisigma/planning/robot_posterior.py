@@ -13,6 +13,7 @@ from pisigma.calibration.geometric.problem.setup import IdentifiedGeometry
 from pisigma.calibration.hybrid.calibrator import HybridCalibrator
 from pisigma.calibration.hybrid.gravity import USUAL, to_first_row_frame
 from pisigma.calibration.hybrid.result import HybridResult
+from pisigma.calibration.hybrid.sensor_values import joint_columns
 from pisigma.calibration.hybrid.uncertainty import PositionUncertainty
 from pisigma.estimation.covariance_root import CovarianceRoot, multiply_updated_root
 from pisigma.files.errors import IdentificationError, ImplausibleError
@@ -209,7 +210,19 @@ class RobotPosterior:
         else:
             noise = q.new_tensor([instrument.sigma] * 3 + [instrument.sigma_rotation] * 3)
             columns = columns / noise[:, None]
-        return self.uncertainty.covariance_root.left_multiply(columns)
+        return self.uncertainty.covariance_root.left_multiply(self._with_joint_noise(columns))
+
+    def _with_joint_noise(
+        self, columns: Float64[Tensor, "poses values unknowns"]
+    ) -> Float64[Tensor, "poses values unknowns"]:
+        """Divide values of noise 1 by the noise that includes the repeatability of the joints, `1 + J J^T`."""
+        deviation = RobotClass.from_robot(self.uncertainty.space.robot).joint_repeatability
+        if not deviation:
+            return columns
+        J = deviation * columns[..., joint_columns(self.uncertainty.space)]
+        noise = torch.eye(columns.shape[1], dtype=columns.dtype) + J @ J.mT
+        whitened: Tensor = torch.linalg.solve_triangular(torch.linalg.cholesky(noise), columns, upper=False)
+        return whitened
 
     def with_unknown_base_and_tool(
         self, base: Float64[np.ndarray, " 6"], tool: Float64[np.ndarray, " 6"]

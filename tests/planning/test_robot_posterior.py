@@ -1,5 +1,7 @@
 """Distribution of a robot's unknowns: conditioning on poses, predictions, and improbable rows."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -39,6 +41,22 @@ def test_columns_are_the_derivative_of_the_measured_values(robot: Robot, kind: s
     else:
         moved = (T[1] - T[0]) / step
     assert_close(B[:, :3, index], moved * size / 1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("kind", ["position", "distance"])
+def test_noise_of_an_arm_of_servos_includes_the_repeatability_of_its_joints(kind: str) -> None:
+    so101, instrument = Robot.load("so101"), Instrument(kind, 1e-3, anchor=(0.5, 0.1, 0.0))
+    q = random_joints(so101, 3, 0) / 2
+    B = RobotPosterior.from_robot(so101, instrument).sensitivities(q)
+    exact = RobotPosterior.from_robot(replace(so101, maker=""), instrument)
+    joints = [exact.uncertainty.space.index(f"theta_{number}") for number in range(1, 6)]
+    for row, values in enumerate(exact.columns(q)[:, :3]):
+        away = forward_kinematics(so101, q[row])[:3, 3] - torch.tensor(instrument.anchor)
+        X = values if kind == "position" else (away / away.norm())[None] @ values
+        J = X[:, joints]
+        C = 1e-6 * torch.eye(len(X)) + np.deg2rad(0.5) ** 2 * J @ J.mT
+        X = X @ RobotPosterior.from_robot(so101, instrument).uncertainty.root
+        assert_close(B[row].mT @ B[row], X.mT @ torch.linalg.solve(C, X), rtol=1e-6, atol=1e-6)
 
 
 def test_conditioning_agrees_with_a_normal_distribution(robot: Robot) -> None:

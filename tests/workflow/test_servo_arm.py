@@ -86,3 +86,21 @@ def test_images_of_a_phone_are_weighted_by_the_noise_of_the_servos(seed):
     noisy = later + SERVO * torch.from_numpy(np.random.default_rng(seed).normal(size=later.shape))
     noise = positions(true, noisy.numpy()) - positions(true, later.numpy())
     assert np.square(error).sum() < 0.25 * np.square(noise).sum()
+
+
+def test_lengths_between_touched_points_calibrate_without_held_out_rows():
+    """The zeros of this arm make lengths of the nominal arm wrong by more than those of other classes can be."""
+    nominal, true, random = servo_arm(4)
+    low, high = np.clip(nominal.limits, -1.6, 1.6).T
+    q, later = random.uniform(low, high, (80, 5)), random.uniform(low, high, (200, 5))
+    points = positions(true, q)
+    length = torch.from_numpy(np.linalg.norm(points[::2] - points[1::2], axis=1)).repeat_interleave(2)
+    logged = torch.from_numpy(q + SERVO * random.normal(size=q.shape))
+    pairs = tuple(f"pair {number}" for number in range(40) for _ in range(2))
+    rows = pisigma.Measurements(logged, distance=length, pair=pairs)
+    settings = pisigma.CalibrationSettings(model="geometric", folds=0)
+    calibration = pisigma.calibrate(nominal, rows, settings)
+    apart = [np.linalg.norm(np.diff(positions(one, later), axis=0), axis=1) for one in (nominal, true)]
+    found = np.linalg.norm(np.diff(positions(calibration.model.identified, later), axis=0), axis=1)
+    assert np.square(found - apart[1]).mean() < 0.1 * np.square(apart[0] - apart[1]).mean()
+    assert calibration.summary.predicted_rms_mm > 0

@@ -290,8 +290,11 @@ def predicted_at_other_poses(
     q, generator = measurements.q.detach().cpu(), torch.Generator().manual_seed(0)
     orders = torch.rand(OTHER_POSES, *q.shape, generator=generator).argsort(1)
     every = torch.arange(measurements.rows).repeat(OTHER_POSES)
+    alone = replace(
+        measurements, distance=None, pair=None, anchor=None, anchor_place=None
+    )  # pairs are two rows
     others = replace(
-        measurements.select(every), q=q[None].take_along_dim(orders, 1).flatten(0, 1).to(measurements.q)
+        alone.select(every), q=q[None].take_along_dim(orders, 1).flatten(0, 1).to(measurements.q)
     )
     if isinstance(result, HybridResult):
         deviation = result.deviation(others)

@@ -21,6 +21,7 @@ from pisigma.measurement.sensors.anchor import (
 )
 from pisigma.measurement.sensors.sensor import distinct_names, numbers_of
 from pisigma.robot.description import Robot
+from pisigma.robot.robot_class import RobotClass
 from pisigma.robot.se3 import rotation_from_rpy, rpy_from_rotation
 
 MAX_ITERATIONS = 60
@@ -45,7 +46,7 @@ DOUBTFUL = 0.01
 COLLAPSED = 0.25
 """Largest share of the errors that may remain in another unit."""
 MAX_WRONG_SHARE = 0.25
-"""Share of the distances that may be off by more than `MAX_NOMINAL_ERROR`."""
+"""Share of the distances that may be off by more than `MAX_NOMINAL_ERROR`, or by the usual zeros of servos."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,11 +192,12 @@ def tools_from_distances(
         position = torch.from_numpy(tools.get(name, nominal_tool)[:3].copy())
         tool, residual = (one[0] for one in distances.fitted(torch.ones(1).double(), position, held, reach))
         _refuse_other_units(space.robot, distances, (tool, residual), (position, held), measurements.source)
-        off = int((residual.abs() > MAX_NOMINAL_ERROR * reach).sum())
+        limit = max(MAX_NOMINAL_ERROR, RobotClass.from_robot(space.robot).usual.joint_offset) * reach
+        off = int((residual.abs() > limit).sum())
         if off > MAX_WRONG_SHARE * len(residual):
             raise ImplausibleError(
                 f"expected distances of robot '{space.robot.name}' at these joint values, got {off} of {len(residual)} "
-                f"that are off by more than {MAX_NOMINAL_ERROR * reach * 1e3:.3g} mm for any tool",
+                f"that are off by more than {limit * 1e3:.3g} mm for any tool",
                 expected="distances of this robot",
                 value=off,
                 at=Place(measurements.source),
