@@ -35,6 +35,7 @@ NOT_HERE: Mapping[str, str] = {
     "OMP_NUM_THREADS=1 python benchmarks/": "takes hours",
     "python benchmarks/": "takes hours",
     "pisigma calibrate ur5 corners.csv tracker.csv --camera wrist.yaml": "needs two cameras and a tracker",
+    "pisigma calibrate models/my_ur5 corners.csv --only hand-eye": "needs images of a board; options.txt has the call",
     "pisigma use cells/welder7": "names a model of the reader's cell",
     "pisigma export models/my_arm --format fanuc-mastering": "has ... for the counts of the reader's robot",
 }
