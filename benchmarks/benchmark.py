@@ -9,17 +9,25 @@ Packages that need other versions run with another Python: `--python pybotics=PA
 
 import argparse
 import json
+import math
+import os
 import sys
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from shared_benchmark.fits import fits_of
+from shared_benchmark.fits import fits_of, overrun_rows
 from shared_benchmark.methods import NAMES as METHODS
 from shared_benchmark.methods import method_of
 from shared_benchmark.page import write_page
+from shared_benchmark.public_series import Series
+from shared_benchmark.rows import Method
 from shared_benchmark.series import NAMES as SERIES
 from shared_benchmark.series import series_of
 from shared_benchmark.splits import SPLITS, folds_of
 from shared_benchmark.store import RESULTS, errors_of, replace, tables_of
+
+STORING = threading.Lock()
 
 
 def main() -> None:
@@ -38,6 +46,7 @@ def main() -> None:
     run.add_argument(
         "--quick", action="store_true", help="Run the first fold of the first split of every series"
     )
+    run.add_argument("--jobs", type=int, default=os.cpu_count(), help="Fits at the same time")
     run.add_argument("--out", type=Path, help="Folder of the results")
     page = commands.add_parser("page", help="Write the page from stored results")
     page.add_argument("--results", type=Path, default=RESULTS)
@@ -60,28 +69,37 @@ def main() -> None:
 
 
 def run_methods(options: argparse.Namespace) -> None:
-    """Run the chosen methods, print one line for each split, and store each when it is complete."""
-    pythons = dict(one.split("=", 1) for one in options.python)
+    """Run the chosen methods, several at a time, and store each split when it is complete."""
+    chains = []
     for name in options.series:
         series = series_of(name)
         missing = series.missing()
-        if missing is not None:
+        if missing is None:
+            chains += [(options, series, method_of(method)) for method in options.method]
+        else:
             print(f"{name}: {missing}", file=sys.stderr)
-            continue
-        splits = [split for split in series.splits if split in options.split]
-        for split in splits[:1] if options.quick else splits:
-            for method in map(method_of, options.method):
-                if options.quick and method.slow:
-                    continue
-                python = pythons.get(method.name, sys.executable)
-                new = tables_of(fits_of(series, split, method, python, 1 if options.quick else None))
-                folder = options.out or (None if options.quick else RESULTS)
-                if folder is not None:
-                    replace(folder, new)
-                status = "; ".join(dict.fromkeys(new[0]["status"].to_pylist()))
-                errors = errors_of(new[1], name, split, method.name)
-                error = f"{errors.rms:.4f} mm" if len(errors.row) else ""
-                print(f"{name:10s} {split:14s} {method.name:14s} {error:12s} {status}", flush=True)
+    with ThreadPoolExecutor(options.jobs) as pool:
+        list(pool.map(lambda chain: run_splits(*chain), chains))
+
+
+def run_splits(options: argparse.Namespace, series: Series, method: Method) -> None:
+    """Run a method on the splits of a series, with few training rows first, and print one line for each."""
+    pythons = dict(one.split("=", 1) for one in options.python)
+    splits = [split for split in series.splits if split in options.split]
+    if options.quick:
+        splits = [] if method.slow else splits[:1]
+    below = math.inf
+    for split in sorted(splits, key=lambda split: len(folds_of(series, split)[0].train)):
+        python = pythons.get(method.name, sys.executable)
+        new = tables_of(fits_of(series, split, method, python, 1 if options.quick else None, below))
+        below = min(below, overrun_rows(new[0].to_pylist()))
+        status = "; ".join(dict.fromkeys(new[0]["status"].to_pylist()))
+        errors = errors_of(new[1], series.name, split, method.name)
+        error = f"{errors.rms:.4f} mm" if len(errors.row) else ""
+        with STORING:
+            if options.out is not None or not options.quick:
+                replace(options.out or RESULTS, new)
+            print(f"{series.name:10s} {split:14s} {method.name:15s} {error:12s} {status}", flush=True)
 
 
 if __name__ == "__main__":

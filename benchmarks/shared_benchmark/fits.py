@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import math
 import os
 import signal
 import subprocess
@@ -81,11 +82,9 @@ def predict(task: Task, method: str, python: str) -> tuple[Fit, Prediction | Non
 
 
 def fits_of(
-    series: Series, split: str, method: Method, python: str, folds: int | None = None
+    series: Series, split: str, method: Method, python: str, folds: int | None = None, below: float = math.inf
 ) -> Iterator[tuple[Fit, RowErrors | None]]:
     """Run a method on the folds of a split.
-
-    After an overrun the other folds of the split are not tried.
 
     Args:
         series: the series.
@@ -93,6 +92,7 @@ def fits_of(
         method: the method.
         python: its Python.
         folds: number of folds to run, from the first; None for all.
+        below: number of training rows from which folds are not tried, because a fit overran; an overrun lowers it.
     """
     key = {"series": series.name, "split": split, "method": method.name}
     hashes = {
@@ -101,28 +101,30 @@ def fits_of(
         "code_sha256": code_hash(method),
         "seed": SEED,
     }
-    overrun = False
     for number, fold in enumerate(folds_of(series, split)[:folds]):
         base = {**key, "fold": number, "train_rows": len(fold.train), **hashes}
         if series.measured not in method.measured:
             yield {**base, "status": f"does not use rows of the kind '{series.measured}'"}, None
             return
-        if overrun:
-            yield {**base, "status": "not tried after an overrun"}, None
+        if len(fold.train) >= below:
+            yield {**base, "status": f"not tried after an overrun with {below} rows"}, None
             continue
         task, test, test_series = make_task(series, split, fold)
         fit, prediction = predict(task, method.name, python)
-        overrun = fit["status"].startswith("over ")
+        if fit["status"].startswith("over "):
+            below = len(fold.train)
         if prediction is None:
             yield {**base, **fit}, None
             continue
         numbers = np.arange(len(test.q)) if split == "session" else fold.test
         errors = row_errors(test_series, prediction, test, numbers, split == "session")
         distance = errors_between_sockets(prediction, test, test_series.known_distances(test))
-        yield (
-            {**base, **fit, "distance_mm": distance},
-            errors,
-        )
+        yield {**base, **fit, "distance_mm": distance}, errors
+
+
+def overrun_rows(fits: list[Fit]) -> float:
+    """Return the smallest number of training rows of the fits that overran; infinite without any."""
+    return min((fit["train_rows"] for fit in fits if fit["status"].startswith("over ")), default=math.inf)
 
 
 def make_task(series: Series, split: str, fold: Fold) -> tuple[Task, Rows, Series]:

@@ -104,7 +104,11 @@ class Series:
 
     def known_distances(self, rows: Rows) -> dict[tuple[str, str], float]:
         """Return the known distances between the sockets of some rows [m]."""
-        return {} if rows.socket is None else matching_sockets(self.distances, rows.socket.tolist())
+        if rows.socket is None:
+            return {}
+        here = set(rows.socket.tolist())
+        known = matching_sockets(self.distances, self.measurements.socket or ())
+        return {pair: length for pair, length in known.items() if here.issuperset(pair)}
 
 
 def to_measurements(rows: Rows) -> Measurements:

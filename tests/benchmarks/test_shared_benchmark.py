@@ -87,6 +87,30 @@ def test_a_fit_runs_in_its_own_process_and_a_crash_is_a_status(module, arm_task,
     assert fits.predict(task, "hybrid", sys.executable)[0]["status"] == "over 1 s"
 
 
+def test_larger_fits_are_not_tried_after_an_overrun(module, shared_data, monkeypatch):
+    """Fits to fewer rows still run; a method that cannot use the rows has one status."""
+    fits, series = module("fits"), module("series").series_of("fanuc")
+    tried = []
+
+    def overrun(task, method, python):
+        tried.append(len(task.train.q))
+        return {"status": "over 300 s"}, None
+
+    monkeypatch.setattr(fits, "predict", overrun)
+    method = module("methods").method_of("nominal")
+    found = [fit for fit, _ in fits.fits_of(series, "random", method, sys.executable)]
+    assert tried == [570]
+    assert [fit["status"] for fit in found][1:] == ["not tried after an overrun with 570 rows"] * 4
+    assert fits.overrun_rows(found) == 570
+    sockets = fits.fits_of(
+        module("series").series_of("panda"),
+        "placements",
+        module("methods").method_of("pybotics"),
+        sys.executable,
+    )
+    assert [fit["status"] for fit, _ in sockets] == ["does not use rows of the kind 'socket'"]
+
+
 def make_errors(scores: ModuleType, scale: float) -> object:
     error = scale * np.random.default_rng(1).standard_normal((400, 3))
     return scores.RowErrors(
