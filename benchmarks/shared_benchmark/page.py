@@ -113,7 +113,7 @@ def _series_table() -> str:
         [
             f"`{one.name}`: {one.title}",
             one.sensor,
-            f"{one.citation.split(',')[0]}, <{one.url}>, {one.licence}",
+            f"{one.citation.split(',')[0]}, `{one.url.removeprefix('https://')}`, {one.licence}",
             one.note,
         ]
         for one in map(series_of, SERIES)
