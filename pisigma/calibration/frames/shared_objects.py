@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
+import torch
 from jaxtyping import Float64
 from torch import Tensor
 
@@ -12,6 +13,9 @@ from pisigma.calibration.geometric.problem.parameters import ParameterSpace
 from pisigma.calibration.geometric.result import CalibrationResult
 from pisigma.calibration.hybrid.uncertainty import PositionUncertainty
 from pisigma.estimation.covariance_root import CovarianceRoot
+
+DETERMINED = 1e-6
+"""Smallest over largest standard deviation of the directions of a base below which one of them was not estimated."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,17 +51,24 @@ class ArmPosterior:
         first = self.space.indices_of("base").start + 6 * self.space.frames.index(frame)
         return range(first, first + 6)
 
+    def _is_determined(self, frame: str) -> bool:
+        """Return whether all six directions of the base in a frame were estimated."""
+        rows = list(self.base_rows(frame))
+        scaled = self.root[rows] / torch.from_numpy(self.space.usual_errors[rows])[:, None]
+        return int(torch.linalg.matrix_rank(scaled, rtol=DETERMINED)) == len(rows)
+
     @cached_property
     def shared_objects(self) -> dict[tuple[str, str], tuple[str, tuple[int, ...]]]:
         """Frame and indices of the parameters of everything that another arm could have measured too.
 
         These are named frames in which the base was calibrated, and points at positions that were estimated: sockets
-        and anchors. For a frame, the parameters are those of the base.
+        and anchors. For a frame, the parameters are those of the base. A base with a direction that the rows did not
+        determine, which kept its value before and has no covariance, is not shared.
         """
         found = {
             ("frame", frame): (frame, tuple(self.base_rows(frame)))
             for frame in self.space.frames
-            if frame and bool(self.root[list(self.base_rows(frame))].any())
+            if frame and self._is_determined(frame)
         }
         for group in self.space.unknowns:
             first, size = self.space.indices_of(group.name).start, len(group.columns)

@@ -14,6 +14,7 @@ from testing.two_arms import BASES, FRAMES, FREE, TOOL, UR5, own_fit, pose_of, p
 from pisigma.calibration.frames.arm_bases import fit_arm_bases
 from pisigma.calibration.frames.tool_to_tool import Postures, tool_to_tool_deviation
 from pisigma.calibration.geometric.result import CalibrationResult
+from pisigma.estimation.covariance_root import CovarianceRoot
 from pisigma.files.errors import IdentificationError
 from pisigma.measurement.conditions import JointState
 from pisigma.measurement.dataset import Measurements
@@ -164,6 +165,17 @@ def test_arms_without_anything_in_common_are_refused():
     hall, jig = posterior("left", own_fit(0, 3, "hall")), posterior("right", own_fit(0, 4, "jig"))
     with refused(IdentificationError, value="none"):
         fit_arm_bases((hall, jig))
+
+
+def test_frame_with_an_undetermined_direction_is_not_shared():
+    left, right = posteriors(1, "hall")
+    rows = list(right.base_rows("hall"))
+    root = right.root.clone()
+    direction = torch.tensor([0.6, 0.8, 0, 0, 0, 0], dtype=torch.float64)
+    root[rows] -= direction[:, None] * (direction @ root[rows])
+    held = replace(right.uncertainty, covariance_root=CovarianceRoot(root))
+    with refused(IdentificationError, value="none"):
+        fit_arm_bases((left, replace(right, uncertainty=held)))
 
 
 def test_order_of_the_arms_does_not_matter():
