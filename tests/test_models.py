@@ -2,6 +2,9 @@
 
 import csv
 import re
+import subprocess
+import sys
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -140,3 +143,19 @@ def test_figures_are_reproduced(folder, repository):
                 found = JointErrorFigures.from_errors(errors[:, index], model.robot.revolute[index])
                 for name, value in joint[part][when].items():
                     assert_close(getattr(found, name), value, rtol=1e-6, atol=1e-9)
+
+
+def test_the_wheel_of_models_contains_all_of_them(repository, tmp_path):
+    command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(tmp_path)]
+    done = subprocess.run(
+        [*command, str(repository / "packaging" / "pisigma-models")],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    (wheel,) = tmp_path.glob("*.whl")
+    names = {name for name in zipfile.ZipFile(wheel).namelist() if name.startswith("pisigma_models/")}
+    files = {path for folder in (*FOLDERS, *MEASURED) for path in folder.iterdir()}
+    inside = {f"pisigma_models/{path.relative_to(MODELS).as_posix()}" for path in files}
+    assert names == inside | {"pisigma_models/__init__.py", "pisigma_models/README.md"}
