@@ -111,8 +111,8 @@ def check_rows_of_frames(
 ) -> tuple[Diagnostic, ...]:
     """Check rows to which base, tool or both were fitted, without those that the others contradict.
 
-    The rows are checked against the nominal robot, if its arm was used, and against the model with the fitted frames;
-    then the residuals are compared with the reach.
+    The rows are checked against the model whose arm was used, with the frames fitted, or against the nominal robot and
+    its model with the fitted frames; then the residuals are compared with the reach.
 
     Args:
         rows: the rows.
@@ -135,7 +135,8 @@ def check_rows_of_frames(
     def findings() -> Iterator[Iterable[Diagnostic]]:
         if isinstance(against, Robot):
             yield check_rows(some, against).diagnostics
-        yield check_rows_by_model(some, found.model, kinds[found.fit.only]).diagnostics
+        model = found.model if isinstance(against, Robot) else against
+        yield check_rows_by_model(some, model, kinds[found.fit.only]).diagnostics
         yield check_residual(checked)
 
     return _until_implausible(findings())

@@ -18,6 +18,7 @@ from pisigma.model.calibrated_model import CalibratedModel, corrected_joints, po
 from pisigma.model.frame_model import frames_of_model
 from pisigma.model.geometric_model import model_of_hybrid
 from pisigma.robot.se3 import transform_from_xyzrpy
+from pisigma.validation.gate import check_rows_of_frames
 
 TOOL = np.array([0.03, -0.02, 0.1, 0.0, 0.0, 0.0])
 """Position of a new target on the flange."""
@@ -100,3 +101,12 @@ def test_large_uncertainty_is_rounded(monkeypatch):
     found = frames_of_model(hybrid(), new_target(hybrid()), "tool")
     assert found.model.uncertainty is not None
     assert found.model.uncertainty.covariance_root.rounded is not None
+
+
+@pytest.mark.parametrize("factor", [1.0, 1.02])
+def test_scale_of_the_rows_is_checked_by_the_model_whose_arm_was_used(factor):
+    model, rows = hybrid(), new_target(hybrid(), 10)
+    assert rows.position is not None
+    some = replace(rows, position=factor * rows.position)
+    findings = check_rows_of_frames(some, model, frames_of_model(model, some, "hand-eye"))
+    assert [one.kind for one in findings] == ([] if factor == 1.0 else ["scale"])
