@@ -46,7 +46,9 @@ def few_choices() -> Iterator[None]:
 def few_robots() -> Iterator[None]:
     """Compare rows with large errors with six robots of the catalogue, as each takes a tenth of a second."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(other_robot, "catalogue", lambda: ("fanuc_r2000", "kiro4", "rb5", "ur10", "ur5", "ur5e"))
+        patch.setattr(
+            other_robot, "catalogue", lambda: ("fanuc_r2000", "kiro4", "rb5", "ur10", "ur5", "ur5e")
+        )
         yield
 
 
