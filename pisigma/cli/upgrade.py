@@ -25,6 +25,7 @@ def upgrade(model: ModelOrCell, as_json: AsJson = False) -> None:
         for one in done.models:
             name = f"model '{one.name}'" if is_cell(model) else str(model)
             if one.before == one.after:
+                print_lines([f"{name}: {change}" for change in one.changes])
                 print_lines([f"{name} already has the newest format ({one.after})."])
             else:
                 print_lines([f"{name}: format {one.before} was upgraded to {one.after}.", *one.changes])

@@ -27,6 +27,7 @@ from pisigma.model.folder.model_document import (
     write_document,
 )
 from pisigma.model.folder.model_folder import describe, load_model, read_weights
+from pisigma.robot.kernels.description_file import read_description
 
 _RENAMED = {
     "dealings": "repeats",
@@ -59,6 +60,8 @@ _NO_FADE = (
     "The correction now applies at all joint values, with a predicted standard deviation; up to format 3 it faded to "
     "zero outside the measured ones."
 )
+
+_KERNELS = "The arrays of the compiled kernels had the form of another version; they were written again."
 
 ROOT = "uncertainty.root"
 MAX_DEVIATIONS = 3.0
@@ -108,7 +111,7 @@ def upgrade_folder(folder: str | os.PathLike[str], check: Callable[[CalibratedMo
             remedy="train or copy the model again",
         )
     if before == FORMAT:
-        return Upgrade(load_model(path).name, before, FORMAT)
+        return _with_new_kernels(path, document, check)
     document["metrics"] = _metrics(str(document.get("kind")), _renamed(document["metrics"]))
     if "uncertainty" in document:
         document["uncertainty"] = _in_order(
@@ -122,14 +125,37 @@ def upgrade_folder(folder: str | os.PathLike[str], check: Callable[[CalibratedMo
         document["weights_sha256"] = _with_exact_root(scratch / WEIGHTS, str(document.get("weights_sha256")))
         if changes and (card := scratch / CARD).is_file():
             card.write_bytes(_FADED.sub(_EXTRAPOLATED, card.read_bytes()))
-        text = document_text(
-            {key: value for key, value in document.items() if key not in ("format", "compiled_sha256")}
-        )
+        text = _text_of(document)
         write_document(text, None, scratch / DESCRIPTION)
         model = load_model(scratch)
         describe(text, model, scratch)
         check(model, scratch)
     return Upgrade(model.name, before, FORMAT, changes)
+
+
+def _with_new_kernels(
+    path: Path, document: Mapping[str, Any], check: Callable[[CalibratedModel, Path], None]
+) -> Upgrade:
+    """Write the arrays of the compiled kernels of a folder again if this version cannot read them."""
+    model, changes = load_model(path), tuple[str, ...]()
+    try:
+        if (path / COMPILED).is_file():
+            read_description(path / COMPILED)
+    except ModelError:
+        changes = (_KERNELS,)
+        others = {entry.name for entry in path.iterdir() if entry.is_file()} - {COMPILED}
+        with staged_folder(path, overwrite=True, names=MODEL_FILES | others) as scratch:
+            for name in sorted(others):
+                (scratch / name).write_bytes(read_model_file(path, name))
+            describe(_text_of(document), model, scratch)
+            check(model, scratch)
+    return Upgrade(model.name, FORMAT, FORMAT, changes)
+
+
+def _text_of(document: Mapping[str, Any]) -> str:
+    return document_text(
+        {key: value for key, value in document.items() if key not in ("format", "compiled_sha256")}
+    )
 
 
 def _without_fade(document: dict[str, Any]) -> tuple[str, ...]:

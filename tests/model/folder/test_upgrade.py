@@ -16,6 +16,7 @@ from testing.report import hybrid_under_test
 from pisigma.files.errors import ModelError, OutputError
 from pisigma.joint_correction.conditions import ConditionFeatures
 from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.model.folder.model_document import FORMAT
 from pisigma.model.folder.model_folder import load_model, save_model
 from pisigma.model.folder.upgrade import Upgrade, upgrade_folder
 from pisigma.model.inverse.written_model import check_written
@@ -125,6 +126,19 @@ def test_other_files_in_a_folder_are_kept(tmp_path):
     (tmp_path / "arm" / ".git").rmdir()
     upgrade_folder(tmp_path / "arm", check_written)
     assert (tmp_path / "arm" / "notes.txt").read_text() == "mine"
+
+
+def test_kernels_of_another_version_are_written_again(tmp_path):
+    """The folder becomes the one that this version writes, byte for byte."""
+    folder = tmp_path / "m"
+    folder.mkdir()
+    save_model(hand_made_model("kiro4"), folder)
+    written = {path.name: path.read_bytes() for path in folder.iterdir()}
+    assert not upgrade_folder(folder, check_written).changes
+    (folder / "compiled.npz").write_bytes(b"of another version")
+    done = upgrade_folder(folder, check_written)
+    assert (done.before, done.after, len(done.changes)) == (FORMAT, FORMAT, 1)
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == written
 
 
 def test_product_units_of_an_earlier_version_are_refused_and_nothing_is_changed(tmp_path):
