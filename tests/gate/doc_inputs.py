@@ -177,6 +177,19 @@ def tracked_plan(path: Path, small: Path) -> None:
     Measurements(q=plan.q, position=position).write_csv(path, plan.arm.robot)
 
 
+def by_ruler(path: Path, small: Path) -> None:
+    """Write lengths between touched points of an SO-101 whose zeros are wrong."""
+    robot, random = Robot.load("so101"), np.random.default_rng(0)
+    q = torch.from_numpy(random.uniform(-1.2, 1.2, (80, 5)))
+    dh = robot.dh.copy()
+    dh[:, 0] += 0.1
+    points = forward_kinematics(robot.with_geometry(dh), q)[:, :3, 3]
+    lengths = (points[::2] - points[1::2]).norm(dim=1).repeat_interleave(2)
+    noisy = q + 5e-3 * torch.from_numpy(random.normal(size=q.shape))
+    pairs = tuple(f"p{number}" for number in range(40) for _ in range(2))
+    Measurements(noisy, distance=lengths, pair=pairs).write_csv(path, robot)
+
+
 def with_plumb(path: Path, small: Path) -> None:
     """Write positions of a UR5, and distances of other rows from the z axis."""
     measured("ur5", 0, 60)(path, small)
@@ -286,6 +299,8 @@ MY_UR5, MY_UR10 = calibrated("ur5"), calibrated("ur10")
 EVERYWHERE: Mapping[str, Maker] = {
     **{name: copy(name) for name in ("board.yaml", "camera.yaml", "cell.yaml", "token.txt")},
     "tracker.csv": measured("ur5"),
+    "touches.csv": measured("so101"),
+    "lengths.csv": by_ruler,
     **{name: measured("ur5", 40, 60) for name in ("check.csv", "new_measurements.csv")},
     **{f"{name}.py": copy(f"{name}.py") for name in ("belt", "limits", "hanging_play", "mast", "plumb")},
     "models/my_ur5": MY_UR5,
