@@ -130,6 +130,7 @@ def _method_table() -> str:
 
 def _accuracy(results: Results, name: str) -> str:
     splits = [split for series, split in results.pairs if series == name]
+    ran = {method for series, _, method in results.statuses if series == name}
     best = {
         split: min(
             (
@@ -148,7 +149,9 @@ def _accuracy(results: Results, name: str) -> str:
             return f"**{rms:.3f}**" if rms == best[split] else f"{rms:.3f}"
         return _short(results.statuses.get((name, split, method), ("not run",)))
 
-    rows = ([f"`{method}`", *(cell(split, method) for split in splits)] for method in METHODS)
+    rows = (
+        [f"`{method}`", *(cell(split, method) for split in splits)] for method in METHODS if method in ran
+    )
     return f"### {series_of(name).title}\n\n" + _table(["method", *(f"`{split}`" for split in splits)], rows)
 
 
