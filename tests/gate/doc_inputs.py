@@ -11,6 +11,7 @@ from click.testing import CliRunner
 from gate.option_inputs import REPOSITORY, prepare
 from testing.aged import original_model, rows_after_change
 from testing.models import no_type_checker
+from testing.phone_arm import write_video
 from testing.simulated_arm import simulate
 from typer.main import get_command
 
@@ -225,6 +226,14 @@ def images(part: str, seed: int = 1) -> Maker:
     return made
 
 
+def phone_video(path: Path, small: Path) -> None:
+    """Write the video of an arm in front of a phone, the joint values of its stops, and the board in its gripper."""
+    write_video(path, 24)
+    path.with_name("board.yaml").write_text(
+        "kind: charuco\nrows: 4\ncolumns: 6\nsquare_mm: 18\nmarker_mm: 13\ndictionary: 4x4_50\n"
+    )
+
+
 def exported(model: Maker, form: str) -> Maker:
     """Export a model as a file."""
 
@@ -314,6 +323,7 @@ EVERYWHERE: Mapping[str, Maker] = {
     "both.csv": with_plumb,
     "calibration.conf": exported(MY_UR5, "ur-calibration"),
     "arm.urdf": six_joints,
+    "poses.mp4": phone_video,
     "lerobot_data": copy("lerobot_data"),
     "follower.json": copy("follower.json"),
     "models/so101": copy("so101"),

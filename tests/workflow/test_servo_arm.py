@@ -1,31 +1,12 @@
 """Arms of hobby servos: zeros off by 5 to 17 deg and a repeatability of 0.5 deg are neither faults nor implausible."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
+from testing.phone_arm import SERVO, phone_rows, servo_arm
 
 import pisigma
-from pisigma.measurement.camera.board import Board
-from pisigma.measurement.camera.camera import Camera
-from pisigma.measurement.camera.camera_files import Repeatability
-from pisigma.measurement.camera.image_rows import image_measurements
 from pisigma.robot.kinematics.forward import forward_kinematics
-from pisigma.robot.se3 import transform_from_xyzrpy, xyzrpy_from_transform
-from pisigma.simulation.camera.simulated_images import ImageNoise, project_corners, simulate_images
-
-SERVO = np.deg2rad(0.5)
-
-
-def servo_arm(seed: int) -> tuple[pisigma.Robot, pisigma.Robot, np.random.Generator]:
-    """An SO-101 as described, and as built: zeros off by 5 to 17 deg, links by 1 mm, axes by 2.5 mrad."""
-    random, nominal = np.random.default_rng(seed), pisigma.Robot.load("so101")
-    dh = nominal.dh.copy()
-    dh[:, 0] += np.deg2rad(random.uniform(5, 17, 5)) * random.choice([-1, 1], 5)
-    dh[:, 1:3] += random.normal(0, 1e-3, (5, 2))
-    dh[:, 3:] += random.normal(0, 2.5e-3, (5, 2))
-    return nominal, nominal.with_geometry(dh, base=nominal.base + random.uniform(-0.3, 0.3, 6)), random
 
 
 def positions(robot: pisigma.Robot, q: np.ndarray) -> np.ndarray:
@@ -48,36 +29,9 @@ def test_positions_are_predicted_better_than_the_servos_repeat(seed):
     assert np.square(error).sum(1).mean() < np.square(noise).sum(1).mean()
 
 
-PHONE = Camera("phone", 1920, 1440, 1420.0, 1420.0, 960.0, 720.0, is_fixed=True)
-BOARD = Board("board", 5, 7, 0.014)
-FROM_PHONE = np.array([[0.0, 1, 0, 0], [0, 0, -1, 0.2], [-1, 0, 0, 0.8], [0, 0, 0, 1]])
-"""T_camera_base: the phone looks at the arm from 0.8 m in front of it, 0.2 m above the table."""
-
-
-def images(seed: int, count: int) -> tuple[pisigma.Measurements, pisigma.Robot, torch.Tensor]:
-    """Rows of images of a board in the gripper, the arm as built, and joint values of later images."""
-    nominal, true, random = servo_arm(seed)
-    T_base = torch.from_numpy(FROM_PHONE) @ transform_from_xyzrpy(torch.tensor(nominal.base))
-    T_tool = (
-        transform_from_xyzrpy(torch.tensor(nominal.tool))
-        @ torch.diag(torch.tensor([1.0, -1, -1, 1])).double()
-    )
-    true = true.with_geometry(
-        true.dh, base=xyzrpy_from_transform(T_base).numpy(), tool=xyzrpy_from_transform(T_tool).numpy()
-    )
-    q = torch.from_numpy(random.uniform(*np.clip(nominal.limits, -1.5, 1.5).T, (20 * count, 5)))
-    T = forward_kinematics(true, q)
-    faces = T[:, 2, 2] > 0.7
-    q = q[faces & torch.from_numpy(project_corners(PHONE, BOARD, T)[1].all(1))]
-    actual = q[:count] + SERVO * torch.from_numpy(random.normal(size=(count, 5)))
-    noise, generator = ImageNoise(0.1, Repeatability(0.0, 0.0)), torch.Generator().manual_seed(seed)
-    seen = replace(simulate_images(true, actual, PHONE, BOARD, noise, generator, True), q=q[:count])
-    return image_measurements(seen, PHONE, BOARD, True, Repeatability(), "free"), true, q[count:]
-
-
 @pytest.mark.parametrize("seed", [0, 1])
 def test_images_of_a_phone_are_weighted_by_the_noise_of_the_servos(seed):
-    rows, true, later = images(seed, 40)
+    rows, true, later = phone_rows(seed, 40)
     settings = pisigma.CalibrationSettings(model="geometric", folds=0)
     identified = pisigma.calibrate("so101", rows, settings).model.identified
     wrong = np.rad2deg(identified.dh - true.dh)[1:4, 0]

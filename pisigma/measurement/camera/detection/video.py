@@ -27,7 +27,7 @@ LAG = 0.1
 """Time between frames that are compared [s]; slow motions change neighbouring frames too little."""
 MIN_STILL = 0.4
 """Shortest time at rest of a stop [s]."""
-NOISE_SHARE, NOISE_FACTOR, NOISE_GRAY = 0.2, 1.5, 0.3
+NOISE_SHARE, NOISE_FACTOR, NOISE_GRAY = 0.2, 1.5, 2.0
 """The change of frames at rest is this quantile of all changes; larger changes are motions if they exceed it by this
 factor and this gray level."""
 
