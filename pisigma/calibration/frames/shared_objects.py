@@ -51,12 +51,6 @@ class ArmPosterior:
         first = self.space.indices_of("base").start + 6 * self.space.frames.index(frame)
         return range(first, first + 6)
 
-    def _is_determined(self, frame: str) -> bool:
-        """Return whether all six directions of the base in a frame were estimated."""
-        rows = list(self.base_rows(frame))
-        scaled = self.root[rows] / torch.from_numpy(self.space.usual_errors[rows])[:, None]
-        return int(torch.linalg.matrix_rank(scaled, rtol=DETERMINED)) == len(rows)
-
     @cached_property
     def shared_objects(self) -> dict[tuple[str, str], tuple[str, tuple[int, ...]]]:
         """Frame and indices of the parameters of everything that another arm could have measured too.
@@ -68,7 +62,7 @@ class ArmPosterior:
         found = {
             ("frame", frame): (frame, tuple(self.base_rows(frame)))
             for frame in self.space.frames
-            if frame and self._is_determined(frame)
+            if frame and is_determined(self.root[list(self.base_rows(frame))])
         }
         for group in self.space.unknowns:
             first, size = self.space.indices_of(group.name).start, len(group.columns)
@@ -77,6 +71,14 @@ class ArmPosterior:
                 if group.has_point and bool(self.root[list(rows)].any()):
                     found[group.name, owner] = frame, rows
         return found
+
+
+def is_determined(root: Float64[Tensor, "6 directions"]) -> bool:
+    """Return whether all six directions of a base were estimated, by a root of its covariance [m and rad].
+
+    A direction that was held at its value before has no covariance.
+    """
+    return int(torch.linalg.matrix_rank(root, rtol=DETERMINED)) == len(root)
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from jaxtyping import Float64
 from scipy.stats import f as fisher
 from torch import Tensor
 
-from pisigma.calibration.frames.shared_objects import ArmPosterior
+from pisigma.calibration.frames.shared_objects import ArmPosterior, is_determined
 from pisigma.files.errors import IdentificationError
 from pisigma.model.frame_model import FittedFrames
 from pisigma.robot.se3 import invert, rotation_from_vector, rotation_vector, skew, transform_from_xyzrpy
@@ -36,10 +36,22 @@ class ArmBefore:
 
     @property
     def frames(self) -> tuple[str, ...]:
-        """Frames in which the base was measured before and now."""
+        """Frames in which the base was determined before and now."""
         return tuple(
-            name for name in self.now.fit.solved.geometry.bases if name in self.posterior.space.frames
+            name
+            for name in self.now.fit.solved.geometry.bases
+            if ("frame", name) in self.posterior.shared_objects and is_determined(self._noise(name))
         )
+
+    def _rows(self, frame: str) -> list[int]:
+        """Return the numbers of the base in a frame among the fitted coordinates."""
+        parameters = self.now.fit.parameters
+        return [k for k, one in enumerate(parameters) if one.group == "base" and one.owner == frame]
+
+    def _noise(self, frame: str) -> Float64[Tensor, "6 directions"]:
+        """Return a root of the covariance of the base now by the noise of the rows."""
+        fit = self.now.fit
+        return fit.solved.root[[fit.frames[k] for k in self._rows(frame)]]
 
     @property
     def freedom(self) -> float:
@@ -65,13 +77,9 @@ class ArmBefore:
 
         both = torch.stack([now, before])
         J = torch.func.jacrev(motion)(both)
-        fit = self.now.fit
-        names = [one.name for one in fit.parameters]
-        own = [k for k, one in enumerate(fit.parameters) if one.owner == frame and one.group == "base"]
-        assert len(own) == 6, names
-        arm = J[:, 0] @ self.now.arm_root[own]
+        arm = J[:, 0] @ self.now.arm_root[self._rows(frame)]
         arm = arm + J[:, 1] @ self.posterior.root[list(self.posterior.base_rows(frame))]
-        noise = J[:, 0] @ fit.solved.root[[fit.frames[k] for k in own]]
+        noise = J[:, 0] @ self._noise(frame)
         return motion(both), torch.cat([arm, noise], 1)
 
 
@@ -131,15 +139,16 @@ def find_moved_bases(arms: Sequence[ArmBefore]) -> MovedBases:
         arms: the arms, each measured now in one or more frames of before.
 
     Raises:
-        IdentificationError: an arm was not measured in a frame of before.
+        IdentificationError: the base of an arm is not determined in a named frame of before.
     """
     owners, motions, roots = [], [], []
     for number, arm in enumerate(arms):
         if not arm.frames:
             raise IdentificationError(
-                expected=f"rows of arm '{arm.posterior.name}' in a frame of its calibration",
+                expected=f"rows of arm '{arm.posterior.name}' that determine its base in a named frame of its "
+                "calibration",
                 value=", ".join(arm.now.fit.solved.geometry.bases),
-                remedy="use the same names in the column 'frame'",
+                remedy="use the same name in the column 'frame', and measure 6 different poses or more",
             )
         for frame in arm.frames:
             motion, root = arm.displacement(frame)

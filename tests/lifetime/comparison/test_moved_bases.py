@@ -7,10 +7,13 @@ import pytest
 import torch
 from testing.closeness import assert_close
 from testing.models import no_type_checker
+from testing.refusals import refused
 from testing.two_arms import BASES, FRAMES, UR5, own_fit, pose_of, posterior, rows_now
 
 from pisigma.calibration.frames.arm_bases import fit_arm_bases
 from pisigma.calibration.frames.shared_objects import uncertainty_of
+from pisigma.estimation.covariance_root import CovarianceRoot
+from pisigma.files.errors import IdentificationError
 from pisigma.lifetime.comparison.moved_bases import ArmBefore, MovedBases, find_moved_bases
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.frame_model import frames_of_model
@@ -82,3 +85,17 @@ def test_larger_motion_is_that_of_one_body_only():
 def test_two_bodies_that_moved_are_not_explained_by_one():
     assert not moved(0, bump(0.5, 0.5), "left", "hall").is_one_body
     assert moved(0, bump(0.5, 0.5), "left").is_one_body
+
+
+def test_frame_whose_base_was_not_determined_is_not_compared():
+    with no_type_checker():
+        known = posterior("left", own_fit(0, 0, "hall"))
+        found = frames_of_model(model(0, 0), rows_now(0, 0, STILL, ""), "base")
+    assert ArmBefore(known, STILL, found).frames == ("hall",)
+    root = known.root.clone()
+    root[known.base_rows("hall")[0]] = 0.0
+    held = replace(known.uncertainty, covariance_root=CovarianceRoot(root))
+    arm = ArmBefore(replace(known, uncertainty=held), STILL, found)
+    assert arm.frames == ()
+    with refused(IdentificationError, value="hall"):
+        find_moved_bases([arm])

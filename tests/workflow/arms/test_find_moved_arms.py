@@ -8,7 +8,7 @@ from testing.closeness import assert_close
 from testing.refusals import refused
 from testing.two_arms import UR5, measured_positions, rows_now
 
-from pisigma.files.errors import ModelError
+from pisigma.files.errors import IdentificationError, ModelError
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot.se3 import transform
 from pisigma.workflow.arms.calibrate_arms import Arm, calibrate_arms
@@ -57,6 +57,11 @@ def test_one_arm_cannot_say_whether_it_or_the_frame_moved(folder):
 def test_unknown_arm_is_refused(folder):
     with refused(ModelError, value="middle"):
         find_moved_arms(folder, {"middle": now("")["left"]})
+
+
+def test_too_few_rows_are_refused(folder):
+    with refused(IdentificationError, value=6):
+        find_moved_arms(folder, {"left": now("")["left"].select(torch.tensor([0, 1]))})
 
 
 def test_changed_model_is_refused(folder, tmp_path):
