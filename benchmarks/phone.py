@@ -263,6 +263,8 @@ def main(seeds: range, images: int, ways: list[str]) -> None:
             held = sum(low <= one[name] <= high for one in every)
             print(f"{way}: {name} from {low:g} to {high:g} in {held} of {len(every)} arms")
         pooled = {name: float(np.sqrt(np.mean([one[name] ** 2 for one in every]))) for name in every[0]}
+        predicted = np.array([one["predicted"] * one["model"] for one in every])
+        pooled["predicted"] = float(np.sqrt(np.square(predicted).mean())) / pooled["model"]
         print(f"{way}, RMS of all arms: " + ", ".join(f"{name} {one:.2f}" for name, one in pooled.items()))
 
 
