@@ -62,8 +62,8 @@ Only = Annotated[
         metavar="FRAME", help="Fit only the tool, base or hand-eye transform; ROBOT may be a model."
     ),
 ]
-NOT_STORED = "no model was stored, because the result must not be trusted, for the reasons above."
-ARM_AS_GIVEN = "with --only, the arm is used as given and no row is held out"
+_NOT_STORED = "no model was stored, because the result must not be trusted, for the reasons above."
+_ARM_AS_GIVEN = "with --only, the arm is used as given and no row is held out"
 
 
 @takes_settings
@@ -160,7 +160,7 @@ def _calibrate_frame(
     from pisigma.robot.description import Robot
     from pisigma.workflow.frames.calibrate_frame import calibrate_frame
 
-    settings.check_unused(ARM_AS_GIVEN)
+    settings.check_unused(_ARM_AS_GIVEN)
     arm = robot if is_model(Path(robot)) else Robot.load(robot, base, tip)
     calibration = calibrate_frame(arm, data, only, settings.cameras)
     command = command_line(context)
@@ -178,7 +178,7 @@ def _calibrate_frame_of_cell(
     folder = None if entry is None else cell.model_folder(entry.name)
     _print_frame(calibration, folder, verbose, as_json, cell)
     if entry is None:
-        raise AcceptanceError(NOT_STORED)
+        raise AcceptanceError(_NOT_STORED)
 
 
 def _print_frame(
@@ -217,7 +217,7 @@ def _calibrate_arms(
         summaries = {name: one.summary for name, one in found.calibrations.items()}
         print_result(arms_text(found.summary, summaries, found.warnings, folder, found.seconds), verbose)
     if folder is None:
-        raise AcceptanceError(NOT_STORED)
+        raise AcceptanceError(_NOT_STORED)
 
 
 def _calibrate_cell(
@@ -248,4 +248,4 @@ def _calibrate_cell(
         text = calibration_text(calibration.summary, folder, calibration.seconds)
         print_result(text, verbose, [*wrap_lines(remark), *next_step_lines(cell.status())])
     if entry is None:
-        raise AcceptanceError(NOT_STORED)
+        raise AcceptanceError(_NOT_STORED)

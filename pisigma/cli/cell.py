@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 CellFolder = Annotated[Path, typer.Argument(metavar="CELL", help="Folder of a cell.")]
 Reason = Annotated[str, typer.Option(help="Reason to record in the history.")]
-MAX_LINES = 12
+_MAX_LINES = 12
 """Largest number of sessions that are printed, newest first."""
 
 
@@ -76,7 +76,7 @@ def _print_status(status: "CellStatus") -> None:
             one.sensor,
             f"set aside: {one.set_aside}" if one.set_aside else verdicts.get(one.name, ""),
         )
-        for one in facts.sessions[-MAX_LINES:]
+        for one in facts.sessions[-_MAX_LINES:]
     ]
     if rows:
         print_table(f"sessions ({len(facts.sessions)})", ("session", "rows", "sensor", "verdict"), rows)

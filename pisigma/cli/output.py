@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from pisigma.workflow.result import AbstractModelResult
 
-WIDTH_WITHOUT_TERMINAL = 80
+_WIDTH_WITHOUT_TERMINAL = 80
 
 _ONLY_FOR_PRINTING = ("as_json", "verbose", "help_all")
 
@@ -120,7 +120,7 @@ def screen_width() -> int:
     from rich.console import Console
 
     console = Console()
-    return console.width if console.is_terminal else WIDTH_WITHOUT_TERMINAL
+    return console.width if console.is_terminal else _WIDTH_WITHOUT_TERMINAL
 
 
 def command_line(context: typer.Context, files: Collection[str] = ("out",)) -> str:

@@ -14,7 +14,7 @@ from pisigma.reporting.verdict import Verdict
 
 MAX_LINES = 40
 """Largest number of lines that a command prints without `--verbose` at 80 columns, not counting warnings."""
-SHORT = 12
+_SHORT = 12
 """Number of lines up to which the verdict is not repeated at the end."""
 
 
@@ -60,7 +60,7 @@ def print_screen(
         *wrap_lines([names] if names else []),
         *end,
     ]
-    if len(lines) > SHORT:
+    if len(lines) > _SHORT:
         lines += wrap_lines([verdict.short], "  ")
     typer.echo("\n".join([*lines, *next_step]))
 

@@ -12,15 +12,15 @@ from pisigma.estimation.cholesky import covariance_factor
 from pisigma.estimation.drift import compressed_columns, evidence_coordinates, evidence_gains
 from pisigma.estimation.orthonormal_columns import orthonormal_columns
 
-SIZES = torch.logspace(-3, 1.5, 28, dtype=torch.float64)
+_SIZES = torch.logspace(-3, 1.5, 28, dtype=torch.float64)
 """Sizes of a cause relative to its scale, all equally probable."""
-NOISE = torch.logspace(-2, 2, 41, dtype=torch.float64)
+_NOISE = torch.logspace(-2, 2, 41, dtype=torch.float64)
 """Factors on the noise that are tried."""
-STATED_SPREAD = 0.3
+_STATED_SPREAD = 0.3
 """Prior standard deviation of the logarithm of the factor, where the noise is stated."""
 CLEAR = 5.0
 """Log Bayes factor [nats] above which residuals have a cause: odds of 150 to 1."""
-MAX_CAUSES = 3
+_MAX_CAUSES = 3
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ class FitResiduals:
         """Return all causes, where `named` marks the clear causes; named causes come first, then by Bayes factor."""
         alone = self._compared()
         named, here = set[str](), self
-        while len(named) < MAX_CAUSES:
+        while len(named) < _MAX_CAUSES:
             others = [one for one in here._compared() if one.name not in named]
             best = max(others, key=lambda one: one.log_bayes_factor, default=None)
             if best is None or best.log_bayes_factor < CLEAR:
@@ -108,25 +108,25 @@ class FitResiduals:
 
     def _compared(self) -> list[Cause]:
         """Compare all causes one by one."""
-        evidence = torch.empty(len(NOISE), dtype=torch.float64)
-        gains = {name: torch.empty(len(NOISE), len(SIZES), dtype=torch.float64) for name in self.causes}
-        for row, factor in enumerate(NOISE.tolist()):
+        evidence = torch.empty(len(_NOISE), dtype=torch.float64)
+        gains = {name: torch.empty(len(_NOISE), len(_SIZES), dtype=torch.float64) for name in self.causes}
+        for row, factor in enumerate(_NOISE.tolist()):
             L = covariance_factor(self._total(factor))
             a = torch.linalg.solve_triangular(L, self.y[:, None], upper=False)[:, 0]
             evidence[row] = -0.5 * a.square().sum() - L.diagonal().log().sum()
             if self.is_stated:
-                evidence[row] -= 0.5 * (math.log(factor) / STATED_SPREAD) ** 2
+                evidence[row] -= 0.5 * (math.log(factor) / _STATED_SPREAD) ** 2
             for name, Z in self.causes.items():
                 W = torch.linalg.solve_triangular(L, Z, upper=False)
-                gains[name][row] = evidence_gains(SIZES, *evidence_coordinates(W, a))
+                gains[name][row] = evidence_gains(_SIZES, *evidence_coordinates(W, a))
         nothing = float(evidence.logsumexp(0))
         causes = []
         for name, gain in gains.items():
             joint = evidence[:, None] + gain
-            factor, size = divmod(int(joint.argmax()), len(SIZES))
-            value = float(joint.logsumexp((0, 1))) - math.log(len(SIZES)) - nothing
-            share = self._share(name, float(SIZES[size]), float(NOISE[factor]))
-            causes.append(Cause(name, value, float(SIZES[size]), share))
+            factor, size = divmod(int(joint.argmax()), len(_SIZES))
+            value = float(joint.logsumexp((0, 1))) - math.log(len(_SIZES)) - nothing
+            share = self._share(name, float(_SIZES[size]), float(_NOISE[factor]))
+            causes.append(Cause(name, value, float(_SIZES[size]), share))
         return causes
 
     def _total(self, factor: float) -> Float64[Tensor, "values values"]:

@@ -12,7 +12,7 @@ from pisigma.files.errors import IdentificationError
 
 BLOCK = 192
 """Block size of operations on triangular matrices: small blocks multiply fewer zeros, large ones are faster."""
-MANY_UNKNOWNS = 1_000
+_MANY_UNKNOWNS = 1_000
 """Number of unknowns above which free memory is returned before a matrix is allocated."""
 
 
@@ -91,7 +91,7 @@ def return_free_memory(unknowns: int) -> None:
     After a fit of thousands of unknowns, more than 100 MB of free memory is fragmented, and the matrices of the next
     fit would be allocated in addition to it.
     """
-    if unknowns > MANY_UNKNOWNS and sys.platform == "linux":
+    if unknowns > _MANY_UNKNOWNS and sys.platform == "linux":
         trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
         if trim is not None:
             trim(0)

@@ -16,9 +16,9 @@ SIZES = torch.logspace(-6, -0.5, 56, dtype=torch.float64)
 size."""
 LOG_PRIOR_PENALTY = 4.0
 """Increase of the log evidence that a drift requires [nats]: prior odds of about 1 to 50 for a group of the arm."""
-WRONG_ROW_PENALTY = math.log(100)
+_WRONG_ROW_PENALTY = math.log(100)
 """Increase of the log evidence that a wrong configuration requires [nats]: prior odds of 1 to 100."""
-MAX_SWEEPS = 3
+_MAX_SWEEPS = 3
 NOISE_FACTORS = torch.linspace(-1.0, 1.6, 14, dtype=torch.float64).exp()
 """Factors on the noise of the calibration that are tried."""
 NOISE_SPREAD = 0.3
@@ -95,7 +95,7 @@ class LinearValues:
     def log_prior_penalty(self) -> float:
         """Increase of the log evidence that all wrong configurations together require [nats]."""
         count = len(torch.unique(self.configuration))
-        return len(self.wrong) * (WRONG_ROW_PENALTY + math.log(max(count, 1)))
+        return len(self.wrong) * (_WRONG_ROW_PENALTY + math.log(max(count, 1)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,7 +148,7 @@ class DriftSearch:
         for one, Z in zip(self._groups, self._Z, strict=True):
             self.covariance += one.size**2 * Z @ Z.t()
 
-    def estimate_sizes(self, sweeps: int = MAX_SWEEPS) -> None:
+    def estimate_sizes(self, sweeps: int = _MAX_SWEEPS) -> None:
         """Estimate sizes and noise, one group and one sensor at a time."""
         for _ in range(sweeps):
             before = [one.size for one in self._groups]

@@ -15,7 +15,7 @@ from pisigma.estimation.regression import AbstractRegression, Posterior, SensorC
 
 DETERMINED = 1e-9
 """Share of the precision of a value, or of the best determined unknown, below which it is treated as undetermined."""
-MAX_VARIANCE_RATIO = 1e6
+_MAX_VARIANCE_RATIO = 1e6
 """Ratio of the values' prior variances to the noise variance up to which traces of P are accurate to 1e-4."""
 
 
@@ -117,7 +117,7 @@ class DualRegression(AbstractRegression):
         """Return whether traces of P cancel because the noise is very small; normal equations are then accurate."""
         diagonal = torch.arange(len(self.y)).add(1).cumsum(0) - 1
         trace = float(prior.sizes[prior.classes :].square() @ self.K[:, diagonal].sum(1))
-        return trace > MAX_VARIANCE_RATIO * min(noise) ** 2
+        return trace > _MAX_VARIANCE_RATIO * min(noise) ** 2
 
     def _covariance(self, prior: GaussianPrior, noise: tuple[float, ...]) -> Tensor:
         """Return V, of which only the upper triangle is set."""

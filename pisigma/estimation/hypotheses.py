@@ -21,13 +21,13 @@ from pisigma.estimation.drift import (
     evidence_gains,
 )
 
-TRIED = SIZES[SIZES >= 1e-4]
+_TRIED = SIZES[SIZES >= 1e-4]
 """Sizes of a motion that are tried, all equally probable: 0.1 mm to 0.3 m, 0.006 to 18 deg."""
-CERTAIN = 0.01
+_CERTAIN = 0.01
 """Probability of "nothing (else) moved" below which something certainly moved."""
-NAMED = 0.8
+_NAMED = 0.8
 """Probability above which a motion is reported as having happened."""
-MAX_MOTIONS = 3
+_MAX_MOTIONS = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,9 +125,9 @@ class SessionEvidence:
         while True:
             compared = self._compare(motions)
             unchanged = unchanged if motions else compared.unchanged
-            clear, best = compared.unchanged < CERTAIN, compared.candidates[0]
-            named = best.probability >= NAMED and best.group.single
-            if not (clear and named) or len(motions) == MAX_MOTIONS:
+            clear, best = compared.unchanged < _CERTAIN, compared.candidates[0]
+            named = best.probability >= _NAMED and best.group.single
+            if not (clear and named) or len(motions) == _MAX_MOTIONS:
                 candidates = compared.candidates if clear and not motions else ()
                 return replace(compared, unchanged=unchanged, candidates=candidates)
             motions.append(best)
@@ -179,7 +179,7 @@ class SessionEvidence:
             Z = self._Z[self._groups.index(one.group)]
             K = K + one.size**2 * Z @ Z.t()
         evidence = torch.empty(len(NOISE_FACTORS), dtype=torch.float64)
-        raised = torch.empty(len(NOISE_FACTORS), len(self._groups), len(TRIED), dtype=torch.float64)
+        raised = torch.empty(len(NOISE_FACTORS), len(self._groups), len(_TRIED), dtype=torch.float64)
         # One triangular solve per noise factor whitens values and all hypotheses at once.
         columns = torch.cat([self.values.y[:, None], *self._Z], 1)
         for row, noise_factor in enumerate(NOISE_FACTORS.tolist()):
@@ -192,16 +192,16 @@ class SessionEvidence:
         joint = evidence[:, None, None] + raised
         nothing = evidence.logsumexp(0)
         # Average over noise factors and sizes: a hypothesis must not win by a size chosen afterwards.
-        log_odds = joint.logsumexp((0, 2)) - math.log(len(TRIED)) - nothing
+        log_odds = joint.logsumexp((0, 2)) - math.log(len(_TRIED)) - nothing
         log_odds -= torch.tensor([group.log_prior_penalty for group in self._groups], dtype=torch.float64)
         # What is known to have moved is not a further hypothesis.
         log_odds[[self._groups.index(one.group) for one in motions]] = -math.inf
         log_odds = torch.cat([log_odds, log_odds.new_zeros(1)])
         *probability, unchanged = log_odds.softmax(0).tolist()
-        sizes = TRIED[joint.logsumexp(0).argmax(1)].tolist()
+        sizes = _TRIED[joint.logsumexp(0).argmax(1)].tolist()
         compared = [Motion(*one) for one in zip(self._groups, sizes, probability, strict=True)]
         # The noise factor of the explanation: without further motion if none is needed, else with all of them.
-        likely = evidence if unchanged >= CERTAIN else joint.logsumexp((1, 2))
+        likely = evidence if unchanged >= _CERTAIN else joint.logsumexp((1, 2))
         return Explanation(
             motions=tuple(motions),
             candidates=tuple(sorted(compared, key=lambda one: -one.probability)),
@@ -214,17 +214,17 @@ class SessionEvidence:
 
     def _raised(self, a: Tensor, W: Tensor) -> Float64[Tensor, "groups sizes"]:
         """Return the gain of log evidence for every group and size."""
-        raised = torch.empty(len(self._groups), len(TRIED), dtype=torch.float64)
+        raised = torch.empty(len(self._groups), len(_TRIED), dtype=torch.float64)
         widths = torch.tensor([Z.shape[1] for Z in self._Z])
         # Groups of one unknown are all evaluated in one product; the others need an eigendecomposition each.
         single = widths == 1
         columns = W[:, single.repeat_interleave(widths)]
         eigenvalues = columns.square().sum(0)
         squares = (columns.t() @ a).square() / eigenvalues.clamp(min=1e-300)
-        raised[single] = evidence_gains(TRIED[:, None], eigenvalues[:, None], squares[:, None]).t()
+        raised[single] = evidence_gains(_TRIED[:, None], eigenvalues[:, None], squares[:, None]).t()
         blocks = torch.split(W, widths.tolist(), 1)
         for number in (~single).nonzero()[:, 0].tolist():
-            raised[number] = evidence_gains(TRIED, *evidence_coordinates(blocks[number], a))
+            raised[number] = evidence_gains(_TRIED, *evidence_coordinates(blocks[number], a))
         return raised
 
     def _noise(self, noise_factor: float) -> Float64[Tensor, " values"]:

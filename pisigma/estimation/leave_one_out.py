@@ -9,7 +9,7 @@ from torch import Tensor
 from pisigma.estimation.held_out import SINGULAR
 from pisigma.estimation.orthonormal_columns import orthonormal_columns
 
-LEVEL = 1e-3
+_LEVEL = 1e-3
 """Probability, over all rows of a data set, of calling a row wrong although none is."""
 
 
@@ -28,7 +28,7 @@ class RowTest:
     @property
     def is_wrong(self) -> bool:
         """Whether the other rows contradict the row."""
-        return self.probability < LEVEL
+        return self.probability < _LEVEL
 
 
 def most_deviating_row(

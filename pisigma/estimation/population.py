@@ -10,18 +10,18 @@ from torch import Tensor
 
 MIN_ROBOTS = 5
 """Minimum number of robots of a fleet; with fewer, their scatter cannot be distinguished from their uncertainties."""
-EM_STEPS = 60
-SEARCH_STEPS = 25
+_EM_STEPS = 60
+_SEARCH_STEPS = 25
 """Expectation-maximisation steps while outliers are searched for; these need not converge."""
-CLASS_ROBOTS = 0.02
+_CLASS_ROBOTS = 0.02
 """Weight of the robot class in the variances of the fleet, as a number of robots: small, because robots of one type
 are more alike, but large enough that unknowns that no rows determine are as uncertain as in the class."""
-SEARCH_CLASS_ROBOTS = 0.2
+_SEARCH_CLASS_ROBOTS = 0.2
 """Weight of the robot class, as a number of robots, while outliers are searched for; it is larger, because all other
 robots would be outliers if a few robots made the fleet too narrow."""
-ROBOTS_PER_CHUNK = 100
+_ROBOTS_PER_CHUNK = 100
 """Number of robots whose inverse matrices are kept at a time (40 MB)."""
-MAX_CONCENTRATIONS = 10
+_MAX_CONCENTRATIONS = 10
 FALSE_ALARM = 1e-3
 """Probability that any robot of a fleet without outliers is classified as one."""
 
@@ -108,9 +108,9 @@ def without_outliers(
     """
     alike = _nearest_to_median(evidence, start)
     population = start
-    for _ in range(MAX_CONCENTRATIONS):
+    for _ in range(_MAX_CONCENTRATIONS):
         chosen = [evidence[number] for number in alike]
-        population = expectation_maximisation(chosen, start, usual, SEARCH_CLASS_ROBOTS, SEARCH_STEPS)
+        population = expectation_maximisation(chosen, start, usual, _SEARCH_CLASS_ROBOTS, _SEARCH_STEPS)
         surprises = [population.squared_distance(one) for one in evidence]
         ratios = sorted(square / max(count, 1) for square, count in surprises)
         # The chosen half scatters less than all robots, so the median robot sets the unit.
@@ -145,8 +145,8 @@ def expectation_maximisation(
     evidence: Sequence[Information],
     start: Population,
     usual: Float64[Tensor, " unknowns"],
-    class_robots: float = CLASS_ROBOTS,
-    steps: int = EM_STEPS,
+    class_robots: float = _CLASS_ROBOTS,
+    steps: int = _EM_STEPS,
 ) -> Population:
     """Estimate mean and covariance of the robots' errors by expectation-maximisation.
 
@@ -179,9 +179,9 @@ def _maximised(
     size, count = now.geometric, len(evidence)
     precision = torch.linalg.inv(now.covariance)
     at_mean, x, scatter = precision @ now.mean, [], torch.zeros_like(precision)
-    for first in range(0, count, ROBOTS_PER_CHUNK):
+    for first in range(0, count, _ROBOTS_PER_CHUNK):
         # Expectation: posterior mean and covariance of every robot under the current population.
-        some = evidence[first : first + ROBOTS_PER_CHUNK]
+        some = evidence[first : first + _ROBOTS_PER_CHUNK]
         factors = torch.linalg.cholesky(torch.stack([one.normal for one in some]) + precision)
         inverses = torch.cholesky_inverse(factors)
         right = torch.stack([one.descent for one in some]) + at_mean

@@ -10,7 +10,7 @@ SMALLEST_SIZE = 1e-9
 """Prior size [rad] below which a group of weights is excluded."""
 FIRST_SIZE = 2e-5
 """Initial prior size of weights [rad]."""
-RELAXATION = 1.5
+_RELAXATION = 1.5
 """Over-relaxation of MacKay's rule, in logarithms; above about 1.8 it overshoots."""
 
 
@@ -49,6 +49,6 @@ class GaussianPrior:
         The rule approaches its fixed point from one side in ever shorter steps, so it is over-relaxed.
         """
         sizes = (square.clamp(min=0.0) / determined.clamp(min=1e-12)).sqrt()
-        sizes = (self.sizes * (sizes / self.sizes) ** RELAXATION).clamp(min=SMALLEST_SIZE)
+        sizes = (self.sizes * (sizes / self.sizes) ** _RELAXATION).clamp(min=SMALLEST_SIZE)
         is_fixed = (determined <= 1e-9) | (torch.arange(len(sizes), device=sizes.device) < self.classes)
         return replace(self, sizes=torch.where(is_fixed, self.sizes, sizes))

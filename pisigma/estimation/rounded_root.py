@@ -12,7 +12,7 @@ from torch import Tensor
 
 STEPS = (1 / 256, 1 / 512, 1 / 1024)
 """Units to try, as shares of an unknown's standard deviation given all unknowns before it."""
-SMALLEST_UNIT = 2.0**-14
+_SMALLEST_UNIT = 2.0**-14
 """Smallest unit as a share of an unknown's standard deviation: multiples of it by whole numbers fit into 16 bits."""
 _BLOCK = 64
 """Rows that are rounded with one matrix product."""
@@ -111,7 +111,7 @@ def _rounded(lower: Float64[Tensor, "unknowns unknowns"], step: float) -> Rounde
         step: unit of every row as a share of its diagonal entry.
     """
     pivot = lower.diagonal().abs()
-    smallest = torch.linalg.vector_norm(lower, dim=1) * SMALLEST_UNIT
+    smallest = torch.linalg.vector_norm(lower, dim=1) * _SMALLEST_UNIT
     unit = torch.maximum(step * pivot, smallest)
     numbers, Z = torch.zeros_like(lower), torch.eye(len(lower)).to(lower)
     for row, exact in _rows_times(lower, Z):

@@ -11,12 +11,12 @@ from torch import Tensor
 from pisigma.estimation.cholesky import covariance_factor
 from pisigma.estimation.drift import LinearValues, evidence_gains
 
-FACTORS = torch.logspace(0.5, 4.5, 17, dtype=torch.float64)
+_FACTORS = torch.logspace(0.5, 4.5, 17, dtype=torch.float64)
 """Factors on the noise that are tried for a wrong configuration."""
-MAX_SUSPECTS = 3
-MIN_GAIN = 2.0
+_MAX_SUSPECTS = 3
+_MIN_GAIN = 2.0
 """Smallest gain of log evidence [nats] of a suspect configuration while everything else is unchanged."""
-MAX_WRONG_SHARE = 0.25
+_MAX_WRONG_SHARE = 0.25
 """Largest share of wrong configurations; if four configurations disagree, it is unknown which one is wrong."""
 
 
@@ -60,7 +60,7 @@ def mark_wrong_rows(
         The best explanation.
     """
     configurations = len(torch.unique(explained.values.configuration))
-    while len(explained.values.wrong) + 1 <= MAX_WRONG_SHARE * configurations:
+    while len(explained.values.wrong) + 1 <= _MAX_WRONG_SHARE * configurations:
         tried = [explain(wrong) for wrong in _suspects(explained)]
         best = max(tried, key=lambda one: one.log_evidence, default=explained)
         if best.log_evidence <= explained.log_evidence:
@@ -87,11 +87,11 @@ def _suspects(explained: ExplainedRows[What]) -> list[dict[int, float]]:
         # The block of V^-1 is the precision of these values given all others, as if they were held out.
         eigenvalues, U = torch.linalg.eigh(inverse[chosen][:, chosen] * sigma * sigma[:, None])
         squares = (U.t() @ (a[chosen] * sigma)).square() / eigenvalues.clamp(min=1e-300)
-        raised = evidence_gains(FACTORS, eigenvalues.clamp(min=0.0), squares)
+        raised = evidence_gains(_FACTORS, eigenvalues.clamp(min=0.0), squares)
         best = int(raised.argmax())
-        if float(raised[best]) > MIN_GAIN:
-            tried.append((float(raised[best]), number, float(FACTORS[best])))
+        if float(raised[best]) > _MIN_GAIN:
+            tried.append((float(raised[best]), number, float(_FACTORS[best])))
     if len(tried) == len(torch.unique(values.configuration)):
         return []  # an explanation that does not fit any row is itself wrong
-    tried = sorted(tried, reverse=True)[:MAX_SUSPECTS]
+    tried = sorted(tried, reverse=True)[:_MAX_SUSPECTS]
     return [{**values.wrong, number: factor} for _, number, factor in tried]

@@ -11,7 +11,7 @@ from pisigma.files.model_files import MODEL_FILES, is_model
 from pisigma.files.output_file import write_failure
 from pisigma.files.scratch import ASIDE, FOLDER, KEPT, remove_stale_scratch, scratch_beside
 
-MAX_NEW_FOLDERS = 100
+_MAX_NEW_FOLDERS = 100
 """Largest number of nested folders that are created for a model."""
 
 
@@ -40,9 +40,9 @@ def check_folder(
             problem = "the output is the working directory or contains it"
             raise _refusal(folder, problem, expected="a folder that contains nothing else", value=str(here))
         parent = next(path for path in target.parents if path.exists())
-        if (new := len(target.relative_to(parent).parts)) > MAX_NEW_FOLDERS:
-            problem = f"the output needs more than {MAX_NEW_FOLDERS} nested new folders"
-            raise _refusal(folder, problem, expected=f"{MAX_NEW_FOLDERS} new folders or fewer", value=new)
+        if (new := len(target.relative_to(parent).parts)) > _MAX_NEW_FOLDERS:
+            problem = f"the output needs more than {_MAX_NEW_FOLDERS} nested new folders"
+            raise _refusal(folder, problem, expected=f"{_MAX_NEW_FOLDERS} new folders or fewer", value=new)
         if parent == target.parent:
             remove_stale_scratch(target)
         check_conflicts(folder, inputs)

@@ -18,7 +18,7 @@ from pathlib import Path
 
 from pisigma.files.errors import Place, PluginError
 
-ENTRY_POINTS = "pisigma.plugins"
+_ENTRY_POINTS = "pisigma.plugins"
 """Entry point group of plug-in packages."""
 
 
@@ -64,7 +64,7 @@ def load_installed() -> None:
         return
     from importlib.metadata import entry_points  # imported here, because it takes 0.1 s
 
-    for point in entry_points(group=ENTRY_POINTS):
+    for point in entry_points(group=_ENTRY_POINTS):
         origin = f"plug-in '{point.name}'" + (f" of {point.dist.name}" if point.dist else "")
         with _as_plugin(origin, "repair or uninstall the package"):
             point.load()

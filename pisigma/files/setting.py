@@ -17,7 +17,7 @@ from typing import Annotated, Any, ForwardRef, Literal, Union, get_args, get_ori
 
 from pisigma.files.errors import PisigmaError, SettingError
 
-UNITS = {"mm": ("m", 1e-3), "mrad": ("rad", 1e-3), "deg": ("rad", math.pi / 180.0), "ms": ("s", 1e-3)}
+_UNITS = {"mm": ("m", 1e-3), "mrad": ("rad", 1e-3), "deg": ("rad", math.pi / 180.0), "ms": ("s", 1e-3)}
 """SI unit and conversion factor by unit of the command line."""
 
 
@@ -29,7 +29,7 @@ class Option:
         name: name of the option, such as "--camera"; None: made from the name of the setting.
         kind: type of the command-line value if it differs from that of the setting.
         read: function that converts the command-line value to the setting.
-        unit: unit of the command-line value, one of `UNITS`; `read`, if given, has to convert it.
+        unit: unit of the command-line value, one of `_UNITS`; `read`, if given, has to convert it.
         min: smallest value that is accepted.
         max: largest value that is accepted.
         metavar: placeholder of the value in the help.
@@ -116,7 +116,7 @@ class Setting:
         """Convert a command-line value to the setting."""
         if self.option.read is not None:
             return self.option.read(stated)
-        return stated if self.option.unit is None else stated * UNITS[self.option.unit][1]
+        return stated if self.option.unit is None else stated * _UNITS[self.option.unit][1]
 
 
 @functools.cache
@@ -233,7 +233,7 @@ def _stated_default(default: Any, option: Option) -> Any:
     if isinstance(default, bool) or option.kind is bool:
         return default is True and option.kind is None
     if option.unit is not None and default is not None:
-        return float(f"{default / UNITS[option.unit][1]:.6g}")
+        return float(f"{default / _UNITS[option.unit][1]:.6g}")
     if option.default is not None or (option.kind is not None and not isinstance(default, str)):
         return option.default
     return None if default == () else default
@@ -242,7 +242,7 @@ def _stated_default(default: Any, option: Option) -> Any:
 def _help(meaning: str, option: Option, is_repeated: bool) -> str:
     """Return the help text of an option, in complete sentences and in the unit of the option."""
     if option.unit is not None:
-        meaning = meaning.replace(f"[{UNITS[option.unit][0]}]", f"[{option.unit}]")
+        meaning = meaning.replace(f"[{_UNITS[option.unit][0]}]", f"[{option.unit}]")
     meaning = re.sub(r"[;.]? None: ([^.]*)\.?$", r". [default: \1]", meaning)
     starts_with_choice = meaning.partition(" ")[0].endswith(":")
     sentence = meaning if starts_with_choice else meaning[:1].upper() + meaning[1:]

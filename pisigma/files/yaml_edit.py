@@ -10,7 +10,7 @@ from pisigma.files.errors import PisigmaError, Place
 from pisigma.files.yaml_file import plain_content, yaml_text
 
 Keys = Sequence[str | int]
-INDENT = 2
+_INDENT = 2
 """Number of spaces by which the first key of an empty section is indented."""
 _COMMENTS = re.compile(r"[^\n]*\n(?:[ \t]*(?:#[^\n]*)?\n)*")
 """Pattern of the end of a line with the blank lines and comments after it."""
@@ -131,7 +131,7 @@ def _with_added(
     section = parent if is_empty else node
     if section.flow_style or isinstance(key, int) is not isinstance(section, yaml.SequenceNode):
         return _with_replaced(text, node, wanted)
-    column = section.start_mark.column + (INDENT if is_empty else 0)
+    column = section.start_mark.column + (_INDENT if is_empty else 0)
     comments = _COMMENTS.match(text, node.start_mark.index)
     end = comments.end() if is_empty and comments else node.end_mark.index
     stated = re.compile(rf"^ {{{column}}}#[ ]?{re.escape(str(key))}:", re.MULTILINE).search(text, start, end)

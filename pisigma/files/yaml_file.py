@@ -31,7 +31,7 @@ MAX_BYTES = 2**18
 MAX_VALUES = 200_000
 """Largest number of values in a file with expanded aliases; `CHARACTERS_PER_VALUE` characters count as one value."""
 CHARACTERS_PER_VALUE = 64
-SAFE_DEPTH = 2000
+_SAFE_DEPTH = 2000
 """Nesting depth that libyaml, which does not check its stack, certainly parses without overflow."""
 
 
@@ -241,7 +241,7 @@ def _load(text: str, error: type[PisigmaError], source: str) -> tuple[yaml.Node 
 def _composed(text: str) -> tuple[Any, yaml.Node | None]:
     """Return a loader and the root node; the loader uses libyaml unless that might overflow its stack or fails."""
     longest_line = max(map(len, text.splitlines()), default=0)
-    if text.count("[") + text.count("{") + 2 * longest_line < SAFE_DEPTH:
+    if text.count("[") + text.count("{") + 2 * longest_line < _SAFE_DEPTH:
         with suppress(yaml.YAMLError):
             return (loader := _CompiledLoader(text)), loader.get_single_node()
     return (plain := _PlainLoader(text)), plain.get_single_node()

@@ -11,7 +11,7 @@ from pisigma.joint_correction.feature import USUAL_SIZE, AbstractFeature, Featur
 from pisigma.measurement.conditions import JointState
 from pisigma.robot.description import Robot
 
-HARMONICS, LOW = 8, 3
+_HARMONICS, LOW = 8, 3
 """Number of harmonics of every axis, and number of low harmonics, which have a separate prior size: guides have
 errors in low harmonics, gears also in higher ones."""
 
@@ -47,8 +47,8 @@ class CoupledSeries(AbstractFeature):
         axes = len(robot.axes)
         driven = np.zeros((robot.dof, axes), dtype=bool) if coupling is None else coupling.driven
         sliding = torch.tensor([0 if turns else 1 for turns in robot.revolute])[:, None]
-        self.used = torch.from_numpy(np.tile(driven, (1, 1 + 2 * HARMONICS)))
-        bands = ([2] * LOW + [4] * (HARMONICS - LOW)) * 2
+        self.used = torch.from_numpy(np.tile(driven, (1, 1 + 2 * _HARMONICS)))
+        bands = ([2] * LOW + [4] * (_HARMONICS - LOW)) * 2
         self.group = torch.tensor([0, *bands]).repeat_interleave(axes) + sliding
         self._bars = () if coupling is None else coupling.four_bars
         if self._bars:
@@ -84,7 +84,7 @@ class CoupledSeries(AbstractFeature):
         """Return scaled values, sines and cosines of all axes, then derivatives with respect to bar lengths."""
         q = self.robot.to_controller(state.q)
         scaled = (q - self._middle.to(q)) / self._half.to(q)
-        angles = [k * self._rate.to(q) * q for k in range(1, HARMONICS + 1)]
+        angles = [k * self._rate.to(q) * q for k in range(1, _HARMONICS + 1)]
         parts = [scaled, *(angle.sin() for angle in angles), *(angle.cos() for angle in angles)]
         values = torch.cat(parts, -1)
         columns = values.unsqueeze(-2).expand(*state.q.shape, values.shape[-1])

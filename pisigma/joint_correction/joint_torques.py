@@ -14,12 +14,12 @@ from pisigma.joint_correction.gravity_torques import Direction, GravityTorques
 from pisigma.measurement.conditions import TORQUE, JointState
 from pisigma.robot.description import Robot
 
-MIN_ROWS = 30
+_MIN_ROWS = 30
 """Rows with a torque of a joint that its model of gravity torques needs: about twice the number of masses and centres
 of mass that the torque of a joint of a six-axis arm depends on."""
-MIN_TORQUE = 1e-6
+_MIN_TORQUE = 1e-6
 """[Nm or N] A joint whose torque varies less has no deflection that could be identified."""
-RIDGES = (1e-6, 1e-4, 1e-2, 1.0)
+_RIDGES = (1e-6, 1e-4, 1e-2, 1.0)
 """Shares of the mean square of the columns that are added to the normal equations of the modelled torques, because some
 masses cannot be distinguished; the one with the smallest left-out errors is used."""
 
@@ -105,9 +105,11 @@ class JointTorques(AbstractFeature):
         for joint, measured in enumerate(torque.t()):
             rows = torch.isfinite(measured)
             y, X = measured[rows], columns[rows, joint]
-            if len(y) >= MIN_ROWS and float(y.std()) > MIN_TORQUE:
+            if len(y) >= _MIN_ROWS and float(y.std()) > _MIN_TORQUE:
                 scale[joint] = float(y.std())
-                masses, left_out = min((_fit(X, y, ridge) for ridge in RIDGES), key=lambda fit: fit[1].norm())
+                masses, left_out = min(
+                    (_fit(X, y, ridge) for ridge in _RIDGES), key=lambda fit: fit[1].norm()
+                )
                 model[joint], missed[rows, joint] = masses.cpu(), left_out / math.sqrt(len(y))
         if not any(scale):
             return ()

@@ -8,7 +8,7 @@ import numpy as np
 
 from pisigma.files.errors import missing_extra
 
-OPSET, IR_VERSION = 17, 8
+_OPSET, _IR_VERSION = 17, 8
 """Versions of the operator set and of the file format, which runtimes of 2022 support."""
 
 BATCH = "batch"
@@ -135,8 +135,8 @@ class OnnxGraph:
         )
         model = helper.make_model(
             graph,
-            opset_imports=[helper.make_opsetid("", OPSET)],
-            ir_version=IR_VERSION,
+            opset_imports=[helper.make_opsetid("", _OPSET)],
+            ir_version=_IR_VERSION,
             producer_name="pisigma",
             producer_version=__version__,
             doc_string=doc,

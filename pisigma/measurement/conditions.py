@@ -13,7 +13,7 @@ from pisigma.measurement.groups import groups_of_equal_joints, numbers_of_names
 
 CONDITIONS = ("payload_kg", "temperature_c")
 """Columns of conditions with one number per row."""
-MIN_SPREAD = 1e-9
+_MIN_SPREAD = 1e-9
 """Smallest range of a condition [kg or deg C] over which its effect can be identified."""
 APPROACH = "approach"
 """Key of `JointState.stated`: `(*batch, dof)`, +1 if the joint's value increased before it stopped, -1 if it decreased;
@@ -22,9 +22,9 @@ APPROACH = "approach"
 TORQUE = "torque"
 """Key of `JointState.stated`: `(*batch, dof)`, measured torques of the drives [Nm; N for prismatic joints]; NaN if not
 given."""
-TORQUE_STEP = 0.2
+_TORQUE_STEP = 0.2
 """Difference of torques, over their standard deviation in all rows, that is another load of the arm."""
-MIN_MOTION = 1e-3
+_MIN_MOTION = 1e-3
 """[rad or m] Smaller motions of a joint need not take up the play of its gear."""
 
 
@@ -67,7 +67,7 @@ def stated_conditions(measurements: Measurements) -> tuple[str, ...]:
     """Return the names of the conditions that every row states and that vary."""
     stated = []
     for name, values in zip(CONDITIONS, conditions_of(measurements, CONDITIONS).t(), strict=True):
-        if bool(torch.isfinite(values).all()) and float(values.max() - values.min()) > MIN_SPREAD:
+        if bool(torch.isfinite(values).all()) and float(values.max() - values.min()) > _MIN_SPREAD:
             stated.append(name)
     return tuple(stated)
 
@@ -84,7 +84,7 @@ def repeat_key(measurements: Measurements) -> Float64[Tensor, "rows _key"]:
     """Return the values that repeats of a pose have in common: joint values, payload, approach (0 if not given), load.
 
     The payload is included if every row states one and it varies. The load is the difference of the torques from those
-    of the first row at these values, in steps of `TORQUE_STEP`; smaller differences are noise.
+    of the first row at these values, in steps of `_TORQUE_STEP`; smaller differences are noise.
     """
     loaded = tuple(name for name in stated_conditions(measurements) if name == "payload_kg")
     columns = [measurements.q, conditions_of(measurements, loaded)]
@@ -96,7 +96,7 @@ def repeat_key(measurements: Measurements) -> Float64[Tensor, "rows _key"]:
         first = torch.full_like(group, len(group)).scatter_reduce(
             0, group, torch.arange(len(group), device=group.device), "amin"
         )
-        step = TORQUE_STEP * torque.std(0, correction=0).clamp(min=MIN_SPREAD)
+        step = _TORQUE_STEP * torque.std(0, correction=0).clamp(min=_MIN_SPREAD)
         columns.append(((torque - torque[first[group]]) / step).round())
     return torch.cat(columns, 1)
 
@@ -128,11 +128,11 @@ def motions_between_rows(
 def approach_by_order(measurements: Measurements) -> Float64[Tensor, "rows dof"]:
     """Return the direction of approach of every joint if the rows were measured in the order of their file.
 
-    It is that of the joint's last motion by more than `MIN_MOTION`; NaN if this is not known (`motions_between_rows`).
+    It is that of the joint's last motion by more than `_MIN_MOTION`; NaN if this is not known (`motions_between_rows`).
     """
     motion = motions_between_rows(measurements)[0]
     approach, last = np.empty_like(motion), np.full(motion.shape[1], np.nan)
     for row in order_of_rows(measurements):
-        last = np.where(np.abs(motion[row]) <= MIN_MOTION, last, np.sign(motion[row]))
+        last = np.where(np.abs(motion[row]) <= _MIN_MOTION, last, np.sign(motion[row]))
         approach[row] = last
     return torch.from_numpy(approach).to(measurements.q.device)

@@ -16,24 +16,24 @@ from pisigma.measurement.readings import READINGS
 from pisigma.robot.description import Robot
 from pisigma.robot.se3 import rpy_from_rotation
 
-DEGREE = math.pi / 180
-LENGTH_STEPS = sorted((*(10.0**-k for k in range(3, 10)), *(0.0254 * 10.0**-k for k in range(2, 7))))[::-1]
+_DEGREE = math.pi / 180
+_LENGTH_STEPS = sorted((*(10.0**-k for k in range(3, 10)), *(0.0254 * 10.0**-k for k in range(2, 7))))[::-1]
 """Rounding steps of lengths [m]: decimals of a metre and of an inch."""
-ANGLE_STEPS = sorted((*(DEGREE * 10.0**-k for k in range(1, 9)), *(10.0**-k for k in range(3, 10))))[::-1]
+_ANGLE_STEPS = sorted((*(_DEGREE * 10.0**-k for k in range(1, 9)), *(10.0**-k for k in range(3, 10))))[::-1]
 """Rounding steps of angles [rad]: decimals of a degree and of a radian."""
-GRID_TOLERANCE = 1e-3
+_GRID_TOLERANCE = 1e-3
 """Largest deviation of a rounded value from a multiple of its step, as a share of the step; values may have been
 converted and rounded again."""
-ROTATION_STEP = 1e-3
+_ROTATION_STEP = 1e-3
 """Rounding step [rad] assumed for orientations whose rounding is unknown, such as quaternions."""
-IMAGE_STEP = 1e-5
+_IMAGE_STEP = 1e-5
 """Rounding step [m or rad] assumed for poses from corners of images, whose pixels may have been rounded."""
-STANDING, RETURNING = 2e-6, 2e-5
+_STANDING, _RETURNING = 2e-6, 2e-5
 """Smallest standard deviations of repeated readings [m or rad], for a robot at standstill and for a robot that
 returned to a pose."""
-MIN_EVIDENCE = math.log(1e4)
+_MIN_EVIDENCE = math.log(1e4)
 """Natural logarithm of the odds against chance above which equal rows are treated as copies."""
-MIN_EXCESS, MIN_SHARE = 10.0, 0.95
+_MIN_EXCESS, _MIN_SHARE = 10.0, 0.95
 """Rows are treated as copies only if equal rows are this many times as frequent as by chance, or have this share."""
 ROW_READINGS, ROW_STEPS = 9, 4
 """Number of values of a row after the joint values, and number of rounding steps of a row."""
@@ -81,11 +81,11 @@ class RowValues:
             rows.numbers.get("rotation", torch.full((rows.rows, 3, 3), torch.nan)).detach().cpu().double()
         )
         revolute = torch.tensor([axis.type == "revolute" for axis in robot.axes])
-        axes = _steps(q[:, revolute], ANGLE_STEPS), _steps(q[:, ~revolute], LENGTH_STEPS)
-        angle = _steps(rpy_from_rotation(rotation), ANGLE_STEPS, ROTATION_STEP)
-        steps = torch.stack([*axes, _steps(length, LENGTH_STEPS), angle], 1)
+        axes = _steps(q[:, revolute], _ANGLE_STEPS), _steps(q[:, ~revolute], _LENGTH_STEPS)
+        angle = _steps(rpy_from_rotation(rotation), _ANGLE_STEPS, _ROTATION_STEP)
+        steps = torch.stack([*axes, _steps(length, _LENGTH_STEPS), angle], 1)
         if "corner" in READINGS:
-            steps[rows.is_measured("corner").cpu(), 2:] = IMAGE_STEP
+            steps[rows.is_measured("corner").cpu(), 2:] = _IMAGE_STEP
         numbers = torch.cat([q, length, rotation[:, :, :2].flatten(1)], 1)
         file = numbers_of_names(rows.origin or (rows.source,) * rows.rows)
         return RowValues(numbers, steps, _kinds(robot), file)
@@ -162,7 +162,7 @@ def _steps(
     found = torch.full((len(values),), otherwise or steps[-1], dtype=torch.float64)
     for step in reversed(steps):
         deviation = (values / step - (values / step).round()).abs().nan_to_num(nan=0.0)
-        found = torch.where((deviation <= GRID_TOLERANCE).all(1), step, found)
+        found = torch.where((deviation <= _GRID_TOLERANCE).all(1), step, found)
     return found
 
 
@@ -193,7 +193,7 @@ def original_rows(values: RowValues, known: int = 0) -> Int64[Tensor, " rows"]:
     standing = same_joints.run[better] == same_joints.run[worse]
     best = rank.clone()
     # consecutive rows at a pose repeat better than returns to it, so their probabilities of equal readings differ
-    for scope, deviation in ((standing, STANDING), (~standing, RETURNING)):
+    for scope, deviation in ((standing, _STANDING), (~standing, _RETURNING)):
         equal = torch.zeros(count, dtype=torch.bool)
         equal[worse[scope]] = True
         partners = same_joints.count_partners(rank, known, scope is standing)
@@ -220,11 +220,11 @@ def _are_copies(
     once = chance[tried].clamp(max=1 - 1e-12)
     expected = float(-torch.expm1(partners[tried].clamp(min=1) * torch.log1p(-once)).sum())
     share, usual = found / count, expected / count
-    if not (found >= MIN_EXCESS * expected or share >= max(MIN_SHARE, usual)):
+    if not (found >= _MIN_EXCESS * expected or share >= max(_MIN_SHARE, usual)):
         return False
     # the exponent of Chernoff's bound: Kullback-Leibler divergence of the observed from the expected share
     different = 0.0 if share == 1 else (1 - share) * math.log((1 - share) / (1 - usual))
-    return count * (share * math.log(share / max(usual, 1e-300)) + different) >= MIN_EVIDENCE
+    return count * (share * math.log(share / max(usual, 1e-300)) + different) >= _MIN_EVIDENCE
 
 
 @dataclass(frozen=True, eq=False)
@@ -320,8 +320,8 @@ def _equal_pairs(values: RowValues) -> tuple[Int64[Tensor, " pairs"], Int64[Tens
 def _agree(values: Float64[Tensor, "2 pairs"], steps: Float64[Tensor, "2 pairs"]) -> Bool[Tensor, " pairs"]:
     """Return whether two values may be roundings of one value, to the same or to two different steps."""
     fine, coarse = steps.amin(0), steps.amax(0)
-    largest = torch.where(coarse - fine > GRID_TOLERANCE * coarse, coarse + fine, coarse) * (
-        0.5 + GRID_TOLERANCE
+    largest = torch.where(coarse - fine > _GRID_TOLERANCE * coarse, coarse + fine, coarse) * (
+        0.5 + _GRID_TOLERANCE
     )
     return ((values[0] - values[1]).abs() <= largest) | values.isnan().all(0)
 

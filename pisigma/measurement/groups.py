@@ -9,7 +9,7 @@ from torch import Tensor
 from pisigma.files.errors import MeasurementError, Place
 from pisigma.measurement.dataset import Measurements
 
-MIN_GROUPS = 3
+_MIN_GROUPS = 3
 """Smallest number of placements, sockets or anchors that are held out as a whole; with fewer, too few rows would
 remain."""
 
@@ -58,7 +58,7 @@ def held_out_groups(measurements: Measurements) -> Int64[Tensor, " rows"]:
     """Return the index of the group that is held out together for model selection, for every row.
 
     Rows of one socket or anchor share its unknown position, so they predict each other better than other rows; the
-    same holds for the sockets of one placement. Groups are therefore whole placements if there are `MIN_GROUPS` of
+    same holds for the sockets of one placement. Groups are therefore whole placements if there are `_MIN_GROUPS` of
     them, otherwise whole sockets and anchors, otherwise the groups of `groups_to_keep_whole`.
 
     Returns:
@@ -77,7 +77,7 @@ def held_out_groups(measurements: Measurements) -> Int64[Tensor, " rows"]:
         named = torch.tensor(
             [bool(one or other) for one, other in zip(*names, strict=True)], dtype=torch.bool
         )
-        if len(torch.unique(group[named])) >= MIN_GROUPS:
+        if len(torch.unique(group[named])) >= _MIN_GROUPS:
             return group
     return whole
 

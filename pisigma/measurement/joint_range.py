@@ -15,7 +15,7 @@ from pisigma.robot.row import Row
 _MAX_NAMED = 5
 """Largest number of rows that a warning lists."""
 
-MAX_TORQUE = 1e3
+_MAX_TORQUE = 1e3
 """[Nm/m^4] Largest torque over the fourth power of the reach, as masses grow with its cube: 75 for the UR5 (150 Nm), 60
 for the FANUC R-2000iC."""
 
@@ -89,7 +89,7 @@ def _torque_warnings(robot: Robot, rows: Measurements) -> tuple[str, ...]:
         return ()
     turning = np.flatnonzero(robot.revolute)
     largest = np.nan_to_num(np.abs(rows.torque.cpu().numpy()[:, turning])).max(0, initial=0.0)
-    limit = MAX_TORQUE * robot.reach**4
+    limit = _MAX_TORQUE * robot.reach**4
     if not len(turning) or largest.max() <= limit:
         return ()
     joint = int(turning[largest.argmax()])

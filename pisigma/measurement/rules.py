@@ -17,10 +17,10 @@ from pisigma.measurement.readings import READINGS, Unit, from_si, reading_number
 
 AXES = ("x", "y", "z")
 """Names of the axes of a frame, for touches."""
-SPLITS = ("train", "test")
-MIN_SIGMA = 1e-12
+_SPLITS = ("train", "test")
+_MIN_SIGMA = 1e-12
 """Smallest standard deviation of a sensor [m or rad]; no sensor is more accurate."""
-PAYLOADS = (0.0, 2500.0)
+_PAYLOADS = (0.0, 2500.0)
 """Range of payloads [kg]; the strongest arms on the market lift 2,300 kg."""
 TEMPERATURES = (-50.0, 150.0)
 """Range of temperatures [deg C] in which robots work; it excludes room temperatures in kelvins (293)."""
@@ -193,9 +193,9 @@ def rows_where(bad: Bool[np.ndarray, " rows"]) -> list[int]:
 def _value_faults(data: MeasuredFields, labels: FieldLabels) -> Iterator[RowAndFault]:
     """Find impossible standard deviations, payloads, temperatures, directions of approach, sets and dates."""
     for name, least, most in (
-        ("sigma_position", MIN_SIGMA, math.inf),
-        ("sigma_rotation", MIN_SIGMA, math.inf),
-        ("payload", *PAYLOADS),
+        ("sigma_position", _MIN_SIGMA, math.inf),
+        ("sigma_rotation", _MIN_SIGMA, math.inf),
+        ("payload", *_PAYLOADS),
         ("temperature", *TEMPERATURES),
     ):
         values = data.array(name)
@@ -217,7 +217,7 @@ def _value_faults(data: MeasuredFields, labels: FieldLabels) -> Iterator[RowAndF
                 shown = labels.format_value("approach", values[row])
                 yield row, Fault("", labels(f"approach{joint}"), expected, shown, _CORRECT)
     for row, split in enumerate(data.texts.get("split", ())):
-        if split not in SPLITS:
+        if split not in _SPLITS:
             yield row, Fault("", labels("split"), "train or test", split, "write one of them")
     for row, date in enumerate(data.texts.get("date", ())):
         if date and not is_date(date):

@@ -19,13 +19,13 @@ SplitBy = Literal["joints", "interleaved", "time", "space", "placement"]
 blocks in the file's order; by space: blocks of the measured positions; by placement: all sockets of a placement, or
 all rows of a frame, together."""
 
-RANDOM_SPLITS: tuple[SplitBy, ...] = ("joints", "placement")
+_RANDOM_SPLITS: tuple[SplitBy, ...] = ("joints", "placement")
 """Kinds of splits that assign groups to folds at random, so that repeats differ."""
-HELD_OUT_GROUPS, MAX_REPEATS = 200, 10
+_HELD_OUT_GROUPS, _MAX_REPEATS = 200, 10
 """Number of held-out groups, summed over repeats, at which the random assignment has little influence; and the largest
 number of repeats."""
 
-FOLDS = 5
+_FOLDS = 5
 """Default number of folds of a cross-validation that is not by placement."""
 
 TrainTest = tuple[Int64[Tensor, " _train"], Int64[Tensor, " _test"]]
@@ -39,7 +39,7 @@ class Splitting:
     Attributes:
         by: how rows are assigned, see `SplitBy`.
         seed: random seed.
-        folds: number of folds of a cross-validation; 0 for no cross-validation, None for `FOLDS` or one per placement.
+        folds: number of folds of a cross-validation; 0 for no cross-validation, None for `_FOLDS` or one per placement.
         hold_out: share of the rows that is held out once, instead of folds.
     """
 
@@ -68,10 +68,10 @@ class Splitting:
         elif self.folds == 0:
             return []
         else:
-            folds = FOLDS if self.folds is None and self.by != "placement" else self.folds
-            if folds is not self.folds and len(set(groups_to_keep_whole(measurements).tolist())) < FOLDS:
+            folds = _FOLDS if self.folds is None and self.by != "placement" else self.folds
+            if folds is not self.folds and len(set(groups_to_keep_whole(measurements).tolist())) < _FOLDS:
                 raise MeasurementError(
-                    expected=f"{FOLDS} or more different poses for a cross-validation",
+                    expected=f"{_FOLDS} or more different poses for a cross-validation",
                     value=len(set(groups_to_keep_whole(measurements).tolist())),
                     at=Place(measurements.source),
                     remedy="measure more (about 50 for a good calibration), or do not cross-validate (--folds 0)",
@@ -138,7 +138,7 @@ def repeated_k_folds(
         folds: number of folds, 2 or more; None for as many as there are groups.
         seed: random seed of the first repeat; the seeds of the other repeats follow from it.
         by: see `k_folds`.
-        times: number of repeats; None for the number that holds out `HELD_OUT_GROUPS` groups, at most `MAX_REPEATS`,
+        times: number of repeats; None for the number that holds out `_HELD_OUT_GROUPS` groups, at most `_MAX_REPEATS`,
             and for one repeat if groups are held out one by one or are not assigned at random by joints.
 
     Returns:
@@ -150,12 +150,12 @@ def repeated_k_folds(
     generator = torch.Generator().manual_seed(seed)
     first = k_folds(measurements, folds, generator, by)
     groups = len(_groups(measurements, by)[1])
-    differ = by in RANDOM_SPLITS and len(first) < groups
+    differ = by in _RANDOM_SPLITS and len(first) < groups
     if times is None:
-        usual = min(HELD_OUT_GROUPS // groups, MAX_REPEATS)
+        usual = min(_HELD_OUT_GROUPS // groups, _MAX_REPEATS)
         times = max(usual, 1) if by == "joints" and differ else 1
     if times > 1 and not differ:
-        what = f"{groups} folds of {groups} {_kind(by)}" if by in RANDOM_SPLITS else f"folds by {by}"
+        what = f"{groups} folds of {groups} {_kind(by)}" if by in _RANDOM_SPLITS else f"folds by {by}"
         raise MeasurementError(
             option="repeats",
             expected=f"one repeat, because {what} are the same every time",

@@ -33,7 +33,7 @@ Frames = dict[str, Float64[np.ndarray, " 6"]]
 """Bases per frame or tools per target: x, y, z [m], roll, pitch, yaw [rad]."""
 CHUNK = 4_096
 """Number of poses whose features are in memory at a time; each has a few hundred feature columns per joint."""
-DIFFERENCE_STEP = 1e-5
+_DIFFERENCE_STEP = 1e-5
 """Step of central differences [rad or m]; for a correction with 100 cycles per turn the error is 1e-6 of the slope."""
 
 
@@ -368,7 +368,7 @@ def _motion(arm: HybridArm, q: Tensor, exact: bool) -> tuple[Tensor, Tensor]:
 
 def _slope(arm: HybridArm, q: Float[Tensor, "poses dof"]) -> Float[Tensor, "poses dof dof"]:
     """Compute the derivatives of corrections with respect to joint values, by central differences."""
-    step = DIFFERENCE_STEP * torch.eye(q.shape[1], dtype=q.dtype, device=q.device)
+    step = _DIFFERENCE_STEP * torch.eye(q.shape[1], dtype=q.dtype, device=q.device)
     above, below = torch.chunk(arm.joint_correction(q[:, None] + torch.cat([step, -step])), 2, 1)
-    slope: Tensor = (above - below).mT / (2 * DIFFERENCE_STEP)
+    slope: Tensor = (above - below).mT / (2 * _DIFFERENCE_STEP)
     return slope

@@ -25,7 +25,7 @@ from pisigma.model.training_rows import stored_training_rows
 from pisigma.robot.description import Robot
 from pisigma.robot.se3 import invert, transform_from_xyzrpy, xyzrpy_from_transform
 
-KIND = "frame_calibration"
+_KIND = "frame_calibration"
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +55,7 @@ def frames_of_robot(robot: Robot, rows: Measurements, only: FrameChoice) -> Fitt
     """Fit frames with the arm of a robot as drawn; for the errors see `fit_frames`."""
     fit = fit_frames(robot, rows, only)
     model = model_of_calibration(robot.name, robot, fit.solved.result(), rows)
-    return FittedFrames(fit, replace(model, kind=KIND), _exact_arm(fit), misfit_causes(fit))
+    return FittedFrames(fit, replace(model, kind=_KIND), _exact_arm(fit), misfit_causes(fit))
 
 
 def frames_of_model(model: CalibratedModel, rows: Measurements, only: FrameChoice) -> FittedFrames:
@@ -138,7 +138,7 @@ def _with_frames(model: CalibratedModel, fit: FrameFit, rows: Measurements) -> C
     frames: dict[str, Any] = {**own, **of_hybrid}
     return replace(
         model,
-        kind=KIND,
+        kind=_KIND,
         robot=robot,
         branches=branches_of(robot, model.starts),
         calibrated=model.calibrated and _with_first(model.calibrated, own),

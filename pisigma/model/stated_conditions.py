@@ -29,9 +29,9 @@ _BEYOND = {
     "temperature_c": "the correction stays that of the nearest measured temperature",
 }
 """Clause about the extrapolation of a model outside the measured values of a condition."""
-MIN_TORQUES = 5
+_MIN_TORQUES = 5
 """Rows with a torque of a joint from which its sign and unit are compared with the calibration."""
-MAX_TORQUE_RATIO = 5.0
+_MAX_TORQUE_RATIO = 5.0
 """Largest ratio of measured to modelled torques, or of modelled to measured ones, that another load explains."""
 
 
@@ -109,12 +109,12 @@ def under_stated_torques(model: CalibratedModel, torques_nm: Sequence[float]) ->
             expected=f"{model.robot.dof} finite torques, one per joint", value=torques_nm, option="torques_nm"
         )
     usual = learned.modelled(JointState(model.starts.double())).abs().numpy().max(0, initial=0.0)
-    largest = MAX_TORQUE_RATIO * (usual + np.sqrt(np.diag(learned.covariance)))
+    largest = _MAX_TORQUE_RATIO * (usual + np.sqrt(np.diag(learned.covariance)))
     beyond = np.flatnonzero((np.abs(values) > largest) & (np.array(learned.scale) > 0))
     if len(beyond) and len(model.starts):
         joint = int(beyond[0])
         raise ModelError(
-            expected=f"a torque of joint {joint + 1} up to {largest[joint]:.3g} Nm, {MAX_TORQUE_RATIO:g} times the "
+            expected=f"a torque of joint {joint + 1} up to {largest[joint]:.3g} Nm, {_MAX_TORQUE_RATIO:g} times the "
             "largest of the calibration",
             value=float(values[joint]),
             option="torques_nm",
@@ -186,13 +186,13 @@ def _unlike_torques(name: str, learned: JointTorques, rows: Measurements) -> tup
         stated = torch.isfinite(tau)
         size = float(model[stated].square().sum())
         if (
-            int(stated.sum()) < MIN_TORQUES
+            int(stated.sum()) < _MIN_TORQUES
             or size <= 9 * row[joint] * int(stated.sum())
             or not learned.scale[joint]
         ):
             continue
         ratio = float(tau[stated] @ model[stated]) / size
-        if not 1 / MAX_TORQUE_RATIO <= ratio <= MAX_TORQUE_RATIO:
+        if not 1 / _MAX_TORQUE_RATIO <= ratio <= _MAX_TORQUE_RATIO:
             unlike.append(f"{ratio:.2g} times those in column tau_{joint + 1}")
     if not unlike:
         return ()

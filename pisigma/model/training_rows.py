@@ -14,7 +14,7 @@ from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.stored_starts import rows_at_starts
 from pisigma.robot.description import Robot
 
-MAX_KEPT_ROWS = 10_000
+_MAX_KEPT_ROWS = 10_000
 """Largest number of rows whose joint values and readings a model stores."""
 
 
@@ -23,7 +23,7 @@ def stored_training_rows(robot: Robot, rows: Measurements, before: RowValues | N
     values = RowValues.from_rows(rows.as_fields(), robot)
     values = values if before is None else before + values
     count = len(values.numbers)
-    return values.select(torch.linspace(0, count - 1, min(count, MAX_KEPT_ROWS)).round().long())
+    return values.select(torch.linspace(0, count - 1, min(count, _MAX_KEPT_ROWS)).round().long())
 
 
 def known_rows(model: CalibratedModel, rows: Measurements) -> Bool[Tensor, " rows"]:

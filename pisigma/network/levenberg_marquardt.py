@@ -10,11 +10,11 @@ from torch import Tensor, nn
 from pisigma.network.energy import energy, output_jacobian, pull_back
 from pisigma.network.pi_sigma import PiSigma, draw_uniform, sum_of_products, weigh_sums
 
-DAMPING_START = 1e-2
-DAMPING_RANGE = (1e-14, 1e10)
-DAMPING_FALL, DAMPING_RISE = 0.2, 3.0
+_DAMPING_START = 1e-2
+_DAMPING_RANGE = (1e-14, 1e10)
+_DAMPING_FALL, _DAMPING_RISE = 0.2, 3.0
 
-WINDOW = 5
+_WINDOW = 5
 """Number of iterations between checks of convergence."""
 CONVERGED_SHARE = 0.02
 """Relative decrease of the cost within a window below which a problem has converged."""
@@ -99,7 +99,7 @@ class LevenbergMarquardt(nn.Module):
         start = start + draw_uniform(start, spread, generator)
         self.register_buffer("fixed", network.fixed.expand(starts, -1, -1).clone())
         self.register_buffer("parameters_now", start)
-        self.register_buffer("damping", start.new_full(shape[:2], DAMPING_START))
+        self.register_buffer("damping", start.new_full(shape[:2], _DAMPING_START))
         self.register_buffer("cost", start.new_full(shape[:2], torch.inf))
         self.register_buffer("window_cost", start.new_full(shape[:2], torch.inf))
         self.register_buffer("moving", torch.ones(shape[:2], dtype=torch.bool))
@@ -125,8 +125,8 @@ class LevenbergMarquardt(nn.Module):
         accepted = (cost < self.cost) & self.moving
         self.parameters_now = torch.where(accepted[..., None, None], candidate, self.parameters_now)
         self.cost = torch.where(accepted, cost, self.cost)
-        factor = torch.where(accepted, DAMPING_FALL, DAMPING_RISE).to(self.damping)
-        self.damping = (self.damping * factor).clamp(*DAMPING_RANGE)
+        factor = torch.where(accepted, _DAMPING_FALL, _DAMPING_RISE).to(self.damping)
+        self.damping = (self.damping * factor).clamp(*_DAMPING_RANGE)
         self._remember(patterns, residual, accepted)
         self._judge_progress()
         best = self._winner()
@@ -210,7 +210,7 @@ class LevenbergMarquardt(nn.Module):
 
     def _judge_progress(self) -> None:
         self.iterations = self.iterations + 1
-        if int(self.iterations) % WINDOW == 0:
+        if int(self.iterations) % _WINDOW == 0:
             gain = self.window_cost - self.cost
             self.moving = self.moving & (gain > CONVERGED_SHARE * self.cost) & (gain > CONVERGED_COST)
             self.window_cost = self.cost.clone()

@@ -17,15 +17,15 @@ from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.kinematics.numeric import solve_numeric
 from pisigma.robot.se3 import invert, rotation_from_rpy, transform
 
-FULL_POSE_DOF = 6
+_FULL_POSE_DOF = 6
 """Number of joints of an arm that reaches any pose in its workspace, so that a closed form can be used."""
-CENTRE_SHARE = 0.5
+_CENTRE_SHARE = 0.5
 """Share of the image's width and height in which the centre of a random board lies."""
 MAX_ITERATIONS = 30
 """Largest number of iterations of the numeric inverse kinematics."""
-MAX_DEPTH_RATIO = 8.0
+_MAX_DEPTH_RATIO = 8.0
 """Largest depth of random boards, as a multiple of the depth at which they fill the image."""
-SIGHT_LINE_SHARES = (0.1, 0.8)
+_SIGHT_LINE_SHARES = (0.1, 0.8)
 """Start and end of the checked part of a line of sight, as shares of the way from the camera to the board: camera and
 board may be mounted on a box."""
 
@@ -72,7 +72,7 @@ class BoardViews:
         T_board = self._sampled_boards(count, generator)
         T_frame_target = T_board if self.sight.is_fixed else invert(T_board)
         T = self.T_cell_frame @ T_frame_target
-        solver = closed_form_solver(arm.robot) if arm.robot.dof == FULL_POSE_DOF else None
+        solver = closed_form_solver(arm.robot) if arm.robot.dof == _FULL_POSE_DOF else None
         if solver is None:
             limits = torch.from_numpy(arm.robot.limits).nan_to_num(posinf=math.pi, neginf=-math.pi)
             start = torch.rand(count, len(limits), generator=generator, dtype=T.dtype)
@@ -113,11 +113,11 @@ class BoardViews:
         camera = self.sight.camera
         draws = torch.rand(count, 6, generator=generator, dtype=torch.float64)
         size = draws.new_tensor([camera.width, camera.height])
-        pixels = size * (0.5 + CENTRE_SHARE * (draws[:, :2] - 0.5))
+        pixels = size * (0.5 + _CENTRE_SHARE * (draws[:, :2] - 0.5))
         rays = torch.from_numpy(camera.undistort(pixels.numpy()))
         left, top, right, bottom = board_sheet(self.sight.board)
         fills = camera.fx * min(right - left, bottom - top) / min(camera.width, camera.height)
-        least, most = max(self.nearest, fills), min(self.farthest, MAX_DEPTH_RATIO * fills)
+        least, most = max(self.nearest, fills), min(self.farthest, _MAX_DEPTH_RATIO * fills)
         # From where the board fills the image to where it is too small in it, within the stated distances.
         depth = least + (most - least) * draws[:, 2:3]
         middle = depth * torch.cat([rays, torch.ones_like(depth)], 1)
@@ -146,7 +146,7 @@ class BoardViews:
         corners = self._sheet @ T_cell_board[:, :3, :3].mT + T_cell_board[:, None, :3, 3]
         T_cell_camera = T_cell_board @ invert(T)
         eye = T_cell_camera[:, None, :3, 3]
-        lines = torch.stack([eye + share * (corners - eye) for share in SIGHT_LINE_SHARES], -2)
+        lines = torch.stack([eye + share * (corners - eye) for share in _SIGHT_LINE_SHARES], -2)
         return faults | arm.blocked_lines_of_sight(q, lines, "the board from the camera")
 
     def _boards(

@@ -18,18 +18,18 @@ from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.kinematics.joint_limits import nearest_turn
 from pisigma.robot.se3 import wrap_to_pi
 
-MAX_DRAWS = 40
+_MAX_DRAWS = 40
 """Largest number of blocks of random poses, each with the requested number of candidates."""
-KERNEL_WIDTH, RARE_SHARE = 0.25, 0.5
+_KERNEL_WIDTH, _RARE_SHARE = 0.25, 0.5
 """Width of the kernel for the density of joint angles [rad], and the share of the mean density below which an angle
 is rare."""
-MIN_VIEWS = 100
+_MIN_VIEWS = 100
 """Views of a board that are drawn together, because a robot reaches few of them."""
-SAME_JOINTS = 1e-6
+_SAME_JOINTS = 1e-6
 """Difference of joint values below which rows of a file are the same pose [rad or m]."""
-OUTSIDE_WORKSPACE = "the reflector is outside the box of the workspace"
-REPEATED = "an earlier row has the same joint values"
-UNREACHED = "the robot does not reach a view of the board"
+_OUTSIDE_WORKSPACE = "the reflector is outside the box of the workspace"
+_REPEATED = "an earlier row has the same joint values"
+_UNREACHED = "the robot does not reach a view of the board"
 
 Workspace = Float64[Tensor, "2 3"]
 """Lowest and highest x, y, z of the reflector in the robot's base frame [m]."""
@@ -104,9 +104,9 @@ def draw_candidates(
     generator = torch.Generator().manual_seed(seed)
     limits = None if views is not None else _sampled_range(arm)
     blocks: list[tuple[Tensor, Faults]] = []
-    while len(blocks) < MAX_DRAWS and sum(int(faults.allowed.sum()) for _, faults in blocks) < count:
+    while len(blocks) < _MAX_DRAWS and sum(int(faults.allowed.sum()) for _, faults in blocks) < count:
         if views is not None:
-            q = views.draw(arm, max(count, MIN_VIEWS), generator)
+            q = views.draw(arm, max(count, _MIN_VIEWS), generator)
         else:
             assert limits is not None
             draws = torch.rand(count, len(limits), generator=generator, dtype=torch.float64)
@@ -131,10 +131,10 @@ def with_workspace(arm: ArmInSurroundings, candidates: Candidates, others: Candi
         others: poses in the whole workspace.
     """
     angles = torch.arange(-180, 180, 5).to(others.q).deg2rad()
-    density = ((others.q[:, None] - angles[:, None]).cos() / KERNEL_WIDTH**2).softmax(1).mean(0)
+    density = ((others.q[:, None] - angles[:, None]).cos() / _KERNEL_WIDTH**2).softmax(1).mean(0)
     rarest = density.min(0)
     middle = torch.where(
-        rarest.values < RARE_SHARE / len(angles), wrap_to_pi(angles[rarest.indices] + math.pi), 0.0
+        rarest.values < _RARE_SHARE / len(angles), wrap_to_pi(angles[rarest.indices] + math.pi), 0.0
     )
 
     def unwrapped(q: Float64[Tensor, "poses dof"]) -> Float64[Tensor, "poses dof"]:
@@ -165,12 +165,12 @@ def read_candidates(
     q = read_joints(path, arm.robot)
     faults = _faults(arm, q, workspace, views)
     failed = torch.cat([_repeats(q)[:, None], faults.failed], 1)
-    return _allowed(q, Faults((REPEATED, *faults.reasons), failed))
+    return _allowed(q, Faults((_REPEATED, *faults.reasons), failed))
 
 
 def _repeats(q: Float64[Tensor, "poses dof"]) -> Bool[Tensor, " poses"]:
     """Return the mask of poses that equal an earlier pose and would be planned twice."""
-    steps = (q / SAME_JOINTS).round().numpy()
+    steps = (q / _SAME_JOINTS).round().numpy()
     _, first, group = np.unique(steps, axis=0, return_index=True, return_inverse=True)
     return torch.from_numpy(first[group.reshape(-1)] < np.arange(len(q)))
 
@@ -212,13 +212,13 @@ def _faults(
     views: BoardViews | None,
 ) -> Faults:
     """Return the faults of poses with respect to surroundings, workspace and camera."""
-    failed = {} if views is None else {UNREACHED: q.isnan().any(1)}
+    failed = {} if views is None else {_UNREACHED: q.isnan().any(1)}
     q = q.nan_to_num()
     faults = arm.faults(q)
     failed |= dict(zip(faults.reasons, faults.failed.unbind(1), strict=True))
     if workspace is not None:
         reflector = forward_kinematics(arm.robot, q)[:, :3, 3]
-        failed[OUTSIDE_WORKSPACE] = ((reflector < workspace[0]) | (reflector > workspace[1])).any(1)
+        failed[_OUTSIDE_WORKSPACE] = ((reflector < workspace[0]) | (reflector > workspace[1])).any(1)
     if views is not None:
         failed |= views.faults(arm, q)
     return Faults(tuple(failed), torch.stack([*failed.values()], 1))

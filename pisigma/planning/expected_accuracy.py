@@ -15,15 +15,15 @@ from pisigma.planning.pose_selection import select_poses
 from pisigma.planning.robot_posterior import RobotPosterior
 from pisigma.planning.surroundings.arm_in_surroundings import ArmInSurroundings
 
-RANDOM_SELECTIONS = 5
+_RANDOM_SELECTIONS = 5
 """Number of random selections of poses with which a plan is compared."""
 DRAWS = 100
 """Number of robots that are drawn from the posterior to compute quantiles."""
 DRAWS_AT_POSE = 1_000
 """Robots that are drawn for the quantile at a single pose, which scatters by 2 % then."""
-MORE_IMAGES = 10
+_MORE_IMAGES = 10
 """Number of additional images whose benefit is predicted."""
-EXACT_CORNERS, EXACT_ROBOT = 1e-4, Repeatability(1e-9, 1e-9)
+_EXACT_CORNERS, _EXACT_ROBOT = 1e-4, Repeatability(1e-9, 1e-9)
 """Noise of corners [px] and repeatability of a robot so small that they do not contribute to the error."""
 
 
@@ -77,7 +77,7 @@ def accuracy_curve(
         seed: random seed of the random selections.
     """
     generator = torch.Generator().manual_seed(seed)
-    orders = [torch.randperm(len(B), generator=generator) for _ in range(RANDOM_SELECTIONS)]
+    orders = [torch.randperm(len(B), generator=generator) for _ in range(_RANDOM_SELECTIONS)]
     points = []
     for count in counts:
         after = multiply_updated_root(D, B[chosen[:count]].flatten(0, 1))
@@ -159,7 +159,7 @@ class CameraProspects:
 
     Attributes:
         rms: RMS position error over the task [m].
-        rms_with_more_images: RMS error with `MORE_IMAGES` more images [m].
+        rms_with_more_images: RMS error with `_MORE_IMAGES` more images [m].
         rms_with_exact_corners: RMS error with corners without noise [m].
         rms_with_exact_robot: RMS error with a robot that repeats exactly [m].
         room: distance that the board may be from its place in the surroundings before it leaves an image [m].
@@ -206,15 +206,15 @@ class CameraProspects:
         others[chosen] = False
         left = candidates.q[others]
         more = (
-            left[select_poses(after.sensitivities(left), after.tool(task), min(MORE_IMAGES, len(left)))]
+            left[select_poses(after.sensitivities(left), after.tool(task), min(_MORE_IMAGES, len(left)))]
             if len(left)
             else left
         )
         return CameraProspects(
             rms_of(after.tool(task)),
             rms_of(after.after_measuring(more).tool(task)) if len(more) else rms_of(after.tool(task)),
-            rms(posterior_with(EXACT_CORNERS, sight.repeatability)),
-            rms(posterior_with(sight.corner_noise, EXACT_ROBOT)),
+            rms(posterior_with(_EXACT_CORNERS, sight.repeatability)),
+            rms(posterior_with(sight.corner_noise, _EXACT_ROBOT)),
             float(views.margin_in_image(arm, q).min()),
             _unidentifiable(arm, sight.is_fixed),
         )
@@ -229,7 +229,7 @@ class CameraProspects:
     def sentences(self) -> tuple[str, ...]:
         """Sentences about what limits the accuracy, what is not identifiable, and how exactly to place the board."""
         better = {
-            f"{MORE_IMAGES} more images": self.rms_with_more_images,
+            f"{_MORE_IMAGES} more images": self.rms_with_more_images,
             "corners without noise": self.rms_with_exact_corners,
             "a robot that repeats exactly": self.rms_with_exact_robot,
         }

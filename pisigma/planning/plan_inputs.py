@@ -32,7 +32,7 @@ from pisigma.robot.description import Robot
 from pisigma.validation.checks.check import MOVES
 from pisigma.validation.gate import check_rows
 
-WORKSPACE_POSES = 1000
+_WORKSPACE_POSES = 1000
 """Number of poses that represent the workspace if a camera measures."""
 
 
@@ -74,7 +74,7 @@ def find_candidates(settings: PlanSettings, arm: ArmInSurroundings) -> Candidate
         candidates = draw_candidates(arm, settings.candidates, settings.seed, workspace, views)
     if views is None:
         return candidates
-    return with_workspace(arm, candidates, draw_candidates(arm, WORKSPACE_POSES, settings.seed, workspace))
+    return with_workspace(arm, candidates, draw_candidates(arm, _WORKSPACE_POSES, settings.seed, workspace))
 
 
 def allow_measured_poses(settings: PlanSettings, arm: ArmInSurroundings) -> ArmInSurroundings:

@@ -14,7 +14,7 @@ from pisigma.measurement.camera.camera_files import CameraFiles, Repeatability
 if TYPE_CHECKING:
     from pisigma.planning.tour import Pace
 
-MIN_SIGMA_PX, MAX_SIGMA_PX = 1e-3, 100.0
+_MIN_SIGMA_PX, _MAX_SIGMA_PX = 1e-3, 100.0
 """Valid range of the noise of a corner [px]; other values are in a wrong unit."""
 
 
@@ -43,8 +43,8 @@ class CameraSettings:
 
     def __post_init__(self) -> None:
         """Refuse values outside their valid range."""
-        if not MIN_SIGMA_PX <= self.sigma_px <= MAX_SIGMA_PX:
-            expected = f"{MIN_SIGMA_PX:g} to {MAX_SIGMA_PX:g} px"
+        if not _MIN_SIGMA_PX <= self.sigma_px <= _MAX_SIGMA_PX:
+            expected = f"{_MIN_SIGMA_PX:g} to {_MAX_SIGMA_PX:g} px"
             raise PlanningError(expected=expected, value=self.sigma_px, option="sigma_px")
         _ = self.repeatability
 
@@ -62,9 +62,9 @@ class CameraSettings:
 SensorKind = Literal["position", "pose", "distance", "camera"]
 Criterion = Literal["D", "I"]
 Box = tuple[float, float, float, float, float, float]
-MIN_LENGTH_MM, MAX_LENGTH_MM = 1e-3, 1e3
+_MIN_LENGTH_MM, _MAX_LENGTH_MM = 1e-3, 1e3
 """Range of instruments' standard deviations and robots' errors [mm]; other values are in the wrong unit."""
-FILES = ("candidates_from", "task", "measured")
+_FILES = ("candidates_from", "task", "measured")
 """Names of the settings that are paths of files."""
 
 
@@ -152,9 +152,9 @@ class PlanSettings:
                 )
         for name in ("sigma_mm", "limit_mm"):
             value = getattr(self, name)
-            if value is not None and not MIN_LENGTH_MM <= value <= MAX_LENGTH_MM:
+            if value is not None and not _MIN_LENGTH_MM <= value <= _MAX_LENGTH_MM:
                 raise PlanningError(
-                    expected=f"{MIN_LENGTH_MM:g} to {MAX_LENGTH_MM:g} mm", value=value, option=name
+                    expected=f"{_MIN_LENGTH_MM:g} to {_MAX_LENGTH_MM:g} mm", value=value, option=name
                 )
         box = self.box_mm
         if box is not None and not all(lower < upper for lower, upper in zip(box[:3], box[3:], strict=True)):
@@ -179,7 +179,7 @@ class PlanSettings:
     def with_files(self, path_of: Callable[[str], str]) -> "PlanSettings":
         """Return the settings with `path_of` applied to every file path."""
         stated: dict[str, Any] = {
-            name: path_of(file) for name in FILES if (file := getattr(self, name)) is not None
+            name: path_of(file) for name in _FILES if (file := getattr(self, name)) is not None
         }
         camera = self.camera
         if camera is not None:

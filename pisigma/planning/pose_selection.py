@@ -14,14 +14,14 @@ from pisigma.planning.plan_settings import Criterion
 DROPPED_VARIANCE = 1e-10
 """Largest share of the task's variance in directions that are dropped. If a base may be anywhere within a metre,
 errors of a tenth of a millimetre, for which a plan is made, are 1e-8 of the variance."""
-MAX_EXCHANGED = 400
+_MAX_EXCHANGED = 400
 """Number of candidates that take part in the exchange: the selected ones, and the best of the others."""
-MIN_GAIN = 1e-6
+_MIN_GAIN = 1e-6
 """Gain below which candidates are not exchanged [nats, or share of the variance]."""
-MIN_REMAINING = 1e-3
+_MIN_REMAINING = 1e-3
 """Remaining share of a value's standard deviation below which a pose cannot be removed without a total loss of
 accuracy."""
-MAX_PASSES = 3
+_MAX_PASSES = 3
 """Largest number of passes over the selected poses in the exchange."""
 
 
@@ -73,7 +73,7 @@ def select_poses(
     remaining = (
         PoseSelection(B, goal, criterion, first.chosen).gains().argsort(descending=True)[: len(B) - count]
     )
-    few = torch.cat([chosen, remaining[: max(MAX_EXCHANGED - count, 0)]])
+    few = torch.cat([chosen, remaining[: max(_MAX_EXCHANGED - count, 0)]])
     choice = PoseSelection(B[few], goal, "D", range(count))
     choice.exchange_candidates()
     if criterion == "I":
@@ -168,7 +168,7 @@ class PoseSelection:
 
     def exchange_candidates(self) -> None:
         """Exchange every selected candidate for the best other one until no exchange improves the criterion."""
-        for _ in range(MAX_PASSES if len(self.chosen) < len(self._B) else 0):
+        for _ in range(_MAX_PASSES if len(self.chosen) < len(self._B) else 0):
             exchanged = False
             for number in list(self.chosen):
                 exchanged |= self._exchange(number)
@@ -186,7 +186,7 @@ class PoseSelection:
             gains = self._gains(without.S, without.P)
         best = int(gains.argmax())
         scale = 1.0 if self._criterion == "D" else float(gains[number])
-        exchanged = float(gains[best] - gains[number]) > MIN_GAIN * scale
+        exchanged = float(gains[best] - gains[number]) > _MIN_GAIN * scale
         if without is not None and not exchanged:
             self.chosen.append(number)
             return False
@@ -221,7 +221,7 @@ class PoseSelection:
         # Woodbury: a pose changes C by rank k only, the number of its values.
         here = torch.eye(G.shape[1]).to(G) + sign * self._B[number] @ G
         lower, failed = torch.linalg.cholesky_ex(here)
-        if sign < 0 and (int(failed) or float(lower.diagonal().min()) < MIN_REMAINING):
+        if sign < 0 and (int(failed) or float(lower.diagonal().min()) < _MIN_REMAINING):
             return None
         # contiguous by rows, because products with all candidates read it in this order
         half = torch.linalg.solve_triangular(lower, G.t(), upper=False).contiguous()

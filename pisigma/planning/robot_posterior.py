@@ -31,10 +31,10 @@ from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.robot_class import RobotClass
 from pisigma.robot.se3 import skew
 
-WIDE_PRIOR = (*(1.0,) * 6, *(0.1,) * 3, *(1.0,) * 3)
+_WIDE_PRIOR = (*(1.0,) * 6, *(0.1,) * 3, *(1.0,) * 3)
 """Standard deviations of base and tool before any measurement [m, rad, m, rad]; they are too wide to have an effect."""
 
-POSES_PER_CHUNK = 512
+_POSES_PER_CHUNK = 512
 """Number of poses whose derivatives are computed together (some MB)."""
 
 
@@ -191,7 +191,7 @@ class RobotPosterior:
 
     def sensitivities(self, q: Float64[Tensor, "poses dof"]) -> Float64[Tensor, "poses values directions"]:
         """Compute the derivative B of measured values divided by their noise; their covariance is `B B^T + 1`."""
-        return torch.cat([self._measured(some) for some in torch.split(q, POSES_PER_CHUNK)])
+        return torch.cat([self._measured(some) for some in torch.split(q, _POSES_PER_CHUNK)])
 
     def _measured(self, q: Float64[Tensor, "poses dof"]) -> Float64[Tensor, "poses values directions"]:
         columns, instrument = self.columns(q), self.instrument
@@ -238,7 +238,7 @@ class RobotPosterior:
         geometry = IdentifiedGeometry(robot, {"": base}, {"": tool}, {})
         space = ParameterSpace(before.space.robot)
         arm, weights = before.root[: space.arm_size], before.root[len(before.space.parameters) :]
-        wide = torch.diag(torch.tensor(WIDE_PRIOR, dtype=torch.float64))
+        wide = torch.diag(torch.tensor(_WIDE_PRIOR, dtype=torch.float64))
         blank = arm.new_zeros(len(wide), arm.shape[1])
         zeros = [rows.new_zeros(len(rows), len(wide)) for rows in (arm, weights)]
         # The new base and tool are independent of the arm: their wide prior is added as a diagonal block.
@@ -260,7 +260,7 @@ def _geometric_sizes(space: ParameterSpace) -> Float64[Tensor, " parameters"]:
     for parameter, value in arm:
         group = PriorGroup(prior_group_of(parameter.group, abs(value) > of_class.usual.length))
         sizes.append(of_class.usual.size_of(group))
-    return torch.tensor([*sizes, *WIDE_PRIOR], dtype=torch.float64)
+    return torch.tensor([*sizes, *_WIDE_PRIOR], dtype=torch.float64)
 
 
 def _weight_sizes(feature: AbstractFeature, of_groups: tuple[float, ...]) -> Float64[Tensor, " weights"]:

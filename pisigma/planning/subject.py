@@ -23,9 +23,9 @@ from pisigma.robot.description import Robot
 from pisigma.robot.robot_file import FrameSection
 from pisigma.robot.se3 import invert, transform_from_xyzrpy, xyzrpy_from_transform
 
-SAME_FRAME = 1e-6
+_SAME_FRAME = 1e-6
 """Difference [m or rad] below which the frames of a plan equal the frames with which the model was calibrated."""
-MAX_PITCH = 1.52
+_MAX_PITCH = 1.52
 """Largest pitch of base and tool at which derivatives are computed [rad]; roll and yaw are degenerate at 90 deg."""
 
 
@@ -160,10 +160,10 @@ class Subject:
 def _is_same(one: Float64[np.ndarray, " 6"], other: Float64[np.ndarray, " 6"]) -> bool:
     """Return whether two frames, as x, y, z, roll, pitch, yaw [m, rad], are the same."""
     T = transform_from_xyzrpy(torch.tensor(np.stack([one, other])))
-    return float((T[0] - T[1]).abs().max()) < SAME_FRAME
+    return float((T[0] - T[1]).abs().max()) < _SAME_FRAME
 
 
 def _regular(xyzrpy: Float64[np.ndarray, " 6"]) -> Float64[np.ndarray, " 6"]:
     """Return a frame with limited pitch, so that its three angles are independent."""
-    pitch = np.clip(xyzrpy[4], -MAX_PITCH, MAX_PITCH)
+    pitch = np.clip(xyzrpy[4], -_MAX_PITCH, _MAX_PITCH)
     return np.concatenate([xyzrpy[:4], [pitch], xyzrpy[5:]])

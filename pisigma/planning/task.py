@@ -25,7 +25,7 @@ REACHED = (Status.REACHED, Status.OUTSIDE_DOMAIN)
 """Statuses of poses whose joint values can be used."""
 TASK_POSES = 300
 """Number of joint vectors that represent the task, if more or none are stated."""
-STARTS = 200
+_STARTS = 200
 """Number of joint vectors from which the inverse kinematics of a robot without a closed form starts."""
 
 
@@ -48,7 +48,7 @@ def task_poses(
         PlanningError: a pose cannot be reached; the message names its line.
     """
     if settings.task is not None:
-        nominal = CalibratedModel(arm.nominal.name, "nominal", arm.nominal, None, None, (), q[:STARTS])
+        nominal = CalibratedModel(arm.nominal.name, "nominal", arm.nominal, None, None, (), q[:_STARTS])
         q = read_task(settings.task, model or nominal)
     return q[torch.linspace(0, len(q) - 1, min(len(q), TASK_POSES)).round().long()]
 

@@ -16,13 +16,13 @@ from pisigma.robot.description import Robot
 
 FIRST_STAGE = 20
 """Number of poses of the first calibration of a robot that was never measured; fewer do not determine its unknowns."""
-MAX_REORDERINGS = 8
+_MAX_REORDERINGS = 8
 """Largest number of attempts to avoid blocked motions by another order; remaining blocked motions get waypoints."""
-MIN_SPEED = 1e-3
+_MIN_SPEED = 1e-3
 """Smallest valid speed [rad/s or m/s]."""
-MAX_SETTLING = 3600.0
+_MAX_SETTLING = 3600.0
 """Longest valid settling time [s]."""
-DETOUR_FACTOR = 3.0
+_DETOUR_FACTOR = 3.0
 """Factor on the duration of a blocked motion while the order is optimised."""
 
 
@@ -46,11 +46,11 @@ class Pace:
             ("speed", self.speed, math.degrees(1.0), "deg/s"),
             ("slide", self.slide, 1e3, "mm/s"),
         ):
-            if not MIN_SPEED <= speed < math.inf:
-                expected, value = f"a speed >= {factor * MIN_SPEED:.2g} {unit}", f"{factor * speed:g} {unit}"
+            if not _MIN_SPEED <= speed < math.inf:
+                expected, value = f"a speed >= {factor * _MIN_SPEED:.2g} {unit}", f"{factor * speed:g} {unit}"
                 raise PlanningError(expected=expected, value=value, option=option)
-        if not 0 <= self.settling <= MAX_SETTLING:
-            expected, value = f"a settling time of 0 to {MAX_SETTLING:g} s", f"{self.settling:g} s"
+        if not 0 <= self.settling <= _MAX_SETTLING:
+            expected, value = f"a settling time of 0 to {_MAX_SETTLING:g} s", f"{self.settling:g} s"
             raise PlanningError(expected=expected, value=value, option="settling")
 
     def duration(
@@ -136,7 +136,7 @@ def _ordered(
     """Return the order of the poses of a stage; with `fixed_start` the first pose remains first."""
     times = seconds[np.ix_(stage, stage)]
     order = _nearest_neighbours(times, fixed_start)
-    for _ in range(MAX_REORDERINGS):
+    for _ in range(_MAX_REORDERINGS):
         order = _two_opt(times, order, fixed_start)
         path = poses[stage[order]]
         free = motions.are_free(path[:-1], path[1:]).numpy()
@@ -144,7 +144,7 @@ def _ordered(
         if not blocked.any():
             break
         one, other = order[:-1][blocked], order[1:][blocked]
-        times[one, other] = times[other, one] = _BLOCKED + DETOUR_FACTOR * times[one, other]
+        times[one, other] = times[other, one] = _BLOCKED + _DETOUR_FACTOR * times[one, other]
     return np.take(stage, order)
 
 

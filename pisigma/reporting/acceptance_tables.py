@@ -9,7 +9,7 @@ from pisigma.reporting.tables import figure_text
 from pisigma.validation.iso9283.repeats import MIN_CYCLES, RepeatedPose, pooled_deviation
 from pisigma.validation.uncertainty.budget import COVERAGE
 
-NOT_STATED = "not stated"
+_NOT_STATED = "not stated"
 _SHARE = f"{100 * COVERAGE:.0f} %"
 
 
@@ -62,15 +62,15 @@ def statement_table(acceptance: Acceptance) -> tuple[tuple[str, str], ...]:
     U, k = instrument.expanded_uncertainty_mm, instrument.coverage_factor
     maker, scatter = acceptance.repeatability_mm, pooled_deviation(acceptance.repeats)
     return (
-        ("instrument", instrument.name or NOT_STATED),
-        ("serial number", instrument.serial or NOT_STATED),
-        ("certificate", instrument.certificate or NOT_STATED),
-        ("calibrated on", instrument.calibrated or NOT_STATED),
+        ("instrument", instrument.name or _NOT_STATED),
+        ("serial number", instrument.serial or _NOT_STATED),
+        ("certificate", instrument.certificate or _NOT_STATED),
+        ("calibrated on", instrument.calibrated or _NOT_STATED),
         (
             "uncertainty of a coordinate",
-            f"U = {NOT_STATED if U is None else f'{U:g} mm'}, k = {NOT_STATED if k is None else f'{k:g}'}",
+            f"U = {_NOT_STATED if U is None else f'{U:g} mm'}, k = {_NOT_STATED if k is None else f'{k:g}'}",
         ),
-        ("repeatability RP of the maker", NOT_STATED if maker is None else f"{maker:g} mm"),
+        ("repeatability RP of the maker", _NOT_STATED if maker is None else f"{maker:g} mm"),
         (
             "standard deviation of a coordinate in repeated poses",
             "no pose was measured twice"
@@ -79,7 +79,7 @@ def statement_table(acceptance: Acceptance) -> tuple[tuple[str, str], ...]:
         ),
         (
             "temperatures of the sessions",
-            NOT_STATED if span is None else f"{span[0]:.1f} to {span[1]:.1f} deg C",
+            _NOT_STATED if span is None else f"{span[0]:.1f} to {span[1]:.1f} deg C",
         ),
     )
 
@@ -97,7 +97,9 @@ def budget_table(acceptance: Acceptance) -> Table:
         )
         for one in budget.components
     ]
-    rows += [(line.partition(":")[0], "", NOT_STATED, "", line.partition(": ")[2]) for line in budget.missing]
+    rows += [
+        (line.partition(":")[0], "", _NOT_STATED, "", line.partition(": ")[2]) for line in budget.missing
+    ]
     if budget.components:
         freedom, k = budget.effective_degrees_of_freedom, budget.coverage_factor
         rows += [
@@ -162,7 +164,7 @@ def iso_table(repeats: Sequence[RepeatedPose]) -> Table:
             mean = sum(values) / len(values)
             rows.append((name, str(len(values)), counts, figure_text(mean), figure_text(max(values))))
         else:
-            rows.append((name, "0", "", NOT_STATED, NOT_STATED))
+            rows.append((name, "0", "", _NOT_STATED, _NOT_STATED))
     return Table(("ISO 9283:1998", "poses", "cycles", "mean [mm]", "largest [mm]"), tuple(rows))
 
 

@@ -13,7 +13,7 @@ from pisigma.files.errors import OutputError
 from pisigma.measurement.camera.board import RULER, Board
 from pisigma.measurement.camera.pattern import Pattern, board_pattern
 
-PAPERS = {
+_PAPERS = {
     "A4 or Letter": (210.0, 279.4),
     "A4": (210.0, 297.0),
     "A3": (297.0, 420.0),
@@ -22,9 +22,9 @@ PAPERS = {
     "A0": (841.0, 1189.0),
 }
 """Width and height of paper [mm]; the first is the part that A4 and Letter have in common."""
-MARGIN = 8.0
+_MARGIN = 8.0
 """Margin that printers leave blank along the edges of a sheet [mm]."""
-FOOT = 22.0
+_FOOT = 22.0
 """Height of the space below the board for its text and the ruler [mm]."""
 MM = 1 / 25.4
 """One millimetre [inch]."""
@@ -60,9 +60,9 @@ def draw_board_sheet(board: Board) -> tuple[str, Figure]:
     figure = Figure(figsize=(width * MM, height * MM))
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0), xlim=(0, width), ylim=(height, 0))
     axes.set_axis_off()
-    corner = np.array([(width - across) / 2, MARGIN]) - 1e3 * pattern.sheet[:2]
+    corner = np.array([(width - across) / 2, _MARGIN]) - 1e3 * pattern.sheet[:2]
     axes.add_patch(PathPatch(_outline(pattern, corner), facecolor="black", edgecolor="none"))
-    top = MARGIN + down + 4
+    top = _MARGIN + down + 4
     start, end = (width - RULER) / 2, (width + RULER) / 2
     axes.plot(
         [start, start, start, end, end, end], [top, top + 4, top + 2, top + 2, top, top + 4], "k", lw=0.5
@@ -78,8 +78,8 @@ def draw_board_sheet(board: Board) -> tuple[str, Figure]:
 
 def _paper(board: Board, across: float, down: float) -> tuple[str, tuple[float, float]]:
     """Return the smallest paper for a board of given width and height [mm], portrait if both formats fit."""
-    needs = max(across, RULER) + 2 * MARGIN, down + FOOT + 2 * MARGIN
-    for name, (width, height) in PAPERS.items():
+    needs = max(across, RULER) + 2 * _MARGIN, down + _FOOT + 2 * _MARGIN
+    for name, (width, height) in _PAPERS.items():
         for title, size in ((name, (width, height)), (f"{name} landscape", (height, width))):
             if needs[0] <= size[0] and needs[1] <= size[1]:
                 return title, size

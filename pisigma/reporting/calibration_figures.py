@@ -27,13 +27,13 @@ _LETTER = 0.07
 """Width of a character of the names along tables [inch]."""
 STYLES = {"nominal": (":", "s"), "geometric": ("--", "o"), "hybrid": ("-", "^")}
 """Line and marker of every model, so that they differ without colour."""
-POINTS = 1_000
+_POINTS = 1_000
 """Points of a curve: 9 per period of the 110th harmonic, 2 per pixel."""
-MAX_DOTS = 2_000
+_MAX_DOTS = 2_000
 """Largest number of dots in a panel; if there are more rows, an even selection of them is drawn."""
-LOG_RATIO = 5.0
+_LOG_RATIO = 5.0
 """Ratio of the largest to the smallest standard deviation above which axes are logarithmic."""
-BINS = 8
+_BINS = 8
 """Bins with equal numbers of values in which predicted and actual spread are compared."""
 
 
@@ -169,7 +169,7 @@ def draw_corrections(correction: JointCorrection, measurements: Measurements, pa
     for j, (axes, joint) in enumerate(zip(panels, joints, strict=False)):
         unit, factor, small, scale = JOINT_UNITS[joint.type]
         values, line = _over_own_value(correction, q, j)
-        step = max(len(q) // MAX_DOTS, 1)
+        step = max(len(q) // _MAX_DOTS, 1)
         axes.plot(
             q[::step, j].numpy() * factor, corrections[::step, j] * scale, ".", color="0.55", markersize=2.5
         )
@@ -190,8 +190,8 @@ def _over_own_value(
     correction: JointCorrection, q: Float64[Tensor, "rows dof"], joint: int
 ) -> tuple[Float64[np.ndarray, " points"], Float64[np.ndarray, " points"]]:
     """Return values of one joint over its measured range and its corrections, with other joints at their medians."""
-    values = torch.linspace(float(q[:, joint].min()), float(q[:, joint].max()), POINTS, dtype=torch.float64)
-    at = q.median(0).values.repeat(POINTS, 1)
+    values = torch.linspace(float(q[:, joint].min()), float(q[:, joint].max()), _POINTS, dtype=torch.float64)
+    at = q.median(0).values.repeat(_POINTS, 1)
     at[:, joint] = values
     with torch.no_grad():
         return values.numpy(), correction(at)[:, joint].numpy()
@@ -243,19 +243,19 @@ def draw_spread(spread: PredictedSpread, path: Path) -> None:
     figure = Figure(figsize=(6.8, 5.2))
     axes = figure.add_subplot()
     set_margins(figure, left=0.75, right=0.15, bottom=0.55, top=0.35)
-    step = max(len(sigma) // (3 * MAX_DOTS), 1)
+    step = max(len(sigma) // (3 * _MAX_DOTS), 1)
     axes.plot(sigma[::step], error[::step], ".", color="0.6", markersize=2, label="coordinate of a row")
     ends = np.array([sigma[0], sigma[-1]])
     axes.plot(ends, ends, "-", color="black", linewidth=1.0, label="as predicted")
     axes.plot(ends, WITHIN * ends, "--", color="black", linewidth=1.0, label="95 % should be below")
-    parts = [part for part in np.array_split(np.arange(len(sigma)), BINS) if len(part)]
+    parts = [part for part in np.array_split(np.arange(len(sigma)), _BINS) if len(part)]
     middle = [np.sqrt((sigma[part] ** 2).mean()) for part in parts]
     axes.plot(
         middle, [np.sqrt((error[part] ** 2).mean()) for part in parts], "D", color="tab:red",
         markeredgecolor="black", label="RMS error of a bin",
     )  # fmt: skip
     axes.set(xlabel="predicted standard deviation [mm]", ylabel="|error| [mm]")
-    far = bool(ends[1] > LOG_RATIO * ends[0])
+    far = bool(ends[1] > _LOG_RATIO * ends[0])
     if far:
         axes.set(xscale="log", yscale="log", ylim=(float(np.quantile(error, 0.02)), None))
     else:

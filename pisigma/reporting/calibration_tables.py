@@ -23,11 +23,11 @@ from pisigma.validation.held_out.validation_figures import (
     ValidationFigures,
 )
 
-PARAMETER_COLUMNS = ("parameter", "unit", "nominal", "estimated", "change", "std. error", "remark")
+_PARAMETER_COLUMNS = ("parameter", "unit", "nominal", "estimated", "change", "std. error", "remark")
 TRIAL_COLUMNS = ("tried", "unknowns", "log evidence", "held-out error", "seconds", "kept")
-SIGNIFICANT = 2.0
+_SIGNIFICANT = 2.0
 """Standard errors below which a change cannot be distinguished from 0."""
-UNCERTAIN = "not distinguishable from 0"
+_UNCERTAIN = "not distinguishable from 0"
 _FIGURES = ("nominal", "estimated", "change", "standard_error")
 
 _say = functools.partial(sentences, "calibration.txt.j2")
@@ -39,7 +39,7 @@ def parameter_table(parameters: Sequence[ParameterFigures]) -> Table:
     Figures are rounded according to their standard errors. A change of less than two standard errors cannot be
     distinguished from 0.
     """
-    return Table(PARAMETER_COLUMNS, tuple(_parameter_row(one) for one in parameters))
+    return Table(_PARAMETER_COLUMNS, tuple(_parameter_row(one) for one in parameters))
 
 
 def _parameter_row(parameter: ParameterFigures) -> tuple[str, ...]:
@@ -47,9 +47,11 @@ def _parameter_row(parameter: ParameterFigures) -> tuple[str, ...]:
     digits = 4 if not error else min(max(1 - math.floor(math.log10(error)), 1), 6)
     figures = (parameter.nominal, parameter.estimated, parameter.change, error)
     texts = ("" if value is None else f"{round(value, digits) + 0.0:.{digits}f}" for value in figures)
-    small = error is not None and parameter.change is not None and abs(parameter.change) < SIGNIFICANT * error
+    small = (
+        error is not None and parameter.change is not None and abs(parameter.change) < _SIGNIFICANT * error
+    )
     label = (
-        ", ".join([*(() if parameter.label == "identified" else (parameter.label,)), UNCERTAIN])
+        ", ".join([*(() if parameter.label == "identified" else (parameter.label,)), _UNCERTAIN])
         if small
         else parameter.label
     )

@@ -12,11 +12,11 @@ from pisigma.reporting.verdict import Verdict, count_text, rms_text, rounded
 from pisigma.validation.held_out.calibration_summary import CalibrationSummary, ScaleFigures
 from pisigma.validation.held_out.validation_figures import ValidationFigures
 
-LIKELY_SCALE, POSSIBLE_SCALE = 1.0, 0.1
+_LIKELY_SCALE, _POSSIBLE_SCALE = 1.0, 0.1
 """Odds above which a common factor on all lengths is a warning, or a remark, if the error that would follow matters."""
-MIN_SCALE_SHARE = 0.5
+_MIN_SCALE_SHARE = 0.5
 """Share of the held-out RMS error above which the error that would follow from a wrong scale matters."""
-MIN_COVERAGE = 0.9
+_MIN_COVERAGE = 0.9
 """Share of held-out coordinates within their predicted 95 % intervals below which these are called too narrow."""
 _SHOWN = {"rms": "RMS", "p95": "95 %", "max": "largest"}
 
@@ -99,7 +99,7 @@ def _trust(summary: CalibrationSummary, warnings: int) -> str:
     if judged is None:
         return "not known: no row was held out, so nothing judged the calibration."
     share = judged.coverage
-    covered = share is None or share >= MIN_COVERAGE
+    covered = share is None or share >= _MIN_COVERAGE
     cautions = ["the sensor's scale may be wrong"] if scale_matters(summary) else []
     cautions += [] if covered else ["the predicted accuracy is too good"]
     intervals = (
@@ -123,13 +123,13 @@ def _next_step(summary: CalibrationSummary, folder: Path | None, warnings: int) 
     return f"{first} with other poses: `pisigma verify {folder} ROWS.csv`."
 
 
-def scale_matters(summary: CalibrationSummary, odds: float = LIKELY_SCALE) -> bool:
+def scale_matters(summary: CalibrationSummary, odds: float = _LIKELY_SCALE) -> bool:
     """Return whether a wrong scale of the sensor has at least these odds and causes an error that matters."""
     scale, judged = summary.scale, summary.validation_errors
     if scale is None or judged is None or scale.odds < odds:
         return False
     *_, best = judged.models.values()
-    return best.rms_mm is not None and scale.rms_mm >= MIN_SCALE_SHARE * best.rms_mm
+    return best.rms_mm is not None and scale.rms_mm >= _MIN_SCALE_SHARE * best.rms_mm
 
 
 def scale_text(scale: ScaleFigures) -> str:
@@ -171,7 +171,7 @@ def calibration_text(
         warnings = [f"{one} {scale_error(summary.scale)}" if one in found else one for one in warnings]
     elif summary.scale is not None and scale_matters(summary):
         warnings = [scale_text(summary.scale), *warnings]
-    elif summary.scale is not None and scale_matters(summary, POSSIBLE_SCALE):
+    elif summary.scale is not None and scale_matters(summary, _POSSIBLE_SCALE):
         remarks = [scale_text(summary.scale)]
     written = f"Model written to {folder} in {seconds:.1f} s; its README.md has all figures."
     return ResultText(

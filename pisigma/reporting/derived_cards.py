@@ -21,12 +21,12 @@ from pisigma.reporting.verdict import rounded
 from pisigma.validation.held_out.distillation_summary import DistillationSummary
 from pisigma.validation.held_out.frame_summary import FrameSummary
 
-CANDIDATES = {
+_CANDIDATES = {
     "recalibrated": "recalibrated",
     "old": "old, with base and tool of these rows",
     "scratch": "from scratch",
 }
-OF_FLEET = CANDIDATES | {"recalibrated": "fleet and these rows", "old": "mean robot of the fleet"}
+_OF_FLEET = _CANDIDATES | {"recalibrated": "fleet and these rows", "old": "mean robot of the fleet"}
 
 
 def write_recalibration_card(model: CalibratedModel, summary: RecalibrationSummary, folder: Path) -> None:
@@ -59,7 +59,7 @@ def write_frame_card(model: CalibratedModel, summary: FrameSummary, folder: Path
 
 def candidate_names(summary: RecalibrationSummary) -> dict[str, str]:
     """Return the names of the candidates by their keys in the figures."""
-    return OF_FLEET if summary.parent.kind == FLEET_PRIOR else CANDIDATES
+    return _OF_FLEET if summary.parent.kind == FLEET_PRIOR else _CANDIDATES
 
 
 def candidate_table(summary: RecalibrationSummary) -> Table:

@@ -9,7 +9,7 @@ from pisigma.reporting.result_text import ResultText, Table, sentences, table_bl
 from pisigma.reporting.verdict import Verdict, count_text, rounded
 from pisigma.validation.held_out.frame_summary import CoordinateFigures, FrameSummary
 
-REMEDIES = {
+_REMEDIES = {
     "arm": "calibrate the arm with 40 images or more (`pisigma calibrate` without --only), or state a calibrated model",
     "joint zeros": "set the joint zeros again, or calibrate the arm with `--set free=joint_offsets`",
     "joint noise": "read the joint values when the arm has settled, and check clocks and backlash",
@@ -72,7 +72,7 @@ def cause_sentence(summary: FrameSummary) -> tuple[str, ...]:
     ]
     which = " and the ".join(f"{CAUSES[one.cause]}, {one.size}" for one in named)
     unclear = f" The rows can hardly tell it from: {', '.join(rivals)}." if rivals else ""
-    remedies = ", and ".join(REMEDIES[one.cause] for one in named)
+    remedies = ", and ".join(_REMEDIES[one.cause] for one in named)
     return (
         f"The residuals are larger than their noise because of the {which}.{unclear} Remedy: {remedies}.",
     )

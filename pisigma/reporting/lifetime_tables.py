@@ -34,7 +34,7 @@ def _chart_row(chart: Chart) -> tuple[str, ...]:
     return (chart.what, value, chart.unit, *shares, " and ".join(chart.kinds) or "no")
 
 
-NO_VALUE = "-"
+_NO_VALUE = "-"
 
 
 def difference_table(differences: ParameterDifferences, names: tuple[str, str]) -> Table:
@@ -53,6 +53,6 @@ def _difference_row(one: ParameterDifference) -> tuple[str, ...]:
     """Return the row of a parameter; without a test, the cells of its shift are empty."""
     values = (f"{value:.4f}" for value in (one.first, one.second))
     if one.shift is None or one.deviation is None or one.p is None:
-        return (one.name, one.unit, *values, NO_VALUE, NO_VALUE, NO_VALUE)
+        return (one.name, one.unit, *values, _NO_VALUE, _NO_VALUE, _NO_VALUE)
     p = "<0.0001" if one.p < 1e-4 else f"{one.p:.2g}"
     return (one.name, one.unit, *values, f"{one.shift:z.4f}", f"{NORMAL_95 * one.deviation:.4f}", p)

@@ -20,7 +20,7 @@ from pisigma.reporting.tables import (
     pose_table,
 )
 
-WRAPPED = 24
+_WRAPPED = 24
 """Characters of a text above which its column is wrapped."""
 
 
@@ -56,7 +56,7 @@ def column_classes(table: Table) -> tuple[str, ...]:
     for place in range(len(table.columns)):
         cells = [Markup(row[place]).striptags() for row in table.rows if row[place]]
         texts = [one for one in cells if re.search(r"[^\W\d_]{2}", one)]
-        is_long = max(map(len, cells), default=0) > WRAPPED
+        is_long = max(map(len, cells), default=0) > _WRAPPED
         classes.append("" if 2 * len(texts) <= len(cells) else "text long" if is_long else "text")
     return tuple(classes)
 

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from pisigma.validation.held_out.validation_figures import ErrorFigures
 
-MANY_ROWS = 100
+_MANY_ROWS = 100
 """Number of rows from which errors deserve three digits, because their RMS is known to a few percent."""
-SMALLEST = 1e-4
+_SMALLEST = 1e-4
 """Errors below which their size does not matter [mm or deg]."""
 
 
@@ -43,13 +43,13 @@ class Verdict:
         return ((self.heading, self.accuracy), ("Trust", self.trust), ("Next", self.next_step))
 
 
-def rounded(value: float, rows: int = MANY_ROWS) -> str:
+def rounded(value: float, rows: int = _MANY_ROWS) -> str:
     """Return an error with three digits, or two if few rows were judged."""
-    digits = 3 if rows >= MANY_ROWS else 2
+    digits = 3 if rows >= _MANY_ROWS else 2
     if value == 0 or not math.isfinite(value):
         return f"{value:g}"
-    if abs(value) < SMALLEST:
-        return f"< {SMALLEST:g}" if value > 0 else f"> -{SMALLEST:g}"
+    if abs(value) < _SMALLEST:
+        return f"< {_SMALLEST:g}" if value > 0 else f"> -{_SMALLEST:g}"
     return f"{value:.{max(0, digits - 1 - math.floor(math.log10(abs(value))))}f}"
 
 

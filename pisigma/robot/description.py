@@ -19,7 +19,7 @@ from pisigma.robot.urdf_frames import Frame, frame_of, rotation, row_frame, tran
 if TYPE_CHECKING:
     import pytorch_kinematics
 
-BASE_FRAME, TOOL_FRAME = "base_link", "tool0"
+_BASE_FRAME, _TOOL_FRAME = "base_link", "tool0"
 """Names of the first and last frame of a pytorch-kinematics chain."""
 
 
@@ -256,7 +256,7 @@ def serial_chain(robot: Robot) -> "pytorch_kinematics.SerialChain":
         parent.add_child(child)
         return child
 
-    root = frames.Frame(BASE_FRAME, frames.Link(BASE_FRAME), frames.Joint("root", dtype=double))
+    root = frames.Frame(_BASE_FRAME, frames.Link(_BASE_FRAME), frames.Joint("root", dtype=double))
     last, behind = root, frame_of(robot.base)
     for row, (theta, d, a, alpha, beta) in zip(robot.rows, robot.dh.tolist(), strict=True):
         last = attach(
@@ -269,5 +269,5 @@ def serial_chain(robot: Robot) -> "pytorch_kinematics.SerialChain":
             limits=(row.lower, row.upper) if np.isfinite([row.lower, row.upper]).all() else None,
         )
         behind = row_frame(0.0, 0.0, a, alpha, beta)
-    attach(last, TOOL_FRAME, behind @ frame_of(robot.tool), "tool")
-    return SerialChain(Chain(root, dtype=double), TOOL_FRAME, dtype=double)
+    attach(last, _TOOL_FRAME, behind @ frame_of(robot.tool), "tool")
+    return SerialChain(Chain(root, dtype=double), _TOOL_FRAME, dtype=double)

@@ -11,7 +11,7 @@ from pisigma.robot.se3 import nearest_rotation, rotation_from_vector, rotation_v
 
 LEVER_SHARE = 0.2
 """Lever arm that converts rotation errors to position errors, as a share of the robot's reach."""
-ALTERNATIONS = 10
+_ALTERNATIONS = 10
 """Number of alternating projections onto rotations that refine the initial guess of base and tool."""
 MAX_ITERATIONS = 20
 AFFINE_UNKNOWNS = 13
@@ -233,7 +233,7 @@ def _affine_base_and_tool(
         # The leading singular vectors are the rotations up to a common sign, so both signs are tried.
         leading = torch.linalg.svd(K)[2][..., 0, :]
         Z = _nearest_rotations(torch.cat([leading, -leading], -2)[..., None])
-        for _ in range(ALTERNATIONS):
+        for _ in range(_ALTERNATIONS):
             bases = _nearest_rotations(K @ Z.flatten(-2)[..., None])
             Z = _nearest_rotations(K.mT @ bases.flatten(-2)[..., None])
         agreement = (bases.flatten(-2) * (K @ Z.flatten(-2)[..., None])[..., 0]).sum(-1)

@@ -16,7 +16,7 @@ from pisigma.robot.row import Row
 from pisigma.robot.urdf_frames import Frame, rotation, translation
 from pisigma.robot.urdf_rows import turned_to
 
-TYPES = {"hinge": "revolute", "slide": "prismatic"}
+_TYPES = {"hinge": "revolute", "slide": "prismatic"}
 """Type of the DH row by type of the MJCF joint."""
 
 
@@ -123,7 +123,7 @@ class MjcfDrawing:
             self._moved(body, before, row)
             for body, before, row in zip(bodies, [None, *bodies], rows, strict=False)
         ]
-        kinds = [TYPES.get(one.joint.get("type", "hinge"), "") for one in found]
+        kinds = [_TYPES.get(one.joint.get("type", "hinge"), "") for one in found]
         names = [body.find("joint").get("name") for body in bodies]
         if nominal.coupling is not None or len(bodies) != len(rows) or kinds != [row.type for row in rows]:
             expected = f"the joints {', '.join(row.name for row in rows)}, one in a body and none coupled"

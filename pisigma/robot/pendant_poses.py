@@ -11,7 +11,7 @@ from pisigma.robot.description import Robot
 from pisigma.robot.row import FRAME_COLUMNS, Row, in_file_units
 from pisigma.robot.urdf_frames import Frame, frame_of, row_frame, xyzrpy_of
 
-ROTATION, STROKE = math.pi / 2, 0.1
+_ROTATION, _STROKE = math.pi / 2, 0.1
 """Values to which a revolute axis [rad] and a prismatic axis [m] are moved."""
 
 
@@ -66,7 +66,7 @@ def pendant_poses(
     count, (lower, upper) = len(nominal.axes), nominal.axis_limits.T
     values = np.zeros((count + 1, count))
     for index, axis in enumerate(nominal.axes):
-        step = ROTATION if axis.type == "revolute" else STROKE
+        step = _ROTATION if axis.type == "revolute" else _STROKE
         ends = min(step, upper[index]), max(-step, lower[index])
         values[index + 1, index] = ends[0] if abs(ends[0]) >= abs(ends[1]) else ends[1]
     inside = ((values >= lower) & (values <= upper)).all(1)

@@ -9,7 +9,7 @@ from pisigma.robot.description import Robot
 
 ClassName = Literal["industrial", "cobot", "hobby", "servo"]
 
-COBOT_MAKERS: Final = (
+_COBOT_MAKERS: Final = (
     "Franka",
     "Rainbow Robotics",
     "UFACTORY",
@@ -18,8 +18,8 @@ COBOT_MAKERS: Final = (
     "Techman",
     "Neuromeka",
 )
-HOBBY_MAKERS: Final = ("Enactic", "Niryo", "AR4", "Dobot")
-SERVO_MAKERS: Final = ("TheRobotStudio", "Alexander Koch", "Trossen", "ROBOTIS", "Elephant Robotics")
+_HOBBY_MAKERS: Final = ("Enactic", "Niryo", "AR4", "Dobot")
+_SERVO_MAKERS: Final = ("TheRobotStudio", "Alexander Koch", "Trossen", "ROBOTIS", "Elephant Robotics")
 
 
 @dataclass(frozen=True)
@@ -96,11 +96,11 @@ class RobotClass:
         """Return the class of a robot by its maker; `INDUSTRIAL` if the maker is not known."""
         if robot.maker.startswith("Universal Robots"):
             return UNIVERSAL_ROBOTS
-        if robot.maker.startswith(COBOT_MAKERS):
+        if robot.maker.startswith(_COBOT_MAKERS):
             return COBOT
-        if robot.maker.startswith(SERVO_MAKERS):
+        if robot.maker.startswith(_SERVO_MAKERS):
             return SERVO
-        return HOBBY if robot.maker.startswith(HOBBY_MAKERS) else INDUSTRIAL
+        return HOBBY if robot.maker.startswith(_HOBBY_MAKERS) else INDUSTRIAL
 
     def allows(self, sizes: Sequence[tuple[int, float]]) -> bool:
         """Return whether errors of these sizes [m or rad], by group of parameters, are possible in this class."""

@@ -13,7 +13,7 @@ from pisigma.files.errors import Place, RobotError, make_printable, nearest_choi
 from pisigma.robot.urdf_file import parse_xml, read_urdf
 from pisigma.robot.urdf_frames import Frame, frame_of
 
-AXIS_LENGTH_TOLERANCE = 1e-2
+_AXIS_LENGTH_TOLERANCE = 1e-2
 """Largest deviation of an axis from unit length, which files write with few digits."""
 
 
@@ -220,7 +220,7 @@ def _moving(joint: Any, origin: Frame, at: Place, commanded: Collection[str]) ->
     # URDF's default axis is x; pytorch-kinematics' own chains use z.
     axis = np.array((1.0, 0.0, 0.0) if joint.axis is None else joint.axis, dtype=np.float64)
     length = float(np.linalg.norm(axis))
-    if abs(length - 1) > AXIS_LENGTH_TOLERANCE:
+    if abs(length - 1) > _AXIS_LENGTH_TOLERANCE:
         expected = "a unit vector such as 0 0 1"
         problem = f"joint '{joint.name}': expected {expected} as the axis, got a vector of length {length:g}"
         raise RobotError(problem, expected=expected, value=length, at=at)

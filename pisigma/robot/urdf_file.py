@@ -11,9 +11,9 @@ from pisigma.files.errors import Place, RobotError, nearest_choice
 from pisigma.files.input_file import read_input
 from pisigma.robot.row import MAX_MAGNITUDE
 
-JOINT_TYPES = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
+_JOINT_TYPES = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
 
-MAX_ELEMENTS = 10_000
+_MAX_ELEMENTS = 10_000
 """Largest number of links and joints of a file; a whole cell has some hundreds."""
 
 _KEPT = {"origin": ("xyz", "rpy"), "axis": ("xyz",), "parent": ("link",), "child": ("link",)}
@@ -55,8 +55,8 @@ def read_urdf(path: str | os.PathLike[str], root: Any = None) -> tuple[Any, Call
                 remedy="use different names",
             )
         lines[kind, name] = element.sourceline
-        if len(lines) > MAX_ELEMENTS:
-            expected = f"at most {MAX_ELEMENTS:,} links and joints"
+        if len(lines) > _MAX_ELEMENTS:
+            expected = f"at most {_MAX_ELEMENTS:,} links and joints"
             raise RobotError(f"expected {expected}", expected=expected, at=Place(path))
         copied = etree.SubElement(reduced, kind, name=name)
         if kind == "joint":
@@ -141,8 +141,8 @@ def _copy_joint(element: Any, copied: Any, path: str | os.PathLike[str]) -> None
     name = element.get("name")
     at = Place(path, element.sourceline)
     kind = element.get("type")
-    if kind not in JOINT_TYPES:
-        hint = nearest_choice(kind or "", JOINT_TYPES)
+    if kind not in _JOINT_TYPES:
+        hint = nearest_choice(kind or "", _JOINT_TYPES)
         raise RobotError(f"joint '{name}': unknown type '{kind}'", value=kind, at=at, remedy=hint)
     copied.set("type", kind)
     for child in element.iterchildren(*(f"{{*}}{tag}" for tag in _KEPT)):

@@ -65,7 +65,7 @@ def _limits_entry(row: Row) -> dict[str, list[float]]:
 BASE_LINK = "base_link"
 TOOL_LINK = "tool0"
 MASS, INERTIA, EFFORT, VELOCITY = "1", "0.01", "1000", "10"
-PLACEHOLDERS = (
+_PLACEHOLDERS = (
     f"Masses ({MASS} kg), inertias ({INERTIA} kg m2), efforts ({EFFORT}) and velocities ({VELOCITY}) are placeholders, "
     "not values of the robot: only the kinematics was calibrated. Enter the values of the maker to simulate forces."
 )
@@ -78,7 +78,7 @@ def robot_to_urdf(robot: Robot, comments: tuple[str, ...] = ()) -> str:
     axis, in the opposite sense if its direction is -1; `Trans(a, 0, 0) · RotX(alpha) · RotY(beta)` leads to the next
     joint. The description needs no common normals, so parallel axes keep their positions. Base and tool are fixed
     joints, links are named `link_1` and so on, joints like the rows. `effort` and `velocity`, which the format
-    requires, and masses and inertias, without which MuJoCo rejects the file, are `PLACEHOLDERS`, as a comment in the
+    requires, and masses and inertias, without which MuJoCo rejects the file, are `_PLACEHOLDERS`, as a comment in the
     file states. A coupled joint is followed by one joint on the same axis for each other axis of the controller that
     moves it, which mimics that axis.
 
@@ -90,7 +90,7 @@ def robot_to_urdf(robot: Robot, comments: tuple[str, ...] = ()) -> str:
         OutputError: URDF cannot express a joint's limits or the linkage that drives it.
     """
     root = ElementTree.Element("robot", name=robot.name)
-    for sentence in (*comments, PLACEHOLDERS):
+    for sentence in (*comments, _PLACEHOLDERS):
         root.append(ElementTree.Comment(comment_text(sentence)))
     names = {row.name for row in robot.rows}
     link = "link_0"

@@ -68,7 +68,7 @@ class OrientationSection(Section):
         return home @ rotation_from_rpy(torch.deg2rad(self.spread_deg * draws))
 
 
-EXTRA_DRAWS = 9
+_EXTRA_DRAWS = 9
 """Number of additional draws per joint vector for coupled joints, whose stops exclude some draws."""
 
 Range = tuple[float, float]
@@ -113,7 +113,7 @@ class JointsRandom(Section):
         q = sample()
         if robot.coupling is None or not robot.coupling.stops:
             return q
-        many = torch.cat([q] + [sample() for _ in range(EXTRA_DRAWS)])
+        many = torch.cat([q] + [sample() for _ in range(_EXTRA_DRAWS)])
         kept = many[torch.from_numpy(robot.coupling.is_within_limits(many.numpy()))]
         if len(kept) < self.count:
             raise RecipeError(

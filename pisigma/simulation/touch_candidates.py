@@ -76,15 +76,15 @@ def check_names(placements: Sequence[JigPlacement]) -> None:
         )
 
 
-MAX_DRAWS = 20
+_MAX_DRAWS = 20
 """Largest number of draws, after which the search for candidates fails."""
-CANDIDATES_PER_DRAW = 8192
+_CANDIDATES_PER_DRAW = 8192
 """Number of candidates per draw."""
 MAX_ITERATIONS = 10
 """Largest number of iterations of the numeric inverse kinematics to an end of the travel; about five are needed."""
-END_TOLERANCE = 1e-8
+_END_TOLERANCE = 1e-8
 """Tolerance of the inverse kinematics at the ends of the travel [m and rad]."""
-MAX_JOINT_MOTION = 1.5
+_MAX_JOINT_MOTION = 1.5
 """Motion of a joint within the travel [rad or m] above which the branch must have changed."""
 
 
@@ -208,7 +208,7 @@ class TouchCandidatesSection(Section):
         axes = sorted(set(jig.axis.tolist()))
         share = {axis: (self.count + len(axes) - 1 - place) // len(axes) for place, axis in enumerate(axes)}
         parts: list[TouchCandidates] = []
-        for _ in range(MAX_DRAWS):
+        for _ in range(_MAX_DRAWS):
             sampled = self._draw(jig, placement.name, robot.dof, generator)
             parts.append(self._reachable(robot, jig, placement, sampled))
             reachable = TouchCandidates.concatenate(parts)
@@ -221,14 +221,14 @@ class TouchCandidatesSection(Section):
         raise RecipeError(
             option="touches",
             expected=f"{share[lacking]} touches of robot '{robot.name}' along {'xyz'[lacking]} of jig "
-            f"'{placement.name}' (of {MAX_DRAWS * CANDIDATES_PER_DRAW} random ones)",
+            f"'{placement.name}' (of {_MAX_DRAWS * _CANDIDATES_PER_DRAW} random ones)",
             value=len(of_axis[lacking]),
             remedy="place the jig nearer, allow more tilt, choose a smaller margin, travel or shaft, or another branch",
         )
 
     def _draw(self, jig: Jig, name: str, dof: int, generator: torch.Generator) -> TouchCandidates:
         """Draw faces, points and orientations of the torch that are clear of the jig, but may be unreachable."""
-        u = torch.rand(CANDIDATES_PER_DRAW, 7, generator=generator, dtype=torch.float64)
+        u = torch.rand(_CANDIDATES_PER_DRAW, 7, generator=generator, dtype=torch.float64)
         face = _draw_faces(jig, u[:, 0])
         lower, upper = (bound[face] for bound in jig.extent)
         point = lower + (upper - lower) * u[:, 1:4]
@@ -246,7 +246,7 @@ class TouchCandidatesSection(Section):
             sign=jig.sign[face],
             coordinate=jig.coordinate[face],
             T_jig_tool=transform(R, point),
-            q=torch.zeros(CANDIDATES_PER_DRAW, dof, dtype=torch.float64),
+            q=torch.zeros(_CANDIDATES_PER_DRAW, dof, dtype=torch.float64),
         )
         return sampled.select(self._is_clear(jig, sampled))
 
@@ -274,9 +274,11 @@ class TouchCandidatesSection(Section):
         T, outward = T[reached], (T_base_jig[:3, :3] @ jig.outward[sampled.face].mT).mT
         shift = self.travel_mm / 1e3 * torch.stack([outward, -outward])
         Ts_end = transform(T[:, :3, :3].expand(2, -1, 3, 3), T[:, :3, 3] + shift)
-        ends = solve_numeric(robot, Ts_end, sampled.q, tolerance=END_TOLERANCE, max_iterations=MAX_ITERATIONS)
+        ends = solve_numeric(
+            robot, Ts_end, sampled.q, tolerance=_END_TOLERANCE, max_iterations=MAX_ITERATIONS
+        )
         ends_reached = ends.status == Status.REACHED
-        ends_reached &= (ends.q - sampled.q).abs().amax(-1) < MAX_JOINT_MOTION
+        ends_reached &= (ends.q - sampled.q).abs().amax(-1) < _MAX_JOINT_MOTION
         ends_reached &= singularity_measure(robot, ends.q) >= self.least_singular_value
         return sampled.select(ends_reached.all(0))
 

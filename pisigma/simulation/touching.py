@@ -24,7 +24,7 @@ from pisigma.simulation.true_robot import TrueRobot
 
 OnMiss = Literal["error", "leave_out"]
 
-CONTACT_TOLERANCE = 1e-13
+_CONTACT_TOLERANCE = 1e-13
 """Distance of the tip from the coordinate of the touch [m] at which the approach ends."""
 MAX_ITERATIONS = 50
 """Largest number of iterations, after which the approach fails; about ten are needed."""
@@ -150,7 +150,7 @@ def _approach(
         tip = (true_Ts_jig_base[:, :3, :3] @ position[..., None])[..., 0] + true_Ts_jig_base[:, :3, 3]
         gap = candidates.sign * ((tip * along).sum(-1) - coordinate)
         open_ = (
-            (gap.abs() > CONTACT_TOLERANCE)
+            (gap.abs() > _CONTACT_TOLERANCE)
             & (moved.abs() <= travel)
             & (solution.status != Status.NOT_CONVERGED)
         )
@@ -158,7 +158,7 @@ def _approach(
             break
         moved = torch.where(open_, moved + gap, moved)
     met = (
-        (gap.abs() <= 10 * CONTACT_TOLERANCE)
+        (gap.abs() <= 10 * _CONTACT_TOLERANCE)
         & (moved.abs() <= travel)
         & (solution.status != Status.NOT_CONVERGED)
     )

@@ -23,7 +23,7 @@ from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.held_out.frames.fitted_frames import FrameKind
 from pisigma.validation.setup_faults.setup_fault import SetupFault
 
-MIN_ROWS_TO_CALIBRATE = 12
+_MIN_ROWS_TO_CALIBRATE = 12
 """Smallest number of rows whose calibration shows whether the errors of the arm are too large for this robot."""
 
 
@@ -159,7 +159,7 @@ def _against_robot(rows: Measurements, robot: Robot) -> Iterator[Iterable[Diagno
     yield check_position_size(robot, rows)
     yield joint_columns(robot, rows)
     yield other_robot_diagnostics(robot, rows)
-    if rows.rows >= MIN_ROWS_TO_CALIBRATE:
+    if rows.rows >= _MIN_ROWS_TO_CALIBRATE:
         yield _as_calibrated(rows, robot)
 
 

@@ -6,7 +6,7 @@ from typing import Annotated
 from pisigma.files.errors import MeasurementError
 from pisigma.files.setting import HIDDEN, KEY, Option
 
-MAX_RESAMPLES = 1_000_000
+_MAX_RESAMPLES = 1_000_000
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Bootstrap:
     def __post_init__(self) -> None:
         """Refuse settings that do not define an interval."""
         for name, valid, expected in (
-            ("resamples", 2 <= self.resamples <= MAX_RESAMPLES, f"2 to {MAX_RESAMPLES:,} resamples"),
+            ("resamples", 2 <= self.resamples <= _MAX_RESAMPLES, f"2 to {_MAX_RESAMPLES:,} resamples"),
             ("confidence", 0 < self.confidence < 1, "a confidence level between 0 and 1"),
             ("seed", self.seed >= 0, "a seed of at least 0"),
         ):

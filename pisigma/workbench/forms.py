@@ -28,9 +28,9 @@ FIRST = {
     "import": ("unit", "join"),
 }
 """Settings that are shown at once; other settings are behind "all settings"."""
-NEW_CELL = {"sensor": "--sensor", "limit_mm": "--limit-mm"}
+_NEW_CELL = {"sensor": "--sensor", "limit_mm": "--limit-mm"}
 """Settings of a new cell, with their options."""
-LEFT_OUT = ("map", "no_history")
+_LEFT_OUT = ("map", "no_history")
 """Settings of a form of their own, or that a cell does not have."""
 
 
@@ -103,7 +103,7 @@ def form_of_cell(file: CellFile) -> dict[str, list[Field]]:
 def form_of_new_cell() -> list[Field]:
     """Return the fields of a new cell besides its robot."""
     fields = {one.key: one for one in _section(CellDocument, {}, "")}
-    return [replace(fields[key], option=option) for key, option in NEW_CELL.items()]
+    return [replace(fields[key], option=option) for key, option in _NEW_CELL.items()]
 
 
 def changed_cell(file: CellFile, form: Mapping[str, str]) -> str:
@@ -187,7 +187,7 @@ def _settings(step: str) -> list[Setting]:
     return [
         one
         for one in flat_settings(STEPS[step])
-        if one.key not in (*CAMERA_KEYS, *LEFT_OUT)
+        if one.key not in (*CAMERA_KEYS, *_LEFT_OUT)
         and one.kind is not Path
         and get_origin(one.kind) is not list
     ]

@@ -12,9 +12,9 @@ from typing import Any
 from pisigma.files.errors import ModelError, Place
 from pisigma.robot.description import Robot
 
-TIMEOUT = 2.0
+_TIMEOUT = 2.0
 """Longest time to wait for an answer of the server [s]."""
-WARM_UP = 100
+_WARM_UP = 100
 """Number of requests after the start, whose times are the first displayed times."""
 
 
@@ -59,7 +59,7 @@ class ModelServer:
                 raise ModelError(problem or "the server did not start", at=Place(self._folder))
             self.ports = json.loads(line)
         there = self._ask([{"q_deg" if all(robot.revolute) else "q": [0.0] * len(robot.axes)}])[0]
-        self._ask([{"pose": there["pose"]}] * WARM_UP if "pose" in there else [])
+        self._ask([{"pose": there["pose"]}] * _WARM_UP if "pose" in there else [])
 
     def stop(self) -> None:
         """Stop the server after it has answered all received requests."""
@@ -78,7 +78,7 @@ class ModelServer:
     def _ask(self, requests: list[dict[str, Any]]) -> list[dict[str, Any]]:
         """Send requests and return the answers, which are empty if the server does not answer."""
         try:
-            with socket.create_connection(("127.0.0.1", self.ports["json_port"]), TIMEOUT) as stream:
+            with socket.create_connection(("127.0.0.1", self.ports["json_port"]), _TIMEOUT) as stream:
                 answers = stream.makefile("r", encoding="utf-8")
                 found = []
                 for number, request in enumerate(requests):

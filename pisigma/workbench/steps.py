@@ -59,11 +59,11 @@ from pisigma.workflow.result_texts import (
 from pisigma.workflow.settings.importing import ImportSettings
 
 Form = Mapping[str, str]
-WIDTH = 200
+_WIDTH = 200
 """Width of tables before models are divided among several [characters]."""
-EXPORT_OPTIONS = ("geometry", "targets", "branch", "config")
-NEEDS_ACTION = "the robot needs attention, for the reasons below."
-NOT_STORED = "no model was stored, because the result must not be trusted, for the reasons below."
+_EXPORT_OPTIONS = ("geometry", "targets", "branch", "config")
+_NEEDS_ACTION = "the robot needs attention, for the reasons below."
+_NOT_STORED = "no model was stored, because the result must not be trusted, for the reasons below."
 
 
 def create(folder: Path, form: Form, files: list[Path]) -> Cell:
@@ -123,7 +123,7 @@ def calibrate(cell: Cell, form: Form, progress: Progress) -> Outcome:
     text = calibration_text(found.summary, folder, found.seconds, also)
     return Outcome(
         _in_cell(text, cell),
-        NOT_STORED if entry is None else "",
+        _NOT_STORED if entry is None else "",
         rows=rows_at_fault(found.summary.diagnostics),
     )
 
@@ -134,7 +134,7 @@ def verify(cell: Cell, form: Form, progress: Progress) -> Outcome:
     found, entry = cell.verify(None, form.get("of_model") or None, **changed_settings("verify", form))
     in_use = cell.history.in_use
     used = [f"Model '{entry.name}' is in use."] if in_use is not None and in_use.name == entry.name else []
-    text = replace(verification_text(found, WIDTH), closing=tuple(used))
+    text = replace(verification_text(found, _WIDTH), closing=tuple(used))
     refusal = "" if found.accepted else found.sentence
     return Outcome(_in_cell(text, cell), refusal, rows=rows_at_fault(found.diagnostics))
 
@@ -149,7 +149,7 @@ def monitor(cell: Cell, form: Form, progress: Progress) -> Outcome:
     found = cell.monitor(progress, **changed_settings("monitor", form))
     found.save_page(out := output_path(cell.folder, REPORTS, CHARTS))
     text = monitoring_text(found, [f"Charts written to {out.name}."])
-    return Outcome(_in_cell(text, cell), NEEDS_ACTION if found.needs_action else "")
+    return Outcome(_in_cell(text, cell), _NEEDS_ACTION if found.needs_action else "")
 
 
 def recalibrate(cell: Cell, form: Form, progress: Progress) -> Outcome:
@@ -157,7 +157,9 @@ def recalibrate(cell: Cell, form: Form, progress: Progress) -> Outcome:
     accept = form.get("accept_implausible") == "true"
     found, entry = cell.recalibrate(None, progress, accept, **changed_settings("recalibrate", form))
     folder = None if entry is None else cell.model_folder(entry.name)
-    return Outcome(_in_cell(recalibration_text(found, folder), cell), "" if entry is not None else NOT_STORED)
+    return Outcome(
+        _in_cell(recalibration_text(found, folder), cell), "" if entry is not None else _NOT_STORED
+    )
 
 
 def _in_cell(text: ResultText, cell: Cell) -> ResultText:
@@ -278,7 +280,7 @@ def export(cell: Cell, form: Form, files: Mapping[str, Path]) -> Outcome:
                 "there is an export with this name", at=Place(out), remedy="choose another name"
             )
     options: dict[str, Any] = dict(files)
-    options |= {key: form[key].strip() for key in EXPORT_OPTIONS if form.get(key, "").strip()}
+    options |= {key: form[key].strip() for key in _EXPORT_OPTIONS if form.get(key, "").strip()}
     exported = export_from_cell(cell, name, ExportRequest(cell.folder, out, **options))
     contents = kind.contents
     what = exported.summary or f"{contents[0].upper()}{contents[1:]}"

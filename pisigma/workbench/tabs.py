@@ -44,7 +44,7 @@ TABS = {
     "deliver": "Deliver",
 }
 """Titles of the tabs by name."""
-TAB_OF = {
+_TAB_OF = {
     "import": "measure",
     "monitor": "verify",
     "recalibrate": "verify",
@@ -52,17 +52,17 @@ TAB_OF = {
     "use": "status",
 }
 """Tab of a command that has not the name of a tab."""
-FORMATS = tuple(
+_FORMATS = tuple(
     name for name in BUILT_IN if name not in ("staubli", "xacro", "library", "ur-calibration", "rsi")
 )
 """Formats that need no file of the controller."""
 CHARTS = "-monitoring.html"
 """End of the names of pages with control charts in the reports of a cell."""
-FIGURES = (".png", ".svg")
-FIRST_ROWS, MAX_ROWS, MAX_LINES = 8, 40, 2000
+_FIGURES = (".png", ".svg")
+_FIRST_ROWS, _MAX_ROWS, MAX_LINES = 8, 40, 2000
 """First rows of an upload that are shown, and largest numbers of rows with findings, and of lines in a sentence."""
-LINES = re.compile(r"\blines? ((?:\d{1,9}(?:, | to | and )?)+)")
-RANGES = re.compile(r"(\d+)(?: to (\d+))?")
+_LINES = re.compile(r"\blines? ((?:\d{1,9}(?:, | to | and )?)+)")
+_RANGES = re.compile(r"(\d+)(?: to (\d+))?")
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ class Tabs:
                 "together": merge_alike_warnings,
                 "lines": line_numbers_in,
                 "name": lambda path: Path(path).name,
-                "tab_of": lambda step: TAB_OF.get(step, step),
+                "tab_of": lambda step: _TAB_OF.get(step, step),
                 "code": code,
                 "ticks": ticks,
             },
@@ -201,7 +201,7 @@ class Tabs:
                 zip(mapping.file.lines, mapping.file.records, strict=True),
                 key=lambda row: row[0] not in lines,
             )
-            tables.append((mapping, rows[: FIRST_ROWS + min(len(lines), MAX_ROWS)]))
+            tables.append((mapping, rows[: _FIRST_ROWS + min(len(lines), _MAX_ROWS)]))
         template = self._environment.get_template("findings.html.j2")
         return template.render(
             found=found, repairs=repairs, fields=fields, problem=problem, tables=tables, lines=lines
@@ -223,7 +223,7 @@ def repaired_fields(incoming: IncomingRows, repair: Repair) -> dict[str, str]:
 def line_numbers_in(text: str) -> list[int]:
     """Return the line numbers of the rows that a sentence names, such as "line 12" or "lines 3, 7 to 9"."""
     found: list[int] = []
-    for first, last in RANGES.findall(" ".join(LINES.findall(text))):
+    for first, last in _RANGES.findall(" ".join(_LINES.findall(text))):
         found += range(int(first), min(int(last or first), int(first) + MAX_LINES) + 1)
     return found[:MAX_LINES]
 
@@ -248,7 +248,7 @@ def _more(name: str, cell: Cell, status: CellStatus, texts: Mapping[str, str]) -
             return {"charts": [one for one in _names(cell.folder / REPORTS) if one.endswith(CHARTS)][:1]}
         case "deliver":
             return {
-                "formats": {one: BUILT_IN[one][1] for one in FORMATS},
+                "formats": {one: BUILT_IN[one][1] for one in _FORMATS},
                 "downloads": _names(cell.folder / EXPORTS),
                 "reports": [one for one in _names(cell.folder / REPORTS) if not one.endswith(CHARTS)],
                 "columns": POSE_COLUMNS,
@@ -289,7 +289,7 @@ def figures(cell: Cell, status: CellStatus) -> list[tuple[str, str]]:
     if not models:
         return []
     folder = cell.folder / MODELS / models[-1].name
-    return [(models[-1].name, one.name) for one in sorted(folder.rglob("*")) if one.suffix in FIGURES]
+    return [(models[-1].name, one.name) for one in sorted(folder.rglob("*")) if one.suffix in _FIGURES]
 
 
 def _names(folder: Path) -> list[str]:
@@ -298,7 +298,7 @@ def _names(folder: Path) -> list[str]:
     return [one.name for one in sorted(files, key=lambda one: one.stat().st_mtime, reverse=True)]
 
 
-FOLDERS = {"plan": PLANS, "model": MODELS, "export": EXPORTS, "report": REPORTS}
+_FOLDERS = {"plan": PLANS, "model": MODELS, "export": EXPORTS, "report": REPORTS}
 """Folders of downloads by their kind."""
 
 
@@ -309,14 +309,14 @@ def download_of(cell: Cell, kind: str, names: tuple[str, ...]) -> Path:
 
     Args:
         cell: the cell.
-        kind: a key of `FOLDERS`.
+        kind: a key of `_FOLDERS`.
         names: name of the file; for a model, name of the model and of the file.
 
     Raises:
         ModelError: the file does not exist.
     """
-    check_choice(ModelError, "download", kind, tuple(FOLDERS))
-    folder = cell.folder / FOLDERS[kind]
+    check_choice(ModelError, "download", kind, tuple(_FOLDERS))
+    folder = cell.folder / _FOLDERS[kind]
     for one in folder.glob("*/**/*" if kind == "model" else "*"):
         parts = one.relative_to(folder).parts
         if (parts[0], *one.parts[-1:][: len(parts) - 1]) == names and one.is_file() and not one.is_symlink():

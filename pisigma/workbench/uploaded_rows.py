@@ -18,7 +18,7 @@ from pisigma.workbench.uploads import Uploads
 from pisigma.workflow.cell.cell import Cell
 from pisigma.workflow.cell.incoming_rows import IncomingRows
 
-GROWING = "growing"
+_GROWING = "growing"
 """Name of the growing file in a form, instead of the number of an upload."""
 
 
@@ -94,5 +94,5 @@ class UploadedRows:
     def _incoming(self, cell: Cell, form: Mapping[str, str]) -> IncomingRows:
         """Return the uploaded files of a form, or the growing file."""
         numbers = form.get("files", "").split(",")
-        files = [self.growing] if numbers == [GROWING] and self.growing else self._uploads.paths(numbers)
+        files = [self.growing] if numbers == [_GROWING] and self.growing else self._uploads.paths(numbers)
         return steps.incoming_rows(files, cell, form)

@@ -9,9 +9,9 @@ from pathlib import Path
 
 from pisigma.files.errors import MeasurementError, make_printable
 
-MAX_FILES = 20
+_MAX_FILES = 20
 """Largest number of stored files; the oldest file is removed first."""
-MAX_NAME = 60
+_MAX_NAME = 60
 """Longest name [characters]; file systems accept 255 bytes, and a character has up to four."""
 
 
@@ -32,7 +32,7 @@ class Uploads:
             content: content of the file.
         """
         shown = make_printable(name.replace("\\", "/").rpartition("/")[2].replace("\0", ""))[
-            -MAX_NAME:
+            -_MAX_NAME:
         ].strip(". ")
         number = next(self._numbers)
         folder = Path(self._folder.name) / number
@@ -41,7 +41,7 @@ class Uploads:
         path.write_bytes(content)
         with self._lock:
             self._files[number] = path
-            removed = [self._files.pop(one) for one in [*self._files][:-MAX_FILES]]
+            removed = [self._files.pop(one) for one in [*self._files][:-_MAX_FILES]]
         for one in removed:
             one.unlink()
         return number

@@ -35,28 +35,28 @@ from pisigma.workflow.cell.cell import Cell
 from pisigma.workflow.cell.cell_file import CellFile
 
 Form = Mapping[str, str]
-STATUS_AGE = 5.0
+_STATUS_AGE = 5.0
 """Age after which the status is read again [s], because commands may change the cell as well."""
-STATIC = {
+_STATIC = {
     "workbench.js": ("text/javascript", "pisigma.workbench", "static"),
     "workbench.css": ("text/css", "pisigma.workbench", "static"),
     "copies.js": ("text/javascript", "pisigma.reporting", "page"),
 }
 """Type, package and folder of the files of the page."""
-MODEL_STEPS = ("calibrate", "verify", "recalibrate", "use")
+_MODEL_STEPS = ("calibrate", "verify", "recalibrate", "use")
 """Steps that add a model or put one into use."""
-NO_CELL = {"state": "no_cell", "reason": "the folder has no cell yet", "command": "pisigma new"}
+_NO_CELL = {"state": "no_cell", "reason": "the folder has no cell yet", "command": "pisigma new"}
 """Next step of a folder without a cell."""
-STATE_CHECKS = 30
+_STATE_CHECKS = 30
 """Number of times that a waiting request for the state is checked."""
-BROKEN = "broken_cell"
+_BROKEN = "broken_cell"
 """State of a cell whose `cell.yaml` cannot be used."""
-REPORT_POLICY = (
+_REPORT_POLICY = (
     "sandbox allow-scripts; default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; img-src data:; "
     "frame-ancestors 'self'"
 )
 """Content security policy for reports, whose scripts cannot reach the page that shows them."""
-MAX_COMMAND = 2000
+_MAX_COMMAND = 2000
 """Longest command line that is shown."""
 
 
@@ -142,7 +142,7 @@ class Workbench(UploadedRows):
         """
         with self._reading:
             found, when = self._status
-            if time.monotonic() - when > STATUS_AGE:
+            if time.monotonic() - when > _STATUS_AGE:
                 cell, before = self._cell(), found
                 found = None if cell is None else cell.status()
                 self._status = found, time.monotonic()
@@ -177,10 +177,10 @@ class Workbench(UploadedRows):
     @with_error_answers
     async def _state(self, request: web.Request) -> web.StreamResponse:
         # while a step runs, changes are answered at once, and progress after 0.3 s
-        for _ in range(STATE_CHECKS):
+        for _ in range(_STATE_CHECKS):
             if self.jobs.running is None or request.query.get("version") != str(self.jobs.version):
                 break
-            await asyncio.sleep(0.3 / STATE_CHECKS)
+            await asyncio.sleep(0.3 / _STATE_CHECKS)
         following = await asyncio.to_thread(self._next)
         job, version, ended = self.jobs.state()
         running = job and {
@@ -201,9 +201,9 @@ class Workbench(UploadedRows):
 
     async def _static(self, request: web.Request) -> web.StreamResponse:
         name = request.match_info["name"]
-        if name not in STATIC:
+        if name not in _STATIC:
             raise web.HTTPNotFound
-        kind, package, folder = STATIC[name]
+        kind, package, folder = _STATIC[name]
         text = resources.files(package).joinpath(folder, name).read_text(encoding="utf-8")
         return web.Response(text=text, content_type=kind)
 
@@ -214,7 +214,7 @@ class Workbench(UploadedRows):
         shown = "inline" if path.suffix in (".png", ".svg", ".html") else "attachment"
         response = web.FileResponse(path)
         if path.suffix == ".html":
-            response.headers["Content-Security-Policy"] = REPORT_POLICY
+            response.headers["Content-Security-Policy"] = _REPORT_POLICY
         response.headers["Content-Disposition"] = f"{shown}; filename*=UTF-8''{quote(path.name)}"
         return response
 
@@ -242,7 +242,7 @@ class Workbench(UploadedRows):
                 if name == "cell":
                     return self._write_cell(form)
                 found = STEPS[name](self, Cell.open(self.folder), form, progress)
-                if name in MODEL_STEPS:
+                if name in _MODEL_STEPS:
                     self._scene.show_errors(Cell.open(self.folder))
                 return found
             except PisigmaError as problem:
@@ -252,15 +252,15 @@ class Workbench(UploadedRows):
                 with self._reading:  # values that were read before the end of the step are out of date
                     self._status = self._status[0], -math.inf
 
-        self.jobs.start(name, person_of(request), form.pop("command", "")[:MAX_COMMAND], run)
+        self.jobs.start(name, person_of(request), form.pop("command", "")[:_MAX_COMMAND], run)
         return web.json_response({"started": name})
 
     def _next(self) -> dict[str, Any]:
         """Return what to do next as plain values."""
         if (fault := self._fault()) is not None:
-            return {"state": BROKEN, "reason": fault.rstrip("."), "command": ""}
+            return {"state": _BROKEN, "reason": fault.rstrip("."), "command": ""}
         status = self.status()
-        return NO_CELL if status is None else status.step.to_json()
+        return _NO_CELL if status is None else status.step.to_json()
 
     def _fault(self) -> str | None:
         """Return why `cell.yaml` cannot be used; None if it can, or if there is none."""

@@ -52,7 +52,7 @@ from pisigma.validation.held_out.trained_calibrations import (
 from pisigma.workflow.result import AbstractModelResult
 from pisigma.workflow.settings.calibration import CalibrationSettings, ModelKind
 
-ONLY_GEOMETRY = (
+_ONLY_GEOMETRY = (
     "Only the geometry was calibrated, without cross-validation: a joint correction must not learn errors that a fault "
     "of the setup or of the file explains."
 )
@@ -157,7 +157,7 @@ def calibrate(
     test = None if test_rows is None else judge(calibrator, result, rows, test_rows)
     summary = summarise(result)
     summary = summary.with_figures(
-        warnings=(*summary.warnings, *((ONLY_GEOMETRY,) if faulty else ()), *beyond),
+        warnings=(*summary.warnings, *((_ONLY_GEOMETRY,) if faulty else ()), *beyond),
         command=_call(nominal, measurements, settings),
         rows=rows.rows,
         cross_validation=None if validation is None else validation.figures(),

@@ -46,14 +46,14 @@ from pisigma.workflow.result import AbstractModelResult
 from pisigma.workflow.settings.distillation import DistillationSettings
 from pisigma.workflow.solved_poses import SINGULAR_BELOW, Region, SolvedPoses, draw_solved_poses
 
-CHOICE_SHARE, HELD_OUT_SHARE = 0.2, 0.4
+_CHOICE_SHARE, _HELD_OUT_SHARE = 0.2, 0.4
 """Numbers of poses for model selection and for testing, relative to the number of poses to fit to."""
 
-MAX_ERROR_SHARE = 0.2
+_MAX_ERROR_SHARE = 0.2
 """Ratio of the error of the network to the nominal error above which a warning is given."""
 
-DOMAIN_SAMPLES = 512
-MIN_POSES = 100
+_DOMAIN_SAMPLES = 512
+_MIN_POSES = 100
 """Minimum number of poses to fit to."""
 
 _MIN_ROWS_PER_JOINT = 20
@@ -114,14 +114,14 @@ def distill(
         parent = load_model(model)
         sha256 = model_hash(model)
     _check_parent(parent)
-    if settings.poses < MIN_POSES:
+    if settings.poses < _MIN_POSES:
         raise IdentificationError(
-            expected=f"{MIN_POSES} poses or more", value=settings.poses, option="--poses"
+            expected=f"{_MIN_POSES} poses or more", value=settings.poses, option="--poses"
         )
     sizes = (settings.size,) if settings.size is not None else sizes_for(parent, settings.poses)
     region = settings.region or Region(parent.starts.double())
     generator = torch.Generator().manual_seed(settings.seed)
-    choosing, judging = (round(settings.poses * share) for share in (CHOICE_SHARE, HELD_OUT_SHARE))
+    choosing, judging = (round(settings.poses * share) for share in (_CHOICE_SHARE, _HELD_OUT_SHARE))
     total = settings.poses + choosing + judging
     every = draw_solved_poses(CorrectedIK(parent), region, total, generator, progress)
     fitted, chosen_by = slice(settings.poses), slice(settings.poses, settings.poses + choosing)
@@ -138,7 +138,7 @@ def distill(
         kind="distilled",
         robot=parent.robot,
         network=network,
-        domain=Domain.from_rows(scaled[:DOMAIN_SAMPLES], generator),
+        domain=Domain.from_rows(scaled[:_DOMAIN_SAMPLES], generator),
         branches=() if solver is None else solver.most_frequent_branches(every.branch),
         starts=spread_rows((every.q_nominal + every.correction)[fitted]),
         bases=parent.bases,
@@ -229,7 +229,7 @@ def _warnings(held_out: DistilledErrors, rows: int, joints: int) -> tuple[str, .
     sentences = []
     distilled, nominal = held_out.distilled.figures_by_name, held_out.nominal.figures_by_name
     for key, what, unit in (("rms_mm", "position", "mm"), ("rms_deg", "orientation", "deg")):
-        if distilled[key] > MAX_ERROR_SHARE * nominal[key]:
+        if distilled[key] > _MAX_ERROR_SHARE * nominal[key]:
             sentences.append(
                 f"It removes only {100 * max(1 - distilled[key] / nominal[key], 0):.0f} % of the nominal {what} error "
                 f"({distilled[key]:.3g} of {nominal[key]:.3g} {unit} RMS remain): the region is too large for this "

@@ -20,17 +20,17 @@ from pisigma.robot.description import Robot
 from pisigma.validation.held_out.distillation_summary import SizeFigures
 from pisigma.workflow.solved_poses import SolvedPoses
 
-VALIDATION_SHARE = 0.1
+_VALIDATION_SHARE = 0.1
 
-OVERTONE_SCALE = 1e4
+_OVERTONE_SCALE = 1e4
 """Factor by which overtones are scaled down and their weights are scaled up after the fit. Overtones do not show
 where in its range a joint is, and the domain is measured in scaled inputs."""
 
-NEGLIGIBLE_ERROR = 5e-6
+_NEGLIGIBLE_ERROR = 5e-6
 """RMS error of the tool's position [m] below which no larger size is tried: no robot repeats better."""
-ABOUT_AS_GOOD = 1.1
+_ABOUT_AS_GOOD = 1.1
 """Largest ratio of a smaller size's error to the best error at which the smaller size is chosen."""
-MIN_POSES_PER_UNKNOWN = 4
+_MIN_POSES_PER_UNKNOWN = 4
 """Minimum number of poses for each unknown of a size."""
 
 _MIN_MOTION = 1e-6
@@ -56,9 +56,14 @@ class NetworkSize:
         return sum(self.orders) * (inputs + 1)
 
 
-SMOOTH = (NetworkSize((1, 2)), NetworkSize((1, 2, 3)), NetworkSize((1, 2, 3, 4)))
+_SMOOTH = (NetworkSize((1, 2)), NetworkSize((1, 2, 3)), NetworkSize((1, 2, 3, 4)))
 """Sizes for errors that vary slowly with the joints: geometry and sag."""
-RIPPLED = (NetworkSize((1, 2)), NetworkSize((1, 2, 3)), NetworkSize((1, 2, 3), 8), NetworkSize((1, 2, 3), 24))
+_RIPPLED = (
+    NetworkSize((1, 2)),
+    NetworkSize((1, 2, 3)),
+    NetworkSize((1, 2, 3), 8),
+    NetworkSize((1, 2, 3), 24),
+)
 """Sizes for models with ripple of gears and encoders as well."""
 
 
@@ -72,8 +77,8 @@ def sizes_for(model: CalibratedModel, poses: int) -> tuple[NetworkSize, ...]:
     rippled = any(features.fastest > 1 for features in learned)
     sizes = tuple(
         size
-        for size in (RIPPLED if rippled else SMOOTH)
-        if size.unknowns(model.robot) * MIN_POSES_PER_UNKNOWN <= poses
+        for size in (_RIPPLED if rippled else _SMOOTH)
+        if size.unknowns(model.robot) * _MIN_POSES_PER_UNKNOWN <= poses
     )
     if not sizes:
         raise IdentificationError(
@@ -113,10 +118,10 @@ def choose_network(
             reached = parent.forward(q + network(T, q))
         error = float((reached[:, :3, 3] - T[:, :3, 3]).square().sum(-1).mean().sqrt())
         fits.append((network, size, error))
-        if error < NEGLIGIBLE_ERROR:
+        if error < _NEGLIGIBLE_ERROR:
             break
     best = min(error for *_, error in fits)
-    bound = max(ABOUT_AS_GOOD * best, NEGLIGIBLE_ERROR)
+    bound = max(_ABOUT_AS_GOOD * best, _NEGLIGIBLE_ERROR)
     kept = next(k for k, (*_, error) in enumerate(fits) if error <= bound)
     sizes_tried = tuple(
         SizeFigures(
@@ -155,7 +160,7 @@ def _fit_size(
         TrainingError: the fit diverged.
     """
     section = LevenbergMarquardtSection(
-        method="levenberg_marquardt", epochs=epochs, starts=1, validation_share=VALIDATION_SHARE, seed=seed
+        method="levenberg_marquardt", epochs=epochs, starts=1, validation_share=_VALIDATION_SHARE, seed=seed
     )
     sections = _sections(robot, size, pairs.q_nominal)
     groups: list[JointGroup] = []
@@ -165,7 +170,7 @@ def _fit_size(
         progress(", ".join(part.joints))
         network = build_network(robot, [part], pairs)
         generator = torch.Generator().manual_seed(seed)
-        patterns = build_patterns(network, pairs, VALIDATION_SHARE, rows, generator)
+        patterns = build_patterns(network, pairs, _VALIDATION_SHARE, rows, generator)
         ((group, net),) = network.members()
         fit_networks([net], patterns, [part.joints], section)
         _shrink_overtones(net, group.inputs)
@@ -206,6 +211,6 @@ def _sections(robot: Robot, size: NetworkSize, q: Float64[Tensor, "poses dof"]) 
 def _shrink_overtones(network: PiSigma, inputs: Inputs) -> None:
     """Scale inputs with multiples of a joint's value down and their weights up, which leaves the output unchanged."""
     overtone = [max(inputs.combination(name)[1]) > 1 for name in inputs.names]
-    factor = torch.where(torch.tensor(overtone), OVERTONE_SCALE, 1.0).double()
+    factor = torch.where(torch.tensor(overtone), _OVERTONE_SCALE, 1.0).double()
     network.input_scale.mul_(factor)
     network.weight.mul_(factor)

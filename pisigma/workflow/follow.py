@@ -15,7 +15,7 @@ from pisigma.planning.session.state import AccuracyPoint, Alarm, SessionState
 from pisigma.robot.description import Robot
 from pisigma.workflow.measure import MeasuringSession
 
-REST_SUFFIX = ".rest.csv"
+_REST_SUFFIX = ".rest.csv"
 """Suffix of the remaining plan: that of `poses.csv` is written to `poses.rest.csv`."""
 PAUSE = 0.01
 """Time between two reads of the file [s]."""
@@ -122,7 +122,7 @@ def remaining_poses_file(plan: Path, rows: Path, stated: Path | None) -> Path:
         OutputError: the file cannot be written.
     """
     poses = plan.with_name(plan.name.removesuffix(YAML_SUFFIX).removesuffix(".csv") + ".csv")
-    rest = stated or poses.with_suffix(REST_SUFFIX)
+    rest = stated or poses.with_suffix(_REST_SUFFIX)
     check_output(rest, (".csv",), "a plan", (poses, rows))
     check_output(yaml_of(rest), inputs=(yaml_of(poses),))
     return rest

@@ -44,7 +44,7 @@ from pisigma.planning.task import task_poses
 from pisigma.robot.se3 import transform_from_xyzrpy
 from pisigma.workflow.settings.measuring import MeasureSettings
 
-STEP = 5
+_STEP = 5
 """Number of poses between two points of the accuracy curve."""
 
 
@@ -232,7 +232,7 @@ class MeasuringSession:
                 poses,
                 self._further.q,
                 self._task,
-                STEP,
+                _STEP,
             )
         )
         with self._lock:

@@ -54,7 +54,7 @@ from pisigma.workflow.recalibrate import filtered_rows, may_move
 from pisigma.workflow.settings.monitoring import MonitorSettings
 from pisigma.workflow.settings.recalibration import RecalibrationSettings
 
-MIN_ROWS = 5
+_MIN_ROWS = 5
 """Number of rows of a session below which a warning is given."""
 
 
@@ -278,9 +278,9 @@ def monitor(
             f"{place} was left out: it contradicts the other rows of its session; measure it again."
             for place in trusted[-1].session.outliers
         ]
-        if day.rows < MIN_ROWS:
+        if day.rows < _MIN_ROWS:
             warnings.append(
-                f"{trusted[-1].file}: {day.rows} rows show little of what moved; measure {MIN_ROWS} poses or more."
+                f"{trusted[-1].file}: {day.rows} rows show little of what moved; measure {_MIN_ROWS} poses or more."
             )
     if not (trusted or untrusted):
         raise MeasurementError(f"expected new rows, got none: {' '.join(warnings)}", expected="new rows")

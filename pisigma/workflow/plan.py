@@ -42,13 +42,13 @@ from pisigma.planning.tour import Tour, order_of_use, plan_tour, stage_ends
 from pisigma.robot.description import Robot
 from pisigma.validation.checks.camera import view_warnings
 
-STEP = 10
+_STEP = 10
 """Number of poses between two points of the accuracy curve."""
-MIN_WEAK_SHARE = 0.1
+_MIN_WEAK_SHARE = 0.1
 """Share of the remaining variance above which a warning names its cause."""
-MIN_RANGE_SHARE = 0.1
+_MIN_RANGE_SHARE = 0.1
 """Share of the range of a joint that the candidates have to cover in order to represent the workspace."""
-MAX_ROUNDS = 6
+_MAX_ROUNDS = 6
 """Maximum number of times that poses are added in place of unreachable ones."""
 
 
@@ -96,7 +96,7 @@ class Plan:
         return tuple(
             f"{error.name}: {error.rms * 1e3:.3f} mm, {100 * error.share:.0f} % of the variance"
             for error in self.remaining
-            if error.share >= MIN_WEAK_SHARE
+            if error.share >= _MIN_WEAK_SHARE
         )
 
     def to_json(self) -> dict[str, object]:
@@ -270,7 +270,7 @@ class _Problem:
         q, count = self.candidates.q, self.settings.count
         free, motions = torch.arange(len(q)), Motions(self.arm, self.candidates.workspace)
         kept, kept_check = free[:0], free[:0]
-        for _ in range(MAX_ROUNDS):
+        for _ in range(_MAX_ROUNDS):
             progress(f"{count} of {len(free):,} candidates")
             others = _without(free, torch.cat([kept, kept_check]))
             chosen = complete_selection(
@@ -298,8 +298,8 @@ class _Problem:
 
     def curve(self, chosen: Int64[Tensor, " chosen"]) -> tuple[ExpectedAccuracy, ...]:
         """Return the expected accuracy by the number of poses, from 0 poses if there are earlier measurements."""
-        first, count = 0 if self.has_measurements else STEP, len(chosen)
-        return self._curve(chosen, [*range(first, count, STEP), count])
+        first, count = 0 if self.has_measurements else _STEP, len(chosen)
+        return self._curve(chosen, [*range(first, count, _STEP), count])
 
     def poses_needed(
         self, chosen: Int64[Tensor, " chosen"], points: Sequence[ExpectedAccuracy]
@@ -336,7 +336,7 @@ class _Problem:
             arm.robot.axes, (values.amax(0) - values.amin(0)).tolist(), arm.limits.tolist(), strict=True
         ):
             room = min(upper - lower, 2 * math.pi) if axis.type == "revolute" else upper - lower
-            if math.isfinite(room) and moved < MIN_RANGE_SHARE * room:
+            if math.isfinite(room) and moved < _MIN_RANGE_SHARE * room:
                 unit = axis.file_unit
                 still.append(
                     f"{axis.name} by {axis.in_file_unit(moved):.3g} of {axis.in_file_unit(room):.4g} {unit}"

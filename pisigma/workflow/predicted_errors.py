@@ -12,7 +12,7 @@ from pisigma.planning.robot_posterior import RobotPosterior
 from pisigma.validation.held_out.judged_rows import tool_positions
 from pisigma.validation.report.error_map import samples_of_workspace
 
-POSES_PER_CHUNK = 500
+_POSES_PER_CHUNK = 500
 """Poses whose derivatives are in memory at the same time."""
 
 
@@ -38,5 +38,5 @@ def predicted_errors(model: CalibratedModel) -> PredictedErrors:
         IdentificationError: the model keeps no posterior.
     """
     posterior, (q, _) = RobotPosterior.from_model(model), samples_of_workspace(model)
-    p95 = [p95_at(posterior.tool(some)) for some in torch.split(q, POSES_PER_CHUNK)]
+    p95 = [p95_at(posterior.tool(some)) for some in torch.split(q, _POSES_PER_CHUNK)]
     return PredictedErrors(tool_positions(model, q), torch.cat(p95))

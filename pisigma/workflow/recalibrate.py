@@ -52,9 +52,9 @@ from pisigma.workflow.settings.recalibration import RecalibrationSettings
 if TYPE_CHECKING:
     from pisigma.lifetime.fleet.prior import FleetConsistency
 
-MIN_ROWS = 5
+_MIN_ROWS = 5
 """Number of held-out rows below which a warning is given."""
-UNBELIEVABLE = "What has moved is unknown: the recalibrated model does not predict held-out rows."
+_UNBELIEVABLE = "What has moved is unknown: the recalibrated model does not predict held-out rows."
 NOT_TRUSTED = "What has moved is unknown: these rows must not be trusted."
 
 
@@ -260,7 +260,7 @@ def _summary(
             name: HeldOutFigures(rms_mm=None if rms is None else rms * 1e3)
             for name, rms in choice.rms.items()
         },
-        changed=UNBELIEVABLE if moved is None else movements_text(moved),
+        changed=_UNBELIEVABLE if moved is None else movements_text(moved),
         moved=moved or (),
         elsewhere=(),
         effective_parameters=adaptation.effective,
@@ -295,10 +295,10 @@ def _moved_frames(
 def _warnings(model: CalibratedModel, choice: CandidateChoice, rows: Measurements) -> tuple[str, ...]:
     """Return warnings, one sentence each."""
     warnings = [*row_warnings(model.robot, rows), *condition_warnings(model, rows)]
-    if choice.rows < MIN_ROWS:
+    if choice.rows < _MIN_ROWS:
         warnings.append(
             f"Only {choice.rows} of {rows.rows} rows could be held out and predicted, too few to compare the "
-            f"candidates; measure {2 * MIN_ROWS} poses or more."
+            f"candidates; measure {2 * _MIN_ROWS} poses or more."
         )
     return tuple(warnings)
 

@@ -18,10 +18,10 @@ from pisigma.workflow.verify import Verification
 
 MAX_POINTS = 8
 """Largest number of rows of the table of expected errors."""
-MAX_SESSIONS = 6
+_MAX_SESSIONS = 6
 """Number of the last sessions that are shown at once."""
 
-NEXT_STEPS = {
+_NEXT_STEPS = {
     "better": "use the model, and verify again after a change of tool, base or arm.",
     "not_better": "check that the controller applies the correction once, then measure again or recalibrate.",
     "undecided": "measure more poses that differ, and verify again.",
@@ -115,7 +115,7 @@ def verification_text(verification: Verification, width: int, verbose: bool = Fa
     verdict = Verdict(
         f"{errors} ({rows} rows of {Path(verification.data).name}).",
         f"{trust}: {uncapitalised(verification.sentence)}",
-        command if verification.recalibration else NEXT_STEPS[verification.verdict],
+        command if verification.recalibration else _NEXT_STEPS[verification.verdict],
     )
     warnings = [*(fault.sentence for fault in verification.setup_faults), *verification.warnings]
     shown, details = comparison_blocks(verification.comparison, verification.data, width, verbose)
@@ -187,11 +187,11 @@ def monitoring_text(monitoring: Monitoring, closing: Sequence[str] = ()) -> Resu
         tuple(monitoring.warnings),
         (
             sentences("conclusions from all sessions", together),
-            sentences("what has changed", [*said[-MAX_SESSIONS:], *unobservable], "  "),
-            table_block(f"last sessions of {name}", *session_table(sessions[-MAX_SESSIONS:])),
+            sentences("what has changed", [*said[-_MAX_SESSIONS:], *unobservable], "  "),
+            table_block(f"last sessions of {name}", *session_table(sessions[-_MAX_SESSIONS:])),
             *([charts] if len(monitoring.records) > 1 else []),
         ),
-        details if len(sessions) > MAX_SESSIONS else (),
+        details if len(sessions) > _MAX_SESSIONS else (),
         tuple(closing),
     )
 

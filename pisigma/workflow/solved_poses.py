@@ -20,10 +20,10 @@ from pisigma.robot.se3 import wrap_to_pi
 SINGULAR_BELOW = 0.05
 """Nominal `singularity_measure` below which poses are refused, because corrections are steep near singularities."""
 
-POSES_PER_CHUNK = 2_000
+_POSES_PER_CHUNK = 2_000
 """Number of poses that are solved between two reports of progress."""
 
-MAX_TRIES = 20
+_MAX_TRIES = 20
 """Number of random poses per reachable pose above which a region is refused."""
 
 _SAME_BRANCH = 0.05
@@ -100,12 +100,12 @@ def draw_solved_poses(
     refused: dict[str, int] = {}
     drawn = have = 0
     while have < count:
-        some = min(POSES_PER_CHUNK, 2 * count)
+        some = min(_POSES_PER_CHUNK, 2 * count)
         parts, reasons = _solve(ik, region, some, generator)
         kept.append(parts)
         drawn, have = drawn + some, have + len(parts[0])
         refused = {name: refused.get(name, 0) + number for name, number in reasons.items()}
-        if MAX_TRIES * have < drawn:
+        if _MAX_TRIES * have < drawn:
             raise _too_few(ik, region, have, drawn, refused)
         progress(f"{min(have, count)} of {count} poses solved")
     T, q_nominal, correction, branch, status = (torch.cat(part)[:count] for part in zip(*kept, strict=True))

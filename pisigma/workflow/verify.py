@@ -36,30 +36,30 @@ from pisigma.workflow.evaluate import test_rows
 from pisigma.workflow.settings.recalibration import RecalibrationSettings
 from pisigma.workflow.settings.verification import VerificationSettings
 
-MIN_CONFIGURATIONS = 6
+_MIN_CONFIGURATIONS = 6
 """Minimum number of different joint vectors for a verdict."""
-MAX_RESAMPLED_ROWS = 2 * 10**7
+_MAX_RESAMPLED_ROWS = 2 * 10**7
 """Maximum number of random draws for confidence intervals: with many rows, fewer resamples are enough."""
-RESAMPLES = (200, 2000)
+_RESAMPLES = (200, 2000)
 """Minimum and maximum number of resamples."""
 
 NOMINAL, GEOMETRIC, CORRECTED = "nominal", "geometric", "corrected"
 
-HALVED = 0.5
+_HALVED = 0.5
 """Largest ratio of corrected to nominal error at which the corrected model is called better despite a setup fault."""
 
-MOTIONS = {"joint_zero", "frame", "tool"}
+_MOTIONS = {"joint_zero", "frame", "tool"}
 """Setup faults that the posterior of a model explains in more detail."""
 
 Verdict = Literal["better", "not_better", "undecided", "moved", "setup_fault", "implausible"]
 
-NOTHING_SHOWN = "These measurements do not show whether the correction is right"
+_NOTHING_SHOWN = "These measurements do not show whether the correction is right"
 
 _STARTS: dict[Verdict, str] = {
     "better": "The corrected model explains these measurements better than the nominal robot",
     "not_better": "The nominal robot explains these measurements at least as well as the corrected model",
     "undecided": "These measurements do not show whether the corrected model or the nominal robot is more accurate",
-    "implausible": f"{NOTHING_SHOWN}, because their errors are too large to be those of a calibration",
+    "implausible": f"{_NOTHING_SHOWN}, because their errors are too large to be those of a calibration",
 }
 
 
@@ -173,7 +173,7 @@ def verify(
     right = without_wrong_rows([loaded], rows, settings.fitted)
     rows = right.rows
     models = _compared_models(loaded, rows.rotation is not None)
-    resamples = int(np.clip(MAX_RESAMPLED_ROWS // max(rows.rows, 1), *RESAMPLES))
+    resamples = int(np.clip(_MAX_RESAMPLED_ROWS // max(rows.rows, 1), *_RESAMPLES))
     bootstrap = Bootstrap(resamples, settings.seed)
     comparison = compare_models(models, rows, bootstrap, settings.fitted, distances)
     gate = check_rows(rows, loaded, settings.fitted, {"joint_zero"}, models[NOMINAL])
@@ -192,7 +192,7 @@ def verify(
     wrong = (*gate.implausible, *distance_diagnostics(comparison, comparison.models[-1]))
     if wrong and not faults:
         verdict, motion = "implausible", None
-        sentence = f"{NOTHING_SHOWN}: {wrong[0].sentence}"
+        sentence = f"{_NOTHING_SHOWN}: {wrong[0].sentence}"
     name = loaded.name if folder is None else os.fspath(folder)
     return Verification(
         model=name,
@@ -243,7 +243,7 @@ def _motion(
     faults: Sequence[SetupFault],
 ) -> Session | None:
     """Return the moved parts; None if another setup fault or the nominal robot explains the rows better."""
-    if any(not MOTIONS.issuperset(fault.kinds) for fault in faults):
+    if any(not _MOTIONS.issuperset(fault.kinds) for fault in faults):
         return None
     motion = judged_motion(model, rows, fitted)
     nominal = comparison.models[0].position.statistics["rms"] * 1e-3
@@ -260,16 +260,16 @@ def _verdict(
     too_large = all(is_implausible(comparison.models[i], model) for i in (0, -1))
     interval = difference.intervals["mean"]
     verdict: Verdict = "undecided"
-    if comparison.configurations >= MIN_CONFIGURATIONS and interval is not None:
+    if comparison.configurations >= _MIN_CONFIGURATIONS and interval is not None:
         low, high = interval
         if high < 0:
             verdict = "better"
         elif low > 0 or low == high == 0:
             verdict = "not_better"
     misoriented = (
-        any(fault.explains_orientation for fault in faults) and not _orientation_ratio(comparison) <= HALVED
+        any(fault.explains_orientation for fault in faults) and not _orientation_ratio(comparison) <= _HALVED
     )
-    if faults and (too_large or misoriented or (verdict != "not_better" and not ratio <= HALVED)):
+    if faults and (too_large or misoriented or (verdict != "not_better" and not ratio <= _HALVED)):
         return "setup_fault"
     return "implausible" if too_large else verdict
 
@@ -312,8 +312,8 @@ def _sentence(
     interval = difference.intervals["mean"]
     if verdict == "implausible":
         return f"{start}: {figures}."
-    if count < MIN_CONFIGURATIONS or interval is None:
-        return f"{start}: {figures}, but {MIN_CONFIGURATIONS} or more different joint values are needed."
+    if count < _MIN_CONFIGURATIONS or interval is None:
+        return f"{start}: {figures}, but {_MIN_CONFIGURATIONS} or more different joint values are needed."
     return (
         f"{start}: {figures}, it differs by {interval[0]:.3g} to {interval[1]:.3g} mm with "
         f"{100 * comparison.bootstrap.confidence:.0f} % confidence, and it is smaller in "

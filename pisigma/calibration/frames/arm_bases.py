@@ -21,13 +21,13 @@ from pisigma.robot.se3 import (
     transform_from_xyzrpy,
 )
 
-CLOSURE = 1e-9
+_CLOSURE = 1e-9
 """Standard deviation [m or rad] to which frames and points that two arms share are the same, for rounding errors."""
-FALSE_ALARMS = 1e-4
+_FALSE_ALARMS = 1e-4
 """Probability that arms without faults are said to disagree."""
-MAX_ITERATIONS, CONVERGENCE_TOLERANCE = 20, 1e-12
-MIN_POINTS = 3
-COLLINEAR = 1e-3
+MAX_ITERATIONS, _CONVERGENCE_TOLERANCE = 20, 1e-12
+_MIN_POINTS = 3
+_COLLINEAR = 1e-3
 """Second singular value of points over the first one below which they are on a line, which determines no rotation."""
 
 
@@ -103,28 +103,28 @@ class ArmBases:
     @cached_property
     def disagreements(self) -> tuple[Disagreement, ...]:
         """Shared objects on whose place the arms disagree, the least probable first; empty if they agree."""
-        if self.probability >= FALSE_ALARMS:
+        if self.probability >= _FALSE_ALARMS:
             return ()
         found = []
         B, G, r = self.system
         number = torch.tensor(self.equations)
         for index, shared in enumerate(self.shared):
             others = number != index
-            if int(torch.linalg.matrix_rank(G[others], rtol=COLLINEAR)) < G.shape[1]:
+            if int(torch.linalg.matrix_rank(G[others], rtol=_COLLINEAR)) < G.shape[1]:
                 drop, freedom = self.conditioned.misfit, self.conditioned.redundancy
             else:
                 left = condition_on_equalities(B[others], G[others], r[others], closures(others.sum()))
                 drop = self.conditioned.misfit - left.misfit
                 freedom = self.conditioned.redundancy - left.redundancy
             probability = float(chi2.sf(drop, freedom))
-            if probability < FALSE_ALARMS / len(self.shared):
+            if probability < _FALSE_ALARMS / len(self.shared):
                 found.append(Disagreement(shared, self.distances[index], probability))
         return tuple(sorted(found, key=lambda one: (one.probability, -one.distance)))
 
 
 def closures(count: int | Tensor) -> Float64[Tensor, " equations"]:
     """Return the standard deviations of the equations."""
-    return torch.full((int(count),), CLOSURE, dtype=torch.float64)
+    return torch.full((int(count),), _CLOSURE, dtype=torch.float64)
 
 
 def fit_arm_bases(arms: Sequence[ArmPosterior]) -> ArmBases:
@@ -154,7 +154,7 @@ def fit_arm_bases(arms: Sequence[ArmPosterior]) -> ArmBases:
         step = found.x.view(-1, 6)
         T = torch.cat([T[:1], _moved(T[1:], step)])
         z = list(torch.split(found.z, [len(one) for one in z]))
-        if float(step.abs().max()) < CONVERGENCE_TOLERANCE:
+        if float(step.abs().max()) < _CONVERGENCE_TOLERANCE:
             break
     numbers = tuple(number for number, one in enumerate(shared) for _ in range(_count(arms, one)))
     distances = tuple(_distance(arms, one, T) for one in shared)
@@ -267,7 +267,7 @@ def _start(arms: Sequence[ArmPosterior], shared: Sequence[SharedObject]) -> list
         else:
             lost = [arm.name for number, arm in enumerate(arms) if number not in placed]
             raise IdentificationError(
-                expected=f"a frame, or {MIN_POINTS} sockets or anchors that are not on one line, that arm "
+                expected=f"a frame, or {_MIN_POINTS} sockets or anchors that are not on one line, that arm "
                 f"'{lost[0]}' shares with the other arms",
                 value=", ".join(f"{one.kind} '{one.name}'" for one in shared) or "none",
                 remedy="name the same board, jig or instrument in the column 'frame' of the rows of both arms, or the "
@@ -291,10 +291,10 @@ def _place(
             return there @ invert(mine)
         wanted.append(there[:3, 3])
         own.append(mine)
-    if len(own) < MIN_POINTS:
+    if len(own) < _MIN_POINTS:
         return None
     points = torch.stack(wanted)
     spread = torch.linalg.svdvals(points - points.mean(0))
-    if spread[1] <= COLLINEAR * spread[0]:
+    if spread[1] <= _COLLINEAR * spread[0]:
         return None
     return best_base(torch.stack(own), MeasuredPoses.from_tensors(points, None, 0.0))

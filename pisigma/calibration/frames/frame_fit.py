@@ -32,12 +32,12 @@ from pisigma.robot.description import Robot
 
 FrameChoice = Literal["tool", "base", "hand-eye"]
 
-MAX_WRONG_SHARE = 0.25
+_MAX_WRONG_SHARE = 0.25
 """Largest share of wrong rows: of four that disagree it is not known which one is wrong."""
-HARDLY_DETERMINED = 1.0
+_HARDLY_DETERMINED = 1.0
 """Standard deviation [mm or mrad] above which a direction is reported, and above which the undetermined directions
 leave a coordinate without a standard error."""
-NO_FRAMES: Frames = MappingProxyType({})
+_NO_FRAMES: Frames = MappingProxyType({})
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +116,7 @@ class FrameFit:
         return tuple(
             WeakDirection(direction_in_words(vector, names), size, number < self._held)
             for number, (vector, size) in enumerate(zip(vectors.t(), deviation.tolist(), strict=True))
-            if number < self._held or size > HARDLY_DETERMINED
+            if number < self._held or size > _HARDLY_DETERMINED
         )
 
     @property
@@ -124,7 +124,7 @@ class FrameFit:
         """Indices of the coordinates that are uncertain because of a direction that the rows do not determine."""
         vectors, deviation = self._directions
         held = vectors[:, : self._held] * deviation[: self._held].clamp(max=LARGEST_DEVIATION)
-        uncertain = (held.norm(dim=1) > HARDLY_DETERMINED).tolist()
+        uncertain = (held.norm(dim=1) > _HARDLY_DETERMINED).tolist()
         return frozenset(index for index, yes in zip(self.frames, uncertain, strict=True) if yes)
 
     @property
@@ -165,8 +165,8 @@ def fit_frames(
     robot: Robot,
     rows: Measurements,
     only: FrameChoice,
-    bases: Frames = NO_FRAMES,
-    tools: Frames = NO_FRAMES,
+    bases: Frames = _NO_FRAMES,
+    tools: Frames = _NO_FRAMES,
 ) -> FrameFit:
     """Fit base, tool or both by least squares, without the rows that all others contradict.
 
@@ -248,7 +248,7 @@ def _refuse_several(column: str, names: set[str], known: Frames, rows: Measureme
 def _wrong_row(fit: FrameFit) -> int | None:
     """Return the number of the row that the others contradict; None if there is none, or too many are wrong."""
     if (
-        len(fit.wrong) + 1 > MAX_WRONG_SHARE * fit.rows.rows
+        len(fit.wrong) + 1 > _MAX_WRONG_SHARE * fit.rows.rows
         or fit.solved.solution.status == SolutionStatus.EXACT
     ):
         return None

@@ -28,11 +28,11 @@ from pisigma.measurement.sensors.intrinsics import (
 )
 from pisigma.measurement.sensors.sensor import distinct_names
 
-UNIT = 1e-3
+_UNIT = 1e-3
 """[m or rad] Size of the errors of arm, joints and board (as a share) at size 1: 1 mm, 1 mrad, 0.1 %."""
-CAMERA_UNIT = 3.0
+_CAMERA_UNIT = 3.0
 """Errors of the intrinsics at size 1, in standard deviations of a typical calibration."""
-MIN_ROWS = 6
+_MIN_ROWS = 6
 """Rows below which causes are not compared: 36 values, of which base and tool absorb 12."""
 
 CAUSES = {
@@ -56,10 +56,10 @@ def misfit_causes(fit: FrameFit, uncertainty: ArmUncertainty | None = None) -> t
         uncertainty: uncertainty of the arm, if a calibration states it; the arm is a cause if its errors are larger.
 
     Returns:
-        The causes, those that the evidence names first; none with fewer than `MIN_ROWS` poses.
+        The causes, those that the evidence names first; none with fewer than `_MIN_ROWS` poses.
     """
     rows = fit.rows.select(torch.tensor(fit.used))
-    if fit.only != "hand-eye" or rows.rows < MIN_ROWS or not fit.solved.problem.needs_rotation:
+    if fit.only != "hand-eye" or rows.rows < _MIN_ROWS or not fit.solved.problem.needs_rotation:
         return ()
     counted = {"camera": set(cameras(rows) or ()), "board": set(boards(rows) or ())}
     robot = fit.solved.problem.space.robot
@@ -81,7 +81,7 @@ def _residuals(
     moved = solved.solution.linearisation.point[unknowns] - setup.start[unknowns]
     unit = _noise_units(solved, values)
     zeros = X_arm[:, joint_columns(space)]
-    causes = {"arm": UNIT * X_arm, "joint zeros": UNIT * zeros, "joint noise": UNIT * _per_row(values)}
+    causes = {"arm": _UNIT * X_arm, "joint zeros": _UNIT * zeros, "joint noise": _UNIT * _per_row(values)}
     groups = [space.parameters[index].group for index in unknowns]
     for kind in ("camera", "board"):
         chosen = [k for k, group in enumerate(groups) if group == kind]
@@ -104,8 +104,8 @@ def _residuals(
 def _usual_error(kind: str, name: str) -> float:
     """Return the error of an unknown of a camera or a board at size 1."""
     if kind == "board":
-        return UNIT
-    return CAMERA_UNIT * USUAL_DEVIATIONS[INTRINSICS.index(name.rsplit("_", 1)[-1])]
+        return _UNIT
+    return _CAMERA_UNIT * USUAL_DEVIATIONS[INTRINSICS.index(name.rsplit("_", 1)[-1])]
 
 
 def _noise_units(solved: SolvedCalibration, values: WhitenedValues) -> Float64[Tensor, " values"]:
@@ -151,9 +151,9 @@ def _stated_deviations(solved: SolvedCalibration, rows: Measurements) -> Float64
 
 def size_text(cause: Cause) -> str:
     """Describe the size of a cause."""
-    error = cause.size * UNIT
+    error = cause.size * _UNIT
     if cause.name == "camera":
-        return f"{cause.size * CAMERA_UNIT:.2g} x a typical calibration"
+        return f"{cause.size * _CAMERA_UNIT:.2g} x a typical calibration"
     if cause.name == "board":
         return f"{error * 100:.2g} %"
     angle = f"{math.degrees(error):.2g} deg"

@@ -14,7 +14,7 @@ from pisigma.calibration.geometric.result import CalibrationResult
 from pisigma.calibration.hybrid.uncertainty import PositionUncertainty
 from pisigma.estimation.covariance_root import CovarianceRoot
 
-DETERMINED = 1e-6
+_DETERMINED = 1e-6
 """Smallest over largest standard deviation of the directions of a base below which one of them was not estimated."""
 
 
@@ -78,7 +78,7 @@ def is_determined(root: Float64[Tensor, "6 directions"]) -> bool:
 
     A direction that was held at its value before has no covariance.
     """
-    return int(torch.linalg.matrix_rank(root, rtol=DETERMINED)) == len(root)
+    return int(torch.linalg.matrix_rank(root, rtol=_DETERMINED)) == len(root)
 
 
 @dataclass(frozen=True)

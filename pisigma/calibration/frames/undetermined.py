@@ -18,19 +18,19 @@ from pisigma.calibration.geometric.result import SolvedCalibration
 from pisigma.estimation.orthonormal_columns import orthonormal_columns
 from pisigma.robot.se3 import wrap_to_pi
 
-LARGEST_SPREAD = 60.0
+_LARGEST_SPREAD = 60.0
 """Standard deviation [mm or mrad], times the square root of the number of rows, above which a direction is not
 determined.
 
 Noise that shifts the tool also turns it, by the shift over a lever of about 400 mm. These turns look like information,
 even on directions that no row determines, with a standard deviation of 400 mm per row whatever the noise is. Below
 60 mm per row, errors are at most 1.25 times the stated ones for 4 to 12 touches."""
-ROUNDING = 1e-9
+_ROUNDING = 1e-9
 """Information on a direction over that on the best determined one below which it is a rounding error."""
-CONTRADICTED = 3.0
+_CONTRADICTED = 3.0
 """Ratio of the residuals with and without holding a direction above which the rows contradict its value before. Turns
 by the noise raise the residuals by a factor of at most 1 + distance / 400 mm."""
-MAX_SHIFTS, SMALL = 10, 1e-6
+_MAX_SHIFTS, _SMALL = 10, 1e-6
 """Largest number of shifts to the values before, and the remaining distance [mm or mrad] at which they end; one shift
 suffices for tools, while undetermined rotations of a base are nonlinear."""
 
@@ -65,7 +65,7 @@ class FrameDirections:
         information, vectors = torch.linalg.eigh(own.t() @ own)
         directions = X.new_zeros(len(active), len(information))
         directions[ours] = vectors
-        is_known = information > ROUNDING * information.max()
+        is_known = information > _ROUNDING * information.max()
         return FrameDirections(directions, torch.where(is_known, information.clamp(min=0) ** -0.5, torch.inf))
 
     def in_user_coordinates(
@@ -87,7 +87,7 @@ def hold_undetermined(
 ) -> SolvedCalibration:
     """Fit again with all directions held at the values before that the rows do not determine.
 
-    A direction is not determined if its standard deviation is infinite, or larger than `LARGEST_SPREAD` for the number
+    A direction is not determined if its standard deviation is infinite, or larger than `_LARGEST_SPREAD` for the number
     of rows unless the rows contradict its value before.
 
     Args:
@@ -101,7 +101,7 @@ def hold_undetermined(
     """
     found, space = FrameDirections.at_solution(solved, frames), solved.problem.space
     unknown = int(torch.isinf(found.deviation).sum())
-    weak = int((found.deviation * solved.problem.rows**0.5 > LARGEST_SPREAD).sum())
+    weak = int((found.deviation * solved.problem.rows**0.5 > _LARGEST_SPREAD).sum())
     before = values_before(space, bases, tools)
     for count in range(weak, 0, -1):
         held = _with_held(solved, frames, found.deviation[:count], before)
@@ -126,14 +126,14 @@ def _with_held(
 ) -> SolvedCalibration:
     """Shift the least determined directions to the values before, and fit the others again, until nothing changes."""
     space, units = solved.problem.space, torch.from_numpy(solved.problem.space.usual_errors)
-    for _ in range(MAX_SHIFTS):
+    for _ in range(_MAX_SHIFTS):
         found = FrameDirections.at_solution(solved, frames)
         held = HeldDirections(found.directions[:, : len(deviation)], deviation)
         vectors, length = found.in_user_coordinates(solved)
         off = before - solved.geometry.values_of(space)
         off = torch.where(space.is_length, off, wrap_to_pi(off)) / units
         missing = (vectors.t() @ off)[: len(deviation)] / length[: len(deviation)]
-        if solved.problem.held is not None and float(missing.abs().max()) < SMALL:
+        if solved.problem.held is not None and float(missing.abs().max()) < _SMALL:
             break
         problem = replace(solved.problem, held=held)
         step = problem.step_scale * (held.directions @ missing)
@@ -151,4 +151,4 @@ def _contradicts(held: SolvedCalibration, free: SolvedCalibration) -> bool:
         float((torch.stack([part.distance.square().sum() for part in view.contributions]) / variances).sum())
         for view in (sensor_view_of(held.solution.linearisation), sensor_view_of(free.solution.linearisation))
     ]
-    return held.solution.status != SolutionStatus.EXACT and squares[0] > CONTRADICTED**2 * squares[1]
+    return held.solution.status != SolutionStatus.EXACT and squares[0] > _CONTRADICTED**2 * squares[1]

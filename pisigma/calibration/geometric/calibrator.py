@@ -44,9 +44,9 @@ from pisigma.robot.description import Robot
 from pisigma.robot.robot_class import CLASSES
 from pisigma.robot.row import FRAME_COLUMNS
 
-ROUGH_ROWS = 4_096
+_ROUGH_ROWS = 4_096
 """Largest number of rows used for the first steps."""
-ROUGH_STEPS = 3
+_ROUGH_STEPS = 3
 """Number of steps without the prior; they determine the noise relative to which the prior is weighted."""
 
 
@@ -253,9 +253,9 @@ class GeometricCalibrator:
             The solution after these steps, the findings with the added parameters, and indices of all free parameters.
         """
         problem = setup.problem.with_active(active)
-        if problem.rows > ROUGH_ROWS:
-            problem = problem.select(randomly_chosen_rows(problem.rows, ROUGH_ROWS).to(problem.q.device))
-        steps = min(ROUGH_STEPS, self.maximum_iterations)
+        if problem.rows > _ROUGH_ROWS:
+            problem = problem.select(randomly_chosen_rows(problem.rows, _ROUGH_ROWS).to(problem.q.device))
+        steps = min(_ROUGH_STEPS, self.maximum_iterations)
         rough = levenberg_marquardt(problem.without_prior(), setup.start, steps, close_enough=1.0)
         unknowns, here = setup.free_unknowns, rough.linearisation
         kept = sorted(set(active) - set(unknowns))

@@ -21,10 +21,10 @@ from pisigma.robot.se3 import wrap_to_pi
 
 LOST = 1e-10
 """Eigenvalue of the scaled information (unit diagonal) below which a direction is undetermined."""
-IN_A_SUM = 1e-3
+_IN_A_SUM = 1e-3
 """Component of an undetermined direction, relative to the largest one in mm and mrad, above which it contains a
 coordinate of a base."""
-HELD = 0.7
+_HELD = 0.7
 """Ratio of standard error to prior standard deviation above which the data hardly determine a parameter."""
 
 
@@ -84,7 +84,7 @@ def parameter_table(
     angle = torch.tensor([parameter.unit == "rad" for parameter in space.parameters])
     change = torch.where(angle, wrap_to_pi(change), change)
     errors = np.sqrt(np.maximum(covariance.diagonal(), 0))
-    held = errors * np.sqrt(_prior_precision(problem, here)) > HELD
+    held = errors * np.sqrt(_prior_precision(problem, here)) > _HELD
     active = set(problem.active.tolist())
     silent = _without_rows(problem, here.normal.cpu(), findings)
     undetermined = (geometry.coordinate_jacobian[:, silent] != 0).any(1).tolist()
@@ -126,7 +126,7 @@ def _sums_with_bases(
             if name in left:
                 unchanged[space.index(one.names[0]), left.index(name)] = -coefficient
     shift = (geometry.coordinate_jacobian @ unchanged) / torch.from_numpy(space.usual_errors)[:, None]
-    parts = shift.abs() > IN_A_SUM * shift.abs().amax(0, keepdim=True)
+    parts = shift.abs() > _IN_A_SUM * shift.abs().amax(0, keepdim=True)
     return {
         index: [name for name, part in zip(left, parts[index].tolist(), strict=True) if part]
         for index in space.indices_of("base")

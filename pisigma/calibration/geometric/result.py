@@ -39,7 +39,7 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.sensors.registry import measured_errors
 from pisigma.robot.description import Robot
 
-DISAGREEING = 10.0
+_DISAGREEING = 10.0
 """Factor on the variance of angles above which the calibration gives a warning."""
 
 
@@ -307,7 +307,7 @@ def _warnings(solved: SolvedCalibration) -> tuple[CalibrationWarning, ...]:
     """Return warnings about angles that disagree with lengths, and about frames that do not fit."""
     disagreement = float(sensor_view_of(solved.refined).disagreement.max())
     warnings = []
-    if disagreement > DISAGREEING:
+    if disagreement > _DISAGREEING:
         sentence = (
             "the measured angles disagree with the measured lengths by far more than their noise, so their weight was "
             f"reduced to 1/{disagreement:.2g}; check for a wobbling wrist, or an orientation error of the sensor that "

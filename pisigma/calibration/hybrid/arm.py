@@ -14,7 +14,7 @@ from pisigma.robot.description import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.kinematics.tolerances import MEASURED_ROUNDING
 
-LARGEST_GAP = math.radians(60)
+_LARGEST_GAP = math.radians(60)
 """Largest distance of two measured joint values [rad] between which all values are treated as measured."""
 
 
@@ -56,7 +56,7 @@ class JointCoverage:
         for j in range(len(self.turning)):
             of_joint = [(q[:, j] * self.rate[j]).cpu()]
             for middle, half in zip(self.middle[self.joint == j], self.half[self.joint == j], strict=True):
-                steps = 2 + int(2 * float(half) / LARGEST_GAP)
+                steps = 2 + int(2 * float(half) / _LARGEST_GAP)
                 of_joint.append(middle + half * torch.linspace(-1, 1, steps, dtype=torch.float64))
             angles.append(torch.cat(of_joint))
         return JointCoverage._around(angles, self.rate, self.turning)
@@ -81,10 +81,10 @@ class JointCoverage:
 def _stretches(angles: np.ndarray, turns: bool) -> list[tuple[float, float]]:
     """Return the lowest and highest angle of every range without a large gap; a range may extend beyond 2π."""
     values = np.unique(np.mod(angles, 2 * np.pi) if turns else angles)
-    breaks = np.flatnonzero(np.diff(values) > LARGEST_GAP)
+    breaks = np.flatnonzero(np.diff(values) > _LARGEST_GAP)
     lows = values[np.concatenate([[0], breaks + 1])]
     highs = values[np.concatenate([breaks, [len(values) - 1]])]
-    if turns and values[0] + 2 * np.pi - values[-1] <= LARGEST_GAP:
+    if turns and values[0] + 2 * np.pi - values[-1] <= _LARGEST_GAP:
         if len(lows) == 1:
             return [(0.0, 2 * np.pi)]
         lows, highs = lows[1:], np.concatenate([highs[1:-1], [highs[0] + 2 * np.pi]])

@@ -51,7 +51,7 @@ from pisigma.robot.description import Robot
 
 SEARCHED_ROWS = 4_000
 """Largest number of rows used to select features; the final fit uses all rows."""
-GROSS = 50.0
+_GROSS = 50.0
 """Largest residual of rows used for the first model, in standard deviations of the geometric calibration."""
 
 _NOTHING_FOUND = "The data show nothing beyond the geometry, so the geometric calibration is kept."
@@ -199,7 +199,7 @@ class HybridCalibrator:
         values = sensor_values(problem, point)
         distances = [one.residual.norm(dim=1) * one.root / view.scales[k] for k, one in enumerate(values)]
         weights = [
-            ((distance < GROSS) | one.certain).to(distance)
+            ((distance < _GROSS) | one.certain).to(distance)
             for distance, one in zip(distances, values, strict=True)
         ]
         rows = Rows.from_linearisation(

@@ -27,10 +27,10 @@ from pisigma.estimation.regression import Posterior
 from pisigma.joint_correction.feature import AbstractFeature
 from pisigma.measurement.groups import groups_of_equal_joints
 
-FOLDS, FOLDS_OF_FEW, FEW_GROUPS = 4, 8, 60
+_FOLDS, _FOLDS_OF_FEW, FEW_GROUPS = 4, 8, 60
 """Number of folds that are held out, number of folds for few groups, and number of groups up to which groups are
 few."""
-MANY_GROUPS = 600
+_MANY_GROUPS = 600
 """Number of groups up to which noise and prior sizes are updated for every fold."""
 EXACT_GROUPS = 200
 """Number of poses or positions up to which held-out rows are predicted by exact fits; rows of other sensors always
@@ -38,7 +38,7 @@ are."""
 
 TOLERANCE = 1.005
 """Ratio of RMS errors above which errors are treated as larger; a smaller difference does not matter in practice."""
-REFITS = 10
+_REFITS = 10
 """Number of Gauss-Newton steps for unknowns that only held-out rows determine, such as the position of their socket."""
 
 
@@ -170,7 +170,7 @@ def _with_own_unknowns(
     if not len(own):
         return x
     x = x.index_copy(0, own, start[own])
-    for _ in range(REFITS):
+    for _ in range(_REFITS):
         blocks = []
         for one in _values(design, x):
             chosen = held[one.row] | one.certain
@@ -230,8 +230,8 @@ def choose_final_correction(
         return FinalCorrection(
             choice, refine(problem, choice.rows.group, choice), _held_out_in_search(choice)
         )
-    folds = replace(choice.rows, group=group).folds(FOLDS if count > FEW_GROUPS else FOLDS_OF_FEW, count)
-    updates = int(count <= MANY_GROUPS)
+    folds = replace(choice.rows, group=group).folds(_FOLDS if count > FEW_GROUPS else _FOLDS_OF_FEW, count)
+    updates = int(count <= _MANY_GROUPS)
     before = held_out_rows(Design(problem, ()), _geometric_posterior(solved, choice), group, folds, updates)
     for part in _parts(choice):
         progress(f"held-out rows, {part.best.name}")

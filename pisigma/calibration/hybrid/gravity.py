@@ -20,21 +20,21 @@ from pisigma.robot.se3 import rotation_from_rpy
 
 USUAL: Direction = (0.0, 0.0, -1.0)
 """Direction of gravity in the base frame of a robot on the floor."""
-FLOOR_ODDS = 100.0
+_FLOOR_ODDS = 100.0
 """Prior odds of a robot on the floor against a robot that is mounted otherwise although the user does not state it;
 also of gravity along an axis of the base against an inclined direction. The measured UR10, which is on the floor,
 has a log evidence for an inclined direction that is 16 above that of the axes."""
-HARMONICS = 8
+_HARMONICS = 8
 """Number of harmonics of a series that is fitted as well: low harmonics of a gear look like torques of gravity along
 other axes."""
-LEAST_INCLINATION = math.radians(30)
+_LEAST_INCLINATION = math.radians(30)
 """Angle to all axes above which a direction is inclined. Unmodelled errors of simulated arms on the floor, and of the
 measured UR10, look like an inclination by up to 24 deg, which predicts held-out rows better, but not rows of another
 session; smaller inclinations have to be stated."""
 AXES: tuple[Direction, ...] = (USUAL, (-1.0, 0.0, 0.0), (0.0, -1.0, 0.0))
-STARTS = 64
+_STARTS = 64
 """Number of directions on a half sphere, about 18 deg apart; the best of them is refined."""
-UPDATES = 8
+_UPDATES = 8
 """Number of steps of Newton's method, which converges in 3 to 6 steps on simulated arms."""
 
 
@@ -55,7 +55,7 @@ def gravity_by_evidence(
     with a positive sum of masses is chosen. Directions other than down must have a log evidence above that of the
     other axes by `CLEARLY` plus the log prior odds against them; an inclined direction, which is fitted to the rows,
     also by minus the logarithm of the share of the half sphere that the rows leave for it (Laplace's approximation),
-    and must not be near an axis (`LEAST_INCLINATION`).
+    and must not be near an axis (`_LEAST_INCLINATION`).
 
     Args:
         robot: the nominal robot.
@@ -69,7 +69,7 @@ def gravity_by_evidence(
 
     def fitted(*directions: Direction) -> tuple[AbstractDesignRegression, Posterior, Design]:
         torques = (GravityTorques(robot, to_first_row_frame(robot, one)) for one in directions)
-        design = Design(rows.problem, (*torques, FourierSeries(robot, HARMONICS)))
+        design = Design(rows.problem, (*torques, FourierSeries(robot, _HARMONICS)))
         fit = build_regression(design, rows)
         return fit, fit.maximise_evidence(design.prior(prior_scale), noise, tolerance=ROUGHLY), design
 
@@ -84,10 +84,10 @@ def gravity_by_evidence(
     (second, _), (first, best) = sorted(map(judged, AXES))[1:]
     direction, share = _most_probable(_evidence_of_direction(*fitted(*AXES)))
     inclined, direction = judged(direction)
-    is_inclined = max(map(abs, direction)) < math.cos(LEAST_INCLINATION)
-    if is_inclined and inclined - first > CLEARLY + 2 * math.log(FLOOR_ODDS) - math.log(share):
+    is_inclined = max(map(abs, direction)) < math.cos(_LEAST_INCLINATION)
+    if is_inclined and inclined - first > CLEARLY + 2 * math.log(_FLOOR_ODDS) - math.log(share):
         return direction
-    return best if first - second > CLEARLY + math.log(FLOOR_ODDS) else USUAL
+    return best if first - second > CLEARLY + math.log(_FLOOR_ODDS) else USUAL
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,17 +152,17 @@ def _evidence_of_direction(
 
 
 def _most_probable(log_evidence: _EvidenceOfDirection) -> tuple[Direction, float]:
-    """Find the direction with the highest evidence by Newton's method from the best of `STARTS` directions.
+    """Find the direction with the highest evidence by Newton's method from the best of `_STARTS` directions.
 
     Returns:
         The direction in the base frame, and the share of the half sphere that is compatible with the rows.
     """
-    number = torch.arange(STARTS, dtype=torch.float64)
+    number = torch.arange(_STARTS, dtype=torch.float64)
     # Fibonacci lattice: equal steps of height are equal areas, and the golden angle spreads the directions evenly.
-    height, turn = (number + 0.5) / STARTS, math.pi * (3 - math.sqrt(5)) * number
+    height, turn = (number + 0.5) / _STARTS, math.pi * (3 - math.sqrt(5)) * number
     level = (1 - height.square()).sqrt()
     tried = torch.stack([height, level * turn.cos(), level * turn.sin()], 1)
-    for _ in range(UPDATES):
+    for _ in range(_UPDATES):
         c = tried[log_evidence(tried).argmax()]
         gradient, hessian = log_evidence.derivatives(c)
         curvature, along = torch.linalg.eigh(hessian)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pisigma.files.errors import MeasurementError
 from pisigma.measurement.sensors.sensor import AbstractSensor
 
-MAX_ABSOLUTE = 0.01
+_MAX_ABSOLUTE = 0.01
 """Largest noise [m or rad]; in folders of earlier versions, a larger noise is a factor on stated standard
 deviations."""
 
@@ -28,7 +28,7 @@ class CalibrationNoise:
 
     def is_factor(self, name: str) -> bool:
         """Return whether the value of a sensor is a factor on stated standard deviations."""
-        return self.value[name] > MAX_ABSOLUTE if self.stated is None else name in self.stated
+        return self.value[name] > _MAX_ABSOLUTE if self.stated is None else name in self.stated
 
     def standard_deviation(self, name: str) -> float:
         """Return the standard deviation of a sensor [m or rad]; NaN if it is unknown."""

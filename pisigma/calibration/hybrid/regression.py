@@ -18,7 +18,7 @@ from pisigma.estimation.prior import GaussianPrior
 from pisigma.estimation.regression import Posterior, SensorCount
 from pisigma.joint_correction.feature import AbstractFeature
 
-NARROW = 64
+_NARROW = 64
 """Number of rows whose columns are in memory at a time, if only products with some columns are needed."""
 
 
@@ -77,7 +77,7 @@ class NormalEquations(PrimalRegression, AbstractDesignRegression):
         for N, b, whole, sensor in zip(normal, descent, self.normal, self.rows.values, strict=True):
             _copy_chosen(whole, before, N[:first, :first])
             N[new] = 0.0
-            for rows in chunks(len(sensor.row), NARROW):
+            for rows in chunks(len(sensor.row), _NARROW):
                 root = sensor.root[rows, None]
                 X = (design.columns(sensor, rows) * root[..., None]).flatten(0, 1)
                 N[new].addmm_(X[:, new].t(), X)

@@ -21,7 +21,7 @@ from pisigma.estimation.held_out import HeldOutErrors
 from pisigma.estimation.regression import Posterior
 from pisigma.joint_correction.feature import AbstractFeature
 
-LEVEL = 1.03
+_LEVEL = 1.03
 """Ratio of the held-out RMS error to the lowest one so far above which features are rejected despite the evidence."""
 CLEARLY = 5.0
 """Increase of the log evidence needed to keep features (a Bayes factor of 150: very strong, Kass and Raftery 1995).
@@ -31,27 +31,27 @@ errors are 0.998 and 1.001 times the errors at 5, on average over 80 fits each, 
 and 1.004 (120 fits each). On simulated arms with errors of the geometry alone it costs 1.7 %."""
 CLEAR_GAIN = 1.0
 """Decrease of the held-out squared errors [standard errors] that is regarded as an improvement."""
-STRONGLY = 3.0
+_STRONGLY = 3.0
 """Increase of the log evidence that is strong: a Bayes factor of 20 (Kass and Raftery 1995)."""
-MAX_EFFECTIVE_SHARE = 0.75
+_MAX_EFFECTIVE_SHARE = 0.75
 """Largest effective number of unknowns per value; with more, they cannot be separated from the noise."""
 MAX_USUAL_SHARE = 0.97
 """Largest effective number of unknowns per value if the prior sizes of the weights start with their usual sizes,
 which regularise what few values do not determine."""
-MIN_USUAL_SCALE = 0.4
+_MIN_USUAL_SCALE = 0.4
 """Prior scale of the geometry that is also tried if the estimated scale is smaller: a geometric calibration of few
 rows attributes the effects of missing features to noise, and underestimates small errors of the geometry."""
-USUAL_UPDATES = 5
+_USUAL_UPDATES = 5
 """Number of updates of the usual sizes; few values hardly determine them, so more updates are not useful."""
 ROUGHLY = 1.0
 """Increase of the log evidence per update below which fits have converged during the selection of features."""
 FEW_GROUPS = 200
 """Number of groups up to which more folds are used."""
-FEW_TOGETHER = 60
+_FEW_TOGETHER = 60
 """Number of groups up to which all features are also tried together, starting with the usual sizes of their weights."""
 FIRST_MODEL_SIZES = 3
 """Index of the size of a growing feature that is used in a model with all features."""
-MAX_FAILURES = 3
+_MAX_FAILURES = 3
 """Number of successive sizes without improvement after which larger sizes are not tried."""
 
 Progress = Callable[[str], None]
@@ -91,7 +91,7 @@ class FeatureFit:
 
     design: Design
     posterior: Posterior
-    largest_share: float = MAX_EFFECTIVE_SHARE
+    largest_share: float = _MAX_EFFECTIVE_SHARE
     held_out: HeldOutErrors | None = None
 
     @property
@@ -210,14 +210,14 @@ class FeatureSearch:
             tried = self._tried([*before, chosen], best)
             failures, grown = (failures + 1, grown) if tried is best else (0, True)
             best = tried
-            if failures == MAX_FAILURES:
+            if failures == _MAX_FAILURES:
                 break
         for chosen in others if grown else ():
             if chosen not in before:
                 best = self._tried([*best.design.features, chosen], best)
         together = [*others, *growing[:FIRST_MODEL_SIZES][-1:]]
-        if len(together) > 1 and self.rows.groups <= FEW_TOGETHER:
-            usual = tuple(max(scale, MIN_USUAL_SCALE) for scale in self.prior_scale)
+        if len(together) > 1 and self.rows.groups <= _FEW_TOGETHER:
+            usual = tuple(max(scale, _MIN_USUAL_SCALE) for scale in self.prior_scale)
             for scale in dict.fromkeys((tuple(self.prior_scale), usual)):
                 best = self._from_usual_sizes(together, scale, best)
         for chosen in last:
@@ -263,9 +263,9 @@ class FeatureSearch:
         tried, held_out = self.fit_features(features, best, sizes)
         better = (
             tried.posterior.log_evidence - best.posterior.log_evidence > CLEARLY + odds
-            and held_out < self._least * LEVEL
+            and held_out < self._least * _LEVEL
             and tried.gain(best) > least_gain
-            and self._regression.effective_share(tried.posterior) < MAX_EFFECTIVE_SHARE
+            and self._regression.effective_share(tried.posterior) < _MAX_EFFECTIVE_SHARE
         )
         self._note(tried, held_out / self._unit, began, better)
         if better:
@@ -284,13 +284,13 @@ class FeatureSearch:
         began = time.monotonic()
         design = Design(self.rows.problem, tuple(features))
         fit = self._regression.select(design)
-        posterior = fit.maximise_evidence(design.usual_prior(prior_scale), self.noise, USUAL_UPDATES)
+        posterior = fit.maximise_evidence(design.usual_prior(prior_scale), self.noise, _USUAL_UPDATES)
         errors = fit.held_out_errors(posterior, self._folds)
         held_out = errors.rms(posterior.noise, self.noise)
         better = (
             posterior.log_evidence - best.posterior.log_evidence
-            > (STRONGLY if best.design.features else CLEARLY)
-            and held_out < self._least * LEVEL
+            > (_STRONGLY if best.design.features else CLEARLY)
+            and held_out < self._least * _LEVEL
             and fit.effective_share(posterior) < MAX_USUAL_SHARE
         )
         tried = FeatureFit(design, posterior, MAX_USUAL_SHARE, errors)

@@ -13,9 +13,9 @@ from pisigma.joint_correction.feature import angle_per_joint_value
 HIGHEST = 3_000
 """Highest order of a line [1/turn]. Motors with 10 pole pairs and gears of 1:101 have cogging at 2,020; an error of
 0.1 mrad shifts the phase of the highest order by 0.3 rad."""
-MAX_LINES = 8
+_MAX_LINES = 8
 """Largest number of lines per joint."""
-ALIKE = 0.9
+_ALIKE = 0.9
 """Correlation of two harmonics at the measured joint values above which they cannot be distinguished."""
 BLOCK = 64
 """Number of powers of `exp(i angle)` that are computed directly; higher powers are products of these."""
@@ -87,7 +87,7 @@ def _lines_of_joint(
     ss, cc, sc = (total - G2.real) / 2, (total + G2.real) / 2, G2.imag / 2
     determinant = ss * cc - sc.square()
     orders: list[int] = []
-    while len(orders) < MAX_LINES:
+    while len(orders) < _MAX_LINES:
         P = _sums(angle, slope, HIGHEST + 1)
         sine, cosine = (
             (cc * P.imag - sc * P.real) / determinant,
@@ -113,7 +113,7 @@ def _distinguishable(G: Complex128[Tensor, " _orders"], lowest: int) -> Bool[Ten
         lowest: lowest order; a joint whose values are too close together has no distinguishable orders.
     """
     orders = torch.arange(HIGHEST + 1)
-    constant = (G.abs() > ALIKE * G[0].real).nonzero()[:, 0]
+    constant = (G.abs() > _ALIKE * G[0].real).nonzero()[:, 0]
     beyond = constant[constant >= lowest]
     highest = int(beyond[0]) / 2 if len(beyond) else HIGHEST + 1
     return (orders >= lowest) & (orders < highest)

@@ -33,10 +33,10 @@ CHUNK = 128
 """Number of rows whose columns are in memory at a time."""
 FEW_GROUPS = 600
 """Number of groups up to which noise and prior sizes are estimated again for every fold that is held out."""
-VERY_FEW_GROUPS = 60
+_VERY_FEW_GROUPS = 60
 """Number of groups up to which `FOLDS_OF_FEW` folds are held out: a calibration without a quarter of so few rows is
 much worse than with all rows, so its errors are not representative."""
-FOLD_UPDATES, FEWER_UPDATES, SOME_GROUPS = 3, 1, 150
+_FOLD_UPDATES, _FEWER_UPDATES, _SOME_GROUPS = 3, 1, 150
 """Number of updates of noise and prior sizes for every fold, for few and for more groups, and the number of groups
 up to which the first applies. With one update, 0.9 % fewer of 30 rows are in the predicted 95 % intervals, 0.4 % of
 100 rows and 0.3 % of 300 rows; fitting 300 rows then takes four fifths of the time."""
@@ -46,7 +46,7 @@ MAX_EXACT_ENTRIES = 1 << 18
 ROUNDING_TOLERANCE = 0.009
 """Largest relative change of a predicted standard deviation by rounding the covariance root; the standard deviations
 themselves are known to some 2 % from 1,000 held-out rows."""
-PROBED_ROWS, PROBED_FRAMES = 200, 8
+_PROBED_ROWS, _PROBED_FRAMES = 200, 8
 """Rows, and frames or targets, at which the change is computed."""
 
 
@@ -127,12 +127,12 @@ class PositionUncertainty:
 
     def _probes(self, state: JointState) -> Float64[Tensor, "probes unknowns"]:
         """Return the combinations of unknowns in poses of rows, at permuted joint values, and in motions between."""
-        rows = state[torch.linspace(0, len(state.q) - 1, min(len(state.q), PROBED_ROWS)).round().long()]
+        rows = state[torch.linspace(0, len(state.q) - 1, min(len(state.q), _PROBED_ROWS)).round().long()]
         generator = torch.Generator().manual_seed(0)
         order = torch.rand(rows.q.shape, generator=generator).argsort(0)
         others = replace(rows, q=rows.q.take_along_dim(order, 0))
         frames, targets = len(self.space.frames), len(self.space.targets)
-        pairs = sorted({(f % frames, f % targets) for f in range(min(max(frames, targets), PROBED_FRAMES))})
+        pairs = sorted({(f % frames, f % targets) for f in range(min(max(frames, targets), _PROBED_FRAMES))})
         probes = []
         for frame, target in pairs:
             here, there = (self.columns(one, one.q, frame, target) for one in (rows, others))
@@ -200,9 +200,9 @@ def position_uncertainty(
         held_out: held-out predictions of this fit, if available; they are used if there are too many groups to
             estimate noise and prior sizes again for every fold.
     """
-    folds = rows.folds(FOLDS if rows.groups > VERY_FEW_GROUPS else FOLDS_OF_FEW, MAX_GROUPS)
+    folds = rows.folds(FOLDS if rows.groups > _VERY_FEW_GROUPS else FOLDS_OF_FEW, MAX_GROUPS)
     if rows.groups <= FEW_GROUPS:
-        updates = FOLD_UPDATES if rows.groups <= SOME_GROUPS else FEWER_UPDATES
+        updates = _FOLD_UPDATES if rows.groups <= _SOME_GROUPS else _FEWER_UPDATES
         missed = fit.held_out_errors_refitted(posterior, folds, updates)
     else:
         missed = held_out or fit.held_out_errors(posterior, folds)

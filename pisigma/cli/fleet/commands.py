@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from pisigma.workflow.fleet.prior import FleetPriorResult
     from pisigma.workflow.fleet.run import FleetRun
 
-SHOWN = 10
+_SHOWN = 10
 """Largest number of cells in a table."""
 
 Folder = Annotated[
@@ -170,7 +170,7 @@ def _print_status(seen: "FleetStatus", page: Path | None, verbose: bool) -> None
     from pisigma.lifetime.cell.step import ATTENTION
     from pisigma.reporting.fleet_tables import ERRORS_NOTE, cell_table, fleet_verdict, state_table
 
-    worst, few = [one for one, _ in seen.by_error], len(seen.cells) <= SHOWN
+    worst, few = [one for one, _ in seen.by_error], len(seen.cells) <= _SHOWN
     warned = [f"{one.name}: {one.step.reason}" for one in seen.cells if one.step.state in ATTENTION]
     warned += [f"{name}: {reason}" for name, reason in seen.unreadable.items()]
     print_screen(
@@ -182,7 +182,7 @@ def _print_status(seen: "FleetStatus", page: Path | None, verbose: bool) -> None
             ),
             table_block("cells", *cell_table(seen.cells))
             if few
-            else table_block("largest errors", *cell_table(worst[:SHOWN])),
+            else table_block("largest errors", *cell_table(worst[:_SHOWN])),
         ],
         [
             table_block("all cells", *cell_table([] if few else seen.cells)),

@@ -23,13 +23,13 @@ from pisigma.reporting.solution_text import FAILURES, file_units
 from pisigma.robot.description import Robot
 from pisigma.robot.kinematics.status import Status
 
-BAD_ROW = "bad_row"
+_BAD_ROW = "bad_row"
 """Status of a row that is not a pose."""
 
 FAR = 50.0
 """Multiple of the reach beyond which a position is refused; metres that are read as millimetres are off by 1000."""
 
-LISTED = 10
+_LISTED = 10
 """Largest number of failed rows that are listed."""
 
 _MEASURES = ("position_residual_mm", "rotation_residual_deg", "domain_measure")
@@ -58,7 +58,7 @@ class PoseFileResult:
     Attributes:
         rows: number of rows.
         statuses: number of rows by status.
-        first_failed: the first `LISTED` rows that failed, in the order of the file.
+        first_failed: the first `_LISTED` rows that failed, in the order of the file.
         failed: number of rows that failed.
         switches: lines at which a path changes its branch or is interrupted, with a description.
     """
@@ -86,7 +86,7 @@ class PoseFileResult:
             return None
         first, *others = self.first_failed
         more = [
-            f"line {row.line} {row.status}" + (f" ({row.reason})" if row.status == BAD_ROW else "")
+            f"line {row.line} {row.status}" + (f" ({row.reason})" if row.status == _BAD_ROW else "")
             for row in others
         ]
         if self.failed > len(self.first_failed):
@@ -160,8 +160,8 @@ def _solved_rows(
         *chunk.bad,
         *(UnusableRow(line, far) for line, far in zip(chunk.line, too_far, strict=True) if far),
     ]
-    rows = [(row.line, [str(row.line), BAD_ROW]) for row in bad]
-    failed = [FailedRow(row.line, BAD_ROW, row.reason) for row in bad]
+    rows = [(row.line, [str(row.line), _BAD_ROW]) for row in bad]
+    failed = [FailedRow(row.line, _BAD_ROW, row.reason) for row in bad]
     if near:
         kept = torch.tensor([not far for far in too_far])
         solution, switches = _solve(solver, chunk.T[kept], branch, path)
@@ -174,11 +174,11 @@ def _solved_rows(
             for line, status in zip(near, statuses, strict=True)
             if status in FAILURES
         )
-    outcome.statuses.update([BAD_ROW] * len(bad))
+    outcome.statuses.update([_BAD_ROW] * len(bad))
     outcome.rows += len(rows)
     outcome.failed += len(failed)
     failed.sort(key=lambda row: row.line)
-    outcome.first_failed.extend(failed[: LISTED - len(outcome.first_failed)])
+    outcome.first_failed.extend(failed[: _LISTED - len(outcome.first_failed)])
     return (cells for _, cells in sorted(rows, key=lambda row: row[0]))
 
 

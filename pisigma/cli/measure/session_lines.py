@@ -15,7 +15,7 @@ from pisigma.workflow.result_texts import accuracy_text
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
-SHOWN_ROWS, SHOWN_ALARMS, SHOWN_POINTS = 8, 4, 8
+_SHOWN_ROWS, _SHOWN_ALARMS, _SHOWN_POINTS = 8, 4, 8
 """Largest numbers of rows, alarms and points on the page; the last ones are shown."""
 
 
@@ -88,11 +88,11 @@ def page(step: SessionStep | None, state: SessionState, title: str) -> "Renderab
             laid_out.add_row(*(Text(make_printable(cell, cut=False)) for cell in row))
         return laid_out
 
-    first = max(0, len(state.rows.line) - SHOWN_ROWS)
+    first = max(0, len(state.rows.line) - _SHOWN_ROWS)
     rows = [(str(state.rows.line[row]), _verdict(state, row)) for row in range(first, len(state.rows.line))]
-    points = (*state.reached, *state.expected)[-SHOWN_POINTS:]
+    points = (*state.reached, *state.expected)[-_SHOWN_POINTS:]
     waiting = "" if step is None else step.growth.waiting
-    alarms = [make_printable(alarm.sentence, cut=False) for alarm in state.alarms[-SHOWN_ALARMS:]]
+    alarms = [make_printable(alarm.sentence, cut=False) for alarm in state.alarms[-_SHOWN_ALARMS:]]
     colour = {"measure": "bold", "repeat": "bold red", "correct": "bold red", "stop": "bold green"}[
         state.advice.action
     ]

@@ -24,12 +24,12 @@ from pisigma.robot.se3 import (
 )
 
 MAX_ITERATIONS = 50
-UNOBSERVABLE = 1e-6
+_UNOBSERVABLE = 1e-6
 """Share of the column of a parameter outside the span of base and tool below which the parameter is unobservable."""
-NO_EFFECT = 1e-4
+_NO_EFFECT = 1e-4
 """Directions of the unknowns with a smaller effect, relative to the largest, are not changed: base and tool would move
 far without a benefit."""
-CONVERGENCE_TOLERANCE = 1e-12
+_CONVERGENCE_TOLERANCE = 1e-12
 POSES = 1_000
 """Number of poses for the fit, and of other poses for its evaluation."""
 
@@ -114,11 +114,11 @@ def solve_approximation(problem: ApproximationProblem) -> tuple[Robot, tuple[boo
         there = problem.apply_step(robot, step)
         left, J_there = problem.residual(there)
         if left @ left < missing @ missing:
-            converged = float(step.abs().max()) < CONVERGENCE_TOLERANCE
+            converged = float(step.abs().max()) < _CONVERGENCE_TOLERANCE
             robot, missing, J, damping = there, left, J_there, damping / 10
             if converged:
                 break
-        elif damping > 1e6 or float(step.abs().max()) < CONVERGENCE_TOLERANCE:
+        elif damping > 1e6 or float(step.abs().max()) < _CONVERGENCE_TOLERANCE:
             break
         else:
             damping *= 10
@@ -131,7 +131,7 @@ def _step(
     """Compute a damped step from the singular values of the column-scaled Jacobian."""
     scale = J.norm(dim=0).clamp(min=1e-12)
     U, s, V = torch.linalg.svd(J / scale, full_matrices=False)
-    gain = torch.where(s > NO_EFFECT * s[0], s / (s.square() + damping * s[0].square()), 0.0)
+    gain = torch.where(s > _NO_EFFECT * s[0], s / (s.square() + damping * s[0].square()), 0.0)
     step: Tensor = V.mT @ (gain * (U.mT @ missing)) / scale
     return step
 
@@ -143,7 +143,7 @@ def _observable(J: Float64[Tensor, "values unknowns"], count: int) -> tuple[bool
     for column in J[:, :count].unbind(1):
         column = column / column.norm().clamp(min=1e-12)
         residual = column - basis @ (basis.mT @ column)
-        observable.append(bool(residual.norm() > UNOBSERVABLE))
+        observable.append(bool(residual.norm() > _UNOBSERVABLE))
         if observable[-1]:
             basis = torch.cat([basis, (residual / residual.norm())[:, None]], 1)
     return tuple(observable)
@@ -152,7 +152,7 @@ def _observable(J: Float64[Tensor, "values unknowns"], count: int) -> tuple[bool
 def _basis(columns: Float64[Tensor, "values columns"]) -> Float64[Tensor, "values rank"]:
     """Return an orthonormal basis of the span of columns, regardless of their norms."""
     U, s, _ = torch.linalg.svd(columns / columns.norm(dim=0).clamp(min=1e-12), full_matrices=False)
-    basis: Tensor = U[:, s > UNOBSERVABLE * s[0]]
+    basis: Tensor = U[:, s > _UNOBSERVABLE * s[0]]
     return basis
 
 

@@ -90,7 +90,7 @@ def joints_by_axes(robot: Robot) -> Float64[np.ndarray, "dof axes"]:
     return matrix
 
 
-MEANING = (
+_MEANING = (
     "The real robot commanded to q is where the nominal robot is at q + offset: command q - offset, or enter the "
     "offset into the controller's zero positions. Base and tool were fitted together with the offsets."
 )
@@ -108,7 +108,7 @@ def departure_sentence(what: str, lost: Departure, nominal: Departure) -> str:
 
 def offset_sentences(offsets: JointOffsets) -> tuple[str, ...]:
     """Return sentences on the meaning of the offsets and their loss of accuracy."""
-    sentences = [MEANING, departure_sentence("Offsets alone deviate", offsets.lost, offsets.nominal)]
+    sentences = [_MEANING, departure_sentence("Offsets alone deviate", offsets.lost, offsets.nominal)]
     if offsets.unobservable:
         sentences.append(
             f"Offsets of {', '.join(offsets.unobservable)} are 0 because base or tool have the same effect."

@@ -29,15 +29,15 @@ from pisigma.robot.urdf_frames import Frame, frame_of, inverse, rotation, row_fr
 from pisigma.robot.urdf_rows import rows_of_chain
 from pisigma.robot.writing import comment_text, robot_to_urdf, unused_name
 
-SAME = 2e-3
+_SAME = 2e-3
 """Largest difference from rows of the drawn model, which may be rounded to millimetres [m or rad]."""
-SNAP = 1e-5
+_SNAP = 1e-5
 """Deviations of drawn right angles [rad] up to this are due to rounding."""
-DIGITS = 6
+_DIGITS = 6
 """Decimals of drawn positions [m] that are used."""
-MESHES = (".stl", ".obj", ".msh")
+_MESHES = (".stl", ".obj", ".msh")
 """Meshes that MuJoCo reads."""
-ORIENTATIONS = ("quat", "euler", "axisangle", "xyaxes", "zaxis")
+_ORIENTATIONS = ("quat", "euler", "axisangle", "xyaxes", "zaxis")
 _HINGES = {"revolute": "hinge", "continuous": "hinge", "prismatic": "slide"}
 
 
@@ -53,7 +53,7 @@ def _write(request: ExportRequest) -> Exported:
         if left_out:
             warnings.append(
                 f"{len(left_out)} meshes, such as {left_out[0]}, are not in the file, because MuJoCo reads only "
-                f"{', '.join(MESHES)}."
+                f"{', '.join(_MESHES)}."
             )
     directory = re.search(r'<compiler\s[^>]*meshdir="([^"]*)"', text)
     folder = request.out.parent / (directory.group(1) if directory else "")
@@ -170,7 +170,7 @@ def _geometry(shape: Any, asset: Any) -> dict[str, str] | str:
     kind, half = etree.QName(form).localname, {"box": "size", "cylinder": "length"}
     if kind == "mesh":
         file = form.get("filename").removeprefix("package://").removeprefix("file://")
-        if Path(file).suffix.lower() not in MESHES:
+        if Path(file).suffix.lower() not in _MESHES:
             return str(file)
         scale = form.get("scale", "1 1 1")
         known = {(mesh.get("file"), mesh.get("scale")): mesh.get("name") for mesh in asset}
@@ -203,7 +203,7 @@ def _place(element: Any, T: Frame) -> None:
     """State the pose of an element in its parent, with all digits."""
     from scipy.spatial.transform import Rotation
 
-    for name in ORIENTATIONS:
+    for name in _ORIENTATIONS:
         element.attrib.pop(name, None)
     element.set("pos", _text(T[:3, 3]))
     element.set("quat", _text(Rotation.from_matrix(T[:3, :3]).as_quat(scalar_first=True)))
@@ -293,7 +293,7 @@ def _row_frames(nominal: Robot, origins: Sequence[Frame], path: str | os.PathLik
     start = rotation(2, by[0]) @ translation(0.0, 0.0, by[1])
     differences = (drawn.fields.dh - own.fields.dh)[:-1]
     differences[:1, :2] = 0.0
-    check_same_geometry(differences, SAME, path, "give the MJCF file of this robot, with the same joints")
+    check_same_geometry(differences, _SAME, path, "give the MJCF file of this robot, with the same joints")
     frames = [there @ inverse(here) for there, here in zip(drawn.frames, own.frames, strict=True)]
     return [drawn.frames[0] @ start @ inverse(own.frames[0]), *frames[1:]]
 
@@ -301,8 +301,8 @@ def _row_frames(nominal: Robot, origins: Sequence[Frame], path: str | os.PathLik
 def _without_rounding(T: Frame) -> Frame:
     """Return a frame with exact right angles, because a row depends on whether its axes intersect."""
     snapped = T.copy()
-    snapped[:3, 3] = T[:3, 3].round(DIGITS)
-    if np.abs(T[:3, :3] - T[:3, :3].round()).max() < SNAP:
+    snapped[:3, 3] = T[:3, 3].round(_DIGITS)
+    if np.abs(T[:3, :3] - T[:3, :3].round()).max() < _SNAP:
         snapped[:3, :3] = T[:3, :3].round()
     return snapped
 

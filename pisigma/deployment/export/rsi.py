@@ -18,10 +18,10 @@ from pisigma.files.errors import OutputError, Place
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.robot.writing import comment_text
 
-SENDER = "pisigma"
+_SENDER = "pisigma"
 """Name of the sender in answers (`SENTYPE`)."""
 AXES = tuple(f"A{number}" for number in range(1, 7))
-REMARKS = (
+_REMARKS = (
     "ASPos and AKorr are in degrees. AKorr are absolute corrections of the joint values that the controller computes "
     "with its nominal kinematics: RSI_ON(#ABSOLUTE). With #RELATIVE they would add up in every cycle.",
     "In the RSI context, connect the outputs 1 to 6 of ETHERNET to the inputs A1 to A6 of AXISCORR, set the limits of "
@@ -71,7 +71,7 @@ def _port(text: str) -> int:
     return port
 
 
-EXAMPLE = RsiAddress("192.168.1.10", 49152, SENDER)
+EXAMPLE = RsiAddress("192.168.1.10", 49152, _SENDER)
 """Address in a file that was not made from another one."""
 SET_ADDRESS = (
     f"IP_NUMBER and PORT ({EXAMPLE.host}:{EXAMPLE.port}) are examples: set them to the address at which the computer "
@@ -98,10 +98,10 @@ def check_six_axes(model: CalibratedModel) -> None:
 def rsi_configuration(host: str, port: int, comments: tuple[str, ...] = ()) -> str:
     """Write the ETHERNET configuration; comments state units and what the RSI context needs."""
     root = etree.Element("ROOT")
-    for sentence in (*comments, *REMARKS):
+    for sentence in (*comments, *_REMARKS):
         root.append(etree.Comment(comment_text(sentence)))
     settings = etree.SubElement(root, "CONFIG")
-    values = {"IP_NUMBER": host, "PORT": str(port), "SENTYPE": SENDER, "ONLYSEND": "FALSE"}
+    values = {"IP_NUMBER": host, "PORT": str(port), "SENTYPE": _SENDER, "ONLYSEND": "FALSE"}
     for name, value in values.items():
         etree.SubElement(settings, name).text = value
     sent = etree.SubElement(etree.SubElement(root, "SEND"), "ELEMENTS")
@@ -126,7 +126,7 @@ def _write(request: ExportRequest) -> Exported:
     )
     text = rsi_configuration(address.host, address.port, comments)
     facts = model_facts(model) | {"address": f"{address.host}:{address.port}"}
-    remarks = (*comments, *REMARKS, *((SET_ADDRESS,) if request.like is None else ()))
+    remarks = (*comments, *_REMARKS, *((SET_ADDRESS,) if request.like is None else ()))
     return Exported(text, facts, remarks, summary="RSI configuration")
 
 

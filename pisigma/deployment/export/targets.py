@@ -20,7 +20,7 @@ from pisigma.model.inverse.corrected_ik import load
 from pisigma.planning.plan_file import joint_columns
 from pisigma.robot.row import FRAME_COLUMNS, in_file_units
 
-KINDS = ("joints", "cartesian")
+_KINDS = ("joints", "cartesian")
 POSE_COLUMNS = tuple(in_file_units(FRAME_COLUMNS, np.zeros(6)))
 
 
@@ -91,7 +91,7 @@ def _check_options(request: ExportRequest) -> None:
     """Check that options can be combined."""
     kind = request.targets
     if kind is not None:
-        check_choice(OutputError, "--targets", kind, KINDS)
+        check_choice(OutputError, "--targets", kind, _KINDS)
     if request.is_csv:
         for name, value in (("--targets", kind), ("--config", request.config)):
             if value is not None:
@@ -124,7 +124,7 @@ def _write(request: ExportRequest) -> Exported:
         if table
         else program_text(targets, request.out, cartesian, request.config),
         facts={
-            "targets": "both" if table else request.targets or KINDS[0],
+            "targets": "both" if table else request.targets or _KINDS[0],
             "robot": targets.robot.name,
             "rows": len(targets.line),
             "statuses": dict(statuses),

@@ -39,11 +39,11 @@ if TYPE_CHECKING:
 _SOURCE = re.compile(re.escape(URDF_SOURCE) + r".+, from link '(?P<base>.*)' to link '(?P<tip>.*)'")
 CALIBRATED_FRAME = "calibrated_frame"
 CALIBRATED_TOOL = "calibrated_tool"
-MISSING = (
+_MISSING = (
     f"Masses, inertias, efforts and velocities that were missing or 0 in the file are placeholders ({MASS} kg, "
     f"{INERTIA} kg m2, {EFFORT}, {VELOCITY}), in {{links}}. Enter the maker's values before you simulate forces."
 )
-SAME = 1e-9
+_SAME = 1e-9
 """Largest difference of rows that are treated as equal to the rows of the file [m or rad]."""
 
 
@@ -187,7 +187,7 @@ def update_urdf(
         _set_origin(elements[name], origin)
     _widen_limits(elements, nominal)
     if filled := _fill_in(root):
-        comments = (*comments, MISSING.format(links=", ".join(filled)))
+        comments = (*comments, _MISSING.format(links=", ".join(filled)))
     T_frame_base = frame_of(calibrated.base) @ inverse(frame_of(rows.fields.base))
     last = row_frame(*calibrated.dh[-1].tolist()) @ frame_of(calibrated.tool)
     mount = None
@@ -217,7 +217,7 @@ def _check_same(described: RobotFields, nominal: Robot, path: str) -> None:
             remedy="give the file that the robot was loaded from, and the same tip",
         )
     remedy = "give the file that the robot was loaded from"
-    check_same_geometry((described.dh - nominal.dh)[:-1], SAME, path, remedy)
+    check_same_geometry((described.dh - nominal.dh)[:-1], _SAME, path, remedy)
 
 
 def check_same_geometry(
@@ -265,9 +265,9 @@ def _widen_limits(elements: dict[str, Any], nominal: Robot) -> None:
         limit = next(elements[axis.name].iterchildren("{*}limit"), None)
         if limit is None or limit.get("lower") is None or limit.get("upper") is None:
             continue
-        if axis.lower < float(limit.get("lower")) - SAME:
+        if axis.lower < float(limit.get("lower")) - _SAME:
             limit.set("lower", repr(axis.lower))
-        if axis.upper > float(limit.get("upper")) + SAME:
+        if axis.upper > float(limit.get("upper")) + _SAME:
             limit.set("upper", repr(axis.upper))
 
 

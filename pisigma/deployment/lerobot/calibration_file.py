@@ -22,7 +22,7 @@ from pisigma.measurement.foreign.lerobot_motors import (
 from pisigma.model.calibrated_model import CalibratedModel
 
 README = "README.md"
-NOT_EXPRESSED = (
+_NOT_EXPRESSED = (
     "LeRobot's file has one zero per motor, in the middle of range_min and range_max: lengths of links, angles between "
     "axes, backlash and gravity cannot be expressed in it.",
     "Zeros are rounded to half a tick (0.04 deg). One end of a range is moved inwards by twice the offset, so that the "
@@ -122,7 +122,7 @@ def _write(request: ExportRequest) -> Exported:
     fitted = fit_joint_offsets(model)
     offsets = dict(zip([axis.name for axis in fitted.robot.axes], fitted.values.tolist(), strict=True))
     text = motors_text(with_offsets(motors, offsets, request.like))
-    sentences = (*offset_remarks(model), *offset_sentences(fitted), *NOT_EXPRESSED)
+    sentences = (*offset_remarks(model), *offset_sentences(fitted), *_NOT_EXPRESSED)
     title = f"# LeRobot calibration of model {model.name} (robot {model.robot.name})"
     facts = model_facts(model) | fitted.departures()
     facts["offsets_deg"] = {name: float(np.rad2deg(value)) for name, value in offsets.items()}

@@ -22,7 +22,7 @@ _POSE, _NEAR = HEAD.size, HEAD.size + 128
 ANSWER = struct.Struct(f"<4sIQII{JOINTS}d2d8s")
 """Joint values [rad or m], NaN after the last joint, the residuals of position [m] and rotation [rad], and the first
 bytes of the SHA-256 of the model, 0 if no model answered."""
-MAX_TOKEN_BYTES = 1024
+_MAX_TOKEN_BYTES = 1024
 
 TOKEN = 1
 """Flag of a first frame that has a token after its head."""
@@ -60,7 +60,9 @@ class BinaryFrames(AbstractProtocol):
         if count < HEAD.size:
             return 0
         _, length, name, _, flags = HEAD.unpack_from(received)
-        fits = HEAD.size < length <= HEAD.size + MAX_TOKEN_BYTES if flags == TOKEN else length == REQUEST.size
+        fits = (
+            HEAD.size < length <= HEAD.size + _MAX_TOKEN_BYTES if flags == TOKEN else length == REQUEST.size
+        )
         if not fits:
             raise BrokenStreamError(_refusal(name, Refusal.BROKEN_FRAME))
         return length if count >= length else 0

@@ -11,7 +11,7 @@ CHUNK = 4096
 """Largest number of bytes that is read at a time, so that no client delays other clients by long messages."""
 MAX_DRAIN_BYTES = 2**22
 """Largest number of bytes that is read from a client when the server stops, so that no client can delay the stop."""
-MESSAGES_PER_TURN = 100
+_MESSAGES_PER_TURN = 100
 """Number of messages of a client that are answered in one turn when the server stops."""
 
 Submit = Callable[["Connection", Callable[[], bytes]], None]
@@ -121,7 +121,7 @@ class Connection:
             while not self.busy and not self._unsent:
                 if not self._received or not (length := self._protocol.message_length(self._received)):
                     break
-                if self._stopping and answered == MESSAGES_PER_TURN:
+                if self._stopping and answered == _MESSAGES_PER_TURN:
                     self.waits_since = None
                     return
                 message = bytes(memoryview(self._received)[:length])

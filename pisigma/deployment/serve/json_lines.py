@@ -31,7 +31,7 @@ from pisigma.robot.kinematics.status import Status
 
 MAX_LINE_BYTES = 2**20
 """Largest length of a line, which is sufficient for a path of about 8,000 poses [bytes]."""
-MAX_ID_CHARACTERS = 200
+_MAX_ID_CHARACTERS = 200
 
 _TASKS = ("pose", "path", "q_deg", "q", "ask")
 """Keys that determine the task of a request; every request has exactly one of them."""
@@ -236,10 +236,10 @@ def _read(message: bytes) -> dict[str, Any]:
     if (
         name is not None
         and type(name) is not int
-        and not (isinstance(name, str) and len(name) <= MAX_ID_CHARACTERS)
+        and not (isinstance(name, str) and len(name) <= _MAX_ID_CHARACTERS)
     ):
         raise RequestError(
-            f"expected an integer or a string of at most {MAX_ID_CHARACTERS} characters", option="id"
+            f"expected an integer or a string of at most {_MAX_ID_CHARACTERS} characters", option="id"
         )
     return request
 

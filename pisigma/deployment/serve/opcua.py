@@ -30,9 +30,9 @@ if TYPE_CHECKING:
 NAMESPACE = "urn:pisigma:server"
 USER = "pisigma"
 """Name of the user whose password is the token of the server."""
-POLL_INTERVAL = 0.5
+_POLL_INTERVAL = 0.5
 """Time between two checks which models are served [s]."""
-STATUS_INTERVAL = 10.0
+_STATUS_INTERVAL = 10.0
 """Time after which age and state of a model are determined again [s]."""
 _CERTIFICATE, _KEY, _TRUSTED = "server_certificate.der", "server_key.pem", "trusted"
 _CERTIFICATE_DAYS = 3650
@@ -116,7 +116,7 @@ class OpcUa:
         started.set_result(asyncio.get_running_loop())
         while not self._stopping.is_set():
             with contextlib.suppress(asyncio.TimeoutError):
-                await asyncio.wait_for(self._stopping.wait(), POLL_INTERVAL)
+                await asyncio.wait_for(self._stopping.wait(), _POLL_INTERVAL)
             await self._look(server, index, robots)
         listener = server.bserver and server.bserver._server
         if listener is not None:
@@ -255,7 +255,7 @@ class _Robot:
         if status.age_days is None:
             age = ua.DataValue(StatusCode=ua.StatusCode(ua.StatusCodes.BadNoData))
         await self._variables["AgeDays"].write_value(age)
-        self._sha256, self._next = model.sha256, time.monotonic() + STATUS_INTERVAL
+        self._sha256, self._next = model.sha256, time.monotonic() + _STATUS_INTERVAL
 
 
 def _argument(name: str, kind: int, meaning: str, length: int | None = None) -> "asyncua.ua.Argument":

@@ -61,7 +61,7 @@ def tokens_match(given: bytes | None, wanted: bytes) -> bool:
     return given is not None and hmac.compare_digest(given, wanted)
 
 
-MAX_NUMBER = 1e9
+_MAX_NUMBER = 1e9
 """Largest accepted value of a pose or joint [mm or deg]."""
 
 
@@ -82,9 +82,9 @@ def read_numbers(request: dict[str, Any], key: str, count: int) -> list[float]:
         length = len(values) if isinstance(values, list) else str(values)[:40]
         raise RequestError(expected=f"a list of {count} numbers", value=length, option=key)
     for value in values:
-        if type(value) not in (float, int) or not -MAX_NUMBER <= value <= MAX_NUMBER:
+        if type(value) not in (float, int) or not -_MAX_NUMBER <= value <= _MAX_NUMBER:
             raise RequestError(
-                expected=f"{count} numbers [mm or deg] up to {MAX_NUMBER:g}",
+                expected=f"{count} numbers [mm or deg] up to {_MAX_NUMBER:g}",
                 value=str(value)[:40],
                 option=key,
             )

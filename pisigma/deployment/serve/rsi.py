@@ -31,18 +31,18 @@ from pisigma.model.inverse.corrected_ik import CorrectedIK
 from pisigma.robot.kernels import arrays
 from pisigma.robot.kinematics.status import Status
 
-CYCLE_MS = 4
+_CYCLE_MS = 4
 """[ms] Interpolation cycle of a controller, or a third of it (12 ms); the time stamp counts milliseconds."""
-MAX_CYCLE_MS = 3 * CYCLE_MS
-MAX_GAP = 10
+_MAX_CYCLE_MS = 3 * _CYCLE_MS
+_MAX_GAP = 10
 """Largest number of cycles from one answer to the next; those between were lost or late."""
-MAX_STEP_DEG = 0.05
+_MAX_STEP_DEG = 0.05
 """[deg] Largest change of a correction per cycle: 12.5 deg/s at 4 ms, far above what moving along a path needs."""
 RAMP_MS = 2000
 """[ms] Time in which the corrections rise from 0 at the start of a stream, and fall to 0 at its end."""
-SILENCE = 0.5
+_SILENCE = 0.5
 """[s] Without packets for this time, the controller has ended the stream (RSI_OFF)."""
-MAX_PACKET = 65535
+_MAX_PACKET = 65535
 _IPOC = re.compile(rb"<IPOC>\s*(\d+)\s*</IPOC>")
 _SETPOINT = re.compile(rb"<ASPos\s([^>]*)>")
 _VALUE = re.compile(rb'(A[1-6])\s*=\s*"([^"]*)"')
@@ -106,7 +106,7 @@ class RsiAnswers:
         self._form = f"<Sen Type={kind}><AKorr {attributes}/><IPOC>%d</IPOC></Sen>"
         self.counts, self.finished = RsiCounts(), False
         self._first: int | None = None
-        self._last, self._cycle, self._leaving = 0, MAX_CYCLE_MS, False
+        self._last, self._cycle, self._leaving = 0, _MAX_CYCLE_MS, False
         self._weight, self._sent = 0.0, (0.0,) * len(AXES)
 
     def leave(self) -> None:
@@ -129,8 +129,8 @@ class RsiAnswers:
         share = self._weight * self._weight * (3 - 2 * self._weight)  # without a jump of the speed
         sent = tuple(share * value for value in wanted)
         change = tuple((new - old) / max(cycles, 1) for new, old in zip(sent, self._sent, strict=True))
-        if max(map(abs, change)) > MAX_STEP_DEG:
-            raise _fault("a change of the correction per cycle of at most", f"{MAX_STEP_DEG} deg", change)
+        if max(map(abs, change)) > _MAX_STEP_DEG:
+            raise _fault("a change of the correction per cycle of at most", f"{_MAX_STEP_DEG} deg", change)
         self._sent = sent
         self.finished = self._leaving and self._weight == 0
         self.counts.answered += 1
@@ -143,9 +143,9 @@ class RsiAnswers:
             self._first = self._last = stamp
             return 0
         elapsed = stamp - self._last
-        if elapsed <= 0 or elapsed % CYCLE_MS:
+        if elapsed <= 0 or elapsed % _CYCLE_MS:
             raise RequestError(
-                expected=f"an IPOC that is a multiple of {CYCLE_MS} ms after {self._last}",
+                expected=f"an IPOC that is a multiple of {_CYCLE_MS} ms after {self._last}",
                 value=stamp,
                 option="IPOC",
                 remedy="end RSI on the controller and start it again",
@@ -153,9 +153,9 @@ class RsiAnswers:
         self._cycle, self._last = min(self._cycle, elapsed), stamp
         cycles = elapsed // self._cycle
         self.counts.unanswered += cycles - 1
-        if cycles > MAX_GAP:
+        if cycles > _MAX_GAP:
             raise RequestError(
-                expected=f"at most {MAX_GAP - 1} cycles without an answer",
+                expected=f"at most {_MAX_GAP - 1} cycles without an answer",
                 value=cycles - 1,
                 option="IPOC",
                 remedy="check the network, and run nothing else on this computer",
@@ -311,12 +311,12 @@ class RsiServer:
         """
         found = None
         while found is None:
-            if not select.select([self._socket], [], [], SILENCE)[0]:
+            if not select.select([self._socket], [], [], _SILENCE)[0]:
                 return None
             began = time.perf_counter()
             with contextlib.suppress(BlockingIOError):
                 while True:
-                    packet, sender = self._socket.recvfrom(MAX_PACKET)
+                    packet, sender = self._socket.recvfrom(_MAX_PACKET)
                     if controller in (None, sender[0]):
                         found, controller = (packet, sender, began), sender[0]
                     else:

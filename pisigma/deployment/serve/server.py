@@ -23,8 +23,8 @@ from pisigma.deployment.serve.settings import ServeSettings, is_local
 from pisigma.deployment.serve.zeromq import ZeroMq
 from pisigma.files.errors import OutputError
 
-MAX_CONNECTIONS = 512
-SWITCH_INTERVAL = 1e-4
+_MAX_CONNECTIONS = 512
+_SWITCH_INTERVAL = 1e-4
 """Longest time for which the thread of slow answers holds the interpreter while quick answers wait [s]."""
 
 
@@ -88,7 +88,7 @@ class Server:
         gc.collect()
         gc.freeze()  # excludes loaded objects from garbage collection, which would take milliseconds
         switching = sys.getswitchinterval()
-        sys.setswitchinterval(SWITCH_INTERVAL)
+        sys.setswitchinterval(_SWITCH_INTERVAL)
         swept, interval = time.monotonic(), self._settings.client_timeout / 10
         while not self._stops:
             self._step(interval)
@@ -147,9 +147,9 @@ class Server:
             stream, _ = listener.accept()
         except OSError:
             return False
-        if len(self._connections) >= MAX_CONNECTIONS:
+        if len(self._connections) >= _MAX_CONNECTIONS:
             self._sweep(time.monotonic())  # some of them may be closed already
-        if len(self._connections) >= MAX_CONNECTIONS:
+        if len(self._connections) >= _MAX_CONNECTIONS:
             stream.close()
             self.metrics.cut_off += 1
             return True

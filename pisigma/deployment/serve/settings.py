@@ -12,8 +12,8 @@ from pisigma.files.errors import OutputError
 from pisigma.files.input_file import read_input
 from pisigma.files.setting import HIDDEN, Option
 
-LAST_PORT = 65535
-CLIENT_TIMEOUT = 10.0
+_LAST_PORT = 65535
+_CLIENT_TIMEOUT = 10.0
 """Longest time for the remainder of a message, a token, or the reception of an answer, before a client is
 disconnected [s]."""
 
@@ -55,7 +55,7 @@ class ServeSettings:
         opcua_certificates: folder of the certificate for OPC UA, which is created if it is missing, and of the
             certificates of clients in the subfolder `trusted`. Required if other machines can reach the server.
         token: token that every client has to send first; on a command line, a file that contains the token.
-        client_timeout: see `CLIENT_TIMEOUT`.
+        client_timeout: see `_CLIENT_TIMEOUT`.
         rsi: file of `pisigma export --format rsi`, to serve only a KUKA controller over RSI.
         rsi_max_correction: largest correction of a joint over RSI [rad]; a larger correction ends the stream.
         polling: time to busy-poll for the next request [s] (0: sleep at once). The server polls only if requests
@@ -63,14 +63,14 @@ class ServeSettings:
     """
 
     host: str = "127.0.0.1"
-    json_port: Annotated[int, Option("--port", min=0, max=LAST_PORT)] = 0
-    binary_port: Annotated[int, Option(min=0, max=LAST_PORT)] = 0
-    zmq_port: Annotated[int | None, Option(min=0, max=LAST_PORT)] = None
+    json_port: Annotated[int, Option("--port", min=0, max=_LAST_PORT)] = 0
+    binary_port: Annotated[int, Option(min=0, max=_LAST_PORT)] = 0
+    zmq_port: Annotated[int | None, Option(min=0, max=_LAST_PORT)] = None
     opcua: bool = False
-    opcua_port: Annotated[int, Option(min=0, max=LAST_PORT)] = 4840
+    opcua_port: Annotated[int, Option(min=0, max=_LAST_PORT)] = 4840
     opcua_certificates: Path | None = None
     token: Annotated[str | None, Option("--token-file", kind=Path, read=read_token)] = None
-    client_timeout: Annotated[float, HIDDEN] = CLIENT_TIMEOUT
+    client_timeout: Annotated[float, HIDDEN] = _CLIENT_TIMEOUT
     rsi: Path | None = None
     rsi_max_correction: Annotated[
         float, Option("--rsi-max-correction-deg", unit="deg", min=0, max=5, is_key=True)

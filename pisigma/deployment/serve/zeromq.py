@@ -10,11 +10,11 @@ from pisigma.deployment.serve.models import ServedModels
 from pisigma.deployment.serve.protocol import AbstractProtocol, BrokenStreamError, tokens_match
 from pisigma.files.errors import OutputError
 
-SILENCE_MS = 500
+_SILENCE_MS = 500
 """Time without a message after which all messages that were sent before the stop have arrived [ms]."""
-SEND_TIMEOUT_MS = 2000
+_SEND_TIMEOUT_MS = 2000
 """Longest waiting time for a client that does not read its answers, before an answer is dropped [ms]."""
-MAX_QUEUED = 100
+_MAX_QUEUED = 100
 """Largest number of messages of a client, and of answers to it, in a queue."""
 
 
@@ -49,13 +49,13 @@ class ZeroMq:
         self._token, self._context = token, zmq.Context(1)
         self._socket, self._stopping = self._context.socket(zmq.ROUTER), threading.Event()
         options = {
-            zmq.LINGER: SEND_TIMEOUT_MS,
+            zmq.LINGER: _SEND_TIMEOUT_MS,
             zmq.MAXMSGSIZE: MAX_LINE_BYTES,
-            zmq.RCVTIMEO: SILENCE_MS,
-            zmq.SNDTIMEO: SEND_TIMEOUT_MS,
+            zmq.RCVTIMEO: _SILENCE_MS,
+            zmq.SNDTIMEO: _SEND_TIMEOUT_MS,
             zmq.IPV6: int(":" in host),
-            zmq.RCVHWM: MAX_QUEUED,
-            zmq.SNDHWM: MAX_QUEUED,
+            zmq.RCVHWM: _MAX_QUEUED,
+            zmq.SNDHWM: _MAX_QUEUED,
             # otherwise a ROUTER silently drops answers when the queue is full
             zmq.ROUTER_MANDATORY: 1,
         }

@@ -11,11 +11,11 @@ from pisigma.validation.uncertainty.budget import UncertaintyBudget
 from pisigma.validation.uncertainty.components import SCATTER
 from pisigma.validation.uncertainty.instrument import Instrument
 
-EXPLAINED = 0.999
+_EXPLAINED = 0.999
 """Probability with which errors that the budget explains are found to be explained by it."""
-MAX_FREEDOM = 1e9
+_MAX_FREEDOM = 1e9
 """Degrees of freedom that are treated as infinite."""
-NO_PATHS = "AT and RT: the sessions of a cell contain no measured paths."
+_NO_PATHS = "AT and RT: the sessions of a cell contain no measured paths."
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ class Acceptance:
         """Whether the measured errors are larger than the budget explains, beyond chance.
 
         It is False for a budget without the scatter of the calibration. Otherwise the mean square of the measured
-        coordinates over `u_c²` is compared with the quantile `EXPLAINED` of the F distribution. Its degrees of freedom
+        coordinates over `u_c²` is compared with the quantile `_EXPLAINED` of the F distribution. Its degrees of freedom
         are the number of rows, because the coordinates of a row may be correlated, and those of the budget.
         """
         if self.measured is None or all(one.name != SCATTER for one in self.budget.components):
@@ -103,8 +103,8 @@ class Acceptance:
         from scipy import stats
 
         square = (self.measured.errors.statistics["rms"] / 1e3) ** 2 / 3
-        freedom = min(self.budget.effective_degrees_of_freedom, MAX_FREEDOM)
-        limit = float(stats.f.ppf(EXPLAINED, self.measured.rows, freedom))
+        freedom = min(self.budget.effective_degrees_of_freedom, _MAX_FREEDOM)
+        limit = float(stats.f.ppf(_EXPLAINED, self.measured.rows, freedom))
         return square > limit * self.budget.combined**2
 
     @property
@@ -156,4 +156,4 @@ def missing_statements(
         lines.append("AP and RP: no pose was measured more than once.")
     elif (fewest := min(one.rows for one in repeats)) < CYCLES:
         lines.append(f"AP and RP of {CYCLES} cycles, as ISO 9283 requires: one pose has {fewest}.")
-    return (*lines, NO_PATHS)
+    return (*lines, _NO_PATHS)

@@ -22,9 +22,9 @@ from pisigma.lifetime.cell.history import HISTORY, Check, History, ModelEntry, S
 from pisigma.lifetime.cell.layout import CELL_FILE, MODELS, PLANS, SESSIONS, newest_plan
 from pisigma.measurement.dates import date_in_name
 
-BEFORE_FIT = ("plan", "import")
+_BEFORE_FIT = ("plan", "import")
 """Commands whose checks do not draw conclusions from measured rows."""
-MIN_MEASURED_SHARE = 0.9
+_MIN_MEASURED_SHARE = 0.9
 """Smallest measured share of the poses of a plan with which it is treated as complete; some poses may be out of
 sight."""
 NOT_TRUSTED = ("implausible", "setup_fault", "not_trusted")
@@ -228,12 +228,12 @@ def _incomplete(folder: Path, sessions: Sequence[SessionEntry], checks: Sequence
     if not planned or not any((folder / PLANS).glob("*.csv")):
         return ""
     made = planned[-1]
-    if any(one.checked > made and one.command not in BEFORE_FIT for one in checks):
+    if any(one.checked > made and one.command not in _BEFORE_FIT for one in checks):
         return ""
     measured = sum(one.poses or one.rows for one in sessions if one.taken_in > made and not one.set_aside)
     with newest_plan(folder).open(encoding="utf-8") as file:
         poses = sum(bool(line.strip()) for line in file) - 1
-    if not 0 < measured < MIN_MEASURED_SHARE * poses:
+    if not 0 < measured < _MIN_MEASURED_SHARE * poses:
         return ""
     return f"{measured} of {poses} poses of the newest plan have been measured"
 

@@ -17,11 +17,11 @@ MAX_DAYS_UNVERIFIED = 92
 """Time without a session after which the model in use has to be verified again [days]: a quarter of a year."""
 VERIFICATION_POSES = 10
 """Number of poses of a session for verification or monitoring."""
-MEASURE_AND = f"measure {VERIFICATION_POSES} poses, import them, and"
-CAN_VERIFY = "is not in use; session '{}', to which it was not fitted, can verify it"
-JUDGING = ("verify", "monitor", "recalibrate")
+_MEASURE_AND = f"measure {VERIFICATION_POSES} poses, import them, and"
+_CAN_VERIFY = "is not in use; session '{}', to which it was not fitted, can verify it"
+_JUDGING = ("verify", "monitor", "recalibrate")
 """Commands that compare a session with a model."""
-P95_PER_SCATTER = 2.7955
+_P95_PER_SCATTER = 2.7955
 """95 % quantile of the length of three independent normal errors, per standard deviation (chi distribution)."""
 
 FOREIGN = "foreign"
@@ -227,14 +227,14 @@ def _not_verified(facts: CellFacts) -> Step | None:
     if wrong := _wrongly_fitted(facts, model):
         return _calibrate(facts, *wrong)
     if new := _not_judged(facts, model, "verify", "recalibrate"):
-        why = f"model '{model.name}' {CAN_VERIFY.format(new[-1])}"
+        why = f"model '{model.name}' {_CAN_VERIFY.format(new[-1])}"
         return Step("not_verified", why, facts.command("verify"))
     verdicts = facts.checks_of(model.name, "verify", "recalibrate")
     if verdicts and (step := _after(facts, verdicts[-1], ("not_better", "undecided"))):
         return step
     return Step(
         "not_verified",
-        f"model '{model.name}' has not been verified with new rows; {MEASURE_AND} run `{facts.command('verify')}`",
+        f"model '{model.name}' has not been verified with new rows; {_MEASURE_AND} run `{facts.command('verify')}`",
         facts.command("plan"),
     )
 
@@ -282,7 +282,7 @@ def _other_joint_zeros(facts: CellFacts, model: ModelEntry) -> Step | None:
 
 
 def _session_not_judged(facts: CellFacts, model: ModelEntry) -> Step | None:
-    if not (new := _not_judged(facts, model, *JUDGING)):
+    if not (new := _not_judged(facts, model, *_JUDGING)):
         return None
     verb = "monitor" if model.has_posterior else "verify"
     if facts.limit_mm is not None and _p95(facts, model) is None:
@@ -293,7 +293,7 @@ def _session_not_judged(facts: CellFacts, model: ModelEntry) -> Step | None:
 
 def _last_verdict(facts: CellFacts, model: ModelEntry) -> Step | None:
     """Return the step that follows from the last session that was compared with the model in use."""
-    checks = facts.checks_of(model.name, *JUDGING)
+    checks = facts.checks_of(model.name, *_JUDGING)
     return _after(facts, checks[-1], ("not_better",)) if checks else None
 
 
@@ -303,7 +303,7 @@ def _better_model(facts: CellFacts, model: ModelEntry) -> Step | None:
         return None
     if not (new := _not_judged(facts, newest, "verify")):
         return None
-    why = f"model '{newest.name}' {CAN_VERIFY.format(new[-1])}"
+    why = f"model '{newest.name}' {_CAN_VERIFY.format(new[-1])}"
     return Step("better_model", why, facts.command("verify", "--model", newest.name))
 
 
@@ -313,7 +313,7 @@ def _replaced(facts: CellFacts, model: ModelEntry) -> Step | None:
         return None
     if newest is None or newest.made <= model.made or _wrongly_fitted(facts, newest):
         return _calibrate(facts, *wrong)
-    return Step(wrong[0], f"{wrong[1]}; {MEASURE_AND} verify model '{newest.name}'", facts.command("plan"))
+    return Step(wrong[0], f"{wrong[1]}; {_MEASURE_AND} verify model '{newest.name}'", facts.command("plan"))
 
 
 def _wrongly_fitted(facts: CellFacts, model: ModelEntry) -> tuple[State, str] | None:
@@ -339,10 +339,10 @@ def _outside_limit(facts: CellFacts, model: ModelEntry) -> Step | None:
     if limit is None or (p95 is not None and p95 <= limit):
         return None
     if p95 is None:
-        why = f"it is not known whether model '{model.name}' meets the limit of {limit:g} mm; {MEASURE_AND}"
+        why = f"it is not known whether model '{model.name}' meets the limit of {limit:g} mm; {_MEASURE_AND}"
         return Step("verification_due", f"{why} run `{facts.command('verify')}`", facts.command("plan"))
     missed = f"the 95 % quantile of the position errors is {p95:.3f} mm, above the limit of {limit:g} mm"
-    scatter = P95_PER_SCATTER * (model.scatter_mm or 0.0)
+    scatter = _P95_PER_SCATTER * (model.scatter_mm or 0.0)
     if scatter > limit:
         return Step(
             "limit_below_scatter",

@@ -19,13 +19,13 @@ from pisigma.validation.held_out.pose_statistics import PoseErrors
 FrameChoice = Literal["fitted", "fixed"]
 """Whether base and tool of the second model are fitted to those of the first model, or equal by name."""
 
-POINTS = 60
+_POINTS = 60
 """Number of joint configurations at which models are compared with their uncertainties, half from each model."""
-SAMPLES = 3_000
+_SAMPLES = 3_000
 """Samples of the workspace."""
-FITTED_SAMPLES = 300
+_FITTED_SAMPLES = 300
 """Samples to which base and tool are fitted."""
-MAX_NOMINAL_DIFFERENCE = 0.02
+_MAX_NOMINAL_DIFFERENCE = 0.02
 """Difference of nominal parameters [rad, or share of the reach] up to which models belong to one robot."""
 
 
@@ -66,7 +66,7 @@ class ModelPair:
         frame_names = _frame_names(first, second, frames)
         eye = torch.eye(4, dtype=torch.float64)
         pair = ModelPair(first, second, frames, frame_names, eye, eye)
-        T_first, T_second = pair.poses(pair.workspace[:: SAMPLES // FITTED_SAMPLES])
+        T_first, T_second = pair.poses(pair.workspace[:: _SAMPLES // _FITTED_SAMPLES])
         there = torch.isfinite(T_first + T_second).all(-1).all(-1)
         if not bool(there.any()):
             raise ModelError(
@@ -84,7 +84,7 @@ class ModelPair:
         """Joint values that the models store from their training rows, half from each [rad or m]."""
         generator = torch.Generator().manual_seed(0)
         sampled = [
-            model.starts[torch.randperm(len(model.starts), generator=generator)[: POINTS // 2]]
+            model.starts[torch.randperm(len(model.starts), generator=generator)[: _POINTS // 2]]
             for model in (self.first, self.second)
         ]
         return torch.cat(sampled)
@@ -101,9 +101,9 @@ class ModelPair:
             low, high = kept.amin(0), kept.amax(0)
         generator = torch.Generator().manual_seed(0)
         sampled = torch.rand(
-            max(SAMPLES - len(kept), 0), kept.shape[1], generator=generator, dtype=kept.dtype
+            max(_SAMPLES - len(kept), 0), kept.shape[1], generator=generator, dtype=kept.dtype
         )
-        return torch.cat([kept[:SAMPLES], low + sampled * (high - low)])
+        return torch.cat([kept[:_SAMPLES], low + sampled * (high - low)])
 
     def poses(
         self, q: Float64[Tensor, "poses dof"]
@@ -201,7 +201,7 @@ def _difference(one: Robot, other: Robot) -> tuple[str, str]:
     by[:, [0, 3, 4]] = 2 * np.sin(by[:, [0, 3, 4]] / 2)  # angles are compared modulo one revolution
     apart = np.abs(by) / scale
     row, column = np.unravel_index(int(apart.argmax()), apart.shape)
-    if apart[row, column] <= MAX_NOMINAL_DIFFERENCE:
+    if apart[row, column] <= _MAX_NOMINAL_DIFFERENCE:
         return "", ""
     name = ("theta", "d", "a", "alpha", "beta")[int(column)]
     unit, factor = ("mm", 1e3) if name in ("d", "a") else ("deg", float(np.rad2deg(1.0)))

@@ -14,9 +14,9 @@ from pisigma.files.errors import IdentificationError
 from pisigma.model.frame_model import FittedFrames
 from pisigma.robot.se3 import invert, rotation_from_vector, rotation_vector, skew, transform_from_xyzrpy
 
-FALSE_ALARMS = 1e-3
+_FALSE_ALARMS = 1e-3
 """Probability that arms and frames that did not move are said to have moved."""
-CERTAIN = 5.0
+_CERTAIN = 5.0
 """Difference of log likelihoods above which one moved body is a better explanation than another one."""
 
 
@@ -121,10 +121,10 @@ class MovedBases:
     @cached_property
     def named(self) -> tuple[MovedBody, ...]:
         """The body whose motion explains the differences best; several if they cannot be distinguished, or none."""
-        if self.probability >= FALSE_ALARMS:
+        if self.probability >= _FALSE_ALARMS:
             return ()
         best = self.bodies[0].log_likelihood
-        return tuple(one for one in self.bodies if one.log_likelihood > best - CERTAIN)
+        return tuple(one for one in self.bodies if one.log_likelihood > best - _CERTAIN)
 
 
 def find_moved_bases(arms: Sequence[ArmBefore]) -> MovedBases:
@@ -170,7 +170,7 @@ def find_moved_bases(arms: Sequence[ArmBefore]) -> MovedBases:
     ]
     bodies.sort(key=lambda one: -one.log_likelihood)
     rest, count = square - 2 * bodies[0].log_likelihood, len(y) - 6
-    is_one = count == 0 or float(fisher.sf(rest / count, count, freedom)) >= FALSE_ALARMS
+    is_one = count == 0 or float(fisher.sf(rest / count, count, freedom)) >= _FALSE_ALARMS
     return MovedBases(probability, tuple(bodies), is_one)
 
 

@@ -16,18 +16,18 @@ from pisigma.robot.se3 import wrap_to_pi
 
 Verdict = Literal["different", "same", "unknown"]
 Moved = Literal["leader", "follower", "both", "unknown"]
-FALSE_ALARMS = 1e-3
+_FALSE_ALARMS = 1e-3
 """Probability that a joint of a pair of arms without differences is named."""
-MISSED = 0.025
+_MISSED = 0.025
 """Probability that a joint whose difference is as large as the tolerance is found to be the same."""
 TOLERANCE = math.radians(0.5)
 """Smallest difference that is named [rad]: backlash and gravity shift the means of servos by such angles."""
-BLOCKS, MIN_ROWS = 20, 10
+_BLOCKS, _MIN_ROWS = 20, 10
 """Blocks of consecutive rows, whose means are independent although neighbouring rows of a log are not."""
-CERTAIN = 5.0
+_CERTAIN = 5.0
 """Log odds above which the arm that moved is named."""
-ITERATIONS = 10
-SMALLEST_NOISE = 1e-6
+_ITERATIONS = 10
+_SMALLEST_NOISE = 1e-6
 """Smallest standard deviation of positions [m], which keeps directions without information regular."""
 
 
@@ -94,11 +94,11 @@ def estimate_zero_changes(
     _check_rows(position, "position")
     values, measured = torch.zeros(joints, dtype=torch.float64), torch.from_numpy(np.array(position))
     weight = torch.eye(joints, dtype=torch.float64) / math.pi**2
-    for _ in range(ITERATIONS):
+    for _ in range(_ITERATIONS):
         there = torch.from_numpy(np.array(q)) + values
         J = model.jacobian(there)[:, :3]
         residual = measured - model.forward(there)[:, :3, 3]
-        variance = residual.square().sum() / max(3 * rows - joints, 1) + SMALLEST_NOISE**2
+        variance = residual.square().sum() / max(3 * rows - joints, 1) + _SMALLEST_NOISE**2
         inverse = torch.linalg.inv((J.mT @ J).sum(0) + variance * weight)
         score = (J.mT @ residual[..., None])[..., 0]
         values = values + inverse @ (score.sum(0) - variance * weight @ values)
@@ -114,10 +114,10 @@ def _check_rows(rows: Float64[np.ndarray, "rows columns"], option: str) -> None:
     Raises:
         MeasurementError: there are not.
     """
-    if len(rows) < MIN_ROWS or not np.isfinite(rows).all():
+    if len(rows) < _MIN_ROWS or not np.isfinite(rows).all():
         finite = int(np.isfinite(rows).all(1).sum())
         raise MeasurementError(
-            expected=f"at least {MIN_ROWS} rows, all of numbers",
+            expected=f"at least {_MIN_ROWS} rows, all of numbers",
             value=f"{finite} of {len(rows)}",
             option=option,
         )
@@ -181,18 +181,18 @@ def compare_paired_arms(
     difference = follower - leader
     center = np.angle(np.exp(1j * difference).mean(0))
     difference = center + wrap_to_pi(torch.from_numpy(difference - center)).numpy()
-    blocks = np.array_split(difference, min(BLOCKS, len(leader) // 2))
+    blocks = np.array_split(difference, min(_BLOCKS, len(leader) // 2))
     means = np.array([block.mean(0) for block in blocks])
     error = means.std(0, ddof=1) / math.sqrt(len(blocks))
     freedom = len(blocks) - 1
-    limit = float(student.isf(FALSE_ALARMS / len(names) / 2, freedom))
+    limit = float(student.isf(_FALSE_ALARMS / len(names) / 2, freedom))
     found = []
     for index, name in enumerate(names):
         value, sigma = float(means[:, index].mean()), float(error[index])
         verdict: Verdict = "unknown"
         if abs(value) > max(limit * sigma, tolerance):
             verdict = "different"
-        elif abs(value) + float(student.isf(MISSED, freedom)) * sigma < tolerance:
+        elif abs(value) + float(student.isf(_MISSED, freedom)) * sigma < tolerance:
             verdict = "same"
         changes = [_change(zeros, index) for zeros in (leader_zeros, follower_zeros)]
         moved = _moved(value, sigma, changes, limit, tolerance) if verdict == "different" else None
@@ -228,5 +228,5 @@ def _moved(
     if all(excluded.values()):
         return "both"
     return (
-        "unknown" if excluded[likely] or abs(misfit["leader"] - misfit["follower"]) < 2 * CERTAIN else likely
+        "unknown" if excluded[likely] or abs(misfit["leader"] - misfit["follower"]) < 2 * _CERTAIN else likely
     )

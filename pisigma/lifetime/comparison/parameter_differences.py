@@ -17,9 +17,9 @@ from pisigma.measurement.sensors.sensor import SHOWN_UNITS, ShownUnit
 from pisigma.model.accuracy import parameter_posterior
 from pisigma.model.calibrated_model import CalibratedModel
 
-LEVEL = 0.01
+_LEVEL = 0.01
 """Family-wise significance level: probability of calling any parameter different where two models differ by chance."""
-FACTORS = dict(SHOWN_UNITS.values())
+_FACTORS = dict(SHOWN_UNITS.values())
 """Factors from SI by the shown unit, such as "mm" or "deg"."""
 
 
@@ -89,7 +89,7 @@ class ParameterDifferences:
     level: float
 
 
-def parameter_differences(pair: ModelPair, level: float = LEVEL) -> ParameterDifferences:
+def parameter_differences(pair: ModelPair, level: float = _LEVEL) -> ParameterDifferences:
     """Test which parameters of two models differ.
 
     Differences e of the parameters displace the tool by `d = J e`. Under posteriors with covariances `C1` and `C2`, d
@@ -132,7 +132,7 @@ def _tested(
         return parameter
     shift, deviation = estimate
     chance = math.erfc(abs(shift) / deviation / math.sqrt(2)) * len(effects.tested)
-    factor = FACTORS[parameter.unit]
+    factor = _FACTORS[parameter.unit]
     return replace(
         parameter,
         shift=shift * factor,

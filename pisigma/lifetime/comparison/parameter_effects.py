@@ -19,14 +19,14 @@ from pisigma.robot.frame_fits import LEVER_SHARE
 from pisigma.robot.kinematics.parameter_jacobian import identification_jacobian
 from pisigma.robot.se3 import rotation_from_vector, rotation_vector, skew, xyzrpy_from_transform
 
-MODEL_ERROR = 2e-5
+_MODEL_ERROR = 2e-5
 """Standard deviation of predicted coordinates [m] in addition to the posteriors, about a robot's repeatability."""
-MIN_DISTINCT_SHARE = 0.01
+_MIN_DISTINCT_SHARE = 0.01
 """Share of a parameter's effect that is distinct from other effects, below which the parameter is unobservable."""
-ALIKE = 1 - MIN_DISTINCT_SHARE**2
+_ALIKE = 1 - _MIN_DISTINCT_SHARE**2
 """Correlation of effects above which parameters are exchangeable."""
-FRAME_UNITS = ("m", "m", "m", "rad", "rad", "rad")
-FRAME_MOTIONS = ("along x", "along y", "along z", "about x", "about y", "about z")
+_FRAME_UNITS = ("m", "m", "m", "rad", "rad", "rad")
+_FRAME_MOTIONS = ("along x", "along y", "along z", "about x", "about y", "about z")
 
 Frames = tuple[Float64[Tensor, "4 4"], Float64[Tensor, "4 4"]]
 """Type of a base and a tool."""
@@ -91,7 +91,7 @@ class ParameterEffects:
         X, G, y = ((weight * one).flatten(0, 1) for one in (columns, torch.cat(spread, -1), d[..., None]))
         covariance = G @ G.t()
         S = covariance.clone()
-        S.diagonal().add_(MODEL_ERROR**2)
+        S.diagonal().add_(_MODEL_ERROR**2)
         L = torch.linalg.cholesky(S)
         self._y, self._W, half = (
             torch.linalg.solve_triangular(L, one, upper=False) for one in (y, X, covariance)
@@ -101,7 +101,7 @@ class ParameterEffects:
         self._free = list(range(self._arm, self._arm + 12)) if fitted else []
         left, self._observable = self._left([])
         unit = left / left.norm(dim=0).clamp(min=1e-300)
-        self._alike = ((unit.t() @ unit).abs() > ALIKE) & self._observable & self._observable[:, None]
+        self._alike = ((unit.t() @ unit).abs() > _ALIKE) & self._observable & self._observable[:, None]
         rank = torch.tensor([not self._is_zero(number) for number in range(len(self._alike))]) * len(
             self._alike
         )
@@ -178,7 +178,7 @@ class ParameterEffects:
         if number < self._arm:
             return ParameterSpace(self._pair.first.identified).names[number]
         what, motion = divmod(number - self._arm, 6)
-        return f"{('base', 'tool')[what]} {FRAME_MOTIONS[motion]}"
+        return f"{('base', 'tool')[what]} {_FRAME_MOTIONS[motion]}"
 
     def _is_zero(self, number: int) -> bool:
         """Return whether a parameter is a joint zero: theta, or d of a prismatic joint."""
@@ -189,7 +189,7 @@ class ParameterEffects:
 
     def _unit(self, number: int) -> str:
         if number >= self._arm:
-            return FRAME_UNITS[(number - self._arm) % 6]
+            return _FRAME_UNITS[(number - self._arm) % 6]
         return ParameterSpace(self._pair.first.identified).parameters[number].unit
 
     def _frames(
@@ -220,7 +220,7 @@ class ParameterEffects:
     ) -> tuple[Float64[Tensor, "values parameters"], Bool[Tensor, " parameters"]]:
         """Return the columns with given parameters and free frames projected out, and the mask of observable ones."""
         left = self._without(self._W, given)
-        return left, left.norm(dim=0) > MIN_DISTINCT_SHARE * self._W.norm(dim=0)
+        return left, left.norm(dim=0) > _MIN_DISTINCT_SHARE * self._W.norm(dim=0)
 
     def _without(
         self, columns: Float64[Tensor, "values columns"], given: Sequence[int]

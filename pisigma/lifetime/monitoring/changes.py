@@ -8,13 +8,13 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-MIN_DEGREES_OF_FREEDOM = 2
+_MIN_DEGREES_OF_FREEDOM = 2
 """Smallest number of values in excess of the fitted coefficients."""
-MAX_EVENTS = 8
+_MAX_EVENTS = 8
 """Number of changes of a value above which it is described by a drift."""
-MAX_EXCHANGES = 5
+_MAX_EXCHANGES = 5
 """Largest number of passes that exchange events for better ones."""
-MIN_SQUARE = 1e-9
+_MIN_SQUARE = 1e-9
 """Squared length of a column below which it is a combination of other columns."""
 
 
@@ -85,7 +85,7 @@ class Series:
         """Add events to columns; return them, and the remaining square sum plus penalty."""
         count, chosen = len(self.values), tuple[Event, ...]()
         penalty = 2 * math.log(max(len(self._tried), 1)) + math.log(count)
-        while columns.shape[1] + len(chosen) + MIN_DEGREES_OF_FREEDOM < count and len(chosen) < MAX_EVENTS:
+        while columns.shape[1] + len(chosen) + _MIN_DEGREES_OF_FREEDOM < count and len(chosen) < _MAX_EVENTS:
             best, gain = self._best(columns, chosen)
             if not gain > penalty:
                 break
@@ -95,7 +95,7 @@ class Series:
 
     def _exchanged(self, columns: Tensor, chosen: tuple[Event, ...]) -> tuple[Event, ...]:
         """Return the events after exchanging them for better ones until no exchange improves the fit."""
-        for _ in range(MAX_EXCHANGES):
+        for _ in range(_MAX_EXCHANGES):
             before = chosen
             for number in range(len(chosen)):
                 others = chosen[:number] + chosen[number + 1 :]
@@ -111,7 +111,7 @@ class Series:
         tried = tried - Q @ (Q.t() @ tried)
         square = tried.square().sum(0)
         gain = torch.where(
-            square > MIN_SQUARE, (tried.t() @ left).square() / square.clamp(min=MIN_SQUARE), 0.0
+            square > _MIN_SQUARE, (tried.t() @ left).square() / square.clamp(min=_MIN_SQUARE), 0.0
         )
         number = int(gain.argmax())
         return self._tried[number], float(gain[number])

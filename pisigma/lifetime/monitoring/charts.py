@@ -16,13 +16,13 @@ FALSE_ALARMS_PER_YEAR = 0.05
 """Number of false alarms of all charts of a robot together per year, if nothing changes."""
 SESSIONS_PER_YEAR = 12
 """Number of sessions per year, by which a rate per year is converted to a rate per session."""
-WEIGHT = 0.2
+_WEIGHT = 0.2
 """Weight of the newest session in the moving average."""
-ALLOWANCE = 0.5
+_ALLOWANCE = 0.5
 """Part of a score that is not added to the cumulative sums [standard deviations of a score]."""
-STATES = 101
+_STATES = 101
 """Number of states of the Markov chain from which the limit of the EWMA is computed."""
-OVERSHOOT = 1.166
+_OVERSHOOT = 1.166
 """Mean overshoot of a cumulative sum over its limit for normal scores, on both sides (Siegmund 1985)."""
 
 AlarmKind = Literal["EWMA", "CUSUM"]
@@ -68,7 +68,7 @@ class Chart:
         """Exponentially weighted moving average of the scores; Roberts 1959, Technometrics 1(3)."""
         average, averages = 0.0, []
         for score in self.scores.tolist():
-            average = average if math.isnan(score) else (1 - WEIGHT) * average + WEIGHT * score
+            average = average if math.isnan(score) else (1 - _WEIGHT) * average + _WEIGHT * score
             averages.append(average)
         return torch.tensor(averages, dtype=torch.float64)
 
@@ -79,7 +79,7 @@ class Chart:
         sums = []
         for score in self.scores.tolist():
             if not math.isnan(score):
-                rise, fall = max(rise + score - ALLOWANCE, 0.0), max(fall - score - ALLOWANCE, 0.0)
+                rise, fall = max(rise + score - _ALLOWANCE, 0.0), max(fall - score - _ALLOWANCE, 0.0)
             sums.append((rise, fall))
         return torch.tensor(sums, dtype=torch.float64).reshape(-1, 2)
 
@@ -167,21 +167,21 @@ def limits_of(charts: int, one_sided: bool = False) -> Limits:
 
 def mean_sessions_to_ewma_alarm(limit: float, one_sided: bool) -> float:
     """Compute the mean number of sessions until the moving average passes its limit (one-sided) or either limit."""
-    low = -4.0 * math.sqrt(WEIGHT / (2 - WEIGHT)) if one_sided else -limit
-    edges = torch.linspace(low, limit, STATES + 1, dtype=torch.float64)
+    low = -4.0 * math.sqrt(_WEIGHT / (2 - _WEIGHT)) if one_sided else -limit
+    edges = torch.linspace(low, limit, _STATES + 1, dtype=torch.float64)
     middle = (edges[1:] + edges[:-1]) / 2
-    until = torch.special.ndtr((edges - (1 - WEIGHT) * middle[:, None]) / WEIGHT)
+    until = torch.special.ndtr((edges - (1 - _WEIGHT) * middle[:, None]) / _WEIGHT)
     moves = until.diff(dim=1)
     if one_sided:  # lower values remain in the lowest state
         moves[:, 0] += until[:, 0]
-    mean = torch.linalg.solve(torch.eye(STATES, dtype=torch.float64) - moves, torch.ones_like(middle))
+    mean = torch.linalg.solve(torch.eye(_STATES, dtype=torch.float64) - moves, torch.ones_like(middle))
     return float(mean[int(middle.abs().argmin())])
 
 
 def mean_sessions_to_cusum_alarm(limit: float) -> float:
     """Compute the mean number of sessions until a cumulative sum passes its limit."""
-    b = 2 * ALLOWANCE * (limit + OVERSHOOT)
-    return (math.exp(b) - b - 1) / (2 * ALLOWANCE**2)
+    b = 2 * _ALLOWANCE * (limit + _OVERSHOOT)
+    return (math.exp(b) - b - 1) / (2 * _ALLOWANCE**2)
 
 
 def _solved(sessions_of: Callable[[float], float], target: float, low: float, high: float) -> float:

@@ -34,16 +34,16 @@ from pisigma.validation.held_out.calibration_validation import pose_errors_of
 Verdict = Literal["unchanged", "moved", "unclear"]
 ZERO_PRIOR = 0.02
 """Prior standard deviation [rad, or share of the reach] of joint zeros that are estimated for charts, about 1 deg."""
-UNOBSERVABLE = 0.005
+_UNOBSERVABLE = 0.005
 """Posterior standard deviation [rad, or share of the reach] above which a joint zero is unobservable, about 0.3 deg."""
-MIN_GAIN_RATIO = 1.05
+_MIN_GAIN_RATIO = 1.05
 """Expected ratio of errors before and after a recalibration above which it is recommended."""
-MAX_NOISE_FACTOR = 2.0
+_MAX_NOISE_FACTOR = 2.0
 """Factor on the noise of the calibration up to which an explanation is complete."""
-MIN_NAMED_PROBABILITY = 0.05
+_MIN_NAMED_PROBABILITY = 0.05
 """Probability above which an ambiguous explanation is named."""
-MAX_LINEARISATIONS = 4
-CONVERGENCE_TOLERANCE = 1.0
+_MAX_LINEARISATIONS = 4
+_CONVERGENCE_TOLERANCE = 1.0
 """RMS change of predicted values, over their noise, below which linearisation ends."""
 
 
@@ -113,8 +113,8 @@ class Session:
         """Whether the arm changed so much that a recalibration is recommended."""
         arm = any(not is_frame(one.what) for one in self.moved) or bool(self.candidates)
         return arm and (
-            self.rms > MIN_GAIN_RATIO * self.rms_after
-            or max(self.rotation_ratio, self.score_ratio) > MIN_GAIN_RATIO
+            self.rms > _MIN_GAIN_RATIO * self.rms_after
+            or max(self.rotation_ratio, self.score_ratio) > _MIN_GAIN_RATIO
         )
 
     @property
@@ -124,7 +124,7 @@ class Session:
             named = (
                 f"{what} ({format_probability(share)})"
                 for what, share in self.candidates[:3]
-                if share >= MIN_NAMED_PROBABILITY
+                if share >= _MIN_NAMED_PROBABILITY
             )
             return f"something changed, but these rows cannot distinguish what: {' or '.join(named)}."
         if self.verdict == "unchanged":
@@ -213,7 +213,7 @@ class _Solved:
     @property
     def has_usual_noise(self) -> bool:
         """Whether the noise is about that of the calibration."""
-        return self.explanation.noise_factor <= MAX_NOISE_FACTOR
+        return self.explanation.noise_factor <= _MAX_NOISE_FACTOR
 
     @property
     def probable_movements(self) -> tuple[Motion, ...]:
@@ -258,14 +258,14 @@ def _solve(
     group = held_out_groups(problem.setup.measurements)
     x = problem.mean
     wrong: Mapping[int, float] = {}
-    for _ in range(MAX_LINEARISATIONS):
+    for _ in range(_MAX_LINEARISATIONS):
         values = linear_values(problem, linearise_rows(problem.design, x, 0.0, group))
         solved = _explained(problem, noise, replace(values, wrong=wrong))
         values, wrong = solved.values, solved.values.wrong
         there = solved.unknowns(tuple(_sized(one) for one in solved.probable_movements))
         step = values.X @ (there - x) / values.deviation(noise)
         x = there
-        if float(step.square().mean().sqrt()) < CONVERGENCE_TOLERANCE or (
+        if float(step.square().mean().sqrt()) < _CONVERGENCE_TOLERANCE or (
             solved.frame_moved and not relocated
         ):
             break
@@ -328,7 +328,7 @@ def _judged(solved: _Solved, relocated: dict[FrameKey, float]) -> Session:
         standing=tuple(" ".join(owner).strip() for owner in relocated),
         observable=tuple(
             float(evidence.estimate_shift([group], explanation.noise_factor)[1].sqrt())
-            < UNOBSERVABLE * float(group.scale)
+            < _UNOBSERVABLE * float(group.scale)
             for group in _joints(solved)
         ),
         outliers=tuple(every.place(row) for row in wrong.nonzero()[:, 0].tolist()),

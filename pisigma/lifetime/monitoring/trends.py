@@ -17,13 +17,13 @@ from pisigma.lifetime.monitoring.history import Record
 from pisigma.lifetime.recalibration.movement import CLEAR, NORMAL_95
 from pisigma.measurement.sensors.sensor import SHOWN_UNITS, ShownUnit
 
-DAYS_PER_MONTH = 365.25 / 12
+_DAYS_PER_MONTH = 365.25 / 12
 """Mean length of a month [days]."""
-MIN_SESSIONS = 4
+_MIN_SESSIONS = 4
 """Sessions on different days from which a drift is estimated."""
-MIN_TEMPERATURE_SPREAD = 3.0
+_MIN_TEMPERATURE_SPREAD = 3.0
 """Standard deviation of the temperatures [K] above which a dependence on them is estimated."""
-MAX_MONTHS = 120.0
+_MAX_MONTHS = 120.0
 """Range of forecasts: ten years."""
 
 
@@ -173,7 +173,7 @@ def trends_of(revolute: Sequence[bool], records: Sequence[Record]) -> tuple[Tren
         revolute: whether each joint of the robot is revolute.
         records: sessions sorted by date.
     """
-    if len(torch.unique(months_of(records))) < MIN_SESSIONS:
+    if len(torch.unique(months_of(records))) < _MIN_SESSIONS:
         return ()
     overs, trends = _overs(records), list[Trend]()
     for joint in range(len(revolute)):
@@ -196,7 +196,7 @@ def jumps_of(revolute: Sequence[bool], records: Sequence[Record]) -> tuple[Jump,
         revolute: whether each joint of the robot is revolute.
         records: sessions sorted by date.
     """
-    if len(torch.unique(months_of(records))) < MIN_SESSIONS:
+    if len(torch.unique(months_of(records))) < _MIN_SESSIONS:
         return ()
     overs, jumps = _overs(records), list[Jump]()
     for joint in range(len(revolute)):
@@ -223,7 +223,7 @@ def _overs(records: Sequence[Record]) -> list[tuple[Literal["month", "kelvin"], 
         [math.nan if one.temperature_c is None else one.temperature_c for one in records], dtype=torch.float64
     )
     overs: list[tuple[Literal["month", "kelvin"], Tensor]] = [("month", months_of(records))]
-    if bool(torch.isfinite(temperature).all()) and float(temperature.std()) >= MIN_TEMPERATURE_SPREAD:
+    if bool(torch.isfinite(temperature).all()) and float(temperature.std()) >= _MIN_TEMPERATURE_SPREAD:
         overs.append(("kelvin", temperature))
     return overs
 
@@ -253,7 +253,7 @@ class _Zero:
         """Find the changes of a joint zero; None if too few sessions determine it."""
         values, covariance = _joint_values(records, joint)
         there = torch.isfinite(values).nonzero()[:, 0]
-        if len(there) < MIN_SESSIONS + len(overs) - 1:
+        if len(there) < _MIN_SESSIONS + len(overs) - 1:
             return None
         columns = [torch.ones(len(records), dtype=torch.float64), *(over - over.mean() for _, over in overs)]
         A = torch.stack(columns, 1)[there]
@@ -274,7 +274,7 @@ def forecast_of(records: Sequence[Record], limit_mm: float) -> Forecast:
     rms = torch.tensor([one.session.rms * 1e3 for one in records], dtype=torch.float64)
     passed = bool(rms[-1] > limit_mm)
     date = earliest = None
-    if not passed and bool((rms > 0).all()) and len(torch.unique(months)) >= MIN_SESSIONS:
+    if not passed and bool((rms > 0).all()) and len(torch.unique(months)) >= _MIN_SESSIONS:
         # The RMS of n values has a relative standard deviation of sqrt(1 / 2n).
         spread = rms * torch.tensor([math.sqrt(0.5 / one.session.values) for one in records]).double()
         # A jump must exceed the usual noise between sessions; the fit of the line estimates its scatter below.
@@ -301,7 +301,7 @@ def forecast_of(records: Sequence[Record], limit_mm: float) -> Forecast:
 def months_of(records: Sequence[Record]) -> Float64[Tensor, " sessions"]:
     """Compute the months since the first session."""
     days = [datetime.date.fromisoformat(one.date).toordinal() for one in records]
-    return (torch.tensor(days, dtype=torch.float64) - days[0]) / DAYS_PER_MONTH
+    return (torch.tensor(days, dtype=torch.float64) - days[0]) / _DAYS_PER_MONTH
 
 
 def _joint_values(records: Sequence[Record], joint: int) -> tuple[Tensor, Tensor]:
@@ -327,7 +327,7 @@ def _log_spread(record: Record) -> float:
 
 def _after(date: str, months: float) -> str | None:
     """Return the date some months after another; None beyond the range of forecasts."""
-    if months > MAX_MONTHS:
+    if months > _MAX_MONTHS:
         return None
-    days = datetime.timedelta(days=max(months, 0.0) * DAYS_PER_MONTH)
+    days = datetime.timedelta(days=max(months, 0.0) * _DAYS_PER_MONTH)
     return (datetime.date.fromisoformat(date) + days).isoformat()

@@ -22,12 +22,12 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import held_out_groups
 from pisigma.measurement.sensors.registry import measured_errors
 
-MAX_LINEARISATIONS = 5
-CONVERGENCE_TOLERANCE = 0.05
+_MAX_LINEARISATIONS = 5
+_CONVERGENCE_TOLERANCE = 0.05
 """RMS change of predicted values, over their noise, below which linearisation ends."""
 MAX_VALUES = 360
 """Largest number of values from which the sizes of the drift are estimated; the posterior uses all values."""
-FIRST_NOISE = {"m": 1e-4, "rad": 1e-4}
+_FIRST_NOISE = {"m": 1e-4, "rad": 1e-4}
 """Initial noise of sensors that the calibration did not have [m or rad]."""
 
 
@@ -135,7 +135,7 @@ def adapt(
     drift = start or Drift(problem.groups, usual)
     drift = replace(drift, groups=_with_sizes(problem.groups, drift.groups))
     rounds = 0
-    while rounds < MAX_LINEARISATIONS:
+    while rounds < _MAX_LINEARISATIONS:
         rounds += 1
         rows = linearise_rows(design, x, effective, group)
         values = replace(linear_values(problem, rows), wrong=wrong)
@@ -148,7 +148,7 @@ def adapt(
         # Convergence is judged by predicted values, as badly determined unknowns may still wander.
         step = values.X @ (mean + update.shift - x) / values.deviation(drift.noise)
         x, effective = mean + update.shift, update.effective
-        if float(step.square().mean().sqrt()) < CONVERGENCE_TOLERANCE:
+        if float(step.square().mean().sqrt()) < _CONVERGENCE_TOLERANCE:
             break
     return Adaptation(
         problem=problem,
@@ -171,7 +171,7 @@ def usual_noise(problem: RecalibrationProblem) -> Float64[Tensor, " sensors"]:
     """
     known = problem.posterior.noise
     sensors = problem.design.problem.sensors
-    first = [1.0 if sensor.sigma is not None else FIRST_NOISE[sensor.unit] for sensor in sensors]
+    first = [1.0 if sensor.sigma is not None else _FIRST_NOISE[sensor.unit] for sensor in sensors]
     usual = [known.noise_of_earlier_rows(sensor) for sensor in sensors]
     chosen = [new if old is None else old for old, new in zip(usual, first, strict=True)]
     return torch.tensor(chosen, dtype=torch.float64)

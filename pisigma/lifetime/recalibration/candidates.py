@@ -28,17 +28,17 @@ NAMES: dict[Kept, str] = {
     "old": "The old model with the frames of the new rows",
     "scratch": "A calibration from scratch",
 }
-OF_FLEET: dict[Kept, str] = NAMES | {
+_OF_FLEET: dict[Kept, str] = NAMES | {
     "recalibrated": "The calibration that starts from the fleet prior",
     "old": "The mean robot of the fleet with base and tool of the new rows",
 }
 """Names of the candidates if the model is a fleet prior."""
-FOLDS = 5
+_FOLDS = 5
 MIN_RATIO = 1.05
 """Ratio of RMS errors below which another candidate does not replace the recalibrated model."""
 CLEAR_RATIO = 2.0
 """Ratio of RMS errors above which a candidate is better, for any distribution of the errors."""
-OUTLIER_FACTOR = 5.0
+_OUTLIER_FACTOR = 5.0
 """Ratio to the median error above which rows that every candidate predicts badly are ignored."""
 
 
@@ -110,7 +110,7 @@ def choose_candidate(
         progress: called with the fold that is being predicted.
     """
     posterior, noise = whole.problem.posterior, whole.drift.noise
-    folds = min(FOLDS, int(groups_to_keep_whole(rows).max()) + 1)
+    folds = min(_FOLDS, int(groups_to_keep_whole(rows).max()) + 1)
     names = get_args(Kept)
     errors: dict[Kept, Tensor] = {name: torch.full((rows.rows,), torch.nan).double() for name in names}
     for number, (train, test) in enumerate(k_folds(rows, folds, 0) if folds > 1 else (), 1):
@@ -128,7 +128,7 @@ def choose_candidate(
                 errors[name][test] = pose_errors_of(candidate(), rows.select(test)).position
             except IdentificationError:  # too few rows to identify it
                 errors[name][test] = torch.inf
-    return replace(_decided(errors), names=OF_FLEET if model.kind == FLEET_PRIOR else NAMES)
+    return replace(_decided(errors), names=_OF_FLEET if model.kind == FLEET_PRIOR else NAMES)
 
 
 def _decided(errors: Mapping[Kept, Float64[Tensor, " rows"]]) -> CandidateChoice:
@@ -136,7 +136,7 @@ def _decided(errors: Mapping[Kept, Float64[Tensor, " rows"]]) -> CandidateChoice
     smallest = torch.stack(list(errors.values())).amin(0)
     judged = torch.isfinite(smallest)
     counted = (
-        judged & (smallest <= OUTLIER_FACTOR * smallest[judged].median()) if bool(judged.any()) else judged
+        judged & (smallest <= _OUTLIER_FACTOR * smallest[judged].median()) if bool(judged.any()) else judged
     )
     rms, p95 = dict[Kept, float | None](), dict[Kept, float | None]()
     for name, lengths in errors.items():

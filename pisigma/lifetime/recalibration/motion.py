@@ -25,7 +25,7 @@ from pisigma.validation.setup_faults.explanations import PLAUSIBLE_SHARE
 from pisigma.validation.setup_faults.nominal_robot_faults import evenly_spaced_rows, measured_rows
 from pisigma.validation.setup_faults.setup_faults import judged_values
 
-MAX_ROWS = 60
+_MAX_ROWS = 60
 """Largest number of rows that are used, because the covariance of all their values is needed."""
 
 
@@ -48,7 +48,7 @@ def judged_motion(
         some = judged_values(model, rows)
         if rows.position is not None:
             some = replace(
-                some.select(evenly_spaced_rows(measured_rows(rows), MAX_ROWS)), pair=None, distance=None
+                some.select(evenly_spaced_rows(measured_rows(rows), _MAX_ROWS)), pair=None, distance=None
             )
         some = posterior.with_model_names(some)
         with torch.no_grad():

@@ -29,7 +29,7 @@ from pisigma.validation.held_out.pose_statistics import image_deviation
 from pisigma.validation.setup_faults.explanations import PLAUSIBLE_SHARE
 
 KIND = "recalibration"
-SUSPICIOUS_FACTOR = 5.0
+_SUSPICIOUS_FACTOR = 5.0
 """Ratio of the errors of held-out rows to the scatter of positions in the calibration above which it is suspicious."""
 
 
@@ -162,7 +162,7 @@ def _large_errors(
             f"{missed}, more than {100 * PLAUSIBLE_SHARE:.0f} % of the reach of robot '{parent.robot.name}': another "
             "robot was measured, or columns or units are wrong; run `pisigma verify` on these rows."
         )
-    elif error > SUSPICIOUS_FACTOR * usual > 0 and parent.kind != FLEET_PRIOR:
+    elif error > _SUSPICIOUS_FACTOR * usual > 0 and parent.kind != FLEET_PRIOR:
         sentence = (
             f"{missed}, while single positions scattered by {usual * 1e3:.2g} mm when the model was made: rows may be "
             "wrong or from another robot, or more has changed than these few rows can determine. Check the rows with "

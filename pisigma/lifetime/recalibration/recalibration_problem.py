@@ -34,11 +34,11 @@ FrameKey = tuple[str, str]
 """Key of a base or a tool: ("base", frame) or ("tool", target)."""
 RELOCATION_PRIOR: dict[ParameterUnit, float] = {"m": 0.1, "rad": 0.1, "px": 100.0, "1": 1.0}
 """Prior standard deviation of a moved base, a moved tool or a new sensor unknown around its guess, by unit."""
-CORRECTION_SCALE = 10.0
+_CORRECTION_SCALE = 10.0
 """Drift of a correction at size 1, as a multiple of the RMS of its weights."""
-CORRECTION_PENALTY = 12.0
+_CORRECTION_PENALTY = 12.0
 """Penalty on a drift of the correction [nats], whose many weights explain errors of few rows by chance."""
-MOVEMENT_PENALTY = math.log(100)
+_MOVEMENT_PENALTY = math.log(100)
 """Penalty on a movement [nats]: prior odds of 1 to 100 that a given joint, base or tool moved since the calibration."""
 
 
@@ -260,9 +260,9 @@ def _groups(
                 groups.append(_relocated_group(space, f"{own.name} {owner}", index))
     if len(posterior.weights):
         index = torch.arange(parameters, len(root))
-        scale = CORRECTION_SCALE * posterior.rms_weights
+        scale = _CORRECTION_SCALE * posterior.rms_weights
         groups.append(
-            DriftGroup("correction", index, scale, log_prior_penalty=CORRECTION_PENALTY, single=False)
+            DriftGroup("correction", index, scale, log_prior_penalty=_CORRECTION_PENALTY, single=False)
         )
     return tuple(group for group in groups if len(group.index))
 
@@ -305,10 +305,10 @@ def movement_hypotheses(problem: RecalibrationProblem) -> tuple[DriftGroup, ...]
         if group.fixed_size:
             continue
         if group.what not in ("lengths", "angles"):
-            single.append(replace(group, log_prior_penalty=MOVEMENT_PENALTY))
+            single.append(replace(group, log_prior_penalty=_MOVEMENT_PENALTY))
             continue
         for index, scale in zip(group.index, group.scale, strict=True):
-            penalty = MOVEMENT_PENALTY + math.log(10 * len(group.index))
+            penalty = _MOVEMENT_PENALTY + math.log(10 * len(group.index))
             single.append(
                 DriftGroup(parameters[int(index)].name, index[None], scale[None], log_prior_penalty=penalty)
             )

@@ -12,7 +12,7 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.model_posterior import ModelPosterior
 
-MAX_ROWS = 30
+_MAX_ROWS = 30
 """Largest number of rows that are used for the decision."""
 MIN_MOVE = 1e-3
 """Size of the drift [m, or share of the reach] below which a base or a tool was not moved."""
@@ -37,8 +37,8 @@ def relocated_frames(
     Raises:
         IdentificationError: see `recalibration_problem`.
     """
-    if rows.rows > MAX_ROWS and rows.pair is None:
-        rows = rows.select(randomly_chosen_rows(rows.rows, MAX_ROWS).sort().values)
+    if rows.rows > _MAX_ROWS and rows.pair is None:
+        rows = rows.select(randomly_chosen_rows(rows.rows, _MAX_ROWS).sort().values)
     bases, tools = known_frames(posterior, rows)
 
     def evidence(relocated: Set[FrameKey]) -> float:

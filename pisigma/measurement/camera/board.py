@@ -18,7 +18,7 @@ Dictionary = Literal[
 ]  # fmt: skip
 """Name of OpenCV's dictionary of the markers in the white squares of a ChArUco board."""
 TagFamily = Literal["tag16h5", "tag25h9", "tag36h10", "tag36h11"]
-TAG_CELLS = {"tag16h5": 6, "tag25h9": 7, "tag36h10": 8, "tag36h11": 8}
+_TAG_CELLS = {"tag16h5": 6, "tag25h9": 7, "tag36h10": 8, "tag36h11": 8}
 """Number of cells along the side of a tag, including its border."""
 RULER = 100.0
 """Length of the line by which the scale of a printed board is checked [mm]."""
@@ -158,7 +158,7 @@ class Board:
     def clearance(self) -> float:
         """Width of the uniformly black or white areas on both sides of an edge, relative to the edge's length."""
         if self.kind == "apriltag":
-            return 1.0 / TAG_CELLS[self.dictionary]
+            return 1.0 / _TAG_CELLS[self.dictionary]
         return 0.4 if self.kind == "checkerboard" else (1 - self.marker / self.square) / 2
 
     @property

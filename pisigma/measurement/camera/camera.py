@@ -19,9 +19,9 @@ USUAL_DEVIATIONS = (0.5, 0.5, 1.0, 1.0, 0.002, 0.01, 2e-4, 2e-4, 0.0)
 """Standard deviations of the intrinsics after a typical calibration, with 0 for k3, which is seldom estimated."""
 
 Positive = Annotated[float, Field(gt=0)]
-UNDISTORTED = 1e-14
+_UNDISTORTED = 1e-14
 """Newton step below which the undistorted point has converged up to rounding."""
-MAX_UNDISTORT_ITERATIONS = 20
+_MAX_UNDISTORT_ITERATIONS = 20
 """Largest number of Newton iterations from a distorted to the undistorted point; ordinary lenses need four."""
 
 
@@ -257,11 +257,11 @@ class Camera:
         """Return x / z and y / z of the rays of pixels, by Newton's method."""
         distorted = (pixels - (self.cx, self.cy)) / (self.fx, self.fy)
         xy = distorted.copy()
-        for _ in range(MAX_UNDISTORT_ITERATIONS):
+        for _ in range(_MAX_UNDISTORT_ITERATIONS):
             now, derivative = self._distorted(xy)
             step = np.linalg.solve(derivative, (distorted - now)[..., None])[..., 0]
             xy += step
-            if not np.abs(step).max(initial=0.0) > UNDISTORTED:
+            if not np.abs(step).max(initial=0.0) > _UNDISTORTED:
                 break
         return xy
 

@@ -9,7 +9,7 @@ from pisigma.files.errors import IdentificationError, MeasurementError, check_ch
 from pisigma.files.setting import KEY, Option, as_texts
 
 IntrinsicsChoice = Literal["fixed", "prior", "free"]
-MAX_REPEATABILITY = 0.01, 0.105
+_MAX_REPEATABILITY = 0.01, 0.105
 """Largest repeatability [m] and [rad]; larger values must be in another unit."""
 
 
@@ -27,7 +27,7 @@ class Repeatability:
 
     def __post_init__(self) -> None:
         """Check both standard deviations."""
-        if not (0 <= self.length <= MAX_REPEATABILITY[0] and 0 <= self.angle <= MAX_REPEATABILITY[1]):
+        if not (0 <= self.length <= _MAX_REPEATABILITY[0] and 0 <= self.angle <= _MAX_REPEATABILITY[1]):
             raise IdentificationError(
                 option="repeatability",
                 expected="standard deviations of 0 to 10 mm and 0 to 6 deg",

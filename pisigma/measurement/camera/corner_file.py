@@ -25,13 +25,13 @@ from pisigma.measurement.fields import MeasuredFields
 from pisigma.measurement.sensors.intrinsics import NOISE_COLUMN
 from pisigma.robot.description import Robot
 
-SAME_JOINTS = 1e-9
+_SAME_JOINTS = 1e-9
 """Largest difference between the joint values in the rows of one image [rad or m]."""
-RESOLUTION_IMAGES = 8
+_RESOLUTION_IMAGES = 8
 """Smallest number of images of which some must show corners outside the upper left quarter of the field of view."""
-CONDITIONS = ("split", "payload", "temperature", "approach", "torque", "date")
+_CONDITIONS = ("split", "payload", "temperature", "approach", "torque", "date")
 """Fields that rows of corners may have in addition to joint values and pixels."""
-IMAGE_COLUMNS = (*CORNERS, "sigma_px", "camera", "board")
+_IMAGE_COLUMNS = (*CORNERS, "sigma_px", "camera", "board")
 """Columns that only rows of corners have."""
 
 MeasurementFiles = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
@@ -80,7 +80,7 @@ def corners_of(table: Table, robot: Robot, files: CameraFiles) -> Measurements:
             files.repeatability,
             files.intrinsics,
         )
-        conditions = {name: getattr(stated.select(first), name) for name in CONDITIONS}
+        conditions = {name: getattr(stated.select(first), name) for name in _CONDITIONS}
         measured.append(replace(solved, **conditions))
     joined = join([one for one in measured if one.rows])
     return joined.select(torch.tensor(joined.line).argsort(stable=True))
@@ -207,7 +207,7 @@ def _without_corners(table: Table, is_corner: Sequence[bool]) -> Table:
     """
     unit = "m" if "x_m" in table.header else "mm"
     position = tuple(f"{axis}_{unit}" for axis in POSITION)
-    left = [number for number, name in enumerate(table.header) if name not in (*IMAGE_COLUMNS, *position)]
+    left = [number for number, name in enumerate(table.header) if name not in (*_IMAGE_COLUMNS, *position)]
     index = {name: number for number, name in enumerate(table.header)}
     records = []
     for row, fields in enumerate(table.records):
@@ -235,7 +235,7 @@ def _images(
         of_image.setdefault(name, []).append(row)
     for name, chosen in of_image.items():
         _check_image(table, name, chosen, rows.q, number)
-    if len(of_image) >= RESOLUTION_IMAGES:
+    if len(of_image) >= _RESOLUTION_IMAGES:
         _check_resolution(table, pixels, camera)
     first = torch.tensor([chosen[0] for chosen in of_image.values()])
     images = Images(
@@ -328,7 +328,7 @@ def _check_image(
             at=replace(at, column="corner"),
             remedy="give every image a different name",
         )
-    if float((q[rows] - q[rows[0]]).abs().max()) > SAME_JOINTS:
+    if float((q[rows] - q[rows[0]]).abs().max()) > _SAME_JOINTS:
         raise MeasurementError(
             "the rows of the image have different joint values",
             at=replace(at, column="image"),

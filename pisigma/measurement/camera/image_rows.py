@@ -36,13 +36,13 @@ from pisigma.measurement.sensors.intrinsics import (
 )
 from pisigma.robot.se3 import skew
 
-MAX_BEND_ITERATIONS = 4
+_MAX_BEND_ITERATIONS = 4
 """Largest number of iterations of the board's shape for given intrinsics; usually the second step is near rounding."""
-BEND_TOLERANCE = 1e-6
+_BEND_TOLERANCE = 1e-6
 """Change of the board's shape [m] below which the iteration ends."""
 MAX_MEDIAN_RESIDUAL = 10.0
 """Median residual of an image's corners [px] above which they cannot be corners of the board."""
-SHAPES = 3
+_SHAPES = 3
 """Number of shapes of a bent board, see `bend_shapes`."""
 
 
@@ -102,7 +102,7 @@ def image_measurements(
     Raises:
         MeasurementError: the corners of an image do not fit the board.
     """
-    loss, bend = HampelLoss(), np.zeros(SHAPES)
+    loss, bend = HampelLoss(), np.zeros(_SHAPES)
 
     def solve(present: Camera) -> list[BoardPose]:
         nonlocal bend
@@ -162,7 +162,7 @@ def _board_poses(
         MeasurementError: the corners of an image do not fit the board.
     """
     observed = images.corners, images.pixels, images.relative_sigma
-    for _ in range(MAX_BEND_ITERATIONS):
+    for _ in range(_MAX_BEND_ITERATIONS):
         corners = bent_corners(board, bend)
         poses = [
             solve_board_pose(camera, corners[number], pixels, loss, sigma)
@@ -173,7 +173,7 @@ def _board_poses(
             break
         before, noise = bend, corner_noise(poses, loss)
         bend = update_bend(bend, board, camera, *observed, poses, noise)
-        if np.abs(bend - before).max() < BEND_TOLERANCE:
+        if np.abs(bend - before).max() < _BEND_TOLERANCE:
             break
     return poses, bend
 
@@ -271,7 +271,7 @@ def update_bend(
     """
     of_corner, corners = bend_shapes(board), bent_corners(board, bend)
     prior = max(noise, MIN_NOISE) / (board.flatness / 2)
-    rows = [np.concatenate([prior * np.eye(SHAPES), -prior * bend[:, None]], 1)]
+    rows = [np.concatenate([prior * np.eye(_SHAPES), -prior * bend[:, None]], 1)]
     for number, at, deviation, pose in zip(numbers, pixels, sigma, poses, strict=True):
         residual, J, by_point = linearise_pixels(camera, corners[number], at, deviation, pose.R, pose.t)
         by_height = (by_point @ pose.R[:, 2])[..., None] * of_corner[number][:, None]

@@ -22,19 +22,19 @@ from pisigma.measurement.camera.camera_files import IntrinsicsChoice
 from pisigma.measurement.sensors.intrinsics import ImageIntrinsics, intrinsics_information
 
 MAX_ITERATIONS = 20
-CONVERGENCE_TOLERANCE = 0.1
+_CONVERGENCE_TOLERANCE = 0.1
 """Change of the intrinsics, in standard deviations, below which they are not linearised again."""
-FREE_FOCAL, FREE_CENTRE = 0.05, 0.05
+_FREE_FOCAL, _FREE_CENTRE = 0.05, 0.05
 """Prior standard deviations of free focal lengths and principal points, relative to focal length and image width;
 lenses vary less."""
-FREE_DISTORTION = (0.3, 1.0, 0.01, 0.01, 3.0)
+_FREE_DISTORTION = (0.3, 1.0, 0.01, 0.01, 3.0)
 """Prior standard deviations of k1, k2, p1, p2 and k3 if they are free."""
-MIN_IMAGES = 3
-UNINFORMATIVE = 10.0
+_MIN_IMAGES = 3
+_UNINFORMATIVE = 10.0
 """Factor on the prior standard deviations of free intrinsics that makes the prior negligible relative to the images."""
 FIRST = ("fx", "fy", "k1")
 """Intrinsics that are estimated first."""
-CELLS = 8
+_CELLS = 8
 """Number of rows and columns of cells of an image, for its coverage by the board."""
 
 
@@ -48,10 +48,10 @@ def prior_deviations(camera: Camera, choice: IntrinsicsChoice) -> Float64[np.nda
     """
     stated = np.array(camera.sigma or USUAL_DEVIATIONS)
     wide = [
-        FREE_FOCAL * camera.fx,
-        FREE_FOCAL * camera.fy,
-        *[FREE_CENTRE * camera.width] * 2,
-        *FREE_DISTORTION,
+        _FREE_FOCAL * camera.fx,
+        _FREE_FOCAL * camera.fy,
+        *[_FREE_CENTRE * camera.width] * 2,
+        *_FREE_DISTORTION,
     ]
     free: np.ndarray = np.where(stated > 0, np.maximum(wide, stated), 0.0)
     return {"fixed": np.zeros(len(INTRINSICS)), "prior": stated, "free": free}[choice]
@@ -117,7 +117,7 @@ def solve_images(
         if not sigma.any():
             return solved
         root, mean = intrinsics_information(solved.intrinsics)
-        if np.linalg.norm(root @ (mean - present.intrinsics)) < CONVERGENCE_TOLERANCE:
+        if np.linalg.norm(root @ (mean - present.intrinsics)) < _CONVERGENCE_TOLERANCE:
             return solved
         if not (np.isfinite(mean).all() and (mean[:2] > 0).all()):
             break
@@ -191,9 +191,9 @@ def calibrate_intrinsics(
     Raises:
         MeasurementError: the images do not determine the intrinsics.
     """
-    if len(views) < MIN_IMAGES:
+    if len(views) < _MIN_IMAGES:
         raise MeasurementError(
-            expected=f"{MIN_IMAGES} or more images of the board",
+            expected=f"{_MIN_IMAGES} or more images of the board",
             value=len(views),
             remedy="take 20, tilted by up to 40 deg",
         )
@@ -251,7 +251,7 @@ def _solved(
     views: Sequence[BoardView], start: Camera, names: Collection[str], loss: AbstractLoss
 ) -> SolvedImages:
     """Solve all poses and the intrinsics in `names`; other intrinsics are fixed."""
-    sigma = UNINFORMATIVE * prior_deviations(replace(start, sigma=(1.0,) * len(INTRINSICS)), "free")
+    sigma = _UNINFORMATIVE * prior_deviations(replace(start, sigma=(1.0,) * len(INTRINSICS)), "free")
     sigma *= [name in names for name in INTRINSICS]
 
     def poses(camera: Camera) -> list[BoardPose]:
@@ -262,8 +262,8 @@ def _solved(
 
 def _covered(views: Sequence[BoardView], size: tuple[int, int]) -> Bool[np.ndarray, "cells cells"]:
     """Return for every cell of the image whether it contains a corner of any view."""
-    covered = np.zeros((CELLS, CELLS), dtype=bool)
+    covered = np.zeros((_CELLS, _CELLS), dtype=bool)
     for view in views:
-        cell = np.clip(CELLS * (view.pixels + 0.5) / size, 0, CELLS - 1).astype(int)
+        cell = np.clip(_CELLS * (view.pixels + 0.5) / size, 0, _CELLS - 1).astype(int)
         covered[cell[:, 1], cell[:, 0]] = True
     return covered

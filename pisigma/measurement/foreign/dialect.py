@@ -13,11 +13,11 @@ from typing import Literal, get_args
 from pisigma.files.errors import MeasurementError, Place
 from pisigma.measurement.csv.table import SPREADSHEET_ERRORS
 
-SEPARATORS = ("\t", ";", ",", "|", " ")
+_SEPARATORS = ("\t", ";", ",", "|", " ")
 """Separators of cells; a space stands for any number of spaces and tabs."""
-SAMPLED_LINES = 300
+_SAMPLED_LINES = 300
 """Number of lines from which the format is recognised."""
-MAX_COLUMNS = 2000
+_MAX_COLUMNS = 2000
 _BLANKS = 0.8
 """Weight of spaces as separators; it is small, because names contain spaces, too."""
 _SMALL, _FAR = 20.0, 200.0
@@ -26,7 +26,9 @@ mm, and no measured position is 200,000 mm away."""
 COMMENT = re.compile(r"\s*(?://|#|%|!|\*\*|--|;|'|REM\b)\s*")
 """Texts with which comments start; rows may start with them, too."""
 Decimal = Literal[".", ","]
-MISSING = frozenset(("", "-", "--", "---", "*", "n/a", "na", "nan", "null", "none", "nil", "n.a.", "missing"))
+_MISSING = frozenset(
+    ("", "-", "--", "---", "*", "n/a", "na", "nan", "null", "none", "nil", "n.a.", "missing")
+)
 """Texts of cells without a measured value, in lower case."""
 _SPACES = " \u00a0\u2009\u202f'\u2019"
 """Separators of thousands other than points and commas."""
@@ -89,7 +91,7 @@ def _pattern(decimal: Decimal) -> re.Pattern[str]:
 
 def is_missing(cell: str) -> bool:
     """Return whether the text of a cell states that nothing was measured."""
-    return cell.strip().lower() in MISSING
+    return cell.strip().lower() in _MISSING
 
 
 @dataclass(frozen=True)
@@ -97,7 +99,7 @@ class Dialect:
     """Format of an exported file.
 
     Attributes:
-        separator: separator of cells, one of `SEPARATORS`.
+        separator: separator of cells, one of `_SEPARATORS`.
         numbers: format of numbers.
     """
 
@@ -122,7 +124,7 @@ class Dialect:
 
     def is_row(self, cells: Sequence[str]) -> bool:
         """Return whether cells are a row: two or more numbers, or one number with markers of missing values."""
-        if not 2 <= len(cells) <= MAX_COLUMNS:
+        if not 2 <= len(cells) <= _MAX_COLUMNS:
             return False
         if cells[0].startswith(("#", "%", ";", "!")):
             return cells[0] in SPREADSHEET_ERRORS
@@ -137,7 +139,7 @@ class Dialect:
 def detect_dialect(lines: Sequence[tuple[int, str]], source: str, decimal: Decimal | None = None) -> Dialect:
     """Find the separator and the decimal sign for which most cells of most lines are numbers.
 
-    Of equally good formats the first is returned, in the order of `SEPARATORS` and with points first.
+    Of equally good formats the first is returned, in the order of `_SEPARATORS` and with points first.
 
     Args:
         lines: line numbers and texts of the lines of the file that are not blank.
@@ -147,12 +149,12 @@ def detect_dialect(lines: Sequence[tuple[int, str]], source: str, decimal: Decim
     Raises:
         MeasurementError: no format results in a table of numbers, or the decimal sign is ambiguous.
     """
-    half = SAMPLED_LINES // 2
+    half = _SAMPLED_LINES // 2
     sampled = [*lines[:half], *lines[half:][-half:]]
     sample = [line for _, line in sampled]
     signs = (decimal,) if decimal else get_args(Decimal)
     choices = [
-        Dialect(separator, NumberFormat(sign)) for separator, sign in itertools.product(SEPARATORS, signs)
+        Dialect(separator, NumberFormat(sign)) for separator, sign in itertools.product(_SEPARATORS, signs)
     ]
     scores = [_score(dialect, sample) for dialect in choices]
     best = max(scores)

@@ -16,20 +16,20 @@ from pisigma.files.input_file import read_text
 if TYPE_CHECKING:
     import pyarrow
 
-INFO = Path("meta", "info.json")
-VERSIONS = ("v2.1", "v3.0")
-STATE, ACTION = "observation.state", "action"
-POSITION = ".pos"
+_INFO = Path("meta", "info.json")
+_VERSIONS = ("v2.1", "v3.0")
+STATE, _ACTION = "observation.state", "action"
+_POSITION = ".pos"
 """End of the names of positions; velocities and torques end in ".vel" and ".torque"."""
-GRIPPER, SHADOW = "gripper", "_shadow"
+_GRIPPER, _SHADOW = "gripper", "_shadow"
 """Ends of the names of motors that LeRobot counts as joints, although they are none."""
-SIDES = ("left_", "right_")
+_SIDES = ("left_", "right_")
 """Prefixes of the two arms of LeRobot's pairs."""
 
 
 def is_lerobot_dataset(path: str | os.PathLike[str]) -> bool:
     """Return whether a folder has the description of a LeRobot data set."""
-    return (Path(path) / INFO).is_file()
+    return (Path(path) / _INFO).is_file()
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,9 +38,9 @@ class LeRobotDataset:
 
     Attributes:
         folder: its folder.
-        version: layout, one of `VERSIONS`.
+        version: layout, one of `_VERSIONS`.
         fps: frames per second.
-        names: names of the values of every feature of joint values (`STATE`, `ACTION`), in their order.
+        names: names of the values of every feature of joint values (`STATE`, `_ACTION`), in their order.
         files: Parquet files of the frames, in the order of the episodes.
     """
 
@@ -57,9 +57,9 @@ class LeRobotDataset:
         Raises:
             MeasurementError: it is missing, has another layout, or does not name its joint values.
         """
-        at = Place(Path(folder) / INFO)
+        at = Place(Path(folder) / _INFO)
         try:
-            info = json.loads(read_text(Path(folder) / INFO, MeasurementError, "JSON"))
+            info = json.loads(read_text(Path(folder) / _INFO, MeasurementError, "JSON"))
             version, fps, features = info["codebase_version"], float(info["fps"]), dict(info["features"])
         except (ValueError, KeyError, TypeError) as problem:
             if isinstance(problem, MeasurementError):
@@ -67,17 +67,17 @@ class LeRobotDataset:
             raise MeasurementError(
                 expected="codebase_version, fps and features of a LeRobot data set", value=str(problem), at=at
             ) from None
-        if version not in VERSIONS:
+        if version not in _VERSIONS:
             raise MeasurementError(
-                expected=f"a data set of layout {' or '.join(VERSIONS)}",
+                expected=f"a data set of layout {' or '.join(_VERSIONS)}",
                 value=version,
                 at=at,
                 remedy="convert it with LeRobot",
             )
-        names = {key: _value_names(features[key], key, at) for key in (STATE, ACTION) if key in features}
+        names = {key: _value_names(features[key], key, at) for key in (STATE, _ACTION) if key in features}
         files = tuple(sorted((Path(folder) / "data").glob("chunk-*/*.parquet")))
         if not names or not files:
-            missing = f"the feature {STATE} or {ACTION}" if files else "Parquet files under data/"
+            missing = f"the feature {STATE} or {_ACTION}" if files else "Parquet files under data/"
             raise MeasurementError(expected=missing, at=at)
         return LeRobotDataset(Path(folder), version, fps, names, files)
 
@@ -144,19 +144,19 @@ def joint_motors(names: Sequence[str], prefix: str = "") -> dict[str, int]:
     Raises:
         MeasurementError: a motor appears twice, or the values are those of two arms and no prefix is given.
     """
-    suffix = POSITION if any(name.endswith(POSITION) for name in names) else ""
+    suffix = _POSITION if any(name.endswith(_POSITION) for name in names) else ""
     motors: dict[str, int] = {}
     for index, name in enumerate(names):
         bare = name.removeprefix("main_").removesuffix(suffix)  # "main_" is older than LeRobot 0.2
         if not name.endswith(suffix) or "." in bare or not bare.startswith(prefix):
             continue
         motor = bare.removeprefix(prefix)
-        if motor.endswith((GRIPPER, SHADOW)):
+        if motor.endswith((_GRIPPER, _SHADOW)):
             continue
         if motor in motors:
             raise MeasurementError("a motor appears twice", value=", ".join(names), option="names")
         motors[motor] = index
-    sides = [side for side in SIDES if any(motor.startswith(side) for motor in motors)]
+    sides = [side for side in _SIDES if any(motor.startswith(side) for motor in motors)]
     if len(sides) > 1:
         raise MeasurementError(
             "the values are those of two arms",

@@ -20,9 +20,9 @@ TICKS = 4096
 """Positions per turn of the 12-bit encoders of Feetech STS3215, Dynamixel XL330 and XL430 servos."""
 DAMIAO = re.compile(r"joint_\d+")
 """Names of OpenArm's motors, which send degrees themselves; their zero is set in the motor, not by a range."""
-BEYOND_RANGE = 10.0
+_BEYOND_RANGE = 10.0
 """Largest angle by which a motor leaves the range that was recorded for it by hand [deg]."""
-NORMALIZED = 200.0
+_NORMALIZED = 200.0
 """Length of the interval from -100 to 100."""
 
 
@@ -117,11 +117,11 @@ def check_values(
         MeasurementError: a value is not possible.
     """
     for name, column in zip(names, values.T, strict=True):
-        limit, remedy = NORMALIZED / 2, "state units=degrees if they are degrees"
+        limit, remedy = _NORMALIZED / 2, "state units=degrees if they are degrees"
         if units == "degrees":
             if motors is None or name not in motors or DAMIAO.fullmatch(name):
                 continue
-            limit = (motors[name].range_max - motors[name].range_min) / 2 * 360 / (TICKS - 1) + BEYOND_RANGE
+            limit = (motors[name].range_max - motors[name].range_min) / 2 * 360 / (TICKS - 1) + _BEYOND_RANGE
             remedy = "give the calibration file with which the values were recorded"
         largest = float(np.abs(column).max(initial=0.0))
         if largest > limit:
@@ -167,4 +167,4 @@ def radians_per_unit(units: LeRobotUnits, name: str, motors: Mapping[str, Motor]
             option="calibration",
             remedy="record degrees, or set drive_mode to 0 and reverse the joint of the robot",
         )
-    return (motor.range_max - motor.range_min) / NORMALIZED * 2 * math.pi / TICKS
+    return (motor.range_max - motor.range_min) / _NORMALIZED * 2 * math.pi / TICKS

@@ -11,7 +11,7 @@ from pisigma.measurement.foreign.units import UNITS, UnitKind
 
 LEFT_OUT = "-"
 """Target of a column that a mapping omits; in front of a target it reverses the sign: "-q4_deg"."""
-ALTHOUGH = "!"
+_ALTHOUGH = "!"
 """Mark after a target in a mapping: the column is in this unit although its heading states another one ("x_in!")."""
 KEYS = ("point", "time")
 """Quantities by which rows of two files are joined; they are not in measurement files."""
@@ -62,7 +62,7 @@ class Target:
         """Text of the target for `--map`."""
         named = measurement_column(self.quantity, self.unit)
         named = named or "_".join(filter(None, (self.quantity, self.unit)))
-        return f"{LEFT_OUT * self.is_reversed}{named}{ALTHOUGH * self.overrides}"
+        return f"{LEFT_OUT * self.is_reversed}{named}{_ALTHOUGH * self.overrides}"
 
     @property
     def missing_unit_kind(self) -> UnitKind | None:
@@ -133,14 +133,14 @@ def parse_target(text: str, heading: str) -> Target:
     """
     if text in ("", LEFT_OUT):
         return Target(LEFT_OUT)
-    name, is_reversed = text.removeprefix(LEFT_OUT).removesuffix(ALTHOUGH), text.startswith(LEFT_OUT)
+    name, is_reversed = text.removeprefix(LEFT_OUT).removesuffix(_ALTHOUGH), text.startswith(LEFT_OUT)
     column = find_column(name)
     known = () if column is None else ((column.quantity, "", column.unit),)
     for quantity, _, unit in (*known, (name, "", ""), name.rpartition("_")):
         is_quantity = bool(known) or quantity in _quantities() or is_joint(quantity)
         has_sign = unit_kind(quantity) in ("angle", "length") or not is_reversed
         if is_quantity and has_sign and (not unit or unit in UNITS) and fits_unit(quantity, unit):
-            return Target(quantity, unit, is_reversed, text.endswith(ALTHOUGH))
+            return Target(quantity, unit, is_reversed, text.endswith(_ALTHOUGH))
     choices = {"q1_deg", "x_mm", "y_mm", "z_mm", "time_s", LEFT_OUT, *_quantities()}
     raise MeasurementError(
         f"unknown target '{text}' of the column '{heading}'",

@@ -30,11 +30,11 @@ from pisigma.robot.kinematics.parameter_jacobian import ToolMotion
 ANCHOR_COLUMNS = ("x", "y", "z", "zero")
 MIN_DISTANCES = 5
 """Smallest number of distances for an initial guess of an anchor's position and zero offset."""
-ITERATIONS = 30
+_ITERATIONS = 30
 """Number of damped least-squares steps after the linear solution."""
 MAX_NOMINAL_ERROR = 0.05
 """Largest plausible position error of the nominal robot, as a share of the reach."""
-MAX_COMPARED = 1_024
+_MAX_COMPARED = 1_024
 """Largest number of distances that are compared with each other."""
 
 
@@ -195,7 +195,7 @@ def _refined(p: Tensor, d: Tensor, unknown: Tensor) -> tuple[Tensor, Tensor]:
 
     residual, J = linearised(unknown)
     damping = torch.full_like(unknown[..., :1], 1e-6)
-    for _ in range(ITERATIONS):
+    for _ in range(_ITERATIONS):
         normal = J.mT @ J
         damped = normal + torch.diag_embed(damping * normal.diagonal(dim1=-2, dim2=-1))
         trial = unknown + torch.linalg.solve(damped, J.mT @ residual[..., None])[..., 0]
@@ -231,7 +231,7 @@ def _check_wire(
             remedy="measure more poses from it, spread over the workspace",
         )
     assert measurements.distance is not None
-    rows, points = rows[:MAX_COMPARED], points[:MAX_COMPARED]
+    rows, points = rows[:_MAX_COMPARED], points[:_MAX_COMPARED]
     distance = measurements.distance.cpu()[rows]
     excess = (distance[:, None] - distance).abs() - torch.cdist(points, points) - MAX_NOMINAL_ERROR * reach
     wrong = (excess > 0).sum(1)

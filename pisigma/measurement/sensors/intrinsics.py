@@ -34,14 +34,14 @@ COLUMNS = tuple(
     ReadingColumn(name, is_text=True, is_optional=True)
     for name in (CAMERA_COLUMN, INTRINSICS_COLUMN, SCALE_COLUMN)
 )
-PIXELS: tuple[str, ...] = ("fx", "fy", "cx", "cy")
+_PIXELS: tuple[str, ...] = ("fx", "fy", "cx", "cy")
 CAMERA_UNITS: dict[str, OtherUnit] = {
-    name: "px" if name in PIXELS else "1" for name in (*PIXELS, "k1", "k2", "p1", "p2", "k3")
+    name: "px" if name in _PIXELS else "1" for name in (*_PIXELS, "k1", "k2", "p1", "p2", "k3")
 }
 NUMBERS = len(CAMERA_UNITS)
-UNINFORMATIVE = 1e3
+_UNINFORMATIVE = 1e3
 """Factor on given standard deviations that makes the prior negligible relative to the images."""
-USUAL_SCALE = 1e-3
+_USUAL_SCALE = 1e-3
 """Relative standard deviation of a board's scale if the board file does not state it: the error of printers and
 paper."""
 
@@ -123,7 +123,7 @@ def without_stated_priors(measurements: Measurements, counted: Mapping[str, Coll
     stated, scales = (texts_of(measurements, name) for name in (INTRINSICS_COLUMN, SCALE_COLUMN))
     images, names = ImageIntrinsics.from_texts(stated), cameras(measurements) or ("",) * len(stated)
     is_counted = np.array([name in counted.get("camera", ()) for name in names])
-    images = replace(images, sigma=np.where(is_counted[:, None], UNINFORMATIVE, 1.0) * images.sigma)
+    images = replace(images, sigma=np.where(is_counted[:, None], _UNINFORMATIVE, 1.0) * images.sigma)
     texts = {
         INTRINSICS_COLUMN: tuple(
             text if name else "" for name, text in zip(names, images.texts, strict=True)
@@ -178,7 +178,7 @@ def scale_deviations(measurements: Measurements) -> Float64[Tensor, " boards"]:
     """
     names, stated = boards(measurements), texts_of(measurements, SCALE_COLUMN)
     other_lengths = bool((~measurements.is_measured("corner") & ~measurements.is_measured("rotation")).any())
-    usual = USUAL_SCALE if other_lengths else 0.0
+    usual = _USUAL_SCALE if other_lengths else 0.0
     texts = [stated[(names or ()).index(board)] for board in distinct_names(names)]
     return torch.tensor([float(text) if text else usual for text in texts], dtype=torch.float64)
 

@@ -10,7 +10,7 @@ from pisigma.measurement.sensors.sensor import AbstractSensor, Derivative, Senso
 from pisigma.robot.kinematics.parameter_jacobian import ToolMotion
 from pisigma.robot.se3 import rotation_vector
 
-NEARLY_OPPOSITE = -0.99
+_NEARLY_OPPOSITE = -0.99
 """Cosine of the rotation angle below which the axis is computed from the symmetric part."""
 
 
@@ -104,7 +104,7 @@ def rotation_difference(
     """
     twice_sine_axis = torch.linalg.cross(predicted, measured, dim=0).sum(1)
     cosine = ((measured * predicted).sum((0, 1)) - 1) / 2
-    if bool((cosine < NEARLY_OPPOSITE).any()):
+    if bool((cosine < _NEARLY_OPPOSITE).any()):
         return rotation_vector(torch.einsum("ijn,kjn->nik", measured, predicted)).t()
     # the vector part of R - R^T has the norm 2 sin, the trace is 1 + 2 cos; atan2 of both is accurate near 0 as well
     sine_square = twice_sine_axis.square().sum(0) / 4

@@ -33,7 +33,7 @@ from pisigma.robot.se3 import transform
 SENSORS: dict[str, type[AbstractSensor]] = {}
 """Classes of sensors by name, in the order of their residuals."""
 
-OUTLIER_FACTOR, MAX_ITERATIONS = 4.0, 3
+_OUTLIER_FACTOR, MAX_ITERATIONS = 4.0, 3
 """Residual relative to the owner's median above which a row is an outlier for the owner's unknowns, and number of
 iterations of the search for outliers."""
 
@@ -181,7 +181,7 @@ def _fitting_best(
         counted, kept = kept, kept.clone()
         for number in range(count):
             own = sensor.present & (owner == number)
-            kept[own] = size[own] <= OUTLIER_FACTOR * size[own].quantile(0.5)
+            kept[own] = size[own] <= _OUTLIER_FACTOR * size[own].quantile(0.5)
         if torch.equal(kept, counted):
             break
     values = torch.bincount(owner[sensor.present & counted], minlength=count) * sensor.components

@@ -25,7 +25,7 @@ SHOWN_UNITS: Mapping[str, tuple[ShownUnit, float]] = {
     "1": ("1", 1.0),
 }
 """For every unit, the unit in which figures are shown, and the conversion factor."""
-MIN_LENGTH = 1e-12
+_MIN_LENGTH = 1e-12
 """Lower bound of lengths in denominators [m]."""
 
 Unknowns = Mapping[str, Float64[Tensor, "columns owners"]]
@@ -300,5 +300,5 @@ def component_along(
 
 def unit_vectors(vectors: Float[Tensor, "3 poses"]) -> Float[Tensor, "3 poses"]:
     """Return the unit vectors of vectors [m]; 0 for zero vectors."""
-    directions: Tensor = vectors / vectors.norm(dim=0).clamp(min=MIN_LENGTH)
+    directions: Tensor = vectors / vectors.norm(dim=0).clamp(min=_MIN_LENGTH)
     return directions

@@ -30,10 +30,10 @@ from pisigma.robot.kinematics.parameter_jacobian import ToolMotion
 PairOfSockets = tuple[str, str]
 SOCKET_COLUMNS = ("x", "y", "z")
 
-MAX_SCATTER = 0.05
+_MAX_SCATTER = 0.05
 """Largest plausible scatter of the rows of one socket by the nominal robot, as a share of the reach."""
 
-OUTLIER_FACTOR = 4.0
+_OUTLIER_FACTOR = 4.0
 """Distance of a row from the median position, relative to the median distance, above which it is an outlier: about 6
 standard deviations."""
 
@@ -101,7 +101,7 @@ class SocketSensor(AbstractSensor):
         points, socket = T[socket >= 0, :3, 3], socket[socket >= 0]
         middle = group_means(points, socket, len(names))
         usual = float((points - middle[socket]).norm(dim=-1).median())
-        if usual > MAX_SCATTER * reach:
+        if usual > _MAX_SCATTER * reach:
             raise IdentificationError(
                 expected="the nominal robot to place the rows of a socket at one position",
                 value=f"a median distance of {usual * 1e3:.3g} mm from their mean",
@@ -118,7 +118,7 @@ class SocketSensor(AbstractSensor):
         rows = numbers_of(measurements.socket, (owner,), measurements.rows).to(T.device) == 0
         points = T[rows, :3, 3]
         off = (points - points.quantile(0.5, dim=0)).norm(dim=-1)
-        middle: Tensor = points[off <= OUTLIER_FACTOR * off.quantile(0.5)].mean(0)
+        middle: Tensor = points[off <= _OUTLIER_FACTOR * off.quantile(0.5)].mean(0)
         return middle
 
 

@@ -40,7 +40,7 @@ from pisigma.robot.description import Robot
 Shape = tuple[int | None, ...]
 """Expected shape of a tensor; None stands for any length."""
 
-ROUNDING = 1e-9
+_ROUNDING = 1e-9
 """Largest difference [m or rad] between the geometry in `model.yaml` and in the weights file."""
 
 DTYPES = {"coverage.joint": torch.int64, "rows.measured": torch.uint8, "uncertainty.numbers": torch.uint8}
@@ -204,7 +204,7 @@ def _exact(name: str, robot: Robot, tensors: Mapping[str, Tensor], same: Sequenc
     """Return the robot with the geometry of the weights file; parts in `same` must agree with the description."""
     values = {part: tensors[f"{name}.{part}"].numpy() for part in _GEOMETRY}
     for part in same:
-        if np.abs(values[part] - getattr(robot, part)).max() > ROUNDING:
+        if np.abs(values[part] - getattr(robot, part)).max() > _ROUNDING:
             raise MisfitError(
                 f"the tensor '{name}.{part}' differs from the geometry in the description",
                 file=WEIGHTS,
@@ -216,7 +216,7 @@ def _exact(name: str, robot: Robot, tensors: Mapping[str, Tensor], same: Sequenc
 def _with_limits(robot: Robot, limits: Tensor) -> Robot:
     """Return the robot with the exact joint limits of the weights file."""
     limited = _limited(robot)
-    if len(limits) and np.abs(limits.numpy() - robot.limits[limited]).max() > ROUNDING:
+    if len(limits) and np.abs(limits.numpy() - robot.limits[limited]).max() > _ROUNDING:
         raise MisfitError(
             "the tensor 'drawn.limits' differs from the joint limits in the description",
             file=WEIGHTS,

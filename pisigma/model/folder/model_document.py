@@ -17,7 +17,7 @@ from pisigma.robot.robot_file import RobotDocument
 
 FORMAT = 5
 """Format number that this version writes; `pisigma.model.folder.upgrade` converts folders of earlier formats."""
-MAX_FACTORS, MAX_UNITS = 100, 1000
+_MAX_FACTORS, _MAX_UNITS = 100, 1000
 """Largest number of factors of a product unit, and of product units of a network."""
 _CHECKSUM = re.compile(r"(.*^)sha256: ([0-9a-f]{64})\n", re.DOTALL | re.MULTILINE)
 
@@ -49,7 +49,7 @@ class GroupSection(Section):
     joints: Annotated[tuple[str, ...], Field(min_length=1)]
     inputs: Annotated[tuple[str, ...], Field(min_length=1)]
     orders: Annotated[
-        tuple[Annotated[int, Field(ge=1, le=MAX_FACTORS)], ...], Field(min_length=1, max_length=MAX_UNITS)
+        tuple[Annotated[int, Field(ge=1, le=_MAX_FACTORS)], ...], Field(min_length=1, max_length=_MAX_UNITS)
     ]
     reference: tuple[_Vector, _Vector, _Vector]
 
@@ -64,8 +64,8 @@ class LearnedSection(Section):
         tools: tools of the hybrid's geometry, by target.
     """
 
-    features: Annotated[tuple[_Feature, ...], Field(max_length=MAX_UNITS)]
-    orders: Annotated[tuple[Annotated[int, Field(ge=2, le=MAX_FACTORS)], ...], Field(max_length=MAX_UNITS)]
+    features: Annotated[tuple[_Feature, ...], Field(max_length=_MAX_UNITS)]
+    orders: Annotated[tuple[Annotated[int, Field(ge=2, le=_MAX_FACTORS)], ...], Field(max_length=_MAX_UNITS)]
     bases: dict[str, _Frame]
     tools: dict[str, _Frame]
 
@@ -102,7 +102,7 @@ class UncertaintySection(Section):
     values: dict[str, dict[str, tuple[FiniteFloat, ...]]] = Field(default_factory=dict)
     free: tuple[Annotated[int, Field(ge=0)], ...]
     rounded: bool = False
-    features: Annotated[tuple[str, ...], Field(max_length=MAX_UNITS)]
+    features: Annotated[tuple[str, ...], Field(max_length=_MAX_UNITS)]
     prior_scale: Annotated[float, Field(gt=0)]
     noise: dict[str, Annotated[FiniteFloat, Field(gt=0)]] = Field(default_factory=dict)
     stated_noise: dict[str, Annotated[FiniteFloat, Field(gt=0)]] | None = None

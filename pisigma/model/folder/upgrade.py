@@ -64,7 +64,7 @@ _NO_FADE = (
 _KERNELS = "The arrays of the compiled kernels had the form of another version; they were written again."
 
 ROOT = "uncertainty.root"
-MAX_DEVIATIONS = 3.0
+_MAX_DEVIATIONS = 3.0
 """Number of standard deviations from the mean within which conditions were treated as measured up to format 3."""
 
 
@@ -250,9 +250,9 @@ def _with_measured_conditions(document: Mapping[str, Any]) -> tuple[str, ...]:
         if feature["name"] == "conditions" and "measured" not in feature:
             spans = zip(feature["names"], feature["mean"], feature["spread"], strict=True)
             feature["measured"] = [
-                [max(low, 0.0) if name == "payload_kg" else low, mean + MAX_DEVIATIONS * spread]
+                [max(low, 0.0) if name == "payload_kg" else low, mean + _MAX_DEVIATIONS * spread]
                 for name, mean, spread in spans
-                for low in [mean - MAX_DEVIATIONS * spread]
+                for low in [mean - _MAX_DEVIATIONS * spread]
             ]
             named = " and ".join(
                 f"{name} {low:.4g} to {high:.4g}"

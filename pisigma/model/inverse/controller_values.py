@@ -21,7 +21,7 @@ if TYPE_CHECKING:  # run-time type checkers resolve the full name without this i
 
 MAX_STARTS = 4
 """Largest number of stored joint values with the nearest poses that are tried in sequence."""
-IGNORED_WEIGHT = 1e-6
+_IGNORED_WEIGHT = 1e-6
 """Weight of rotations about the tool's x and y axes for arms with fewer than six axes, which cannot control them;
 they only determine the choice between joint values that reach the other axes. The tool may then be tilted by up to
 `MAX_TILT`."""
@@ -240,7 +240,7 @@ def solve(motion: Motion, T: Float64[np.ndarray, "rows 4 4"], start: Values) -> 
     q = start.copy()
     weight = np.ones(6)
     # Fewer than six axes cannot control the tilt; a small weight prevents the arm from tilting freely.
-    weight[3:5] = 1.0 if q.shape[1] >= 6 else IGNORED_WEIGHT
+    weight[3:5] = 1.0 if q.shape[1] >= 6 else _IGNORED_WEIGHT
     error, J = _errors(motion, T, q)
     for _ in range(tolerances.MAX_ITERATIONS):
         A, b = J * weight[:, None], error * weight

@@ -23,7 +23,7 @@ from pisigma.robot.kinematics.numeric import (
 from pisigma.robot.kinematics.status import Status
 from pisigma.robot.kinematics.task_axes import TaskAxes
 
-EXACT_ITERATIONS = 25
+_EXACT_ITERATIONS = 25
 """Number of steps with the slope of the correction, after steps without it came near a pose but did not converge."""
 
 
@@ -96,7 +96,7 @@ class NumericArm:
             close = (found.position_residual < tolerances.NEAR_MISS * self.robot.reach) & (
                 found.rotation_residual < tolerances.NEAR_MISS
             )
-            near, rounds = near.index_copy(0, rows, close), EXACT_ITERATIONS
+            near, rounds = near.index_copy(0, rows, close), _EXACT_ITERATIONS
         rows = (~reached).nonzero()[:, 0]
         if len(rows) and self.axes.has_tolerances and self.axes.tolerance.count(0.0) < self.robot.dof:
             better, met = solve_within_tolerances(

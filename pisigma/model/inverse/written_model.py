@@ -13,11 +13,11 @@ from pisigma.model.calibrated_model import CalibratedModel, poses_of_rows
 from pisigma.model.folder.model_folder import load_model, save_model
 from pisigma.model.inverse.corrected_ik import CorrectedIK, load
 
-PROBES = 20
+_PROBES = 20
 """Number of joint vectors at which the model in memory and the model in the folder are compared."""
-PROBE_RADIUS = 0.1
+_PROBE_RADIUS = 0.1
 """Largest distance [rad or m] of the compared joint values from the joint values of training rows."""
-TOLERANCE, JOINT_TOLERANCE = 1e-12, 1e-9
+TOLERANCE, _JOINT_TOLERANCE = 1e-12, 1e-9
 """Largest difference of predictions [m or rad], and of joint values, which result from an iteration."""
 
 
@@ -50,7 +50,7 @@ def check_written(model: CalibratedModel, folder: Path) -> None:
     _check("prior sizes of weights", _prior_sizes(model), _prior_sizes(loaded), 0.0)
     finite = T[torch.isfinite(T).flatten(1).all(1)].numpy()
     before, after = CorrectedIK(model)(finite, throw=False), ik(finite, throw=False)
-    _check("joint values", torch.as_tensor(before.q), torch.as_tensor(after.q), JOINT_TOLERANCE)
+    _check("joint values", torch.as_tensor(before.q), torch.as_tensor(after.q), _JOINT_TOLERANCE)
     _check("statuses", torch.as_tensor(before.status).double(), torch.as_tensor(after.status).double(), 0.0)
 
 
@@ -69,19 +69,19 @@ def _probe(model: CalibratedModel) -> Measurements:
     starts = model.starts.double().cpu()
     if not len(starts):
         starts = torch.zeros(1, model.robot.dof, dtype=torch.float64)
-    numbers = torch.linspace(0, len(starts) - 1, PROBES).round().long()
-    around = 2 * torch.rand((PROBES, model.robot.dof), generator=generator, dtype=torch.float64) - 1
+    numbers = torch.linspace(0, len(starts) - 1, _PROBES).round().long()
+    around = 2 * torch.rand((_PROBES, model.robot.dof), generator=generator, dtype=torch.float64) - 1
     frames, targets = list(model.bases) or [""], list(model.tools) or [""]
     rows = Measurements(
-        q=starts[numbers] + PROBE_RADIUS * around,
-        frame=tuple(frames[k % len(frames)] for k in range(PROBES)),
-        target=tuple(targets[k // len(frames) % len(targets)] for k in range(PROBES)),
+        q=starts[numbers] + _PROBE_RADIUS * around,
+        frame=tuple(frames[k % len(frames)] for k in range(_PROBES)),
+        target=tuple(targets[k // len(frames) % len(targets)] for k in range(_PROBES)),
     )
     return replace(
         rows,
         approach=2.0 * torch.randint(0, 2, rows.q.shape, generator=generator).double() - 1.0,
-        payload=torch.linspace(0.0, 5.0, PROBES, dtype=torch.float64),
-        temperature=torch.linspace(15.0, 30.0, PROBES, dtype=torch.float64),
+        payload=torch.linspace(0.0, 5.0, _PROBES, dtype=torch.float64),
+        temperature=torch.linspace(15.0, 30.0, _PROBES, dtype=torch.float64),
         torque=20.0 * torch.rand(rows.q.shape, generator=generator, dtype=torch.float64) - 10.0,
     )
 

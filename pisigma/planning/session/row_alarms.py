@@ -13,16 +13,16 @@ from pisigma.planning.session.row_judgement import FALSE_ALARMS, RowJudgement
 from pisigma.planning.session.state import Alarm
 from pisigma.robot.description import Robot
 
-SAME_READING = 2e-6
+_SAME_READING = 2e-6
 """Difference below which readings are the same [m]; noise makes independent readings differ by more."""
-SAME_VALUE = 1e-9
+_SAME_VALUE = 1e-9
 """Difference below which numbers are the same up to rounding in the file [SI units]."""
-SAME_POSE, NEAR_POSE = 0.1, 3.0
+_SAME_POSE, NEAR_POSE = 0.1, 3.0
 """Differences of joint values [deg or mm] below which a row is at a pose, and below which it is intended to be at
 the pose."""
-SWAPPED_SHARE = 0.2
+_SWAPPED_SHARE = 0.2
 """Share of its error below which the distance of a point from another pose shows that it belongs to that pose."""
-AMBIGUOUS_ROWS = 6
+_AMBIGUOUS_ROWS = 6
 """Number of rows up to which another row may be the wrong one."""
 
 
@@ -48,14 +48,14 @@ def stale_readings(rows: Measurements, start: int) -> Iterator[Alarm]:
     numbers = torch.cat([values.reshape(rows.rows, -1) for values in fields], 1)
     position = torch.full((rows.rows, 3), torch.nan) if rows.position is None else rows.position
     for row in range(start, rows.rows):
-        frozen = (position[:row] - position[row]).norm(dim=1) < SAME_READING
-        off = (numbers[:row] - numbers[row]).abs() < SAME_VALUE
+        frozen = (position[:row] - position[row]).norm(dim=1) < _SAME_READING
+        off = (numbers[:row] - numbers[row]).abs() < _SAME_VALUE
         same = frozen | (off | (numbers[:row].isnan() & numbers[row].isnan())).all(1)
         if not bool(same.any()):
             continue
         earlier = int(same.nonzero()[0])
         here, there = rows.line[row], rows.line[earlier]
-        if float((rows.q[row] - rows.q[earlier]).abs().max()) < SAME_VALUE:
+        if float((rows.q[row] - rows.q[earlier]).abs().max()) < _SAME_VALUE:
             text = f"line {here}: joint values and readings equal those of line {there}; the row is not used."
             yield Alarm(here, "duplicate", text, repeat=False)
         else:
@@ -79,7 +79,7 @@ def other_joint_values(
         pose = int(off.amax(1).argmin())
         joint = int(off[pose].argmax())
         most = float(off[pose, joint])
-        if most <= SAME_POSE:
+        if most <= _SAME_POSE:
             continue
         name = robot.joints[joint]
         if most <= NEAR_POSE:
@@ -143,7 +143,7 @@ def contradiction_alarm(
     advice = "Check the reflector, its seat and the line of sight, and measure the pose again."
     if bool(rows.is_measured("corner")[row]):
         advice = "Check the image and that robot and board were at rest, and take it again."
-    if rows.rows <= AMBIGUOUS_ROWS:
+    if rows.rows <= _AMBIGUOUS_ROWS:
         advice = f"With so few rows, another one may be wrong instead. {advice}"
     return Alarm(line, "off", f"{what}. {advice}", repeat=True)
 
@@ -166,7 +166,7 @@ def _other_pose(
     T = predicted_poses(geometry.robot, geometry.bases, geometry.tools, at)
     distance = (T[:, :3, 3] - rows.position[row]).norm(dim=1)
     nearest = int(distance.argmin())
-    if not float(distance[nearest]) < SWAPPED_SHARE * length:
+    if not float(distance[nearest]) < _SWAPPED_SHARE * length:
         return ""
     where = names[nearest] if nearest < len(poses) else f"line {rows.line[nearest - len(poses)]}"
     return f"the point of {where} ({float(distance[nearest]) * 1e3:.2f} mm from it)"

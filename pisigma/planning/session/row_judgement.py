@@ -42,15 +42,15 @@ FALSE_ALARMS = 1e-3
 """Expected share of correct rows that are called wrong."""
 FEW_ROWS = 12
 """Number of rows up to which all rows are judged again with every new row, and every row is tried as the wrong one."""
-CONTRADICTORY_FACTOR = 2.0
+_CONTRADICTORY_FACTOR = 2.0
 """Factor on the errors of the robot's class above which few rows contradict each other."""
-MIN_MISFIT_GAIN = 8.0
+_MIN_MISFIT_GAIN = 8.0
 """Decrease of the misfit above which an older row is called wrong instead of a newer one."""
-REPEATABILITY = {"m": 8e-5, "rad": 1e-4}
+_REPEATABILITY = {"m": 8e-5, "rad": 1e-4}
 """Repeatability of robots of any class [m, rad], in addition to the noise of the sensor."""
-USUAL_NOISE = {"m": 5e-5, "rad": 2e-4}
+_USUAL_NOISE = {"m": 5e-5, "rad": 2e-4}
 """Noise of a sensor whose noise is not stated [m, rad]."""
-CLASS_VALUES = 20
+_CLASS_VALUES = 20
 """Weight of the robot's class in the estimate of the size of its errors, as a number of measured values."""
 LINEARISATIONS = 2
 """Number of linearisations of base and tool."""
@@ -111,7 +111,7 @@ class RowModel:
         Args:
             robot: nominal robot.
             rows: all rows.
-            sigma: standard deviation of measured lengths if the rows state none [m]; None for `USUAL_NOISE`.
+            sigma: standard deviation of measured lengths if the rows state none [m]; None for `_USUAL_NOISE`.
             kept: rows to which base and tool are fitted.
 
         Raises:
@@ -119,7 +119,7 @@ class RowModel:
             PoseError: the joint values do not fit the robot.
         """
         calibrator = GeometricCalibrator(robot)
-        setup = calibrator.build(with_fixed_intrinsics(rows, REPEATABILITY["m"], REPEATABILITY["rad"]))
+        setup = calibrator.build(with_fixed_intrinsics(rows, _REPEATABILITY["m"], _REPEATABILITY["rad"]))
         floating = set(floating_bases(setup))
         chosen = [index for index in calibrator.candidates(setup.problem.space) if index not in floating]
         active = [*setup.free_unknowns, *chosen]
@@ -168,19 +168,19 @@ class RowModel:
         P, _, determined = self._projection(kept)
         self._leave_one_out(self.kept.nonzero()[:, 0], kept, P, square, count, errors)
         # The row itself must not affect the scale with which it is compared.
-        left = CLASS_VALUES + len(kept) - determined - torch.where(self.kept, count, 0.0)
+        left = _CLASS_VALUES + len(kept) - determined - torch.where(self.kept, count, 0.0)
         misfit = self.misfit
         # At least 1, the scale of the class: rows that happen to agree must not make the limits stricter.
-        whole = ((CLASS_VALUES + misfit - torch.where(self.kept, square, 0.0)) / left).clamp(min=1.0)
+        whole = ((_CLASS_VALUES + misfit - torch.where(self.kept, square, 0.0)) / left).clamp(min=1.0)
         # For rows that are not used, the scale is at least the one that leave-one-out errors of the kept rows show.
-        each = float((CLASS_VALUES + square.sum()) / (CLASS_VALUES + count.sum()))
+        each = float((_CLASS_VALUES + square.sum()) / (_CLASS_VALUES + count.sum()))
         scale = torch.where(self.kept, whole, whole.clamp(min=each))
         for row in (~self.kept).nonzero()[:, 0]:
             chosen = torch.cat([kept, (self._row == row).nonzero()[:, 0]])
             self._leave_one_out(row[None], chosen, self._projection(chosen)[0], square, count, errors)
         ratio = torch.where(count > 0, square / count, torch.nan) / scale
         chance = torch.from_numpy(fdtrc(count.numpy(), left.numpy(), ratio.numpy()))
-        total = max(1.0, (CLASS_VALUES + misfit) / (CLASS_VALUES + len(kept) - determined))
+        total = max(1.0, (_CLASS_VALUES + misfit) / (_CLASS_VALUES + len(kept) - determined))
         return LeaveOneOutErrors(chance, *self._sizes(errors), total**0.5)
 
     def _leave_one_out(
@@ -284,9 +284,9 @@ def _noise(
     """Return the standard deviation of every value, including the repeatability of the robot."""
     blocks = []
     for sensor, one in zip(setup.problem.sensors, values, strict=True):
-        usual = USUAL_NOISE[sensor.unit] if sigma is None or sensor.unit == "rad" else sigma
+        usual = _USUAL_NOISE[sensor.unit] if sigma is None or sensor.unit == "rad" else sigma
         noise = 1 / one.root if one.stated else torch.full_like(one.root, usual)
-        noise = (noise.square() + REPEATABILITY[sensor.unit] ** 2).sqrt()
+        noise = (noise.square() + _REPEATABILITY[sensor.unit] ** 2).sqrt()
         if isinstance(sensor, CornerSensor):  # the weights of corners include the repeatability
             noise = torch.as_tensor(setup.measurements.readings[NOISE_COLUMN])[one.row]
         blocks.append(noise.repeat_interleave(one.components))
@@ -351,7 +351,7 @@ def _contradicted(
     counts = model.kept
     chance = torch.where(counts, errors.chance, torch.nan)
     suspects = [int(chance.nan_to_num(nan=1.0).argmin())] if bool((chance < FALSE_ALARMS).any()) else []
-    if few and (suspects or errors.scale > CONTRADICTORY_FACTOR):
+    if few and (suspects or errors.scale > _CONTRADICTORY_FACTOR):
         suspects = counts.nonzero()[:, 0].tolist()
     misfits: dict[int, float] = {}
     for row in suspects if len(suspects) > 1 else ():
@@ -361,7 +361,7 @@ def _contradicted(
             every = torch.ones(int(others.sum()), dtype=torch.bool)
             misfits[row] = RowModel.from_rows(robot, rows.select(others), sigma, every).misfit
     least = min(misfits.values(), default=0.0)
-    likely = [row for row in suspects if misfits.get(row, math.inf) <= least + MIN_MISFIT_GAIN] or suspects
+    likely = [row for row in suspects if misfits.get(row, math.inf) <= least + _MIN_MISFIT_GAIN] or suspects
     for row in likely[-1:]:
         others = counts.clone()
         others[row] = False

@@ -22,7 +22,7 @@ from pisigma.robot.description import Robot
 from pisigma.validation.held_out.calibration_validation import pose_errors_of, validate
 from pisigma.validation.held_out.few_rows import fit_if_better
 
-FOLDS = 5
+_FOLDS = 5
 """Number of folds of the cross-validation."""
 
 
@@ -110,7 +110,7 @@ def with_cross_validation(
     if rows is None:
         return so_far.point
     try:
-        folds = k_folds(rows, min(FOLDS, rows.rows), seed=0)
+        folds = k_folds(rows, min(_FOLDS, rows.rows), seed=0)
         errors = validate(HybridCalibrator(robot), rows, folds, progress).models["hybrid"].position
     except (IdentificationError, MeasurementError):
         return so_far.point

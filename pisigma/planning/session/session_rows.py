@@ -37,9 +37,9 @@ from pisigma.validation.checks.check import MOVES
 from pisigma.validation.checks.mixed_rows import MIN_WRONG_SHARE
 from pisigma.validation.gate import check_rows
 
-MAX_CANDIDATES = 1_000
+_MAX_CANDIDATES = 1_000
 """Largest number of candidates of the plan that are considered."""
-MAX_REPLACEMENTS = 3
+_MAX_REPLACEMENTS = 3
 """Largest number of attempts to replace poses to which no free motion leads."""
 
 
@@ -204,8 +204,8 @@ class FurtherPoses:
     ) -> "FurtherPoses":
         """Return evenly selected candidates of a plan."""
         count = len(candidates.q)
-        some = torch.linspace(0, count - 1, min(count, MAX_CANDIDATES)).round().long()
-        motions = Motions(plan.arm, candidates.workspace[:MAX_CANDIDATES])
+        some = torch.linspace(0, count - 1, min(count, _MAX_CANDIDATES)).round().long()
+        motions = Motions(plan.arm, candidates.workspace[:_MAX_CANDIDATES])
         return FurtherPoses(candidates.q[some], candidates.number[some], motions, task)
 
     def replan(
@@ -239,14 +239,14 @@ class FurtherPoses:
         if not bool(plan.check[first]):
             posterior = posterior.after_measuring(plan.q[first])
         seen, tool = posterior.sensitivities(self.q), posterior.tool(self.task)
-        for _ in range(MAX_REPLACEMENTS):
+        for _ in range(_MAX_REPLACEMENTS):
             if count > len(new):
                 return None
             chosen = new[select_poses(seen[new], tool, count, plan.settings.criterion)]
             # Poses that test the model are spread among the others, so that a session that ends early has both kinds.
             use = order_of_use(count, len(check))
             q = torch.cat([self.q[chosen], plan.q[check]])[use]
-            way = plan_tour(self.motions, q, plan.settings.pace, plan.q[first[0]], stages=(AHEAD,))
+            way = plan_tour(self.motions, q, plan.settings.pace, plan.q[first[0]], stages=(_AHEAD,))
             left_out = use[way.left_out]
             # Poses without a collision-free motion to them are replaced by the next best ones.
             shut_in = left_out[left_out < count]
@@ -269,7 +269,7 @@ class FurtherPoses:
         return (off > NEAR_POSE).all(1).nonzero()[:, 0]
 
 
-AHEAD = 10
+_AHEAD = 10
 """Number of next poses whose expected benefit decides whether to stop."""
 
 
@@ -284,7 +284,7 @@ def stopping_advice(
 
     Args:
         limit_mm: limit of the 95 % quantile of the errors [mm]; None for no limit.
-        least_gain_mm: decrease of that quantile by the next `AHEAD` poses below which to stop [mm].
+        least_gain_mm: decrease of that quantile by the next `_AHEAD` poses below which to stop [mm].
         reached: accuracy so far. The limit is reached when the last two points are below it: estimates from few rows
             scatter, so a first point is often below the limit by chance.
         expected: expected accuracy after the remaining poses.
@@ -298,7 +298,7 @@ def stopping_advice(
         if len(below) > 1 and all(below):
             return Advice("stop", f"Stop: with {point.poses} poses {now}{limit}.")
         confirm = ", which the next poses must confirm" if below[-1] else ""
-        ahead = next((one for one in expected if one.poses >= point.poses + AHEAD), None) or next(
+        ahead = next((one for one in expected if one.poses >= point.poses + _AHEAD), None) or next(
             reversed(expected), None
         )
         gain = 0.0 if ahead is None else (point.predicted_p95 - ahead.predicted_p95) * 1e3

@@ -19,7 +19,7 @@ from pisigma.robot.kinematics.tolerances import LIMIT_TOLERANCE
 
 POSES_PER_CHUNK = 2048
 """Number of poses that are checked together (some MB)."""
-ROUNDING = 1e-9
+_ROUNDING = 1e-9
 """Distance by which capsules of a measured pose may overlap without a self-collision [m]."""
 
 
@@ -102,7 +102,7 @@ class ArmInSurroundings:
         room = self.room
         for chunk in torch.split(q, POSES_PER_CHUNK):
             apart = self._apart(self.capsules.segments(chunk))
-            room = torch.minimum(room, apart.amin(0) - ROUNDING)
+            room = torch.minimum(room, apart.amin(0) - _ROUNDING)
         return replace(self, room=room)
 
     @property

@@ -16,14 +16,14 @@ from pisigma.robot.kinematics.components import as_transform
 from pisigma.robot.kinematics.forward import Geometry, iterate_rows
 from pisigma.robot.urdf_frames import inverse, row_frame
 
-RADIUS_SHARES = (0.05, 0.05, 0.05, 0.035)
+_RADIUS_SHARES = (0.05, 0.05, 0.05, 0.035)
 """Default radii of links from the first joint on, as shares of the length of the nominal arm; the last share applies
 to all further links."""
 TOOL_RADIUS = 0.025
 """Default radius of the tool [m]: a bracket with a reflector of 1.5 inches."""
-MIN_LENGTH = 1e-6
+_MIN_LENGTH = 1e-6
 """Length below which a piece of a link needs no capsule [m], because its neighbours cover it."""
-SAMPLES = 500
+_SAMPLES = 500
 """Number of random poses by which capsules that touch by construction are found."""
 
 
@@ -65,7 +65,7 @@ class Capsules:
             robot: nominal robot with the reflector as its tool.
             tip: position of the nominal tool in the frame after the last row, from which the bracket leads to the
                 reflector [m]; None for the origin of that frame.
-            radius: radius of all links [m]; None for `RADIUS_SHARES` of the arm's length.
+            radius: radius of all links [m]; None for `_RADIUS_SHARES` of the arm's length.
             radii: radii of individual links by the names of their rows [m].
             tool_radius: radius of the tool [m].
         """
@@ -75,7 +75,7 @@ class Capsules:
         pieces.append(_Piece(last - 1, False, (last, last), (tip, robot.tool[:3])))
         length = float(np.hypot(robot.dh[:, 1], robot.dh[:, 2]).sum())
         link = np.cumsum([row.type != "fixed" for row in robot.rows])[[piece.row for piece in pieces]]
-        sizes = length * np.array(RADIUS_SHARES)[np.clip(link, 1, len(RADIUS_SHARES)) - 1]
+        sizes = length * np.array(_RADIUS_SHARES)[np.clip(link, 1, len(_RADIUS_SHARES)) - 1]
         sizes = np.full_like(sizes, radius) if radius is not None else sizes
         stated = [(radii or {}).get(robot.rows[piece.row].name) for piece in pieces]
         sizes = np.where([size is None for size in stated], sizes, np.array(stated, dtype=np.float64))
@@ -89,7 +89,7 @@ class Capsules:
             torch.tensor([piece.carrier for piece in pieces]),
         )
         segments = capsules.segments(capsules.random_joints())
-        return capsules._of((segments[:, :, 1] - segments[:, :, 0]).norm(dim=-1).amax(0) > MIN_LENGTH)
+        return capsules._of((segments[:, :, 1] - segments[:, :, 0]).norm(dim=-1).amax(0) > _MIN_LENGTH)
 
     def _of(self, kept: Bool[Tensor, " pieces"]) -> "Capsules":
         """Return the capsules of the kept pieces only."""
@@ -118,7 +118,7 @@ class Capsules:
         segments = self.segments(self.random_joints())
         distance = segment_distance(segments[:, first], segments[:, second])
         touches = distance < self.radius[first] + self.radius[second] + clearance
-        changes = distance.amax(0) - distance.amin(0) > MIN_LENGTH
+        changes = distance.amax(0) - distance.amin(0) > _MIN_LENGTH
         checked = ((self.link[second] - self.link[first]) > 1) & (touches.double().mean(0) < 0.5) & changes
         return torch.stack([first, second], -1)[checked]
 
@@ -126,7 +126,7 @@ class Capsules:
         """Draw joint values within the limits [rad or m], the same at every call."""
         generator = torch.Generator().manual_seed(0)
         limits = torch.from_numpy(self.robot.axis_limits).clamp(-np.pi, np.pi)
-        draws = torch.rand(SAMPLES, len(limits), generator=generator, dtype=torch.float64)
+        draws = torch.rand(_SAMPLES, len(limits), generator=generator, dtype=torch.float64)
         q: Float64[Tensor, "poses dof"] = self.robot.to_dh(
             limits[:, 0] + (limits[:, 1] - limits[:, 0]) * draws
         )

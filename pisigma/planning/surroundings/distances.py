@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-MIN_SQUARED_LENGTH = 1e-18
+_MIN_SQUARED_LENGTH = 1e-18
 """Squared length below which a segment is a point [m²]."""
 
 Segments = Float64[Tensor, "*#batch 2 3"]
@@ -26,8 +26,8 @@ def segment_distance(first: Segments, second: Segments) -> Float64[Tensor, "*_ba
     # Parallel lines have the same distance everywhere, so s is arbitrary; clamped t and then s follow from it.
     parallel = determinant <= 1e-12 * a * e
     s = torch.where(parallel, 0.0, (b * f - c * e) / torch.where(parallel, 1.0, determinant)).clamp(0, 1)
-    t = ((b * s + f) / e.clamp(min=MIN_SQUARED_LENGTH)).clamp(0, 1)
-    s = ((b * t - c) / a.clamp(min=MIN_SQUARED_LENGTH)).clamp(0, 1)
+    t = ((b * s + f) / e.clamp(min=_MIN_SQUARED_LENGTH)).clamp(0, 1)
+    s = ((b * t - c) / a.clamp(min=_MIN_SQUARED_LENGTH)).clamp(0, 1)
     difference: Tensor = (w + s[..., None] * u - t[..., None] * v).norm(dim=-1)
     return difference
 

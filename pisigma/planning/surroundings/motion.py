@@ -6,14 +6,14 @@ from torch import Tensor
 
 from pisigma.planning.surroundings.arm_in_surroundings import ArmInSurroundings
 
-MIN_STEP = 1e-3
+_MIN_STEP = 1e-3
 """Motion of any point of the robot below which a piece is not divided further [m]; half the clearance if that is
 larger."""
-MAX_WAYPOINTS_TRIED = 60
+_MAX_WAYPOINTS_TRIED = 60
 """Number of poses that are tried as waypoints of a motion; ten times as many pairs of poses are tried."""
 BATCH = 20
 """Number of waypoints that are checked together."""
-SAMPLE = 50
+_SAMPLE = 50
 """Number of poses to which motions are checked, to find which of two poses is harder to leave."""
 
 
@@ -55,7 +55,7 @@ class Motions:
 
     def is_harder_to_leave(self, pose: Float64[Tensor, " dof"], other: Float64[Tensor, " dof"]) -> bool:
         """Return whether fewer free motions lead away from a pose than from another pose."""
-        sample = self.pool[:: max(1, len(self.pool) // SAMPLE)]
+        sample = self.pool[:: max(1, len(self.pool) // _SAMPLE)]
         one, two = (int(self.are_free(q.expand_as(sample), sample).sum()) for q in (pose, other))
         return one < two
 
@@ -76,7 +76,7 @@ def is_free(
     """
     free = torch.ones(len(start), dtype=torch.bool)
     travel = (end - start).abs() @ arm.motion_per_joint_value
-    finest = max(MIN_STEP, arm.surroundings.clearance / 2)
+    finest = max(_MIN_STEP, arm.surroundings.clearance / 2)
     motion, middle, half = torch.arange(len(start)), torch.full((len(start),), 0.5), 0.5
     middle = middle.double()
     while len(motion):
@@ -107,7 +107,7 @@ def waypoints(
         Joint values of the waypoints [rad or m]; None if no way was found.
     """
     to, back = _travel(arm, start, pool), _travel(arm, pool, end)
-    tried = (to + back).argsort()[:MAX_WAYPOINTS_TRIED]
+    tried = (to + back).argsort()[:_MAX_WAYPOINTS_TRIED]
     pool, to, back = pool[tried], to[tried], back[tried]
     reached, left = torch.zeros(2, len(pool), dtype=torch.bool)
     for some in torch.split(torch.arange(len(pool)), BATCH):
@@ -120,7 +120,7 @@ def waypoints(
         return None
     first, second = torch.cartesian_prod(first, second).unbind(-1)
     length = to[first] + _travel(arm, pool[first], pool[second]) + back[second]
-    shortest = length.argsort()[: 10 * MAX_WAYPOINTS_TRIED]
+    shortest = length.argsort()[: 10 * _MAX_WAYPOINTS_TRIED]
     for some in torch.split(shortest, BATCH):
         free = is_free(arm, pool[first[some]], pool[second[some]])
         if bool(free.any()):

@@ -13,13 +13,13 @@ from pisigma.validation.held_out.judged_rows import JudgedRows
 from pisigma.validation.report.accuracy import DOMINANT_SHARE, Accuracy, AccuracyLimit
 from pisigma.validation.report.joint_gaps import joint_gaps, outside_errors
 
-MIN_GAIN_PER_DOUBLING = 0.05
+_MIN_GAIN_PER_DOUBLING = 0.05
 """Relative gain of the last doubling of rows above which more rows are recommended."""
-SIGNIFICANT_ERRORS = 2.0
+_SIGNIFICANT_ERRORS = 2.0
 """Standard errors below which a change from nominal is not significant."""
-SMALL_RANGE_KG, SMALL_RANGE_C = 0.5, 3.0
+_SMALL_RANGE_KG, _SMALL_RANGE_C = 0.5, 3.0
 """Ranges of payload [kg] and temperature [°C] below which rows do not show the effect of other values."""
-COVERAGE_TOLERANCE = 0.03
+_COVERAGE_TOLERANCE = 0.03
 """Largest deviation from 0.95 of the share within 95 % intervals that is not reported."""
 
 
@@ -55,7 +55,7 @@ def advice_for(
         *causes,
         *warning_lines(summary),
         *of_rows,
-        *say("weak_parameters", summary.weak_directions, unsure, f"{SIGNIFICANT_ERRORS:.0f}"),
+        *say("weak_parameters", summary.weak_directions, unsure, f"{_SIGNIFICANT_ERRORS:.0f}"),
         *_more_rows(model, summary, limit),
         *_trust(summary),
         *_orientations(model, summary),
@@ -76,7 +76,7 @@ def _unsure(summary: CalibrationSummary) -> list[str]:
         for row in summary.parameters
         if row.standard_error
         and row.change is not None
-        and abs(row.change) < SIGNIFICANT_ERRORS * row.standard_error
+        and abs(row.change) < _SIGNIFICANT_ERRORS * row.standard_error
     ]
 
 
@@ -87,7 +87,7 @@ def _more_rows(model: CalibratedModel, summary: CalibrationSummary, limit: Accur
         gain = 1 - last[1] / before[1]
         doublings = math.log2(last[0] / before[0])
         each = 1 - (1 - gain) ** (1 / doublings) if doublings > 0 and gain < 1 else 0.0
-        return say("more_rows", before, last, max(each, 0.0), each >= MIN_GAIN_PER_DOUBLING)
+        return say("more_rows", before, last, max(each, 0.0), each >= _MIN_GAIN_PER_DOUBLING)
     if limit.scatter_share is None or limit.scatter_share >= DOMINANT_SHARE:
         return ()
     return say("little_scatter", limit.scatter_share, model.provenance.rows)
@@ -95,7 +95,7 @@ def _more_rows(model: CalibratedModel, summary: CalibrationSummary, limit: Accur
 
 def _trust(summary: CalibrationSummary) -> tuple[str, ...]:
     coverage = None if summary.validation_errors is None else summary.validation_errors.coverage
-    return () if coverage is None or abs(coverage - 0.95) < COVERAGE_TOLERANCE else say("trust", coverage)
+    return () if coverage is None or abs(coverage - 0.95) < _COVERAGE_TOLERANCE else say("trust", coverage)
 
 
 def _orientations(model: CalibratedModel, summary: CalibrationSummary) -> tuple[str, ...]:
@@ -109,8 +109,8 @@ def _conditions(rows: JudgedRows | None) -> list[str]:
         return []
     lines: list[str] = []
     for values, name, unit, little in (
-        (rows.measurements.payload, "payload", "kg", SMALL_RANGE_KG),
-        (rows.measurements.temperature, "temperature", "°C", SMALL_RANGE_C),
+        (rows.measurements.payload, "payload", "kg", _SMALL_RANGE_KG),
+        (rows.measurements.temperature, "temperature", "°C", _SMALL_RANGE_C),
     ):
         stated = torch.zeros(0) if values is None else values[torch.isfinite(values)]
         low, high = (float(stated.min()), float(stated.max())) if len(stated) else (None, None)

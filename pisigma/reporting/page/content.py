@@ -40,7 +40,7 @@ from pisigma.validation.report.corrections import (
 from pisigma.validation.report.dependence import Dependence, ErrorsByName, dependences, group_errors_by_name
 from pisigma.validation.report.error_map import ErrorMap, largest_errors, map_of_rows, map_of_workspace
 
-WITHOUT_CAUSE = ("few_rows", "search", "camera", "stated_noise", "temperature")
+_WITHOUT_CAUSE = ("few_rows", "search", "camera", "stated_noise", "temperature")
 """Kinds of warnings that name no cause of the errors."""
 
 
@@ -101,7 +101,7 @@ def causes_of(summary: CalibrationSummary | None, diagnostics: Sequence[Diagnost
         diagnostics: why the judged rows are implausible.
     """
     found = diagnostics or (() if summary is None else summary.diagnostics)
-    named = (one for one in found if one.severity == "implausible" or one.kind not in WITHOUT_CAUSE)
+    named = (one for one in found if one.severity == "implausible" or one.kind not in _WITHOUT_CAUSE)
     return tuple(one.sentence for one in named)
 
 

@@ -33,9 +33,9 @@ from pisigma.validation.report.error_map import Layer
 
 SIZE = (5.2, 3.1)
 """Width and height of a panel [inch]."""
-MANY_DOTS = 200
+_MANY_DOTS = 200
 """Number of dots above which they are rasterised."""
-PIXELS = 130
+_PIXELS = 130
 """Resolution of rasterised dots [pixels per inch]."""
 BEFORE, AFTER, OTHER = "#b35806", "#1f5fa8", "#4d4d4d"
 """Colours that can be distinguished with colour blindness."""
@@ -55,7 +55,7 @@ _STYLE: dict[Any, Any] = {
     "legend.fontsize": 9.0,
 }
 _SVG_METADATA: dict[str, Any] = {"Date": None, "Creator": None}
-MAX_MAP_DOTS = 1_500
+_MAX_MAP_DOTS = 1_500
 """Number of rows with the largest errors of which the flat map has dots, and largest number of other dots; of other
 rows, every fourth has a dot."""
 _COLORS = {"nominal": BEFORE, "geometric": OTHER, "hybrid": AFTER}
@@ -82,7 +82,7 @@ class Drawing:
         stream = io.BytesIO()
         with drawing_style():
             FigureCanvasSVG(self.figure)
-            self.figure.savefig(stream, format="svg", dpi=PIXELS, facecolor="none", metadata=_SVG_METADATA)
+            self.figure.savefig(stream, format="svg", dpi=_PIXELS, facecolor="none", metadata=_SVG_METADATA)
         return stream.getvalue().decode()
 
     def png(self) -> bytes:
@@ -216,7 +216,7 @@ def draw_correction(curve: CorrectionCurve) -> Drawing:
         dots = axes.plot(
             curve.dot_values, curve.dots, ".", color=OTHER, alpha=0.5, markersize=3, label="_rows"
         )
-        dots[0].set_rasterized(len(curve.dots) > MANY_DOTS)
+        dots[0].set_rasterized(len(curve.dots) > _MANY_DOTS)
         for where, line, label in (
             (curve.measured, "-", "_measured"),
             (~curve.measured, "--", "_extrapolated"),
@@ -291,13 +291,13 @@ def draw_map(
         for column, layer in enumerate(layers):
             finite = np.isfinite(layer.values)
             order = np.argsort(layer.values[finite], kind="stable")
-            order = np.concatenate([order[:-MAX_MAP_DOTS:4], order[-MAX_MAP_DOTS:]])[-2 * MAX_MAP_DOTS :]
+            order = np.concatenate([order[:-_MAX_MAP_DOTS:4], order[-_MAX_MAP_DOTS:]])[-2 * _MAX_MAP_DOTS :]
             values, at = layer.values[finite][order], place[finite][order]
             top = max(float(values.max(initial=0.0)), 1e-12)
             for axes, (a, b) in zip(grid[:, column], ((0, 1), (0, 2)), strict=True):
                 dots = axes.scatter(
                     at[:, a], at[:, b], c=values, s=2 + 16 * values / top, cmap="cividis_r", vmin=0.0, vmax=top,
-                    linewidths=0, rasterized=len(values) > MANY_DOTS,
+                    linewidths=0, rasterized=len(values) > _MANY_DOTS,
                 )  # fmt: skip
                 axes.set_aspect("equal", "datalim")
                 axes.set(xlabel=f"{'xyz'[a]} [mm]", ylabel=f"{'xyz'[b]} [mm]")
@@ -359,7 +359,7 @@ def _dots(axes: Axes, x: np.ndarray, y: np.ndarray, color: str, series: str) -> 
     size = 3.6 if len(x) < 3_000 else 2.0
     look: dict[str, Any] = {"color": color, "alpha": opacity, "markersize": size, "markeredgewidth": 0}
     drawn = axes.plot(x, y, ".", label=f"_{series}", **look)
-    drawn[0].set_rasterized(len(x) > MANY_DOTS)
+    drawn[0].set_rasterized(len(x) > _MANY_DOTS)
 
 
 def _plain_log(axes: Axes) -> None:

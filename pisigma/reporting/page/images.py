@@ -12,13 +12,13 @@ from pisigma.reporting.page.figures import AFTER, BEFORE, Drawing, drawing_style
 from pisigma.reporting.page.page import html_page
 from pisigma.reporting.result_text import Table
 
-WIDTH = 4.8
+_WIDTH = 4.8
 """Width of a picture [inch]."""
-MAX_PIXELS = 480
+_MAX_PIXELS = 480
 """Pixels of a picture along u; larger images are averaged."""
-GRAY_STEP = 16
+_GRAY_STEP = 16
 """Step of the gray values; finer noise would make the page ten times as large."""
-ARROW = 0.05
+_ARROW = 0.05
 """Length of the arrow of the 95 % quantile of the residuals, as a share of the image width."""
 
 
@@ -53,7 +53,7 @@ def arrow_scale(detection: DetectedBoards) -> float:
     """Compute the magnification of residuals in all pictures: 1, 2 or 5 times a power of ten."""
     lengths = np.linalg.norm(np.concatenate(list(detection.residuals.values())), axis=1)
     width = next(one.size[0] for one in detection.images if one.is_read)
-    largest = ARROW * width / max(float(np.quantile(lengths, 0.95)), 1e-6)
+    largest = _ARROW * width / max(float(np.quantile(lengths, 0.95)), 1e-6)
     power = 10.0 ** np.floor(np.log10(largest))
     return float(power * max(step for step in (1, 2, 5) if step * power <= largest))
 
@@ -68,7 +68,7 @@ def draw_image(one: BoardImage, detection: DetectedBoards, scale: float) -> Draw
     """
     width, height = one.size
     with drawing_style():
-        figure = Figure(figsize=(WIDTH, WIDTH * height / width))
+        figure = Figure(figsize=(_WIDTH, _WIDTH * height / width))
         axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
         extent = (-0.5, width - 0.5, height - 0.5, -0.5)
         axes.imshow(
@@ -94,5 +94,5 @@ def draw_image(one: BoardImage, detection: DetectedBoards, scale: float) -> Draw
 def _thumbnail(one: BoardImage) -> np.ndarray:
     """Return a copy of an image with few pixels and gray levels."""
     full = Image.fromarray(read_image(one.file))
-    full.thumbnail((MAX_PIXELS, MAX_PIXELS), Image.Resampling.BOX)
-    return np.asarray(full) // GRAY_STEP * GRAY_STEP + GRAY_STEP // 2
+    full.thumbnail((_MAX_PIXELS, _MAX_PIXELS), Image.Resampling.BOX)
+    return np.asarray(full) // _GRAY_STEP * _GRAY_STEP + _GRAY_STEP // 2

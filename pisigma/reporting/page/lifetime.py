@@ -34,7 +34,7 @@ from pisigma.reporting.tables import pose_rows
 from pisigma.validation.held_out.model_comparison import ModelComparison
 from pisigma.validation.report.error_map import Layer
 
-PAGE_WIDTH = 10_000
+_PAGE_WIDTH = 10_000
 """Width of tables on a page, which can scroll [characters]."""
 Mark = tuple[datetime.date, str]
 """Day that is marked in a chart, and its label."""
@@ -288,7 +288,7 @@ def comparison_page(
         level=f"{parameters.level:.2g}",
         maps=[draw_displacement(what, one) for what, one in displacements.items()],
         displacements=pose_rows({what: one.errors.figures for what, one in displacements.items()}),
-        rows=() if rows is None else comparison_tables(rows, "the rows", PAGE_WIDTH),
+        rows=() if rows is None else comparison_tables(rows, "the rows", _PAGE_WIDTH),
         sentences=sentences,
         warnings=warnings,
     )

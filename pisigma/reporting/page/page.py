@@ -35,7 +35,7 @@ from pisigma.validation.report.error_map import ErrorMap
 
 _ESCAPED = {ord(mark): f"\\u{ord(mark):04x}" for mark in "<>&\u2028\u2029"}
 _PACKAGE = "pisigma.reporting.page"
-RESOURCES = {"style": "style.css", "common_script": "copies.js"}
+_RESOURCES = {"style": "style.css", "common_script": "copies.js"}
 """Files of this folder that every page contains, by their names in templates."""
 
 
@@ -72,7 +72,7 @@ def html_page(template: str, **content: object) -> str:
         template: file of the folder `templates` that extends `base.html.j2`.
         content: values by the names in the template.
     """
-    ours = {name: Markup(read_resource(file)) for name, file in RESOURCES.items()}
+    ours = {name: Markup(read_resource(file)) for name, file in _RESOURCES.items()}
     return render(template, image=data_url, **ours, **content)
 
 

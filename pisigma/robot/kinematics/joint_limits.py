@@ -75,10 +75,10 @@ def nearest_turn(
     return torch.where(revolute & (turns != 0), q + 2 * torch.pi * turns, q)
 
 
-GROSS_ANGLE = np.pi / 4
+_GROSS_ANGLE = np.pi / 4
 """Excess over the limits [rad] above which a value must be of another joint, in another unit, or relative to another
 zero; stated limits of published robots were wrong by up to 14 deg."""
-GROSS_SHARE = 0.25
+_GROSS_SHARE = 0.25
 """Excess over the limits of a prismatic joint, as a share of its stroke, above which a value must be of another
 joint, in another unit, or relative to another zero."""
 
@@ -94,4 +94,4 @@ def beyond_limits(
 def far_beyond_limits(q: Float64[np.ndarray, " rows"], axis: Row) -> Bool[np.ndarray, " rows"]:
     """Return which values cannot belong to an axis, even if its stated limits are inaccurate."""
     stroke = axis.upper - axis.lower
-    return beyond_limits(q, axis, GROSS_SHARE * stroke if axis.type == "prismatic" else GROSS_ANGLE)
+    return beyond_limits(q, axis, _GROSS_SHARE * stroke if axis.type == "prismatic" else _GROSS_ANGLE)

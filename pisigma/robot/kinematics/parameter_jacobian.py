@@ -28,9 +28,9 @@ JACOBIAN_CHUNK = 2_048
 """Number of poses that are processed together, so that their Jacobian stays in the processor's cache."""
 
 
-AXES, ORIGIN = slice(6, 9), 9
+AXES, _ORIGIN = slice(6, 9), 9
 """Indices of x, y, z and of the origin in `_frame_axes`."""
-STARTS = torch.tensor((0, 0, 0, 1, 1, ORIGIN, 2, 6, 6, 6, 7, 10, ORIGIN, 8))
+_STARTS = torch.tensor((0, 0, 0, 1, 1, _ORIGIN, 2, 6, 6, 6, 7, 10, _ORIGIN, 8))
 """Indices in `_frame_axes` of the vectors that start the recursion of `_walk_rows`: rotation axes of the base, then
 its frame."""
 
@@ -130,7 +130,7 @@ def tool_motion(
         tool_axes = tool_axes[..., target]
     frames = _walk_rows(robot, dh, q, base_axes)
     tool_steps = _behind(_last(frames), tool_axes)
-    position = tool_steps[ORIGIN]
+    position = tool_steps[_ORIGIN]
     shifts = 3 * frames.shape[0] + 3
     J = q.new_empty((5 * len(robot.rows) + 15, 6 if turning else 3, poses))
     turns = frames[:, ::3]
@@ -170,7 +170,7 @@ def _walk_rows(
         contains the rotation axes of the base (roll, pitch, yaw) and its origin in the same form.
     """
     frames = q.new_empty((len(robot.rows) + 2, 7, 3, q.shape[0]))
-    starts = base_axes.index_select(0, STARTS.to(q.device))[:, :3]
+    starts = base_axes.index_select(0, _STARTS.to(q.device))[:, :3]
     frames[:2].flatten(0, 1).copy_(starts)
     offsets = q.new_tensor(dh[:, :1])
     angles = torch.addmm(offsets, torch.from_numpy(_turning(robot)).to(q), q.t())

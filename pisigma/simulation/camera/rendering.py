@@ -12,22 +12,22 @@ from pisigma.measurement.camera.camera import Camera
 from pisigma.measurement.camera.pattern import Pattern, board_pattern
 from pisigma.robot.se3 import rotation_from_vector, transform
 
-NODE_STEP = 16
+_NODE_STEP = 16
 """Distance [px] of the nodes at which rays are undistorted; a cubic spline between them is accurate to 1e-4 px."""
-SURFACE_ITERATIONS = 4
+_SURFACE_ITERATIONS = 4
 """Number of fixed-point iterations from the plane to a bowed surface; each reduces the error to a few percent."""
-SUBPIXELS = 4
+_SUBPIXELS = 4
 """Number of subpixels in each direction of a pixel that contains an edge."""
-BLUR_LEVELS = 4
+_BLUR_LEVELS = 4
 """Number of blurred images, from the sharpest to the most blurred, between which pixels are interpolated."""
-MIN_BLUR_STEP = 1e-3
+_MIN_BLUR_STEP = 1e-3
 """Smallest difference between blur levels [px], for images of constant blur."""
-MIN_COSINE = 1e-9
+_MIN_COSINE = 1e-9
 """Lower bound of the cosine of the angle between a ray and the board's normal, for rays almost parallel to the
 board."""
 FAR = 1e6
 """Depth [m] that is assigned to rays that do not meet the board."""
-OUTLINE = 20
+_OUTLINE = 20
 """Number of points per edge of the sheet from which the bounds of its image are computed."""
 
 
@@ -165,7 +165,7 @@ def _bounds(
 ) -> tuple[int, int, int, int]:
     """Return the range of pixels that the blurred board covers; the whole image if the board leaves the view."""
     left, top, right, bottom = board.pattern.sheet
-    along = np.linspace(0, 1, OUTLINE)
+    along = np.linspace(0, 1, _OUTLINE)
     x, y = left + along * (right - left), top + along * (bottom - top)
     edges = [(x, np.full_like(x, end)) for end in (top, bottom)]
     edges += [(np.full_like(y, end), y) for end in (left, right)]
@@ -191,7 +191,7 @@ def _rays(camera: Camera, u: np.ndarray, v: np.ndarray) -> Float64[np.ndarray, "
         RectBivariateSpline,
     )
 
-    nodes_u, nodes_v = (np.linspace(at[0], at[-1], 4 + int((at[-1] - at[0]) / NODE_STEP)) for at in (u, v))
+    nodes_u, nodes_v = (np.linspace(at[0], at[-1], 4 + int((at[-1] - at[0]) / _NODE_STEP)) for at in (u, v))
     at_nodes = camera.undistort(np.stack(np.meshgrid(nodes_u, nodes_v), -1))
     return np.stack([RectBivariateSpline(nodes_v, nodes_u, at_nodes[..., axis])(v, u) for axis in (0, 1)])
 
@@ -206,9 +206,9 @@ def _on_surface(
     R, t = T_camera_board[:, :3, :3, None], T_camera_board[:, :3, 3, None]
     origin = [-(R[:, :, axis] * t).sum(1) for axis in range(3)]
     along = [R[:, 0, axis] * rays[0] + R[:, 1, axis] * rays[1] + R[:, 2, axis] for axis in range(3)]
-    facing = np.copysign(np.maximum(np.abs(along[2]), MIN_COSINE), along[2])
+    facing = np.copysign(np.maximum(np.abs(along[2]), _MIN_COSINE), along[2])
     depth = -origin[2] / facing
-    for _ in range(SURFACE_ITERATIONS if board.bow else 0):
+    for _ in range(_SURFACE_ITERATIONS if board.bow else 0):
         xy = np.stack([origin[axis] + depth * along[axis] for axis in (0, 1)], -1)
         depth = (board.height(xy) - origin[2]) / facing
     depth[depth <= 0] = FAR
@@ -226,13 +226,13 @@ def _reflected(surface: "_Surface", xy: Float64[np.ndarray, "2 v u"]) -> Float64
         for columns in (slice(None, -1), slice(1, None))
     )
     centre, along_u, along_v = (a + b + c + d) / 4, (b - a + d - c) / 2, (c - a + d - b) / 2
-    half = (np.abs(along_u) + np.abs(along_v)) / 2 / SUBPIXELS
+    half = (np.abs(along_u) + np.abs(along_v)) / 2 / _SUBPIXELS
     total = np.zeros(centre.shape[1])
-    offsets = (np.arange(SUBPIXELS) + 0.5) / SUBPIXELS - 0.5
+    offsets = (np.arange(_SUBPIXELS) + 0.5) / _SUBPIXELS - 0.5
     for du in offsets:
         for dv in offsets:
             total += surface.mean(centre + du * along_u + dv * along_v, half)
-    gray[across] = total / SUBPIXELS**2
+    gray[across] = total / _SUBPIXELS**2
     return gray
 
 
@@ -301,7 +301,7 @@ def _cell(edges: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _blurred(sharp: np.ndarray, blur: np.ndarray) -> np.ndarray:
     """Blur every pixel by its standard deviation, interpolating between a few blurred images."""
-    levels = np.linspace(blur.min(), max(blur.max(), blur.min() + MIN_BLUR_STEP), BLUR_LEVELS)
+    levels = np.linspace(blur.min(), max(blur.max(), blur.min() + _MIN_BLUR_STEP), _BLUR_LEVELS)
     weight = (blur - levels[0]) / (levels[1] - levels[0])
     total = np.zeros_like(sharp)
     for number, level in enumerate(levels):

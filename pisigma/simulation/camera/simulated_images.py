@@ -28,11 +28,11 @@ from pisigma.robot.se3 import invert, rotation_from_rpy, rotation_from_vector, t
 from pisigma.simulation.camera.rendering import Exposure, TrueBoard, render_image
 from pisigma.simulation.true_robot import TrueRobot
 
-CANDIDATES = 8
+_CANDIDATES = 8
 """Number of candidates per view; candidates that are far apart in joint space are chosen."""
-MAX_ATTEMPTS = 100
+_MAX_ATTEMPTS = 100
 """Largest number of draws per candidate; some draws cannot be reached."""
-GIVEN_FILES = ("joints.csv", "camera.yaml", "board.yaml")
+_GIVEN_FILES = ("joints.csv", "camera.yaml", "board.yaml")
 
 
 class RandomViews(Section):
@@ -68,8 +68,8 @@ class RandomViews(Section):
             RecipeError: the robot has no closed form, or does not reach the requested number of views.
         """
         solver, rng = self.check(robot), np.random.default_rng(self.seed)
-        chosen, needed = list[Tensor](), CANDIDATES * self.count
-        for _ in range(MAX_ATTEMPTS * needed):
+        chosen, needed = list[Tensor](), _CANDIDATES * self.count
+        for _ in range(_MAX_ATTEMPTS * needed):
             T_board_camera = self._view(board, rng)
             T_camera_board = invert(T_board_camera)
             if not _is_whole(camera, board, T_camera_board.numpy()):
@@ -82,7 +82,7 @@ class RandomViews(Section):
                 return select_far_apart(torch.stack(chosen), self.count)
         raise RecipeError(
             option="poses",
-            expected=f"at least {needed} of {MAX_ATTEMPTS * needed} random views of the board within reach of robot "
+            expected=f"at least {needed} of {_MAX_ATTEMPTS * needed} random views of the board within reach of robot "
             f"'{robot.name}'",
             value=len(chosen),
             remedy="check the positions of board and camera, and the distances",
@@ -373,14 +373,14 @@ def write_images(images: SimulatedImages, robot: TrueRobot, folder: str | os.Pat
     names = [f"q{joint + 1}_{axis.file_unit}" for joint, axis in enumerate(axes)]
     lines = [",".join(("image", *names))]
     files = [f"{number:04d}.png" for number in range(images.poses.count)]
-    with staged_folder(folder, names=(*files, *GIVEN_FILES)) as scratch:
+    with staged_folder(folder, names=(*files, *_GIVEN_FILES)) as scratch:
         q = robot.nominal.to_controller(images.joints_read(robot)).numpy()
         for file, joints, image in zip(files, q, images.render(robot), strict=True):
             Image.fromarray(image).save(scratch / file)
             shown = (axis.in_file_unit(float(value)) for axis, value in zip(axes, joints, strict=True))
             lines.append(",".join((file, *(f"{value:.9f}" for value in shown))))
-        (scratch / GIVEN_FILES[0]).write_text("\n".join(lines) + "\n", encoding="utf-8")
-        for document, name in zip((images.camera, images.board), GIVEN_FILES[1:], strict=True):
+        (scratch / _GIVEN_FILES[0]).write_text("\n".join(lines) + "\n", encoding="utf-8")
+        for document, name in zip((images.camera, images.board), _GIVEN_FILES[1:], strict=True):
             stated = document.model_dump(mode="json", exclude_unset=True)
             (scratch / name).write_text(yaml_text(stated), encoding="utf-8")
     return len(q)

@@ -24,19 +24,19 @@ from pisigma.robot.kinematics.parameter_jacobian import identification_jacobian
 from pisigma.validation.checks.check import CheckedCalibration
 from pisigma.validation.held_out.diagnostic import Diagnostic
 
-FRONTAL = np.deg2rad(12.0)
+_FRONTAL = np.deg2rad(12.0)
 """Angle of views [rad]; if 90 % of the views are less oblique, the error over the workspace is 1.5 to 3 times that
 of typical views."""
-ONE_BRANCH = 0.95
+_ONE_BRANCH = 0.95
 """Share of the images in one branch of the arm above which the other branches are treated as not measured."""
-EXPLAINED = 1.3
+_EXPLAINED = 1.3
 """Ratio of the images' scatter to the scatter explained by their corners, below which no model of the arm can
 improve the fit."""
-WIDE = 3.0
+_WIDE = 3.0
 """Standard deviation of the focal length [px] above which intrinsics are regarded as free; 0.5 is typical."""
-CONTRADICTED = 4.0
+_CONTRADICTED = 4.0
 """Deviation, in standard deviations, above which estimated intrinsics contradict their calibration."""
-POSTURES = 200
+_POSTURES = 200
 """Number of random joint vectors at which the error over the joint space is predicted."""
 
 
@@ -68,7 +68,7 @@ def view_warnings(
         robot: the nominal robot.
     """
     most = float(tilt.quantile(0.9))
-    if most < FRONTAL:
+    if most < _FRONTAL:
         yield _warning(
             "frontal_views",
             f"90 % of the images show the board at less than {np.rad2deg(most):.0f} deg from frontal, which "
@@ -78,7 +78,7 @@ def view_warnings(
         )
     solver = closed_form_solver(robot)
     share = 0.0 if solver is None else _largest_share(nearest_branch(solver, q))
-    if share >= ONE_BRANCH:
+    if share >= _ONE_BRANCH:
         yield _warning(
             "one_branch",
             f"{100 * share:.0f} % of the images were taken in one branch of the arm (the same configuration of "
@@ -109,7 +109,7 @@ def _intrinsics(images: Measurements, result: CalibrationResult) -> Iterator[Dia
             continue
         free = sigma > 0
         off = (result.unknowns["camera"][camera] - stated)[free] / sigma[free]
-        if sigma[0] > WIDE:
+        if sigma[0] > _WIDE:
             yield _warning(
                 "intrinsics_free",
                 f"The intrinsics of camera '{camera}' were estimated without a prior, so a bow of the board appears as "
@@ -117,7 +117,7 @@ def _intrinsics(images: Measurements, result: CalibrationResult) -> Iterator[Dia
                 "is one, and mount the board on glass.",
                 camera=camera,
             )
-        elif np.abs(off).max() > CONTRADICTED:
+        elif np.abs(off).max() > _CONTRADICTED:
             yield _warning(
                 "intrinsics_contradicted",
                 f"The images contradict the calibration of camera '{camera}' by {np.abs(off).max():.1f} standard "
@@ -145,7 +145,7 @@ def _limit(images: Measurements, result: CalibrationResult) -> Iterator[Diagnost
     problem, view = result.solved.problem, sensor_view_of(result.solved.refined)
     number = next(k for k, sensor in enumerate(problem.sensors) if sensor.name == "corner")
     ratio = view.noise[number] / float(torch.as_tensor(images.readings[NOISE_COLUMN]).median())
-    if ratio >= EXPLAINED:
+    if ratio >= _EXPLAINED:
         return
     total, shares = _predicted_error(result)
     parts = [
@@ -167,7 +167,7 @@ def _predicted_error(result: CalibrationResult) -> tuple[float, dict[str, float]
     """Predict the RMS error of a position over the joint space [m], and the shares of its square by unknown."""
     limits = torch.from_numpy(np.asarray(result.robot.limits)).clamp(-np.pi, np.pi)
     generator = torch.Generator().manual_seed(0)
-    draws = torch.rand(POSTURES, len(limits), generator=generator, dtype=torch.float64)
+    draws = torch.rand(_POSTURES, len(limits), generator=generator, dtype=torch.float64)
     q = limits[:, 0] + draws * (limits[:, 1] - limits[:, 0])
     J = identification_jacobian(result.robot, q)[1][:, :3, : result.solved.problem.space.arm_size].flatten(
         0, 1

@@ -102,7 +102,7 @@ Move = Literal["frame", "tool", "joint_zero"]
 MOVES: Final[frozenset[Move]] = frozenset({"frame", "tool", "joint_zero"})
 LARGE_SHARE = 2e-3
 """Errors, as a share of the reach, above which their cause is a mistake or a motion, not wear."""
-STEP = 1e-6
+_STEP = 1e-6
 """Step of finite differences with respect to joint values [rad or m]."""
 FITTED = 9
 """Number of parameters of a base and of the position of a tool."""
@@ -166,7 +166,7 @@ class RowsUnderModel:
     ) -> tuple[Float64[Tensor, "rows 4 4"], Float64[Tensor, "dof rows 4 4"]]:
         """Return poses predicted with moved joint zeros [rad or m], and their derivatives by finite differences."""
         zeros = torch.zeros(self.renamed_rows.dof, dtype=torch.float64) if zeros is None else zeros
-        moved = [zeros, *(zeros + STEP * torch.eye(self.renamed_rows.dof).double())]
+        moved = [zeros, *(zeros + _STEP * torch.eye(self.renamed_rows.dof).double())]
         here, *there = (
             poses_of_rows(
                 self.model,
@@ -176,7 +176,7 @@ class RowsUnderModel:
             )
             for by in moved
         )
-        return here, torch.stack([(one - here) / STEP for one in there])
+        return here, torch.stack([(one - here) / _STEP for one in there])
 
     @cached_property
     def predicted(self) -> Float64[Tensor, "rows 4 4"]:

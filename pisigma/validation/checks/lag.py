@@ -16,7 +16,7 @@ from pisigma.validation.setup_faults.ordered_rows import OrderedRows
 MIN_ROWS = 12
 LIKELY = CLEARLY + math.log(100.0)
 """Log Bayes factor above which a lag is reported."""
-NOTICED, LARGE = 1.1, 1.5
+NOTICED, _LARGE = 1.1, 1.5
 """Ratios of the errors with and without the lag above which a warning is given, and above which the calibration is
 implausible."""
 
@@ -52,7 +52,7 @@ def check_lag(checked: CheckedCalibration) -> Iterator[Diagnostic]:
     motion = "from the previous row" if lag.before else "to the next row"
     yield Diagnostic(
         kind="lag",
-        severity="implausible" if lag.factor > LARGE else "warning",
+        severity="implausible" if lag.factor > _LARGE else "warning",
         sentence=f"The joint values were logged {when}: they differ from those at the measurement by "
         f"{abs(lag.share):.2g} of the motion {motion}, which makes the errors {lag.factor:.3g} times as large; log "
         "them when the robot has stopped.",

@@ -29,23 +29,23 @@ from pisigma.validation.setup_faults.setup_faults import find_setup_faults
 
 MIN_WRONG_SHARE = 0.25
 """Share of wrong rows above which it is unknown which rows are wrong."""
-MIN_AGREEING_SHARE = 0.35
+_MIN_AGREEING_SHARE = 0.35
 """Smallest share of the rows that must agree with the model."""
 AGREES = 3.5
 """Ratio of an error to the expected error (of model and sensor) up to which a row agrees with a model."""
-APART = 2.0
+_APART = 2.0
 """Multiple of the limit `AGREES` above which a row belongs to another setup."""
-FAR_APART = 6.0
+_FAR_APART = 6.0
 """Smallest ratio of the median errors of both groups."""
-BETWEEN = 0.15
+_BETWEEN = 0.15
 """Largest share of the rows that may be neither near nor far."""
-DRAWS, SAMPLE = 100, 4
+DRAWS, _SAMPLE = 100, 4
 """Number and size of the random samples of rows to which a base or a tool is fitted, in addition to halves and every
 second row."""
-SPARE_ROWS = 3
+_SPARE_ROWS = 3
 """Number of rows that must agree with a fit in addition to the rows of its sample."""
-ADVICE = " No result is computed from all of them; measure again, or give each group its own file or frame."
-EXPLAINED = 2.5
+_ADVICE = " No result is computed from all of them; measure again, or give each group its own file or frame."
+_EXPLAINED = 2.5
 """Ratio of an error to the expected error up to which moved joint zeros explain all rows."""
 
 
@@ -67,7 +67,7 @@ def check_mixed_rows(judged: RowsUnderModel) -> Iterator[Diagnostic]:
 def mixed_rows(judged: RowsUnderModel, wrong: Bool[Tensor, " rows"]) -> Diagnostic:
     """Report rows that do not agree with the others, what distinguishes them, and what explains them."""
     found = too_many_wrong_rows(judged.rows, wrong)
-    sentence = f"{found.sentence.removesuffix(ADVICE)}{_cause(judged, wrong)}{ADVICE}"
+    sentence = f"{found.sentence.removesuffix(_ADVICE)}{_cause(judged, wrong)}{_ADVICE}"
     return found.model_copy(update={"sentence": sentence})
 
 
@@ -78,10 +78,10 @@ def too_many_wrong_rows(rows: Measurements, wrong: Bool[Tensor, " rows"]) -> Dia
         kind="mixed_rows",
         severity="implausible",
         sentence=f"{int(wrong.sum())} of {rows.rows} rows do not agree with the others: "
-        f"{distinction.clause}.{ADVICE}",
+        f"{distinction.clause}.{_ADVICE}",
         rows=tuple(rows.place(row) for row in wrong.nonzero()[:, 0].tolist()),
         values={"distinguished_by": distinction.by},
-        remedy=ADVICE.strip(),
+        remedy=_ADVICE.strip(),
     )
 
 
@@ -104,14 +104,14 @@ def _agreements(judged: RowsUnderModel) -> Iterator[Float64[Tensor, "rows 4 4"]]
     limit = AGREES * judged.predicted_deviation
     samples = list(_samples(judged.rows.rows))
     for kind in ("base", "tool"):
-        best, most = None, SAMPLE + SPARE_ROWS - 1
+        best, most = None, _SAMPLE + _SPARE_ROWS - 1
         for sample in samples:
             chosen = sample
             for _ in range(3):  # local optimisation: fit again to all rows that agree
                 T = _fitted(judged, kind, chosen)
                 agreeing = judged.error_lengths(T) <= limit
                 chosen = agreeing.nonzero()[:, 0]
-                if len(chosen) < SAMPLE:
+                if len(chosen) < _SAMPLE:
                     break
             if int(agreeing.sum()) > most:
                 best, most = T, int(agreeing.sum())
@@ -124,7 +124,7 @@ def _samples(rows: int) -> Iterator[Tensor]:
     every, draw = torch.arange(rows), torch.Generator().manual_seed(0)
     yield from (every[: rows // 2], every[rows // 2 :], every[::2], every[1::2])
     for _ in range(DRAWS):
-        yield torch.randperm(rows, generator=draw)[:SAMPLE]
+        yield torch.randperm(rows, generator=draw)[:_SAMPLE]
 
 
 def _fitted(judged: RowsUnderModel, kind: str, chosen: Tensor) -> Float64[Tensor, "rows 4 4"]:
@@ -138,13 +138,13 @@ def _fitted(judged: RowsUnderModel, kind: str, chosen: Tensor) -> Float64[Tensor
 def _apart(judged: RowsUnderModel, T: Float64[Tensor, "rows 4 4"]) -> Bool[Tensor, " rows"] | None:
     """Return the mask of rows that are far from the agreeing rows; None if they are few or not clearly separated."""
     ratio = judged.error_lengths(T) / (AGREES * judged.predicted_deviation)
-    near, far = ratio <= 1, ratio > APART
+    near, far = ratio <= 1, ratio > _APART
     count = judged.rows.rows
-    if not int(far.sum()) > MIN_WRONG_SHARE * count or not int(near.sum()) >= MIN_AGREEING_SHARE * count:
+    if not int(far.sum()) > MIN_WRONG_SHARE * count or not int(near.sum()) >= _MIN_AGREEING_SHARE * count:
         return None
-    if int((~near & ~far).sum()) > BETWEEN * count:
+    if int((~near & ~far).sum()) > _BETWEEN * count:
         return None
-    return far if float(ratio[far].median()) > FAR_APART * float(ratio[near].median()) else None
+    return far if float(ratio[far].median()) > _FAR_APART * float(ratio[near].median()) else None
 
 
 def _joints_explain(judged: RowsUnderModel) -> bool:
@@ -153,20 +153,20 @@ def _joints_explain(judged: RowsUnderModel) -> bool:
     J = judged.zero_columns()[1][..., :3, 3].flatten(1).t()
     solution = torch.linalg.lstsq(J, error.flatten(), driver="gelsd").solution
     left = (error.flatten() - J @ solution).view(-1, 3).norm(dim=-1)
-    return float((left / judged.predicted_deviation).square().mean().sqrt()) <= EXPLAINED
+    return float((left / judged.predicted_deviation).square().mean().sqrt()) <= _EXPLAINED
 
 
-CERTAIN = 30.0
+_CERTAIN = 30.0
 """Log Bayes factor above which rows certainly differ. For one arm, unmodelled gear errors and sag give factors of up
 to 90 with frames, and up to 30 otherwise, but small differences."""
-LARGE = {"tool": 1.6, "frame": 2.2, "arm": 2.2}
+_LARGE = {"tool": 1.6, "frame": 2.2, "arm": 2.2}
 """Ratio of the errors with and without the difference above which there are two populations. For one arm (simulated
 with gear errors and sag, and measured: UR5, UR10, FANUC R-2000iC) the ratio is 1.3, 1.9 and 1.9 at most."""
-HARDLY_USED = 0.38
+_HARDLY_USED = 0.38
 """Share of the values absorbed by parameters above which the ratios of one arm grow, because the best of many ways
 to split the rows overfits: 24 sets of 60 positions (share 0.35) have 1.7 at most, of 40 positions (0.5) 2.9, and
 arms of 7 joints (0.63) 3.1."""
-IMPLAUSIBLE = 5.0
+_IMPLAUSIBLE = 5.0
 """Ratio of the errors with and without a different tool or frame above which the calibration is wrong; with two arms
 it always is."""
 
@@ -211,8 +211,8 @@ def _two_sizes(checked: CheckedCalibration) -> Iterator[Diagnostic]:
 def _differ(found: Populations) -> bool:
     """Return whether the rows are two populations rather than one arm with unmodelled errors."""
     return (
-        found.log_bayes_factor > CERTAIN
-        and found.factor > LARGE[found.differing] * max((1 - HARDLY_USED) / (1 - found.used), 1.0)
+        found.log_bayes_factor > _CERTAIN
+        and found.factor > _LARGE[found.differing] * max((1 - _HARDLY_USED) / (1 - found.used), 1.0)
         and int(found.second.sum()) >= MIN_SHARE * found.tried
     )
 
@@ -233,7 +233,7 @@ def _two_populations(rows: Measurements, found: Populations) -> Diagnostic:
             "Name another frame in these rows (column 'frame'), or leave them out",
         ),
     }[found.differing]
-    implausible = found.differing == "arm" or found.factor > IMPLAUSIBLE
+    implausible = found.differing == "arm" or found.factor > _IMPLAUSIBLE
     return Diagnostic(
         kind="two_populations",
         severity="implausible" if implausible else "warning",
@@ -250,7 +250,7 @@ def _two_populations(rows: Measurements, found: Populations) -> Diagnostic:
     )
 
 
-MAX_PLACES = 8
+_MAX_PLACES = 8
 """Largest number of rows that are listed individually."""
 
 
@@ -271,8 +271,8 @@ def distinguishing_property(rows: Measurements, some: Bool[Tensor, " rows"]) -> 
     for distinction in (*_by_name(rows, some), *_by_order(rows, some), *_by_value(rows, some)):
         return distinction
     numbers = some.nonzero()[:, 0].tolist()
-    listed = join_words(rows.place(number) for number in numbers[:MAX_PLACES])
-    more = f" and {len(numbers) - MAX_PLACES} more" if len(numbers) > MAX_PLACES else ""
+    listed = join_words(rows.place(number) for number in numbers[:_MAX_PLACES])
+    more = f" and {len(numbers) - _MAX_PLACES} more" if len(numbers) > _MAX_PLACES else ""
     return Distinction("nothing", f"{listed}{more}, which are scattered among the others")
 
 

@@ -15,15 +15,15 @@ from pisigma.validation.held_out.calibration_validation import pose_errors_of
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.held_out.trained_calibrations import base_and_tool
 
-SUSPICIOUS = 0.01
+_SUSPICIOUS = 0.01
 """Errors of the nominal robot, as a share of its reach, above which other robots are tried, and up to which another
 robot explains the rows; arms are built to a third of it or better."""
-NEARER = 1 / 3
+_NEARER = 1 / 3
 """Ratio of the errors of another robot to those of this robot below which the other is reported. A nominal arm
 explains measurements of such an arm to a thousandth of its reach; different robots differ by more."""
-MIN_ROWS = 6
+_MIN_ROWS = 6
 """Minimum number of rows; with fewer, base and tool alone fit another robot to the rows."""
-MAX_ROWS = 200
+_MAX_ROWS = 200
 """Number of rows that are sufficient to distinguish robots."""
 
 
@@ -32,17 +32,17 @@ def check_other_robot(checked: CheckedCalibration) -> Iterator[Diagnostic]:
     robot = checked.robot
     nominal = None if checked.figures is None else checked.figures.nominal
     stated = None if nominal is None else nominal.rms_mm
-    if stated is None or stated <= SUSPICIOUS * robot.reach * 1e3:
+    if stated is None or stated <= _SUSPICIOUS * robot.reach * 1e3:
         return
     robots = {name: Robot.load(name) for name in catalogue()}
     # small arms have small errors for any rows: another robot has to explain the rows as its own
     others = {
         name: size
         for name, other in robots.items()
-        if (size := _rms_mm(checked, other)) is not None and size <= SUSPICIOUS * other.reach * 1e3
+        if (size := _rms_mm(checked, other)) is not None and size <= _SUSPICIOUS * other.reach * 1e3
     }
     name = min(others, key=lambda other: others[other], default=None)
-    if name is not None and others[name] < NEARER * stated:
+    if name is not None and others[name] < _NEARER * stated:
         yield Diagnostic(
             kind="other_robot",
             severity="implausible",
@@ -63,7 +63,7 @@ def check_other_robot_of_rows(judged: RowsUnderModel) -> Iterator[Diagnostic]:
 def other_robot_diagnostics(robot: Robot, rows: Measurements) -> tuple[Diagnostic, ...]:
     """Check rows without a calibration for another robot; empty if there are too few rows."""
     calibrator = GeometricCalibrator(robot)
-    if rows.rows < MIN_ROWS:
+    if rows.rows < _MIN_ROWS:
         return ()
     try:
         nominal = base_and_tool(calibrator).fit(rows)
@@ -78,7 +78,7 @@ def _rms_mm(checked: CheckedCalibration, other: Robot) -> float | None:
     if other.name == checked.robot.name or other.revolute != checked.robot.revolute:
         return None
     count = checked.rows.rows
-    chosen = torch.linspace(0, count - 1, min(count, MAX_ROWS)).round().long()
+    chosen = torch.linspace(0, count - 1, min(count, _MAX_ROWS)).round().long()
     rows = checked.rows.select(chosen)
     try:
         fitted = base_and_tool(replace(checked.calibrator, robot=other)).fit(rows)

@@ -26,11 +26,11 @@ from pisigma.validation.setup_faults.joint_faults import joint_causes, signs_and
 from pisigma.validation.setup_faults.setup_fault import SetupFault, fault_of_cause
 from pisigma.validation.setup_faults.setup_faults import unexplained
 
-FAR, STRETCHED = 3.0, 0.01
+FAR, _STRETCHED = 3.0, 0.01
 """Limits of a stated distance: it is wrong if it is off by more than this multiple of the RMS error of the rows plus
 this share of the distance."""
 
-MAX_ITERATIONS, MIN_GAIN, STEP, MAX_STEP = 8, 0.9, 1e-6, 0.3
+MAX_ITERATIONS, _MIN_GAIN, _STEP, MAX_STEP = 8, 0.9, 1e-6, 0.3
 """Settings of the fit of motions: number of iterations, ratio of successive errors at which it ends,
 finite-difference step and largest step [rad or m]."""
 
@@ -46,7 +46,7 @@ def distance_diagnostics(comparison: ModelComparison, figures: ModelFigures) -> 
     rms = figures.position.statistics["rms"]
     for one in distances:
         error = one.errors_mm[figures.name]
-        if abs(error) > FAR * rms + STRETCHED * one.stated_mm:
+        if abs(error) > FAR * rms + _STRETCHED * one.stated_mm:
             yield Diagnostic(
                 kind="socket_distance",
                 severity="implausible",
@@ -163,7 +163,7 @@ def _fitted(
     for _ in range(MAX_ITERATIONS if free else 1):
         error = _errors(model, rows, x)
         here = _rms(error)
-        if not here < MIN_GAIN * least:
+        if not here < _MIN_GAIN * least:
             break
         least, best = here, x
         if free:
@@ -194,8 +194,8 @@ def _columns(
     error: Float64[Tensor, "rows 3"],
 ) -> Float64[Tensor, "values free"]:
     """Return the derivatives of all errors with respect to the free unknowns, by finite differences."""
-    eye = STEP * torch.eye(len(x), dtype=torch.float64)
-    columns = [((_errors(model, rows, x + eye[number]) - error) / STEP).flatten() for number in free]
+    eye = _STEP * torch.eye(len(x), dtype=torch.float64)
+    columns = [((_errors(model, rows, x + eye[number]) - error) / _STEP).flatten() for number in free]
     return torch.nan_to_num(torch.stack(columns, -1))
 
 

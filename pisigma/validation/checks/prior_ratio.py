@@ -13,7 +13,7 @@ from pisigma.validation.held_out.diagnostic import Diagnostic
 UNUSUAL = 4.0
 """Ratio of the lower bound of the errors to their prior standard deviation above which a warning is given. Healthy
 robots have up to 4.6 times the default prior of 1 mrad."""
-IMPLAUSIBLE = 10.0
+_IMPLAUSIBLE = 10.0
 """Ratio of the lower bound of the errors to their prior standard deviation above which the rows do not belong to
 this robot (the user can state a wider prior): the odds against a normal error of 10 standard deviations are 1e23 to
 1."""
@@ -38,7 +38,7 @@ def check_prior_ratio(checked: CheckedCalibration) -> Iterator[Diagnostic]:
     well.
     """
     unusual = [ratio for ratio in checked.geometric.prior_ratios if ratio.at_least > UNUSUAL]
-    large = [ratio for ratio in unusual if ratio.at_least > IMPLAUSIBLE]
+    large = [ratio for ratio in unusual if ratio.at_least > _IMPLAUSIBLE]
     possible = narrowest_robot_class(checked, large)
     usual = checked.robot_class
     for ratio in unusual:
@@ -110,7 +110,7 @@ def _size(ratio: PriorRatio) -> str:
 
 
 def _consequence(ratio: PriorRatio, usual: RobotClass, possible: RobotClass | None, believed: bool) -> str:
-    if believed and (possible is usual or possible is None or ratio.at_least <= IMPLAUSIBLE):
+    if believed and (possible is usual or possible is None or ratio.at_least <= _IMPLAUSIBLE):
         return (
             "so the size of the prior was estimated from the data; check the nominal geometry and the robot, or give a "
             "wider prior"
@@ -135,7 +135,7 @@ def _consequence(ratio: PriorRatio, usual: RobotClass, possible: RobotClass | No
 FAR = 8e-3
 """Deviation of a joint zero above which a warning is given [rad]; healthy industrial robots and cobots are within 3
 mrad."""
-CERTAIN = 3.0
+_CERTAIN = 3.0
 """Margin above `FAR`, in standard errors."""
 
 
@@ -151,7 +151,7 @@ def check_joint_zero(checked: CheckedCalibration) -> Iterator[Diagnostic]:
     far = usual.largest.joint_offset if usual is SERVO else FAR
     for one in checked.geometric.parameters:
         joint = one.name.removeprefix("theta_")
-        if joint == one.name or not one.free or abs(one.change) - CERTAIN * one.standard_error < far:
+        if joint == one.name or not one.free or abs(one.change) - _CERTAIN * one.standard_error < far:
             continue
         yield Diagnostic(
             kind="joint_zero",

@@ -22,7 +22,7 @@ from pisigma.validation.checks.unexplained import check_residual, check_unexplai
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.held_out.trained_calibrations import fit_compared_calibrations
 
-CHECKS: tuple[Check, ...] = (
+_CHECKS: tuple[Check, ...] = (
     check_other_robot,
     check_setup_fault,
     check_joint_zero,
@@ -59,7 +59,7 @@ def diagnostics_of(checked: CheckedCalibration) -> tuple[Diagnostic, ...]:
     Raises:
         IdentificationError: the measurements cannot belong to this robot.
     """
-    diagnostics = [diagnostic for check in CHECKS for diagnostic in check(checked)]
+    diagnostics = [diagnostic for check in _CHECKS for diagnostic in check(checked)]
     return tuple(sorted(diagnostics, key=lambda diagnostic: diagnostic.severity != "implausible"))
 
 

@@ -17,17 +17,17 @@ from pisigma.validation.setup_faults.ordered_rows import OrderedRows
 
 STEPS = tuple(factor * 10.0**power for power in (1, 0, -1, -2, -3) for factor in (5, 2, 1))
 """Rounding steps [deg or mm] that are tried, coarsest first."""
-ON_LATTICE = 1e-4
+_ON_LATTICE = 1e-4
 """Largest distance of a rounded value from a multiple of the step, in steps."""
-MIN_ROWS = 12
-MIN_SHARE = 0.25
+_MIN_ROWS = 12
+_MIN_SHARE = 0.25
 """Share of the squared errors above which rounding is reported."""
-MAX_SHARE = 1.7
+_MAX_SHARE = 1.7
 """Largest ratio of the predicted to the observed squared error of rounded rows; the series of joint errors absorbs a
 part of it."""
-LIKELY = math.log(100.0)
+_LIKELY = math.log(100.0)
 """Log likelihood ratio above which rounding causes the errors."""
-SIZES = np.geomspace(1e-3, 1e3, 61)
+_SIZES = np.geomspace(1e-3, 1e3, 61)
 """Sizes of all other errors that are tried, relative to the noise."""
 
 
@@ -72,7 +72,7 @@ def check_rounding(checked: CheckedCalibration) -> Iterator[Diagnostic]:
             step * 1e-3 / 2,
             float(errors.square().sum(1).nanmean().sqrt()),
         )  # sqrt(3) step / sqrt(12)
-        if made**2 > MIN_SHARE * rms**2:
+        if made**2 > _MIN_SHARE * rms**2:
             yield Diagnostic(
                 kind="rounding",
                 severity="warning",
@@ -103,7 +103,7 @@ def joint_rounding(result: CalibrationResult, measurements: Measurements) -> Rou
         unit = np.where(result.robot.revolute, math.degrees(1), 1e3)
         steps = np.array([_common_step(column[:, None]) for column in (q * unit).T]) / unit
     rows = OrderedRows.from_result(result) if steps.any() else None
-    if rows is None or len(rows.residual) < MIN_ROWS:
+    if rows is None or len(rows.residual) < _MIN_ROWS:
         return None
     made = rows.joint_derivative * steps / math.sqrt(12)
     # Residuals of a fit are too small, because the parameters absorbed a part of the errors.
@@ -111,7 +111,7 @@ def joint_rounding(result: CalibrationResult, measurements: Measurements) -> Rou
         rows.values / max(rows.values - rows.effective_parameters, 1.0)
     )
     share = float(np.square(made).sum() / max(np.square(left).sum(), 1e-300))
-    if not MIN_SHARE < share < MAX_SHARE or _gain(left, made) < LIKELY:
+    if not _MIN_SHARE < share < _MAX_SHARE or _gain(left, made) < _LIKELY:
         return None
     position = (made * rows.noise[:, None])[:, :3]
     error = math.sqrt(np.square(position).sum() / len(position))
@@ -127,7 +127,7 @@ def _gain(
     along = np.square(np.einsum("nvk,nv->nk", axes, residual))
 
     def likelihood(share: float) -> float:
-        variances = share * sizes + np.square(SIZES)[:, None, None]
+        variances = share * sizes + np.square(_SIZES)[:, None, None]
         return float((-np.log(variances) - along / variances).sum((1, 2)).max() / 2)
 
     return likelihood(1.0) - likelihood(0.0)
@@ -136,11 +136,11 @@ def _gain(
 def _common_step(values: Float64[np.ndarray, "rows columns"]) -> float:
     """Return the coarsest step of which all values are multiples; 0 if there is none."""
     values = values[np.isfinite(values).all(1)]
-    if len(values) < MIN_ROWS or np.ptp(values, 0).min() <= 0:
+    if len(values) < _MIN_ROWS or np.ptp(values, 0).min() <= 0:
         return 0.0
     for step in STEPS:
         counts = values / step
-        if np.abs(counts - np.round(counts)).max() < ON_LATTICE:
+        if np.abs(counts - np.round(counts)).max() < _ON_LATTICE:
             return step
     return 0.0
 

@@ -19,30 +19,30 @@ from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.setup_faults.cause import length_text
 from pisigma.validation.setup_faults.row_order import Motion, find_motion
 
-LIKELY = CLEARLY + math.log(100.0)
+_LIKELY = CLEARLY + math.log(100.0)
 """Log Bayes factor above which a motion is reported, assuming that something moves in 1 of 100 measurements."""
-CERTAIN = CLEARLY + math.log(1e6)
+_CERTAIN = CLEARLY + math.log(1e6)
 """Log Bayes factor above which a motion can make a calibration implausible; at most one in a million valid
 calibrations is affected."""
-LARGE = 1.5
+_LARGE = 1.5
 """Ratio of the errors with and without the motion above which noise and robot cannot be their only cause."""
-MIN_ROWS = 12
+_MIN_ROWS = 12
 """Smallest number of rows of a setup: 36 values for the 9 parameters of base and tool of positions."""
-FITS_SHARE = 5e-3
+_FITS_SHARE = 5e-3
 """Errors of the nominal robot, as a share of its reach; geometric errors cause smaller ones."""
 FAR = 5.0
 """Ratio of an error to the errors of the rows of a setup above which a row belongs to another setup."""
-MAX_WRONG_SHARE = 0.1
+_MAX_WRONG_SHARE = 0.1
 """Share of the rows of a setup that may be far off without contradicting it."""
 
 
 def check_row_order(checked: CheckedCalibration) -> Iterator[Diagnostic]:
     """Test the residuals for a motion of a frame or the tool at any row, or for a slow motion over all rows.
 
-    A motion is reported if it is `LIKELY`. It makes the calibration implausible if it is `CERTAIN` and its factor on
-    the residuals is `LARGE`. A hybrid has smaller residuals, so smaller motions are visible, but it absorbs a part
+    A motion is reported if it is `_LIKELY`. It makes the calibration implausible if it is `_CERTAIN` and its factor on
+    the residuals is `_LARGE`. A hybrid has smaller residuals, so smaller motions are visible, but it absorbs a part
     of large motions, so both calibrations are tested. A tool that seems to have moved exactly where the rows of
-    another frame start is an effect of errors that the frames do not explain, unless the factor is `LARGE`.
+    another frame start is an effect of errors that the frames do not explain, unless the factor is `_LARGE`.
     """
     motions = [find_motion(checked.geometric)]
     if checked.hybrid is not None and checked.hybrid.learned is not None:
@@ -51,12 +51,12 @@ def check_row_order(checked: CheckedCalibration) -> Iterator[Diagnostic]:
         motion
         for motion in motions
         if motion
-        and motion.log_bayes_factor > LIKELY
-        and not (motion.begins_frame and motion.factor <= LARGE)
+        and motion.log_bayes_factor > _LIKELY
+        and not (motion.begins_frame and motion.factor <= _LARGE)
     ]
     if likely:
         motion = max(likely, key=lambda motion: motion.factor)
-        certain = motion.log_bayes_factor > CERTAIN and motion.factor > LARGE
+        certain = motion.log_bayes_factor > _CERTAIN and motion.factor > _LARGE
         what, remedy = _texts(motion, checked.rows)
         yield Diagnostic(
             kind="row_order",
@@ -134,10 +134,10 @@ def new_setup_refusal(robot: Robot, measurements: Measurements) -> Identificatio
     if not one or measurements.position is None or not bool(torch.isfinite(measurements.position).all()):
         return None
     order = np.argsort(np.array(measurements.line), kind="stable")
-    third = max(len(order) // 3, MIN_ROWS)
-    if len(order) < 2 * MIN_ROWS + 1:
+    third = max(len(order) // 3, _MIN_ROWS)
+    if len(order) < 2 * _MIN_ROWS + 1:
         return None
-    if float(np.median(_errors(robot, measurements, order))) < FITS_SHARE * robot.reach:
+    if float(np.median(_errors(robot, measurements, order))) < _FITS_SHARE * robot.reach:
         return None  # one setup explains all rows
     for backwards in (False, True):
         along = order[::-1] if backwards else order
@@ -148,12 +148,12 @@ def new_setup_refusal(robot: Robot, measurements: Measurements) -> Identificatio
         count = int(agreeing.argmax()) + 1
         first = len(order) - count if backwards else count
         parts = order[:first], order[first:]
-        if min(map(len, parts)) < MIN_ROWS:
+        if min(map(len, parts)) < _MIN_ROWS:
             continue
-        if of_setup[:count].mean() < 1 - MAX_WRONG_SHARE or of_setup[count:].mean() > MAX_WRONG_SHARE:
+        if of_setup[:count].mean() < 1 - _MAX_WRONG_SHARE or of_setup[count:].mean() > _MAX_WRONG_SHARE:
             continue
         fits = [float(np.median(_errors(robot, measurements, part)[part])) for part in parts]
-        if max(fits) < FITS_SHARE * robot.reach:
+        if max(fits) < _FITS_SHARE * robot.reach:
             row = int(order[first])
             return IdentificationError(
                 "the instrument or the tool was moved before this row: the rows before it fit the nominal robot "

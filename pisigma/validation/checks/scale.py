@@ -20,12 +20,12 @@ from pisigma.validation.held_out.calibration_summary import ScaleFigures
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.setup_faults.cause import length_text
 
-SCALE_SIGMAS = (0.003, 0.1)
+_SCALE_SIGMAS = (0.003, 0.1)
 """Prior standard deviations of a common factor on the lengths, with equal probability: for instruments and heat, and
 for wrong units."""
-LENGTH_ERRORS = np.geomspace(3e-5, 1.0, 40)
+_LENGTH_ERRORS = np.geomspace(3e-5, 1.0, 40)
 """Standard deviations of the errors of individual lengths [m], with equal probability."""
-STRONG = math.log(10.0)
+_STRONG = math.log(10.0)
 """Logarithm of the Bayes factor above which a common factor is reported (Jeffreys 1961, Theory of Probability, appendix
 B: "strong").
 
@@ -33,7 +33,7 @@ Only nominal lengths determine the scale, and errors of 0.3 mm of links of 0.5 m
 error of 0.0004. Of 600 simulated arms, 5 are reported without a factor, and 61 with a factor of 1.001. The most
 powerful test (Neyman and Pearson 1933) with as few false alarms, which knows the distribution of link errors, finds a
 factor of 1.001 in half of the KR 10."""
-IMPLAUSIBLE = 0.03
+_IMPLAUSIBLE = 0.03
 """Difference of the factor from 1 above which the unit or the robot is wrong. Heat stretches arms and instruments by
 less than 0.2 %, and wrong use of a scale bar by 1 %."""
 
@@ -65,9 +65,9 @@ class CommonScale:
 def check_scale(checked: CheckedCalibration) -> Iterator[Diagnostic]:
     """Look for a common factor on all lengths, in addition to independent errors of every length."""
     scale = common_scale(checked.geometric)
-    if scale is None or scale.log_bayes_factor < STRONG:
+    if scale is None or scale.log_bayes_factor < _STRONG:
         return
-    implausible = abs(scale.factor - 1) > IMPLAUSIBLE
+    implausible = abs(scale.factor - 1) > _IMPLAUSIBLE
     lengths = (
         "lengths of the board, and that the intrinsics belong to the camera of these images"
         if "corner" in checked.rows.kinds
@@ -138,8 +138,8 @@ def common_scale(result: CalibrationResult) -> CommonScale | None:
     # At the solution, (N + P) (x - nominal) = b, because the nominal values are the mean of the prior.
     right = here.normal.numpy() @ (here.point - problem.nominal)[problem.active].numpy()
     data = here.normal.numpy() - np.diag(precision)
-    plain, estimate, information = np.empty((3, len(LENGTH_ERRORS)))
-    for k, error in enumerate(LENGTH_ERRORS):
+    plain, estimate, information = np.empty((3, len(_LENGTH_ERRORS)))
+    for k, error in enumerate(_LENGTH_ERRORS):
         precision[erring] = error**-2
         normal = data + np.diag(precision)
         diagonal = normal.diagonal()
@@ -155,27 +155,27 @@ def common_scale(result: CalibrationResult) -> CommonScale | None:
         information[k] = lengths @ pull - v @ v
         estimate[k] = u @ v / information[k]
     # A normal prior and a normal likelihood of s: their product integrates in closed form.
-    ratio = np.square(SCALE_SIGMAS)[:, None] * information
+    ratio = np.square(_SCALE_SIGMAS)[:, None] * information
     gain = (np.square(estimate) * information * ratio / (1 + ratio) - np.log1p(ratio)) / 2
     scaled = plain + gain
     best = np.unravel_index(scaled.argmax(), scaled.shape)[1]
     return CommonScale(
         factor=1 + float(estimate[best]),
         sigma=float(information[best] ** -0.5),
-        log_bayes_factor=float(logsumexp(scaled) - logsumexp(plain) - math.log(len(SCALE_SIGMAS))),
+        log_bayes_factor=float(logsumexp(scaled) - logsumexp(plain) - math.log(len(_SCALE_SIGMAS))),
     )
 
 
-MIN_CHANGE = 5e-4
+_MIN_CHANGE = 5e-4
 """Smallest difference of the factor from 1; smaller ones are caused by heat: 20 K stretch an aluminium arm by 0.05
 %."""
-UNUSUAL = 2.0
+_UNUSUAL = 2.0
 """Ratio of errors to expected errors below which no explanation is needed."""
-EXPLAINED_BY_SCALE = 0.6
+_EXPLAINED_BY_SCALE = 0.6
 """Largest share of the errors that may remain after correction of the factor."""
-AS_GOOD_AS_SCALE = 1.3
+_AS_GOOD_AS_SCALE = 1.3
 """Factor by which errors under any other explanation must be larger."""
-MIN_DEVIATIONS = 5.0
+_MIN_DEVIATIONS = 5.0
 """Difference of the factor from 1, in standard deviations, above which it is reported."""
 
 
@@ -189,16 +189,16 @@ def check_scale_of_rows(judged: RowsUnderModel) -> Iterator[Diagnostic]:
     T = base @ judged.poses_before_fit @ tool
     error = (judged.measured.position - T[:, :3, 3]).flatten()
     before, _, _ = _fit(_frames(T), error)
-    if not before > UNUSUAL * usual:
+    if not before > _UNUSUAL * usual:
         return
     position = (judged.measured.position - judged.measured.position.mean(0)).flatten()
     after, factor, deviation = _fit(torch.cat([_frames(T), position[:, None]], 1), error)
     zeros = (base @ judged.zero_columns()[1] @ tool)[..., :3, 3].flatten(1)
     others = (_fit(torch.cat([_frames(T), one[:, None]], 1), error)[0] for one in zeros)
     if (
-        abs(factor) > max(MIN_CHANGE, MIN_DEVIATIONS * deviation)
-        and after < EXPLAINED_BY_SCALE * before
-        and min(others) > AS_GOOD_AS_SCALE * after
+        abs(factor) > max(_MIN_CHANGE, _MIN_DEVIATIONS * deviation)
+        and after < _EXPLAINED_BY_SCALE * before
+        and min(others) > _AS_GOOD_AS_SCALE * after
     ):
         yield Diagnostic(
             kind="scale",

@@ -25,18 +25,18 @@ from pisigma.validation.setup_faults.nominal_robot_faults import (
 )
 from pisigma.validation.setup_faults.setup_fault import combine_alternatives, fault_of_cause
 
-UNRELATED = (
+_UNRELATED = (
     "The measured positions are unrelated to the joint values of their rows, so the joint values and positions of "
     "different rows belong together; check whether one of them was sorted or comes from another program."
 )
-MIN_ROWS_OF_SIZE = 4
+_MIN_ROWS_OF_SIZE = 4
 """Minimum number of rows for the check of size; with fewer, positions may be near each other by chance."""
-SCALE = 30.0
+_SCALE = 30.0
 """Ratio of the spreads of measured and nominal positions above which (or below whose inverse) the unit is wrong."""
-ARM_SHARE = 0.3
+_ARM_SHARE = 0.3
 """Spread of positions caused by a tool that the nominal robot lacks, and smallest spread of typical poses, as a
 share of the reach."""
-MIN_ROWS_FOR_JOINTS = 8
+_MIN_ROWS_FOR_JOINTS = 8
 """Smallest number of rows that distinguish columns of joints: 24 values, 9 of which determine base and tool."""
 
 
@@ -59,7 +59,7 @@ def setup_diagnostics(robot: Robot, rows: Measurements) -> tuple[Diagnostic, ...
         return (fault.diagnostic(severity),)
     if are_unrelated(robot, rows):
         return (
-            Diagnostic(kind="setup_fault", severity="implausible", sentence=UNRELATED, cause="unrelated"),
+            Diagnostic(kind="setup_fault", severity="implausible", sentence=_UNRELATED, cause="unrelated"),
         )
     return ()
 
@@ -81,16 +81,16 @@ def check_setup_of_rows(judged: RowsUnderModel) -> Iterator[Diagnostic]:
 def check_position_size(robot: Robot, rows: Measurements) -> Iterator[Diagnostic]:
     """Compare the spread of the measured positions with the spread of the nominal robot's positions."""
     group = largest_group(rows)
-    if group.position is None or group.rows < MIN_ROWS_OF_SIZE:
+    if group.position is None or group.rows < _MIN_ROWS_OF_SIZE:
         return
     measured, nominal = (
         position_spread(group.position),
         position_spread(forward_kinematics(robot, group.q)[:, :3, 3]),
     )
-    arm = ARM_SHARE * robot.reach
-    if measured > SCALE * (nominal + arm):
+    arm = _ARM_SHARE * robot.reach
+    if measured > _SCALE * (nominal + arm):
         cause, mistake = "mm_named_m", "x, y and z are millimetres that are named metres"
-    elif SCALE * measured < nominal > arm:
+    elif _SCALE * measured < nominal > arm:
         cause = "m_named_mm"
         mistake = "x, y and z are metres that are named millimetres, or do not change with the robot"
     else:
@@ -112,7 +112,7 @@ def joint_columns(robot: Robot, rows: Measurements) -> Iterator[Diagnostic]:
     With at least `MIN_ROWS_NOMINAL` rows, `find_nominal_robot_faults` tries many more hypotheses instead.
     """
     group = largest_group(rows)
-    if not MIN_ROWS_FOR_JOINTS <= group.rows < MIN_ROWS_NOMINAL:
+    if not _MIN_ROWS_FOR_JOINTS <= group.rows < MIN_ROWS_NOMINAL:
         return
     here, usual = _errors(robot, group, group.q[None])[0], usual_error(robot, group.q)
     if not here > usual:

@@ -10,12 +10,12 @@ from pisigma.validation.checks.check import CheckedCalibration
 from pisigma.validation.held_out.calibration_validation import pose_errors_of
 from pisigma.validation.held_out.diagnostic import Diagnostic
 
-DISAGREEING = 3.0
+_DISAGREEING = 3.0
 """Ratio of residuals and stated standard deviations above which (or below whose inverse) a warning is given. A stated
 standard deviation is a manufacturer's bound or an estimate, and rarely correct to better than a factor of 2."""
-CHI_MEDIAN = {1: 0.6745, 3: 1.5382}
+_CHI_MEDIAN = {1: 0.6745, 3: 1.5382}
 """Median length of a standard normal vector by its number of components."""
-HELD_BACK = 0.5
+_HELD_BACK = 0.5
 """Ratio of the residuals without and with the stated noise below which the stated noise impaired the calibration."""
 
 
@@ -30,13 +30,13 @@ def check_stated_noise(checked: CheckedCalibration) -> Iterator[Diagnostic]:
     for sensor, part in zip(
         solved.problem.sensors, sensor_view_of(solved.refined).contributions, strict=True
     ):
-        if sensor.sigma is None or sensor.certain or sensor.components not in CHI_MEDIAN:
+        if sensor.sigma is None or sensor.certain or sensor.components not in _CHI_MEDIAN:
             continue
         distance = part.distance[sensor.present]
-        ratio = float(distance.median()) / CHI_MEDIAN[sensor.components]
+        ratio = float(distance.median()) / _CHI_MEDIAN[sensor.components]
         margin = math.exp(3 / math.sqrt(len(distance)))
         larger = ratio if learned is None else learned.noise[sensor.name]
-        if larger > DISAGREEING * margin:
+        if larger > _DISAGREEING * margin:
             yield Diagnostic(
                 kind="stated_noise",
                 severity="warning",
@@ -46,12 +46,12 @@ def check_stated_noise(checked: CheckedCalibration) -> Iterator[Diagnostic]:
                 cause=sensor.name,
                 values={"residual_over_stated": larger},
             )
-        elif ratio * margin < 1 / DISAGREEING:
+        elif ratio * margin < 1 / _DISAGREEING:
             yield _too_large(checked, sensor.name, 1 / max(ratio, 1e-9))
 
 
 def _too_large(checked: CheckedCalibration, sensor: str, factor: float) -> Diagnostic:
-    held_back = _share_without(checked) < HELD_BACK
+    held_back = _share_without(checked) < _HELD_BACK
     consequence = (
         "and the arm is fitted far better without them, so they impaired the calibration;"
         if held_back

@@ -8,7 +8,7 @@ from pisigma.joint_correction.joint_torques import JointTorques
 from pisigma.validation.checks.check import CheckedCalibration
 from pisigma.validation.held_out.diagnostic import Diagnostic
 
-SIGNIFICANT = 3.0
+_SIGNIFICANT = 3.0
 """Ratio of a compliance to its standard deviation above which its sign is known."""
 
 
@@ -26,7 +26,7 @@ def check_torques(checked: CheckedCalibration) -> Iterator[Diagnostic]:
             deviation = torch.zeros_like(weights[feature])
             deviation[feature.used] = hybrid.uncertainty.root[first : first + count].norm(dim=1)
             compliance = learned.compliances(weights[feature].detach())
-            known = compliance.abs() > SIGNIFICANT * learned.compliances(deviation).abs()
+            known = compliance.abs() > _SIGNIFICANT * learned.compliances(deviation).abs()
             yield from _negative(
                 {joint: float(compliance[joint]) for joint in known.nonzero()[:, 0].tolist()}
             )

@@ -18,12 +18,12 @@ from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.setup_faults.explanations import PLAUSIBLE_SHARE
 from pisigma.validation.setup_faults.setup_faults import unexplained
 
-LARGE = 1e-3
+_LARGE = 1e-3
 """Errors, as a share of the reach, above which calibration must have reduced them; measured arms (UR5, UR10, FANUC,
 Panda, FR3) have 2e-4 to 6e-4."""
-HARDLY = 1.3
+_HARDLY = 1.3
 """Ratio of the errors of the nominal and the calibrated robot below which calibration hardly helped."""
-NOISE = 0.5
+_NOISE = 0.5
 """Share of the errors above which the stated noise of the sensor explains them."""
 
 
@@ -43,8 +43,8 @@ def check_unexplained(checked: CheckedCalibration) -> Iterator[Diagnostic]:
     reach = checked.robot.reach * 1e3
     usual = checked.robot_class
     far = left > usual.remaining * reach
-    large = LARGE if usual is not SERVO else usual.remaining
-    if far or (left > large * reach and nominal < HARDLY * left):
+    large = _LARGE if usual is not SERVO else usual.remaining
+    if far or (left > large * reach and nominal < _HARDLY * left):
         what = "rows of the calibration" if checked.validation is None else "held-out rows"
         yield Diagnostic(
             kind="unexplained",
@@ -63,7 +63,7 @@ def _explained(checked: CheckedCalibration, left: float) -> bool:
     """Return whether rounding or the stated noise of the sensor makes errors of this size [mm]."""
     sigma = checked.rows.sigma_position
     noise = 0.0 if sigma is None else 3**0.5 * float(sigma.nanmedian()) * 1e3
-    return noise > NOISE * left or joint_rounding(checked.geometric, checked.rows) is not None
+    return noise > _NOISE * left or joint_rounding(checked.geometric, checked.rows) is not None
 
 
 MAX_ITERATIONS = 8
@@ -101,7 +101,7 @@ def _left(judged: RowsUnderModel) -> float:
     return least * math.sqrt(values / spare)
 
 
-UNRELATED_SHARE = 0.5
+_UNRELATED_SHARE = 0.5
 """Ratio of the residuals to the spread of the positions above which the joints explain less than three quarters of
 the variance. For a healthy robot the ratio is below 0.01."""
 
@@ -121,7 +121,7 @@ def check_residual(checked: CheckedCalibration) -> Iterator[Diagnostic]:
         else:
             limit, size = IMPLAUSIBLE_SHARE * robot.reach, f"{typical * 1e3:.3g} mm"
             if sensor == "position":
-                limit = min(limit, UNRELATED_SHARE * _spread(checked.rows))
+                limit = min(limit, _UNRELATED_SHARE * _spread(checked.rows))
         if typical > limit > 0:
             before = _typical(checked.errors["nominal"][sensor]) / typical
             yield Diagnostic(

@@ -19,12 +19,12 @@ from pisigma.validation.setup_faults.explanations import PLAUSIBLE_SHARE, PLAUSI
 FAR = 10.0
 """Ratio of an error to the median error above which a row is wrong, if the error is also larger than that of any
 calibrated robot."""
-MAX_WRONG_SHARE = 0.1
+_MAX_WRONG_SHARE = 0.1
 """Largest share of wrong rows; if more rows are far off, it is unknown which are wrong, and no row is left out."""
-MIN_ROWS, MIN_ROWS_TO_FIT = 6, 10
+_MIN_ROWS, _MIN_ROWS_TO_FIT = 6, 10
 """Smallest numbers of rows with which a row can be called wrong: in known frames, and with frames or tools fitted to
 the rows."""
-SUSPICIOUS, REFITS = 3.0, 12
+_SUSPICIOUS, _REFITS = 3.0, 12
 """Ratio of an error to the median error above which a row is not used in the fit of frames and tools, and number of
 such fits."""
 MAX_NAMED = 5
@@ -60,7 +60,7 @@ def without_wrong_rows(
     if not found or any(one is None for one in found):
         return FilteredRows(rows)
     numbers = sorted(set.intersection(*(set(one) for one in found if one is not None)))
-    if not 0 < len(numbers) <= max(MAX_WRONG_SHARE * rows.rows, 1):
+    if not 0 < len(numbers) <= max(_MAX_WRONG_SHARE * rows.rows, 1):
         return FilteredRows(rows)
     kept = torch.ones(rows.rows, dtype=torch.bool)
     kept[numbers] = False
@@ -84,7 +84,7 @@ def _far_rows(
     if rows.position is None:
         return _far_lengths(model, rows)
     there = torch.isfinite(rows.position).all(-1)
-    if int(there.sum()) < (MIN_ROWS_TO_FIT if fitted else MIN_ROWS):
+    if int(there.sum()) < (_MIN_ROWS_TO_FIT if fitted else _MIN_ROWS):
         return None
     numbers = there.nonzero()[:, 0]
     judged = RowsUnderModel.from_rows(model, rows.select(numbers), fitted, ())
@@ -98,7 +98,7 @@ def _far_lengths(model: CalibratedModel, rows: Measurements) -> dict[int, str] |
     """Return the rows that are far off among rows without positions, such as balls in sockets; see `_far_rows`."""
     lengths = errors_of_rows(poses_of_rows(model, rows), rows).position.norm(dim=-1)
     there = torch.isfinite(lengths)
-    if int(there.sum()) < MIN_ROWS_TO_FIT:  # sockets and anchors are fitted to these rows
+    if int(there.sum()) < _MIN_ROWS_TO_FIT:  # sockets and anchors are fitted to these rows
         return None
     far = lengths > max(FAR * float(lengths[there].median()), PLAUSIBLE_SHARE * model.robot.reach)
     return {row: length_text(float(lengths[row])) for row in far.nonzero()[:, 0].tolist()}
@@ -111,12 +111,12 @@ def _fitted_to_usual_rows(judged: RowsUnderModel) -> Float64[Tensor, "rows 4 4"]
     and which rows are suspicious is decided again in every iteration.
     """
     T = judged.predicted
-    for _ in range(REFITS):
+    for _ in range(_REFITS):
         lengths = judged.error_lengths(T)
-        suspicious = lengths > SUSPICIOUS * lengths.median()
+        suspicious = lengths > _SUSPICIOUS * lengths.median()
         if bool(judged.measured.has_rotation.any()):
             angles = _angles(judged, T)
-            suspicious = suspicious | (angles > SUSPICIOUS * angles[judged.measured.has_rotation].median())
+            suspicious = suspicious | (angles > _SUSPICIOUS * angles[judged.measured.has_rotation].median())
         usual = replace(
             judged.measured,
             position=torch.where(suspicious[:, None], T[:, :3, 3], judged.measured.position),
@@ -138,7 +138,7 @@ def _far(judged: RowsUnderModel, T: Float64[Tensor, "rows 4 4"]) -> tuple[Bool[T
     far = lengths > max(FAR * float(lengths.median()), PLAUSIBLE_SHARE * judged.model.robot.reach)
     texts = [length_text(length) for length in lengths.tolist()]
     turned = judged.measured.has_rotation
-    if int(turned.sum()) >= MIN_ROWS:
+    if int(turned.sum()) >= _MIN_ROWS:
         angles = _angles(judged, T)
         typical = float(angles[turned].median())
         if typical <= PLAUSIBLE_TURN:  # otherwise the tool's orientation is unknown to the model

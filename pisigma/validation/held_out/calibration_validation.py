@@ -38,7 +38,7 @@ from pisigma.validation.held_out.trained_calibrations import (
 )
 from pisigma.validation.held_out.validation_figures import LearningPoint, ValidationFigures
 
-FEW_ROWS = 500
+_FEW_ROWS = 500
 """Rows up to which folds are calibrated in parallel threads; larger folds need the memory for themselves."""
 
 
@@ -197,7 +197,9 @@ def judged_folds(
     """Judge every fold of every repeat, in threads or processes; see `fold_tasks` and `validate`."""
     tasks = fold_tasks(calibrator, measurements, repeats, progress if jobs is None else no_progress)
     return (
-        run_in_threads(tasks, measurements.rows > FEW_ROWS) if jobs is None else run_in_processes(tasks, jobs)
+        run_in_threads(tasks, measurements.rows > _FEW_ROWS)
+        if jobs is None
+        else run_in_processes(tasks, jobs)
     )
 
 

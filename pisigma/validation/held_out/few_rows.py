@@ -29,19 +29,19 @@ from pisigma.validation.held_out.trained_calibrations import (
     geometric_result,
 )
 
-MIN_RATIO = 2.0
+_MIN_RATIO = 2.0
 """Measured values per parameter below which rows are few: the noise, and with it the prior scale, is then estimated
 from less than half of them."""
-MIN_RATIO_HELD_OUT = 1.25
+_MIN_RATIO_HELD_OUT = 1.25
 """Values per parameter below which held-out rows cannot decide, because a fit without a pose has hardly more values
 than parameters; an F test of the residuals of all rows decides instead."""
-CHANCE = 1e-4
+_CHANCE = 1e-4
 """Significance level of this test. In 10 and 11 random positions of the measured UR10 and UR5, the fitted arms that
 pass predict other rows with 0.6 and 0.25 times the error of the nominal arm (medians of 27 and 14 draws; the worst
 single one has 1.4 times)."""
-MIN_POSES = 10
+_MIN_POSES = 10
 """Fewer poses cannot decide, even with orientations: 6 poses of the UR10 would give 0.6 to 2.4 times the error."""
-USED_UP = 0.9
+_USED_UP = 0.9
 """Share of the values of a sensor used up by the parameters above which its noise is not determined."""
 
 
@@ -76,12 +76,12 @@ def _helps(
 ) -> bool:
     """Return whether there are enough values per parameter, or else whether a fit predicts held-out poses better."""
     ratio = distinct_values(result.solved.problem) / max(result.solved.findings.estimated, 1)
-    if ratio >= MIN_RATIO:
+    if ratio >= _MIN_RATIO:
         return True
-    if any(noise.used > USED_UP * noise.values for noise in result.noise):
+    if any(noise.used > _USED_UP * noise.values for noise in result.noise):
         return False
-    if ratio < MIN_RATIO_HELD_OUT:
-        return distinct_rows(result.solved.problem) >= MIN_POSES and _evident(calibrator, result, rows)
+    if ratio < _MIN_RATIO_HELD_OUT:
+        return distinct_rows(result.solved.problem) >= _MIN_POSES and _evident(calibrator, result, rows)
     try:
         errors = validate(calibrator, rows, k_folds(rows, None, seed=0), progress).models
     except (IdentificationError, MeasurementError):  # without one pose, nothing can be fitted
@@ -100,7 +100,7 @@ def _evident(calibrator: GeometricCalibrator, result: CalibrationResult, rows: M
     left = sum(noise.values - noise.used for noise, _ in pairs)
     more = sum(noise.used - before.used for noise, before in pairs)
     before = sum((one.values - one.used) * (one.sigma / noise.sigma) ** 2 for noise, one in pairs)
-    return more > 0 and bool(fdtrc(more, left, (before - left) / more) < CHANCE)
+    return more > 0 and bool(fdtrc(more, left, (before - left) / more) < _CHANCE)
 
 
 def fit_with_folds(

@@ -23,7 +23,7 @@ from pisigma.validation.held_out.held_out_rows import HeldOutRows
 from pisigma.validation.held_out.pose_statistics import PoseErrors
 from pisigma.validation.held_out.reference_models import nominal_model
 
-MIN_REPEATS = 10
+_MIN_REPEATS = 10
 """Degrees of freedom that repeated rows need to show the scatter."""
 MAX_PREDICTED = 4_000
 """Rows at which the accuracy is predicted, evenly over all: each takes a millisecond."""
@@ -79,13 +79,13 @@ class JudgedRows:
     def scatter(self) -> float | None:
         """Pooled scatter of positions at equal joint values, as RMS length [mm]; None with too few repeats."""
         finite = torch.isfinite(self.residual).all(-1)
-        if int(finite.sum()) <= MIN_REPEATS:
+        if int(finite.sum()) <= _MIN_REPEATS:
             return None
         measurements = self.measurements.select(finite)
         group = groups_of_equal_joints(measurements.q).tolist()
         names = list(zip(group, measurements.frame, measurements.target, strict=True))
         freedom = len(names) - len(set(names))
-        if freedom < MIN_REPEATS:
+        if freedom < _MIN_REPEATS:
             return None
         values = self.residual[finite]
         mean, _ = _means_by_name(values, names)

@@ -26,11 +26,11 @@ from pisigma.validation.resampling import Bootstrap
 
 Interval = tuple[float, float]
 """Lower and upper end."""
-UNITS = {"position": ("mm", 1e3), "orientation": ("deg", float(np.rad2deg(1.0)))}
+_UNITS = {"position": ("mm", 1e3), "orientation": ("deg", float(np.rad2deg(1.0)))}
 """Unit of every quantity in tables and files, and its factor from SI units."""
 STATISTICS = ("mean", "rms", "p95")
 """Statistics with a confidence interval; the maximum has none, because no resample exceeds the measured one."""
-QUANTILE = 0.95
+_QUANTILE = 0.95
 """Quantile of the statistic "p95"."""
 _BATCH = 2**16
 """Indices that are drawn at a time."""
@@ -93,7 +93,7 @@ def statistics(
     errors, times = errors[order], times[..., order]
     last = times.cumsum(-1)
     count = last[..., -1]
-    place = QUANTILE * (count - 1)
+    place = _QUANTILE * (count - 1)
     lower, upper = (errors[(last <= end[..., None]).sum(-1)] for end in (np.floor(place), np.ceil(place)))
     quantile = lower + (place - np.floor(place)) * (upper - lower)
     return np.stack([times @ errors / count, np.sqrt(times @ errors**2 / count), quantile])
@@ -339,7 +339,7 @@ def _quantity(
     bootstrap: Bootstrap,
 ) -> list[QuantityErrors]:
     """Compute the figures of one quantity for all models, on the common rows that have it under all models."""
-    unit, factor = UNITS[quantity]
+    unit, factor = _UNITS[quantity]
     stacked = torch.stack(list(vectors)) * factor
     there = common & torch.isfinite(stacked).all(-1).all(0)
     sizes = stacked.norm(dim=-1)[:, there].numpy()

@@ -22,7 +22,7 @@ from pisigma.validation.held_out.validation_figures import ErrorFigures
 
 WITHIN = 1.96
 """[standard deviations] Half the width of a 95 % interval of a normal distribution."""
-OTHER_POSES = 5
+_OTHER_POSES = 5
 """Poses per row at which a calibration predicts its errors; their joint values are those of the rows, permuted."""
 
 
@@ -288,8 +288,8 @@ def predicted_at_other_poses(
         None if it predicts no positions.
     """
     q, generator = measurements.q.detach().cpu(), torch.Generator().manual_seed(0)
-    orders = torch.rand(OTHER_POSES, *q.shape, generator=generator).argsort(1)
-    every = torch.arange(measurements.rows).repeat(OTHER_POSES)
+    orders = torch.rand(_OTHER_POSES, *q.shape, generator=generator).argsort(1)
+    every = torch.arange(measurements.rows).repeat(_OTHER_POSES)
     alone = replace(
         measurements, distance=None, pair=None, anchor=None, anchor_place=None
     )  # pairs are two rows

@@ -17,7 +17,7 @@ from pisigma.validation.held_out.pose_statistics import Comparison
 from pisigma.validation.held_out.summary import AbstractSummary
 from pisigma.validation.held_out.validation_figures import ErrorFigures
 
-LEVEL = 0.05
+_LEVEL = 0.05
 """Relative change of an error below which it is treated as unchanged."""
 
 
@@ -289,9 +289,9 @@ def _joint(run: TrainingRun, name: str, paper: Mapping[str, BeforeAfter]) -> Joi
 
 
 def _effect(before: float, after: float) -> Effect:
-    if after > before * (1 + LEVEL):
+    if after > before * (1 + _LEVEL):
         return "raises"
-    return "lowers" if after < before * (1 - LEVEL) else "does not change"
+    return "lowers" if after < before * (1 - _LEVEL) else "does not change"
 
 
 def _rise(before: float, after: float, unit: str) -> str:

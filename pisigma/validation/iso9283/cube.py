@@ -19,7 +19,7 @@ PLANES = {
 """Corners of the diagonal planes of the cube (ISO 9283:1998, 6.8). C1 to C4 are around the upper face, C5 to C8
 below them; the third corner of a plane is opposite the first, and the fourth opposite the second."""
 
-FROM_THE_ENDS = (0.08, 0.12)
+_FROM_THE_ENDS = (0.08, 0.12)
 """Smallest and largest distance of P2 to P5 from the ends of the diagonals, (10 ± 2) % of their length (ISO
 9283:1998, 6.8)."""
 
@@ -58,7 +58,7 @@ class IsoCube:
             MeasurementError: the plane is unknown, or the standard does not allow the share.
         """
         check_choice(MeasurementError, "plane", plane, PLANES)
-        low, high = FROM_THE_ENDS
+        low, high = _FROM_THE_ENDS
         if not low <= share <= high:
             raise MeasurementError(
                 option="share",

@@ -14,7 +14,7 @@ from pisigma.validation.held_out.pose_statistics import PoseErrors, error_statis
 from pisigma.validation.held_out.training_summary import BeforeAfter, TrainingSummary
 from pisigma.validation.held_out.validation_figures import ErrorFigures, ValidationFigures
 
-MODELS = ("nominal", "geometric", "hybrid", "corrected", "full", "distilled")
+_MODELS = ("nominal", "geometric", "hybrid", "corrected", "full", "distilled")
 """Names of the models, in the order of the tables."""
 DOMINANT_SHARE = 0.8
 """Share of the squared error above which measurement scatter limits the accuracy."""
@@ -136,7 +136,7 @@ def _of_distilled(model: CalibratedModel) -> list[Accuracy]:
 def _models(figures: object) -> dict[str, ErrorFigures]:
     if not isinstance(figures, Mapping):
         return {}
-    kept = {name: figures[name] for name in MODELS if isinstance(figures.get(name), Mapping)}
+    kept = {name: figures[name] for name in _MODELS if isinstance(figures.get(name), Mapping)}
     return {name: ErrorFigures.model_validate(errors) for name, errors in kept.items()}
 
 

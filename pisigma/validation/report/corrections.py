@@ -17,13 +17,13 @@ from pisigma.robot.description import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.kinematics.tolerances import MEASURED_ROUNDING
 
-POINTS_PER_CURVE = 1_500
+_POINTS_PER_CURVE = 1_500
 """Number of points of a curve: 13 points per period of the 110th harmonic over a revolution."""
-ROWS_PER_CHUNK = 4_096
+_ROWS_PER_CHUNK = 4_096
 """Number of rows for which the correction is computed at a time, to limit the memory."""
-STRONG_CORRELATION = 0.9
+_STRONG_CORRELATION = 0.9
 """Absolute correlation above which a pair of parameters is listed."""
-MAX_PAIRS = 12
+_MAX_PAIRS = 12
 """Largest number of pairs that are listed."""
 JOINT_UNITS = {
     "revolute": ("deg", math.degrees(1.0), "mdeg", math.degrees(1e3)),
@@ -81,9 +81,9 @@ def _pairs(tables: tuple[Correlations, ...]) -> tuple[tuple[str, str, float], ..
         for names, values in tables
         for i, name in enumerate(names)
         for k in range(i)
-        if abs(values[i, k]) >= STRONG_CORRELATION
+        if abs(values[i, k]) >= _STRONG_CORRELATION
     ]
-    return tuple(sorted(strong, key=lambda pair: -abs(pair[2]))[:MAX_PAIRS])
+    return tuple(sorted(strong, key=lambda pair: -abs(pair[2]))[:_MAX_PAIRS])
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,9 +139,9 @@ def correction_curves(model: CalibratedModel) -> tuple[CorrectionCurve, ...]:
     at_rows, middle = correction_at(model, q), _middle_row(q)
     curves = []
     for j in range(robot.dof):
-        at = middle.repeat(POINTS_PER_CURVE, 1)
-        at[:, j] = torch.linspace(*_range(robot, q, j), POINTS_PER_CURVE, dtype=torch.float64)
-        measured = torch.ones(POINTS_PER_CURVE, dtype=torch.bool)
+        at = middle.repeat(_POINTS_PER_CURVE, 1)
+        at[:, j] = torch.linspace(*_range(robot, q, j), _POINTS_PER_CURVE, dtype=torch.float64)
+        measured = torch.ones(_POINTS_PER_CURVE, dtype=torch.bool)
         if hybrid is not None:
             measured = hybrid.coverage.distance_outside(at)[:, j] <= MEASURED_ROUNDING
         curve = correction_at(model, at)[:, j]
@@ -165,7 +165,7 @@ def correction_curves(model: CalibratedModel) -> tuple[CorrectionCurve, ...]:
 
 def correction_at(model: CalibratedModel, q: Float64[Tensor, "rows dof"]) -> Float64[Tensor, "rows dof"]:
     """Compute the learned correction [rad or m] at joint values [rad or m]."""
-    hybrid, chunks = model.hybrid, torch.split(q, ROWS_PER_CHUNK)
+    hybrid, chunks = model.hybrid, torch.split(q, _ROWS_PER_CHUNK)
     with torch.no_grad():
         if hybrid is not None:
             return torch.cat([hybrid.correction(chunk) for chunk in chunks])

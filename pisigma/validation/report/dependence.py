@@ -16,13 +16,13 @@ from pisigma.validation.held_out.rank_tests import SIGNIFICANT, groups_differ, r
 
 NOTABLE_RATIO = 1.25
 """Ratio of the largest to the smallest RMS error of bins below which a dependence is small."""
-ORDERED = 0.3
+_ORDERED = 0.3
 """Rank correlation of a joint with the order of the rows above which time and position are hard to separate."""
-MAX_BINS = 12
+_MAX_BINS = 12
 """Largest number of bins of a joint's measured values."""
 MIN_ROWS = 8
 """Smallest number of rows of a region or a bin."""
-MIN_ROWS_OF_RMS = 3
+_MIN_ROWS_OF_RMS = 3
 """Smallest number of rows from which the RMS error of a bin is computed."""
 _DEGREES = math.degrees(1.0)
 _UNITS = {"kg": "kg", "c": "°C"}
@@ -295,7 +295,7 @@ def _ordered_joint(rows: JudgedRows) -> tuple[int | None, float]:
     """Return the joint whose values follow the order of the rows most closely; None if there is no such joint."""
     q = rows.measurements.q.numpy()
     r = [abs(rank_correlation(np.arange(float(len(q))), values)[0]) for values in q.T]
-    return (None, 0.0) if max(r) < ORDERED else (int(np.argmax(r)) + 1, max(r))
+    return (None, 0.0) if max(r) < _ORDERED else (int(np.argmax(r)) + 1, max(r))
 
 
 def _over_condition(values: np.ndarray, errors: np.ndarray) -> ConditionTest:
@@ -309,7 +309,7 @@ def root_mean_square(values: Float64[np.ndarray, " values"]) -> float:
 
 
 def bin_errors(
-    values: Float64[np.ndarray, " rows"], errors: Float64[np.ndarray, " rows"], bins: int = MAX_BINS
+    values: Float64[np.ndarray, " rows"], errors: Float64[np.ndarray, " rows"], bins: int = _MAX_BINS
 ) -> BinnedErrors:
     """Compute RMS errors in bins of equal width, fewer bins for few rows."""
     bins = int(np.clip(len(values) // MIN_ROWS, 1, bins))
@@ -317,5 +317,5 @@ def bin_errors(
     edges = np.linspace(low, high if high > low else low + 1.0, bins + 1)
     number = np.clip(np.searchsorted(edges, values, "right") - 1, 0, bins - 1)
     inside = [errors[number == k] for k in range(bins)]
-    rms = [root_mean_square(those) if len(those) >= MIN_ROWS_OF_RMS else math.nan for those in inside]
+    rms = [root_mean_square(those) if len(those) >= _MIN_ROWS_OF_RMS else math.nan for those in inside]
     return BinnedErrors(edges, np.array(rms), number)

@@ -18,9 +18,9 @@ from pisigma.validation.report.dependence import MIN_ROWS, error_lengths, root_m
 
 MAX_POINTS = 20_000
 """Largest number of points of a map; of more rows, the largest errors and an even selection of the others are shown."""
-WORST_SHARE = 0.05
+_WORST_SHARE = 0.05
 """Share of `MAX_POINTS` that is reserved for the largest errors."""
-SAMPLES = 3_000
+_SAMPLES = 3_000
 """Number of samples of the workspace, if no rows were measured."""
 
 Quantity = Literal[
@@ -114,7 +114,7 @@ def map_of_workspace(model: CalibratedModel) -> ErrorMap:
 def samples_of_workspace(model: CalibratedModel) -> tuple[Float64[Tensor, "samples dof"], int]:
     """Return stored joint values and random ones within their ranges [rad or m], and the number of random ones."""
     q = model.starts
-    more = max(SAMPLES - len(q), 0) if len(q) else 0
+    more = max(_SAMPLES - len(q), 0) if len(q) else 0
     if more:
         low, high = q.amin(0), q.amax(0)
         generator = torch.Generator().manual_seed(0)
@@ -139,7 +139,7 @@ def _chosen(layers: list[Layer], rows: int) -> Int64[Tensor, " chosen"]:
     if rows <= MAX_POINTS:
         return torch.arange(rows)
     worst = np.argsort(-np.nan_to_num(layers[min(1, len(layers) - 1)].values), kind="stable")
-    worst = worst[: int(MAX_POINTS * WORST_SHARE)]
+    worst = worst[: int(MAX_POINTS * _WORST_SHARE)]
     others = np.linspace(0, rows - 1, MAX_POINTS - len(worst)).round().astype(int)
     return torch.from_numpy(np.unique(np.concatenate([worst, others])))
 

@@ -14,9 +14,9 @@ from pisigma.validation.held_out.judged_rows import JudgedRows
 Stretch = tuple[float, float]
 """Lowest and highest joint value [rad or m]."""
 
-COVERED = 0.98
+_COVERED = 0.98
 """Share of a joint's range above which no gap is reported."""
-NOT_MOVED = 1e-3
+_NOT_MOVED = 1e-3
 """Share of a joint's range below which the joint is treated as not moved."""
 
 
@@ -43,7 +43,7 @@ class JointGap:
     @property
     def was_moved(self) -> bool:
         """Whether the joint was moved at all."""
-        return self.share >= NOT_MOVED
+        return self.share >= _NOT_MOVED
 
 
 @dataclass(frozen=True)
@@ -78,10 +78,10 @@ def joint_gaps(model: CalibratedModel, rows: JudgedRows | None) -> tuple[JointGa
     for j, (stretches, (low, high)) in enumerate(measured_intervals(model, q)):
         revolute = bool(model.robot.revolute[j])
         share = sum(b - a for a, b in stretches) / (high - low) if high > low else 1.0
-        if not math.isfinite(high - low) or share >= COVERED:
+        if not math.isfinite(high - low) or share >= _COVERED:
             continue
         factor, unit = (math.degrees(1.0), "deg") if revolute else (1e3, "mm")
-        measured = stretches if share >= NOT_MOVED else [(float(q[0, j]), float(q[0, j]))]
+        measured = stretches if share >= _NOT_MOVED else [(float(q[0, j]), float(q[0, j]))]
         gaps.append(
             JointGap(
                 joint=model.robot.joints[j].name,

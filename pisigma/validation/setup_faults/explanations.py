@@ -37,7 +37,7 @@ from pisigma.validation.setup_faults.joint_faults import NEAR_BEST, NOTICED, joi
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
-SMALL_SHARE = 2e-4
+_SMALL_SHARE = 2e-4
 """Errors, as a share of the reach, below which a fault of a joint column is not their cause."""
 PLAUSIBLE_SHARE = 0.01
 """Largest errors of a calibrated robot, and after correction of a fault, as a share of the reach."""
@@ -46,9 +46,9 @@ PLAUSIBLE_TURN = PLAUSIBLE_SHARE / LEVER_SHARE
 `LEVER_SHARE` of the reach."""
 AS_GOOD = 1.5
 """Ratio of the errors of a simpler explanation to the smallest errors up to which the simpler explanation is chosen."""
-MAX_CONVENTIONS = 8
+_MAX_CONVENTIONS = 8
 """Number of promising conventions of orientations that are tried with the whole model."""
-MIN_TURN = 0.01
+_MIN_TURN = 0.01
 """Smallest rotation of a base or a tool that is reported [deg]."""
 _MOVED = {
     "frame": (
@@ -62,8 +62,8 @@ _MOVED = {
         "recalibrate with --moved tool",
     ),
 }
-EULER_ORDERS = ("ZYX", "XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYZ", "ZXZ", "XYX", "XZX", "YXY", "YZY")
-READ_ORDER = EULER_ORDERS[0]
+_EULER_ORDERS = ("ZYX", "XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYZ", "ZXZ", "XYX", "XZX", "YXY", "YZY")
+_READ_ORDER = _EULER_ORDERS[0]
 """Order of the rotations by roll, pitch and yaw in measurement files."""
 _MIRROR = torch.diag(torch.tensor([1.0, -1.0, 1.0], dtype=torch.float64))
 _MIRRORED = "{} mirrored, as in a left-handed frame (an axis has the wrong sign, or two are swapped)"
@@ -106,7 +106,7 @@ def _faults_in_frames(arm: PredictingArm, some: Measurements, here: Hypothesis) 
     if arm.model is not None:
         for T, cause in _other_corrections(arm.model, some):
             yield here.with_cause(cause, T, fitted=0)
-    if not here.error > SMALL_SHARE * arm.robot.reach:
+    if not here.error > _SMALL_SHARE * arm.robot.reach:
         return
     for measured, cause in _likely_conventions(arm, here):
         yield replace(here, measured=measured, causes=(cause,))
@@ -128,7 +128,7 @@ def _likely_conventions(arm: PredictingArm, here: Hypothesis) -> Iterator[tuple[
     for mode in arm.fits_of_frames:
         errors = error_with_fitted(mode, here.T, replace(here.measured, rotation=R))
         limit = max(NEAR_BEST**2 * float(errors.min()), NOTICED**2)
-        for number in errors.argsort()[:MAX_CONVENTIONS].tolist():
+        for number in errors.argsort()[:_MAX_CONVENTIONS].tolist():
             if float(errors[number]) <= limit:
                 advice = "write orientations as described in the documentation of measurement files"
                 _, clause, size = tried[number]
@@ -231,7 +231,7 @@ def _moved(
     origin = torch.zeros(3, 1).to(X) if frames is None else frames[:, :3, 3:]
     shift = (X[:, :3, :3] @ origin + X[:, :3, 3:] - origin).norm(dim=1).max()
     turn = float(torch.rad2deg(rotation_vector(X[:, :3, :3]).norm(dim=-1)).max())
-    motion = length_text(float(shift)) + (f" and {turn:.3g} deg" if turn > MIN_TURN else "")
+    motion = length_text(float(shift)) + (f" and {turn:.3g} deg" if turn > _MIN_TURN else "")
     clause = f"the {what} has moved by about {motion} relative to the model"
     return Cause(kind, clause, advice, 2.0, amount=float(shift))
 
@@ -301,13 +301,13 @@ def other_conventions(
         (_matrices(wxyz), scalar, 1.0),
         (_matrices(wxyz.inv()), f"{scalar} and are conjugate", 1.25),
     )
-    angles = read.as_euler(READ_ORDER)
+    angles = read.as_euler(_READ_ORDER)
     for columns in (RPY, RPY[::-1]):
         of_columns = [RPY.index(name) for name in columns]
         turned, vector = angles[:, of_columns], _as_rotation_vector(angles)[:, of_columns]
         clause = f"{', '.join(columns)} contain the x, y and z of a rotation vector (axis times angle)"
         yield _matrices(Rotation.from_rotvec(vector)), clause, 1.0
-        for order in EULER_ORDERS:
+        for order in _EULER_ORDERS:
             product = " · ".join(f"Rot{axis}({name})" for axis, name in zip(order, columns, strict=True))
             clause = f"roll, pitch and yaw are angles of another order, the Euler angles of {product}"
             yield _matrices(Rotation.from_euler(order, turned)), clause, 1.0
@@ -316,7 +316,7 @@ def other_conventions(
     for signs in itertools.product((1, -1), repeat=3):
         names = ", ".join(("-" if sign < 0 else "") + name for sign, name in zip(signs, RPY, strict=True))
         clause = f"signs of angles are reversed: {names} were meant"
-        yield _matrices(Rotation.from_euler(READ_ORDER, angles * signs)), clause, 1.5
+        yield _matrices(Rotation.from_euler(_READ_ORDER, angles * signs)), clause, 1.5
 
 
 def _as_rotation_vector(angles: Float64[np.ndarray, "rows 3"]) -> Float64[np.ndarray, "rows 3"]:

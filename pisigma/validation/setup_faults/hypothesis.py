@@ -29,25 +29,25 @@ from pisigma.validation.setup_faults.cause import Cause
 
 COLLAPSED = 0.25
 """Largest share of the errors that may remain if a setup fault explains them."""
-MIN_FREEDOM = 6
+_MIN_FREEDOM = 6
 """Smallest number of degrees of freedom that must remain after a fit."""
 _MAX_POSES = 2**17
 FittedFrames = Literal["none", "base", "base and tool"]
 """Frames that are fitted to the rows under a hypothesis."""
-SHIFTS = (1, -1, 2, -2)
+_SHIFTS = (1, -1, 2, -2)
 """Numbers of rows by which joint values may be shifted relative to the measurements."""
-MARGIN = max(SHIFTS)
-ENDS = 3
+MARGIN = max(_SHIFTS)
+_ENDS = 3
 """Base and tool are fitted to the first and to the last third of the rows if a row may have been lost in between."""
 _ADVICE = "look for a joint vector or a measurement that was lost or written twice, and match them again"
 MAX_ITERATIONS = 30
-TRIED, HOPELESS = 8, 0.25
+_TRIED, _HOPELESS = 8, 0.25
 """Number of iterations after which the search is abandoned if more than a share of the cost remains, and this share."""
-CONVERGENCE_TOLERANCE = 1e-3
+_CONVERGENCE_TOLERANCE = 1e-3
 """Relative decrease of the cost per step at convergence."""
-STILL = 1e-3
+_STILL = 1e-3
 """Range below which a joint value is treated as constant [rad or m]."""
-EQUAL = 1e-6
+_EQUAL = 1e-6
 """Difference below which two columns are treated as equal [rad or m]."""
 
 
@@ -152,7 +152,7 @@ class Hypothesis:
     def error(self) -> float:
         """RMS error [m], corrected for the degrees of freedom."""
         spare = self.measured.values - self.fitted
-        if spare < MIN_FREEDOM:
+        if spare < _MIN_FREEDOM:
             return float("inf")
         mean = float(self.measured.squared_errors(self.T).mean()) * self.measured.values / spare
         return float(np.sqrt(mean)) if np.isfinite(mean) else float("inf")
@@ -184,7 +184,7 @@ def shifted_rows(
         measured: measured poses of these rows.
     """
     q = rows.q[chosen]
-    for shift in SHIFTS:
+    for shift in _SHIFTS:
         cause = Cause(
             "rows",
             f"the joint values are shifted by {_count(shift)} relative to the measurements",
@@ -213,14 +213,14 @@ def _shifted_from_a_row(
     inner = torch.arange(MARGIN, rows.rows - MARGIN)
     among = rows.select(inner)
     measured = MeasuredPoses.from_tensors(among.position, among.rotation, LEVER_SHARE * robot.reach)
-    T = {shift: forward_kinematics(robot, rows.q.roll(-shift, 0))[inner] for shift in (0, *SHIFTS)}
-    third = len(chosen) // ENDS
+    T = {shift: forward_kinematics(robot, rows.q.roll(-shift, 0))[inner] for shift in (0, *_SHIFTS)}
+    third = len(chosen) // _ENDS
     for at_start, end in ((True, chosen[:third] - MARGIN), (False, chosen[-third:] - MARGIN)):
         base, tool = best_base_and_tool(T[0][end], measured.select(end))
         errors = {shift: measured.squared_errors(base @ poses @ tool) for shift, poses in T.items()}
         # Errors on both sides add up: the best change has the largest sum of gains from it to the end.
         # With base and tool of the last rows, the rows before the change are shifted, so the sign reverses.
-        for shift in SHIFTS:
+        for shift in _SHIFTS:
             gain = errors[0] - errors[shift] if at_start else errors[shift] - errors[0]
             change = int(gain.flip(0).cumsum(0).flip(0).argmax())
             place = rows.place(int(inner[change]))
@@ -275,7 +275,7 @@ def _freed(
         T = forward_kinematics(robot, turned)
         error = measured.squared_errors(tried[1][0] @ T @ tried[1][1]).sum()
         if error < cost:
-            settled = bool(cost - error < CONVERGENCE_TOLERANCE * cost)
+            settled = bool(cost - error < _CONVERGENCE_TOLERANCE * cost)
             first = error if number == 0 else first
             q, frames, cost, damping = turned, tried[1], error, damping / 10
             here = T, free
@@ -283,7 +283,7 @@ def _freed(
                 break
         else:
             damping = damping * 10
-        if number >= TRIED and cost > HOPELESS * first:
+        if number >= _TRIED and cost > _HOPELESS * first:
             break
         step = base_and_tool_step(here[0], measured, *frames, damping, here[1])
         tried = q, moved_base_and_tool(*frames, step)
@@ -333,14 +333,14 @@ def _turned(
 
 def _copied(q: Float64[Tensor, "rows dof"], joint: int) -> int | None:
     """Return another joint whose column is equal; None if there is none."""
-    same = (q - q[:, joint : joint + 1]).abs().amax(0) < EQUAL
+    same = (q - q[:, joint : joint + 1]).abs().amax(0) < _EQUAL
     same[joint] = False
     return int(same.nonzero()[0, 0]) if bool(same.any()) else None
 
 
 def _cause(robot: Robot, q: Float64[Tensor, "rows dof"], joint: int) -> Cause:
     name, other = f"joint {joint + 1}", _copied(q, joint)
-    if float(q[:, joint].max() - q[:, joint].min()) < STILL:
+    if float(q[:, joint].max() - q[:, joint].min()) < _STILL:
         clause = f"{name} is logged as constant ({torch.rad2deg(q[0, joint]):.4g} deg in all rows), though it moved"
     elif other is not None:
         clause = f"the column of {name} contains the values of joint {other + 1}"

@@ -18,27 +18,27 @@ from pisigma.robot.se3 import wrap_to_pi
 from pisigma.validation.setup_faults.cause import Cause, joints_text
 from pisigma.validation.setup_faults.hypothesis import FittedFrames, PredictingArm
 
-QUARTER = math.pi / 2
-GRADIANS = 0.9
+_QUARTER = math.pi / 2
+_GRADIANS = 0.9
 """Number of degrees in a gradian."""
-ZERO_TOLERANCE = math.radians(0.5)
+_ZERO_TOLERANCE = math.radians(0.5)
 """Distance from a multiple of 90 deg below which a zero is set to that multiple [rad]."""
-MAX_ORDERS = 5040
+_MAX_ORDERS = 5040
 """Number of orders of seven joints; with more joints, only pairs are swapped."""
-MAX_ZEROS = 4**7
-SCREEN_ROWS = 32
+_MAX_ZEROS = 4**7
+_SCREEN_ROWS = 32
 """Number of rows on which every map is tried."""
 NOTICED = 2e-5
 """Errors below which no explanation is needed [m]."""
-PROMISING = 0.5
+_PROMISING = 0.5
 """Largest share of the errors that may remain under a promising map."""
-MAX_KEPT = 3
+_MAX_KEPT = 3
 """Largest number of promising maps of each kind."""
 NEAR_BEST = 4.0
 """Largest ratio of the errors of a promising map to the errors of the best map."""
 STEPS = 36
 """Number of grid values on either side in the search for a zero."""
-REFINEMENTS = 7
+_REFINEMENTS = 7
 """Number of refinements of the grid in the search for a zero."""
 
 
@@ -98,7 +98,7 @@ def other_orders(dof: int) -> JointMaps:
     orders = torch.arange(dof).repeat(math.comb(dof, 2), 1)
     pairs = torch.combinations(torch.arange(dof))
     orders = orders.scatter(1, pairs, pairs.flip(1))
-    if math.factorial(dof) <= MAX_ORDERS:
+    if math.factorial(dof) <= _MAX_ORDERS:
         orders = torch.tensor(list(itertools.permutations(range(dof)))[1:], dtype=torch.int64).reshape(
             -1, dof
         )
@@ -116,7 +116,7 @@ def coupled_joints(dof: int) -> JointMaps:
 def other_units(robot: Robot) -> JointMaps:
     """Return maps of swapped units: degrees and radians (or gradians), and mm and m for prismatic joints."""
     turning = [1.0 if turns else 0.0 for turns in robot.revolute]
-    rows = [[GRADIANS ** (sign * turns) for turns in turning] for sign in (1, -1) if any(turning)]
+    rows = [[_GRADIANS ** (sign * turns) for turns in turning] for sign in (1, -1) if any(turning)]
     for revolute, per_unit in ((True, math.degrees(1)), (False, 1e3)):
         joints = [i for i, turns in enumerate(robot.revolute) if turns == revolute]
         for count in range(1, len(joints) + 1):
@@ -137,12 +137,12 @@ def quarter_turned_zeros(robot: Robot, inner: bool = False) -> JointMaps:
     """
     turning = [i for i, revolute in enumerate(robot.revolute) if revolute]
     turning = [i for i in turning if not inner or 0 < i < robot.dof - 1]
-    if 4 ** len(turning) <= MAX_ZEROS:
+    if 4 ** len(turning) <= _MAX_ZEROS:
         choices = np.array(list(itertools.product((0, 1, 2, -1), repeat=len(turning)))[1:])
     else:
         choices = np.concatenate([k * np.eye(len(turning)) for k in (1, 2, -1)])
     offset = np.zeros((len(choices), robot.dof))
-    offset[:, turning] = choices * QUARTER
+    offset[:, turning] = choices * _QUARTER
     return replace(JointMaps.unchanged(len(choices), robot.dof), offset=torch.from_numpy(offset))
 
 
@@ -205,7 +205,7 @@ def _unit_causes(factor: list[float], robot: Robot) -> list[Cause]:
             wrong = tuple(i for i in joints if abs(factor[i]) != 1 and (abs(factor[i]) < 1) == too_large)
             if wrong:
                 named, are = (large, small) if too_large else (small, large)
-                if GRADIANS <= abs(factor[wrong[0]]) <= 1 / GRADIANS:
+                if _GRADIANS <= abs(factor[wrong[0]]) <= 1 / _GRADIANS:
                     named, are = ("degrees", "gradians") if too_large else ("gradians", "degrees")
                 clause = f"the values of {joints_text(wrong)} are {are} that are named {named}"
                 size = 1.0 if list(wrong) == joints else len(wrong) + 0.5
@@ -234,7 +234,7 @@ def _zero_cause(joints: tuple[int, ...], offset: list[float], robot: Robot) -> C
 
 def is_quarter_turn(angle: float) -> bool:
     """Return whether an angle [rad] is a multiple of 90 deg."""
-    return abs(math.remainder(angle, QUARTER)) < 1e-12
+    return abs(math.remainder(angle, _QUARTER)) < 1e-12
 
 
 def likely_maps(arm: PredictingArm, measurements: Measurements, measured: MeasuredPoses) -> JointMaps:
@@ -270,9 +270,9 @@ def likely_maps(arm: PredictingArm, measurements: Measurements, measured: Measur
         candidates = [(maps, errors[number]) for maps, errors in tried]
         candidates.append((zeros, errors_of(zeros, [mode])[0]))
         least = min(float(errors.min()) for _, errors in candidates if len(errors))
-        limit = min(PROMISING**2 * unchanged[number], max(NEAR_BEST**2 * least, NOTICED**2))
+        limit = min(_PROMISING**2 * unchanged[number], max(NEAR_BEST**2 * least, NOTICED**2))
         for maps, errors in candidates:
-            best = errors.argsort()[:MAX_KEPT]
+            best = errors.argsort()[:_MAX_KEPT]
             likely.append(maps.select(best[errors[best] <= limit]))
     return _distinct(likely)
 
@@ -282,7 +282,7 @@ def _screened_rows(measurements: Measurements) -> Int64[Tensor, " chosen"]:
     names = list(zip(measurements.frame, measurements.target, strict=True))
     most = Counter(names).most_common(1)[0][0]
     rows = torch.tensor([name == most for name in names]).nonzero()[:, 0]
-    count = min(len(rows), SCREEN_ROWS)
+    count = min(len(rows), _SCREEN_ROWS)
     return rows[torch.linspace(0, len(rows) - 1, count).round().long()]
 
 
@@ -295,17 +295,17 @@ def _best_zeros(robot: Robot, errors_of: Callable[[JointMaps], Float64[Tensor, "
     by = torch.zeros(dof, dtype=torch.float64)
     joints = torch.arange(dof).repeat_interleave(2 * STEPS + 1)
     grid = torch.linspace(-1, 1, 2 * STEPS + 1, dtype=torch.float64)
-    for _ in range(REFINEMENTS):
+    for _ in range(_REFINEMENTS):
         tried = by[:, None] + width[:, None] * grid
         errors = errors_of(moved_zeros(joints, tried.flatten(), dof)).reshape(tried.shape)
         by = tried.gather(1, errors.argmin(1, keepdim=True))[:, 0]
         # The minimum is near the best point: two steps of the grid on either side.
         width = width * 2 / STEPS
-    near = (by / QUARTER).round() * QUARTER
+    near = (by / _QUARTER).round() * _QUARTER
     # -180 deg and 180 deg are the same zero.
-    near = torch.where(near < -1.5 * QUARTER, -near, near)
+    near = torch.where(near < -1.5 * _QUARTER, -near, near)
     turning = torch.tensor(robot.revolute)
-    by = torch.where(turning & (wrap_to_pi(by - near).abs() < ZERO_TOLERANCE) & (near != 0), near, by)
+    by = torch.where(turning & (wrap_to_pi(by - near).abs() < _ZERO_TOLERANCE) & (near != 0), near, by)
     return moved_zeros(torch.arange(dof), by, dof)
 
 

@@ -38,36 +38,36 @@ from pisigma.validation.setup_faults.setup_fault import SetupFault, fault_from_h
 
 MAX_ROWS = 1_000
 """Largest number of rows on which hypotheses are tried, evenly over all rows."""
-MAX_ROWS_NOMINAL = 150
+_MAX_ROWS_NOMINAL = 150
 """Largest number of rows on which hypotheses are tried with the nominal robot, for which base and tool are fitted
 each time."""
 MIN_ROWS_NOMINAL = 24
 """Minimum number of rows; with fewer, an affine fit (39 unknowns) leaves too few degrees of freedom."""
-LARGEST_ZERO = 0.1
+_LARGEST_ZERO = 0.1
 """Largest standard deviation of the zeros of revolute joints of industrial arms and cobots after a repair [rad]."""
-MAX_ZEROS = 3.0
+_MAX_ZEROS = 3.0
 """Largest plausible error of a single zero over `largest_zero`."""
-MAX_SLIDE = 3 * HOBBY.largest.length
+_MAX_SLIDE = 3 * HOBBY.largest.length
 """Largest plausible error of the zero of a prismatic joint [m]."""
-USUAL = 1e-3
+_USUAL = 1e-3
 """Usual prior standard deviation of geometric errors [m and rad]."""
-SURE = 1e-3
+_SURE = 1e-3
 """Probability of the F test below which joint values explain positions."""
-MAX_TARGETS = 4
+_MAX_TARGETS = 4
 """Largest number of targets that are searched for under one name."""
-MAX_EXAMPLES = 3
+_MAX_EXAMPLES = 3
 """Largest number of rows that a sentence lists."""
-MAX_TARGET_ITERATIONS = 20
+_MAX_TARGET_ITERATIONS = 20
 """Largest number of alternating fits of base and targets."""
-TARGET_TOLERANCE = 1e-2
+_TARGET_TOLERANCE = 1e-2
 """Relative decrease of the mean square per iteration at convergence."""
-MAX_CLUSTERINGS = 8
+_MAX_CLUSTERINGS = 8
 """Largest number of iterations of assigning rows to the nearest target and fitting base and targets again."""
 
 
 def largest_zero(robot: Robot) -> float:
     """Return the largest standard deviation [rad] of the zeros of revolute joints of this maker's class of robots."""
-    return max(LARGEST_ZERO, RobotClass.from_robot(robot).largest.joint_offset)
+    return max(_LARGEST_ZERO, RobotClass.from_robot(robot).largest.joint_offset)
 
 
 def find_nominal_robot_faults(robot: Robot, measurements: Measurements) -> tuple[SetupFault, ...]:
@@ -88,7 +88,7 @@ def find_nominal_robot_faults(robot: Robot, measurements: Measurements) -> tuple
     rows = largest_group(measurements)
     if rows.rows < MIN_ROWS_NOMINAL:
         return ()
-    chosen = evenly_spaced_rows(torch.arange(MARGIN, rows.rows - MARGIN), MAX_ROWS_NOMINAL)
+    chosen = evenly_spaced_rows(torch.arange(MARGIN, rows.rows - MARGIN), _MAX_ROWS_NOMINAL)
     some, arm = rows.select(chosen), PredictingArm(robot)
     measured = MeasuredPoses.from_tensors(some.position, some.rotation, LEVER_SHARE * robot.reach)
     raw = Hypothesis(some.q, arm.poses(some), measured)
@@ -140,7 +140,7 @@ def _error_with_zeros(robot: Robot, rows: Measurements, measured: MeasuredPoses)
     except IdentificationError:
         return math.inf
     moved = (fitted.dh - robot.dh)[:, :2]
-    if np.abs(moved[:, 0]).max() > MAX_ZEROS * largest_zero(robot) or np.abs(moved[:, 1]).max() > MAX_SLIDE:
+    if np.abs(moved[:, 0]).max() > _MAX_ZEROS * largest_zero(robot) or np.abs(moved[:, 1]).max() > _MAX_SLIDE:
         return math.inf
     arm = PredictingArm(robot.with_geometry(dh=fitted.dh))
     here = next(frame_hypotheses(arm, rows, [Hypothesis(rows.q, arm.poses(rows), measured)]))
@@ -204,7 +204,7 @@ def are_unrelated(robot: Robot, measurements: Measurements) -> bool:
     rows = largest_group(measurements)
     if rows.rows < MIN_ROWS_NOMINAL:
         return False
-    rows = rows.select(evenly_spaced_rows(torch.arange(rows.rows), MAX_ROWS_NOMINAL))
+    rows = rows.select(evenly_spaced_rows(torch.arange(rows.rows), _MAX_ROWS_NOMINAL))
     assert rows.position is not None
     spread_out = float((rows.position - rows.position.mean(0)).square().sum(1).mean().sqrt())
     return spread_out > usual_error(robot, rows.q) and fits_by_chance(
@@ -219,7 +219,7 @@ def usual_error(robot: Robot, q: Float64[Tensor, "rows dof"]) -> float:
     covariance `P`. The part that base and tool absorb is neglected.
     """
     J = identification_jacobian(robot, q)[1][:, :3, : 5 * len(robot.rows)]
-    return USUAL * float(J.square().sum((1, 2)).mean().sqrt())
+    return _USUAL * float(J.square().sum((1, 2)).mean().sqrt())
 
 
 def measured_rows(measurements: Measurements) -> Int64[Tensor, " rows"]:
@@ -260,7 +260,7 @@ def fits_by_chance(T: Float64[Tensor, "rows 4 4"], position: Float64[Tensor, "ro
     free, left = 36, 3 * (len(T) - 13)
     unexplained = float(affine_error(T, MeasuredPoses(position, T[:, :3, :3], none, 0.0))) * left / 3
     total = float((position - position.mean(0)).square().sum())
-    return float(fdtrc(free, left, (total - unexplained) / free / (unexplained / left))) > SURE
+    return float(fdtrc(free, left, (total - unexplained) / free / (unexplained / left))) > _SURE
 
 
 @dataclass(frozen=True, eq=False)
@@ -284,7 +284,7 @@ def target_labellings(
     """Find targets from the measurements alone, as clusters of the measured points of the tool.
 
     The method is k-means, with base and targets fitted to all rows in every iteration. The number of targets is the
-    number of names, and every target gets the most frequent name of its rows; with one name, 2 to `MAX_TARGETS`
+    number of names, and every target gets the most frequent name of its rows; with one name, 2 to `_MAX_TARGETS`
     targets are tried.
 
     Args:
@@ -293,7 +293,7 @@ def target_labellings(
         measured: their measured poses.
     """
     names = tuple(dict.fromkeys(rows.target))
-    for count in range(2, MAX_TARGETS + 1) if len(names) == 1 else (len(names),):
+    for count in range(2, _MAX_TARGETS + 1) if len(names) == 1 else (len(names),):
         number, poses = _clustered(T, measured, count)
         cause = _one_name(rows, number) if len(names) == 1 else _other_names(rows, number, names)
         yield Labelling(cause, poses, count)
@@ -314,13 +314,13 @@ def fit_targets(
     """
     places = torch.zeros(int(number.max()) + 1, 3).to(T)
     last = math.inf
-    for _ in range(MAX_TARGET_ITERATIONS):
+    for _ in range(_MAX_TARGET_ITERATIONS):
         of_rows = T.clone()
         of_rows[:, :3, 3] += (T[:, :3, :3] @ places[number][..., None])[..., 0]
         base, tool = best_base_and_tool(of_rows, measured)
         fitted = base @ of_rows @ tool
         error = float(measured.squared_errors(fitted).mean())
-        if error > (1 - TARGET_TOLERANCE) * last:
+        if error > (1 - _TARGET_TOLERANCE) * last:
             break
         last = error
         points = _in_tool_frame(base @ T, measured)
@@ -355,7 +355,7 @@ def _other_names(rows: Measurements, number: Int64[Tensor, " rows"], names: tupl
     wrong = [row for row, (name, other) in enumerate(zip(rows.target, better, strict=True)) if name != other]
     examples = [
         f"{_where(rows, row)} fits '{better[row]}' instead of '{rows.target[row]}'"
-        for row in wrong[:MAX_EXAMPLES]
+        for row in wrong[:_MAX_EXAMPLES]
     ]
     clause = f"the targets seem to be mixed up: {len(wrong)} of {rows.rows} rows fit a target that they do not name"
     return Cause("target", clause, f"check the column 'target': {join_words(examples)}", 2.0)
@@ -379,7 +379,7 @@ def _clustered(
         far = torch.cdist(points, centres).amin(1).topk(max(1, len(T) // (4 * count))).indices
         centres = torch.cat([centres, points[far].median(0).values[None]])
     centres = centres[1:]
-    for _ in range(MAX_CLUSTERINGS):
+    for _ in range(_MAX_CLUSTERINGS):
         nearest = torch.cdist(points, centres).argmin(1)
         if bool((nearest == number).all()):
             break

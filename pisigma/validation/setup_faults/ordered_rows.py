@@ -23,20 +23,20 @@ from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.joint_correction.gravity_torques import GravityTorques
 from pisigma.measurement.conditions import APPROACH, order_of_rows
 
-MAX_ROWS = 4_000
+_MAX_ROWS = 4_000
 """Largest number of rows that are used, drawn from all rows."""
 SENSORS = ("position", "rotation")
 """Sensors whose values depend on frame and tool directly, without other unknowns."""
-CAP = 3.0
+_CAP = 3.0
 """Multiple of the upper quartile of their lengths at which residuals are clipped during the search for a fault."""
-HARMONICS, JOINT_ERROR = 3, 3e-4
+_HARMONICS, _JOINT_ERROR = 3, 3e-4
 """Harmonics of a series of the joint values, and prior standard deviation of its weights [rad]. The series is fitted
 together with the parameters, because in rows ordered by a joint's values, slow errors of its gear look like a slow
 motion."""
-SAG = 1e-3
+_SAG = 1e-3
 """Prior standard deviation of the weights of gravity torques [rad], which are fitted too: the sag of elastic joints can
 look like a second arm. It is 8.6e-4 for the measured UR10."""
-VALUES_PER_POSE = 6
+_VALUES_PER_POSE = 6
 """Number of independent values of a configuration (the pose of the tool), for any number of targets and repeats."""
 
 
@@ -105,7 +105,7 @@ class OrderedRows:
         if not present:
             return None
         measured = torch.stack(present).any(0).nonzero()[:, 0].cpu()
-        some = measured[randomly_chosen_rows(len(measured), MAX_ROWS)]
+        some = measured[randomly_chosen_rows(len(measured), _MAX_ROWS)]
         some = some[np.argsort(np.argsort(order_of_rows(data))[rows[some]])]
         problem = replace(solved.problem, pairs=0).select(some)
         whole, every = slice(0, len(some)), torch.arange(len(problem.space.parameters))
@@ -135,7 +135,7 @@ class OrderedRows:
     def clipped(self) -> Float64[np.ndarray, "rows values"]:
         """Residuals; large ones are shortened so that they do not determine where a fault is searched for."""
         lengths = np.linalg.norm(self.residual, axis=1)
-        longest = CAP * np.quantile(lengths, 0.75)
+        longest = _CAP * np.quantile(lengths, 0.75)
         shortened: np.ndarray = (
             self.residual * np.minimum(1.0, longest / np.maximum(lengths, 1e-300))[:, None]
         )
@@ -183,10 +183,13 @@ class OrderedRows:
         """
         robot = self.problem.space.robot
         play = Backlash(robot)
-        backlash = ((play, play.used.numpy(), JOINT_ERROR),) if APPROACH in self.problem.state.stated else ()
-        series, sag = FourierSeries(robot, HARMONICS), GravityTorques(robot, to_first_row_frame(robot, USUAL))
+        backlash = ((play, play.used.numpy(), _JOINT_ERROR),) if APPROACH in self.problem.state.stated else ()
+        series, sag = (
+            FourierSeries(robot, _HARMONICS),
+            GravityTorques(robot, to_first_row_frame(robot, USUAL)),
+        )
         masses = sag.used.numpy() & (np.arange(sag.used.shape[1]) % 4 == 0)
-        return (series, series.used.numpy(), JOINT_ERROR), (sag, masses, SAG), *backlash
+        return (series, series.used.numpy(), _JOINT_ERROR), (sag, masses, _SAG), *backlash
 
     @cached_property
     def precision(self) -> Float64[np.ndarray, " unknowns"]:
@@ -258,7 +261,7 @@ class OrderedRows:
     def degrees_of_freedom(self) -> float:
         """Degrees of freedom after the calibration, with at most one pose per configuration."""
         count = len(self.residual) if self.configuration is None else int(self.configuration.max()) + 1
-        return min(self.values, VALUES_PER_POSE * count) - self.effective_parameters
+        return min(self.values, _VALUES_PER_POSE * count) - self.effective_parameters
 
 
 class Effect(NamedTuple):

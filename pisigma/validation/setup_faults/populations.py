@@ -13,27 +13,27 @@ from pisigma.validation.setup_faults.ordered_rows import OrderedRows, inverse_of
 
 MIN_ROWS = 20
 """Minimum number of rows; with fewer, two arms cannot be distinguished."""
-MAX_ROWS = 300
+_MAX_ROWS = 300
 """Largest number of rows to which the populations are fitted, evenly over all rows."""
 MIN_SHARE = 0.1
 """Smallest share of a population; smaller ones are outliers, to which the robust loss gives no weight."""
-TAILS = 5.0
+_TAILS = 5.0
 """Degrees of freedom of the t distribution of the residuals, so that outliers do not become a population."""
-MAX_USED = 0.9
+_MAX_USED = 0.9
 """Largest share of the values absorbed by parameters, relative to the share at which the likelihood is unbounded."""
-STARTS, FIRST_ITERATIONS, MAX_ITERATIONS = 8, 6, 40
+_STARTS, _FIRST_ITERATIONS, MAX_ITERATIONS = 8, 6, 40
 """Number of starts of the expectation maximisation, their iterations, and iterations from the best start."""
-CONVERGENCE_TOLERANCE = 1e-2
+_CONVERGENCE_TOLERANCE = 1e-2
 """Largest change of the probabilities, and relative change of the variance, at convergence."""
-ALTERNATING = 0.95
+_ALTERNATING = 0.95
 """Share of the rows that must alternate: 1 in 20 may be predicted equally well by both populations."""
-DIFFERENCE = 2.0
+_DIFFERENCE = 2.0
 """Ratio of the variance of the difference of two arms to that of an arm and the nominal arm."""
-APART = 4.0
+_APART = 4.0
 """Ratio of the distance of a population to the scatter of the other above which they are separate. Residuals of
 healthy robots are a mixture with ratios of up to 2.5, because the unexplained errors depend on the pose."""
-NORMAL_ITERATIONS = 200
-FLOOR = 1e-6
+_NORMAL_ITERATIONS = 200
+_FLOOR = 1e-6
 """Smallest standard deviation, as a share of the largest residual."""
 _Differing = Literal["arm", "frame", "tool"]
 
@@ -81,8 +81,8 @@ def find_populations(rows: OrderedRows, count: int) -> Populations | None:
     """
     if len(rows.residual) < MIN_ROWS:
         return None
-    index = np.unique(np.linspace(0, len(rows.residual) - 1, MAX_ROWS).round().astype(int))
-    some = index if len(rows.residual) > MAX_ROWS else np.arange(len(rows.residual))
+    index = np.unique(np.linspace(0, len(rows.residual) - 1, _MAX_ROWS).round().astype(int))
+    some = index if len(rows.residual) > _MAX_ROWS else np.arange(len(rows.residual))
     independent = rows.degrees_of_freedom / max(rows.values - rows.effective_parameters, 1.0)
     found = []
     for differing, Z, precision in _differences(rows):
@@ -117,14 +117,14 @@ def _most_used(components: int) -> float:
     Args:
         components: number of components of the residual of a row.
     """
-    return MAX_USED * TAILS / (TAILS + components)
+    return _MAX_USED * _TAILS / (_TAILS + components)
 
 
 def _alternating(second: Bool[np.ndarray, " rows"]) -> Bool[np.ndarray, " rows"]:
     """Return exactly alternating rows for nearly alternating ones, because rows that fit both may be in either."""
     odd: np.ndarray = np.arange(len(second)) % 2 == 1
     for turn in (odd, ~odd):
-        if np.mean(second == turn) > ALTERNATING:
+        if np.mean(second == turn) > _ALTERNATING:
             return turn
     return second
 
@@ -141,7 +141,7 @@ def _differences(
         Z = rows.motion_derivative(kind)[1]
         yield differing, Z, np.zeros(Z.shape[2])
     active = len(rows.problem.active)
-    yield "arm", rows.jacobian[:, :, :active], rows.precision[:active] / DIFFERENCE
+    yield "arm", rows.jacobian[:, :, :active], rows.precision[:active] / _DIFFERENCE
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,18 +186,18 @@ class _Mixture:
         r, X, Z = self.rows.residual[some], self.rows.jacobian[some], self.Z[some]
         rng = np.random.default_rng(0)
         # Expectation maximisation finds local maxima: start with alternating rows (two arms in turns) and at random.
-        starts = [np.arange(len(some)) % 2 * 0.8 + 0.1, *rng.uniform(0, 1, (STARTS - 1, len(some)))]
+        starts = [np.arange(len(some)) % 2 * 0.8 + 0.1, *rng.uniform(0, 1, (_STARTS - 1, len(some)))]
         # The same errors and prior without a difference: what the mixture has to beat.
         alone = _Em(r, X, Z[:, :, :0], np.r_[self.rows.precision])
         one = alone.run(alone.start(np.zeros(len(some))), MAX_ITERATIONS)
         em = _Em(r, X, Z, np.r_[self.rows.precision, self.precision])
-        states = [em.run(em.start(start), FIRST_ITERATIONS) for start in starts]
+        states = [em.run(em.start(start), _FIRST_ITERATIONS) for start in starts]
         state = em.run(max(states, key=lambda state: state.log_likelihood), MAX_ITERATIONS)
         difference = state.x[X.shape[2] :]
         # A difference present in a share p of the rows has the variance p (1 - p) times its square; the variance of a t
         # distribution is its squared scale times TAILS / (TAILS - 2).
         made = float(np.square(Z @ difference).mean()) * state.share * (1 - state.share)
-        left = state.variance * r.size / max(r.size - state.used, 1.0) * TAILS / (TAILS - 2)
+        left = state.variance * r.size / max(r.size - state.used, 1.0) * _TAILS / (_TAILS - 2)
         every = _Em(self.rows.residual, self.rows.jacobian, self.Z, em.precision)
         return _Fit(
             probability=every.probabilities(state.x, state.share, state.variance)[0],
@@ -245,8 +245,8 @@ class _Em:
             state = self._step(state)
             change = np.abs(state.probability - before.probability).max(initial=0.0)
             if (
-                change < CONVERGENCE_TOLERANCE
-                and abs(state.variance / before.variance - 1) < CONVERGENCE_TOLERANCE
+                change < _CONVERGENCE_TOLERANCE
+                and abs(state.variance / before.variance - 1) < _CONVERGENCE_TOLERANCE
             ):
                 break
         return state
@@ -271,7 +271,7 @@ class _Em:
         share = float(np.clip(state.probability.mean(), 1e-3, 1 - 1e-3))
         fresh, log_likelihood = self.probabilities(x, share, variance)
         # Expected weight of a row under the t distribution: outliers have less.
-        weights = (TAILS + values) / (TAILS + squares / variance)
+        weights = (_TAILS + values) / (_TAILS + squares / variance)
         return _State(fresh, weights, x, share, variance, used, log_likelihood)
 
     def squared_residuals(self, x: Float64[np.ndarray, " unknowns"]) -> Float64[np.ndarray, "2 rows"]:
@@ -285,7 +285,7 @@ class _Em:
     ) -> tuple[Float64[np.ndarray, " rows"], float]:
         """Compute the probability that a row belongs to the second population, and the log likelihood of all rows."""
         values = self.r.shape[1]
-        logs = -(TAILS + values) / 2 * np.log1p(self.squared_residuals(x) / variance / TAILS)
+        logs = -(_TAILS + values) / 2 * np.log1p(self.squared_residuals(x) / variance / _TAILS)
         if not self.Z.shape[2]:
             return np.zeros(len(self.r)), float(logs[0].sum()) - self.r.size / 2 * math.log(variance)
         logs = logs + np.log([1 - share, share])[:, None]
@@ -317,7 +317,7 @@ class Mixture:
         return (
             self.log_bayes_factor > math.log(100.0)
             and min(self.share, 1 - self.share) >= MIN_SHARE
-            and self.off > APART * self.scatter
+            and self.off > _APART * self.scatter
         )
 
 
@@ -330,11 +330,11 @@ def two_populations(residuals: Float64[np.ndarray, "rows components"]) -> Mixtur
     rows, components = residuals.shape
     centred = residuals - residuals.mean(0)
     # Without a floor the likelihood is unbounded: a population could shrink to one row or to a plane.
-    floor = (FLOOR * np.abs(centred).max() + 1e-15) ** 2 * np.eye(components)
+    floor = (_FLOOR * np.abs(centred).max() + 1e-15) ** 2 * np.eye(components)
     # Start with the two halves along the first principal axis: two clusters separate along it.
     key = centred @ np.linalg.svd(centred, full_matrices=False)[2][0]
     weight = (key > np.median(key)).astype(float)
-    for _ in range(NORMAL_ITERATIONS):
+    for _ in range(_NORMAL_ITERATIONS):
         members = np.stack([1 - weight, weight])
         counts = members.sum(1).clip(1e-9)
         means = members @ residuals / counts[:, None]

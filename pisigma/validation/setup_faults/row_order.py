@@ -16,18 +16,18 @@ from pisigma.calibration.hybrid.result import HybridResult
 from pisigma.estimation.loss import HampelLoss
 from pisigma.validation.setup_faults.ordered_rows import OrderedRows, inverse_of
 
-MIN_ROWS = 3
+_MIN_ROWS = 3
 """Smallest number of rows before and after a motion."""
-MAX_USED = 0.8
+_MAX_USED = 0.8
 """Largest share of the values that parameters and motions may absorb; with more, the fit follows the noise, which it
 also estimates."""
 DEGREES = (1, 3, 6)
 """Degrees of the polynomials of slow motions, as functions of the share of the rows measured so far."""
-AS_LIKELY = 0.5
+_AS_LIKELY = 0.5
 """Share of the largest log Bayes factor above which a motion at the start of a frame also explains the residuals."""
 MAX_ITERATIONS = 6
 """Largest number of iterations of the reweighting."""
-CONVERGENCE_TOLERANCE = 1e-2
+_CONVERGENCE_TOLERANCE = 1e-2
 """Largest change of the weights, and relative change of the noise, at convergence."""
 _LOSS = HampelLoss()
 _Moved = Literal["frame", "target", "tool"]
@@ -98,7 +98,7 @@ def _motion_of(rows: OrderedRows) -> Motion | None:
     motion, chosen = search.motion(fits[best]), fits[best].candidate
     starts = search.frame_starts(chosen)
     alike = (
-        search.log_bayes_factor(search.reweighted_fit(one), 1.0) > AS_LIKELY * odds[best] for one in starts
+        search.log_bayes_factor(search.reweighted_fit(one), 1.0) > _AS_LIKELY * odds[best] for one in starts
     )
     return replace(motion, begins_frame=any(alike))
 
@@ -131,7 +131,7 @@ class _Candidate:
     @property
     def candidates_tried(self) -> int:
         """Number of candidates from which this one was chosen."""
-        return 1 if self.first is None else len(self.index) - 2 * MIN_ROWS
+        return 1 if self.first is None else len(self.index) - 2 * _MIN_ROWS
 
     def from_row(self, first: int) -> "_Candidate":
         """Return the candidate with a sudden motion before a row."""
@@ -187,7 +187,7 @@ class _Search:
         """Yield everything that may have moved, suddenly at the best row or slowly."""
         for candidate in self._rigid():
             count = len(candidate.index)
-            if count > 2 * MIN_ROWS:
+            if count > 2 * _MIN_ROWS:
                 yield candidate.from_row(self._best_step(self.rows.clipped, candidate))
                 time = (2 * np.arange(count) + 1) / count - 1
                 for degree in DEGREES:
@@ -240,7 +240,7 @@ class _Search:
         information = (ZZ - ZX @ self.rows.covariance @ ZX.transpose(0, 2, 1)) * scale * scale[:, None]
         solution = np.linalg.solve(information + 1e-6 * np.eye(len(scale)), (scale * gain)[..., None])
         explained = (scale * gain * solution[..., 0]).sum(1)
-        return MIN_ROWS + int(explained[MIN_ROWS : len(index) - MIN_ROWS].argmax())
+        return _MIN_ROWS + int(explained[_MIN_ROWS : len(index) - _MIN_ROWS].argmax())
 
     def fit(self, candidate: _Candidate) -> _Fit:
         """Fit a candidate together with the parameters; the row of a sudden motion is then searched once more."""
@@ -253,7 +253,7 @@ class _Search:
         size = candidate.full.shape[2]
         moved[candidate.index] -= candidate.full @ fit.motion[:size]
         gain = (fit.robust_costs(still) - fit.robust_costs(moved))[candidate.index][::-1].cumsum()[::-1]
-        first = MIN_ROWS + int(gain[MIN_ROWS : len(gain) - MIN_ROWS].argmax())
+        first = _MIN_ROWS + int(gain[_MIN_ROWS : len(gain) - _MIN_ROWS].argmax())
         return fit if first == candidate.first else self.reweighted_fit(candidate.from_row(first))
 
     @cached_property
@@ -284,7 +284,7 @@ class _Search:
             fit = _Fit(candidate, x[size:], after, tuple(scale.tolist()), effective)
             before, weight = weight, fit.weights
             changes = np.abs(weight - before).max(), np.abs(scale / old - 1).max()
-            if max(changes) < CONVERGENCE_TOLERANCE:
+            if max(changes) < _CONVERGENCE_TOLERANCE:
                 break
         return fit
 
@@ -297,7 +297,7 @@ class _Search:
             fit: fit of the candidate.
             values_per_independent: number of values per independent value.
         """
-        if fit.effective > MAX_USED * self.rows.values:
+        if fit.effective > _MAX_USED * self.rows.values:
             return -math.inf
         # Neither correlated values nor repeats of a configuration bring more information than one pose each.
         values = max(

@@ -31,7 +31,7 @@ from pisigma.validation.setup_faults.nominal_robot_faults import (
 )
 from pisigma.validation.setup_faults.setup_fault import SetupFault, fault_from_hypothesis
 
-CAUSES = {"base": "frame", "tool": "tool"}
+_CAUSES = {"base": "frame", "tool": "tool"}
 """Kind of the cause of a motion by the kind of frame."""
 
 
@@ -86,7 +86,7 @@ def find_setup_faults(
         if frames_only
         else fault_hypotheses(arm, known, here, most)
     )
-    free = {CAUSES[kind] for kind in fitted}
+    free = {_CAUSES[kind] for kind in fitted}
     faults = tuple(
         fault_from_hypothesis(here, other.without_causes(free), _nominal_error(nominal, known, other))
         for other in choose_simplest(list(tried), most)

@@ -18,7 +18,7 @@ from pisigma.validation.uncertainty.instrument import Instrument
 
 SCATTER = "scatter that the model leaves"
 """Name of the component that makes a budget comparable with measured errors."""
-POSITION = "position"
+_POSITION = "position"
 """Sensor whose residuals are coordinates."""
 
 
@@ -90,7 +90,7 @@ def scatter_component(model: CalibratedModel) -> Component | str:
     `s² = Σ r² / (n - p)` of the n residuals r with the effective number p of parameters, with `ν = n - p` degrees of
     freedom.
     """
-    sigma = math.nan if model.uncertainty is None else model.uncertainty.noise.standard_deviation(POSITION)
+    sigma = math.nan if model.uncertainty is None else model.uncertainty.noise.standard_deviation(_POSITION)
     if math.isnan(sigma):
         return f"{SCATTER}: the calibration did not estimate the standard deviation of a coordinate."
     noise = _noise(model)
@@ -164,7 +164,7 @@ def _noise(model: CalibratedModel) -> NoiseFigures | None:
         return None
     learned = None if summary.hybrid is None else summary.hybrid.learned
     every = summary.noise if learned is None else learned.noise
-    return next((one for one in every if one.sensor == POSITION and one.values is not None), None)
+    return next((one for one in every if one.sensor == _POSITION and one.values is not None), None)
 
 
 def _freedom(model: CalibratedModel) -> float | None:

@@ -11,11 +11,11 @@ from urllib.parse import urlsplit
 from aiohttp import web
 from aiohttp.typedefs import Handler
 
-COOKIE = "pisigma"
+_COOKIE = "pisigma"
 MAX_UPLOAD = 200 * 2**20
 """Largest body of a request [bytes]."""
-SAFE_METHODS = ("GET", "HEAD")
-HEADERS = {
+_SAFE_METHODS = ("GET", "HEAD")
+_HEADERS = {
     "Cache-Control": "no-store",
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; "
     "connect-src 'self'; frame-src 'self'; form-action 'self'; frame-ancestors 'self'; base-uri 'none'",
@@ -25,7 +25,7 @@ HEADERS = {
     "X-Content-Type-Options": "nosniff",
 }
 """Headers of every response, which forbid loading from other servers, storing, and display inside foreign pages."""
-FORBIDDEN = "Open this page with the link that pisigma printed."
+_FORBIDDEN = "Open this page with the link that pisigma printed."
 
 
 def _random_name() -> str:
@@ -63,13 +63,13 @@ class Access:
         if not secrets.compare_digest(
             request.match_info["token"].encode(errors="replace"), self.token.encode()
         ):
-            raise web.HTTPForbidden(text=FORBIDDEN)
+            raise web.HTTPForbidden(text=_FORBIDDEN)
         page = (
             '<!doctype html><title>pisigma</title><link rel="icon" href="data:,">'
             f'<meta http-equiv="refresh" content="0;url={self.root}/">'
         )
         response = web.Response(text=page, content_type="text/html")
-        response.set_cookie(COOKIE, self.cookie, path=self.root, httponly=True, samesite="Strict")
+        response.set_cookie(_COOKIE, self.cookie, path=self.root, httponly=True, samesite="Strict")
         return response
 
     def check(self, request: web.Request) -> None:
@@ -82,9 +82,9 @@ class Access:
             raise web.HTTPForbidden(text=f"The host {escape(request.host)[:100]} is not this machine.")
         if request.match_info.get("token") is not None:
             return
-        cookie = request.cookies.get(COOKIE, "")
+        cookie = request.cookies.get(_COOKIE, "")
         if not secrets.compare_digest(cookie.encode(errors="replace"), self.cookie.encode()):
-            raise web.HTTPForbidden(text=FORBIDDEN)
+            raise web.HTTPForbidden(text=_FORBIDDEN)
         if not is_same_origin(request):
             raise web.HTTPForbidden(text="The request comes from another page.")
 
@@ -97,11 +97,11 @@ class Access:
                 raise web.HTTPRequestEntityTooLarge(MAX_UPLOAD, request.content_length or 0)
             response = await handler(request)
         except web.HTTPException as refusal:
-            for name, value in HEADERS.items():
+            for name, value in _HEADERS.items():
                 refusal.headers.setdefault(name, value)
             raise
         if not response.prepared:
-            for name, value in HEADERS.items():
+            for name, value in _HEADERS.items():
                 response.headers.setdefault(name, value)
         return response
 
@@ -123,7 +123,7 @@ def is_same_origin(request: web.Request) -> bool:
     """Return whether a request was made by a page of this server, or by a person who typed the address."""
     origin = request.headers.get("Origin")
     is_socket = request.headers.get("Upgrade", "").lower() == "websocket"
-    if origin is None and (is_socket or request.method not in SAFE_METHODS):
+    if origin is None and (is_socket or request.method not in _SAFE_METHODS):
         return False
     if origin is not None and origin.partition("://")[2].lower() != request.host.lower():
         return False

@@ -10,7 +10,7 @@ from aiohttp import web
 from pisigma.files.errors import PisigmaError, system_fault
 from pisigma.workbench.job import BusyError
 
-MAX_PERSON = 60
+_MAX_PERSON = 60
 """Longest name of a person."""
 
 
@@ -59,4 +59,4 @@ async def form_of(request: web.Request) -> dict[str, str]:
 
 def person_of(request: web.Request) -> str:
     """Return the name that a person entered, or the address of the browser."""
-    return request.query.get("person", "").strip()[:MAX_PERSON] or f"somebody at {request.remote}"
+    return request.query.get("person", "").strip()[:_MAX_PERSON] or f"somebody at {request.remote}"

@@ -14,9 +14,9 @@ from aiohttp.typedefs import Handler
 from pisigma.files.errors import OutputError
 from pisigma.workbench.server.access import MAX_UPLOAD, Access
 
-MAX_PORTS = 1000
+_MAX_PORTS = 1000
 """Number of ports that are tried."""
-CLOSING_TIME = 1.0
+_CLOSING_TIME = 1.0
 """Time to finish open requests at the end [s]."""
 
 
@@ -62,7 +62,7 @@ class FrontServer:
 
     def _run(self, app: web.Application, closing: Callable[[], Awaitable[None]] | None) -> None:
         """Serve in this thread until `close`."""
-        runner = web.AppRunner(app, access_log=None, shutdown_timeout=CLOSING_TIME)
+        runner = web.AppRunner(app, access_log=None, shutdown_timeout=_CLOSING_TIME)
         self._loop.run_until_complete(runner.setup())
         self._loop.run_until_complete(web.SockSite(runner, self._socket).start())
         self._loop.call_soon(self._started.set)
@@ -93,7 +93,7 @@ def _bound(host: str, port: int) -> socket.socket:
     Raises:
         OutputError: the host is not an address of this machine, or no port is free.
     """
-    for number in range(port, min(port + MAX_PORTS, 2**16)):
+    for number in range(port, min(port + _MAX_PORTS, 2**16)):
         try:
             family, kind, _, _, address = socket.getaddrinfo(host, number, type=socket.SOCK_STREAM)[0]
             with contextlib.ExitStack() as unless_bound:

@@ -19,11 +19,11 @@ from pisigma.files.errors import OutputError, Place
 if TYPE_CHECKING:  # the full name, which type checkers at run time find without this import
     import viser
 
-MAX_MESSAGE = 50 * 2**20
+_MAX_MESSAGE = 50 * 2**20
 """Largest size of a message that viser accepts [bytes]."""
-MAX_PATH = 100
+_MAX_PATH = 100
 """Longest path of a unix socket on all systems [bytes]."""
-SCENE_POLICY = (
+_SCENE_POLICY = (
     "default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:; frame-ancestors 'self'; base-uri 'none'"
 )
 """Content security policy for viser's page, a file that contains its scripts, workers and compiled code."""
@@ -54,9 +54,9 @@ class ViserBackend:
         self._client = _client()
         self._folder = tempfile.TemporaryDirectory(prefix="pisigma-")  # the folder has mode 0700
         path = Path(self._folder.name) / "viser"
-        if len(os.fsencode(path)) > MAX_PATH:
+        if len(os.fsencode(path)) > _MAX_PATH:
             raise OutputError(
-                expected=f"a path for temporary files of at most {MAX_PATH} bytes",
+                expected=f"a path for temporary files of at most {_MAX_PATH} bytes",
                 value=str(path),
                 at=Place(path),
                 remedy="set TMPDIR to a shorter one",
@@ -77,7 +77,7 @@ class ViserBackend:
             body=self._client,
             content_type="text/html",
             charset="utf-8",
-            headers={"Content-Security-Policy": SCENE_POLICY},
+            headers={"Content-Security-Policy": _SCENE_POLICY},
         )
 
     async def _connect(self, request: web.Request) -> web.StreamResponse:
@@ -86,7 +86,7 @@ class ViserBackend:
             self._session = aiohttp.ClientSession(connector=aiohttp.UnixConnector(str(self.path), limit=0))
         stated = request.headers.get("Sec-WebSocket-Protocol", "").split(",")
         protocols = [name.strip() for name in stated if name.strip()]
-        outside = web.WebSocketResponse(protocols=protocols, max_msg_size=MAX_MESSAGE, compress=False)
+        outside = web.WebSocketResponse(protocols=protocols, max_msg_size=_MAX_MESSAGE, compress=False)
         async with self._session.ws_connect("http://viser/", protocols=protocols, max_msg_size=0) as inside:
             await outside.prepare(request)
             ways = [asyncio.ensure_future(_pass_on(*way)) for way in ((outside, inside), (inside, outside))]

@@ -34,21 +34,21 @@ from pisigma.workflow.predicted_errors import PredictedErrors
 if TYPE_CHECKING:  # names in full, which type checkers at run time find without these imports
     import viser
 
-GHOST = 0.35
+_GHOST = 0.35
 """Opacity of the robot at the next pose."""
 
-DOT, SHAFT, HEAD, MAX_ARROW, AXES = 0.02, 0.003, 0.008, 0.3, 0.2
+_DOT, _SHAFT, HEAD, _MAX_ARROW, AXES = 0.02, 0.003, 0.008, 0.3, 0.2
 """Shares of the robot's reach: diameter of a point, radii of shaft and head of an arrow, its largest length, and length
 of the base axes."""
-SHEET, PRINT = (245, 245, 245), (20, 20, 20)
+_SHEET, _PRINT = (245, 245, 245), (20, 20, 20)
 """Colours of a board's sheet and corners."""
-CORNER_DOT = 0.25
+_CORNER_DOT = 0.25
 """Diameter of a corner's dot, as a share of the distance of two corners."""
-CLOUD_DOT = 0.6
+_CLOUD_DOT = 0.6
 """Diameter of a predicted error's dot, as a share of that of a row's."""
-MAX_LABELS, MAX_ARROWS = 50, 1000
+_MAX_LABELS, _MAX_ARROWS = 50, 1000
 """Wrong rows that are labelled with their line, and errors that are drawn as arrows; more are drawn as lines."""
-FLOOR, TRACKER_HEAD, CONE, BEAM, HANDLE = 5.0, 0.05, 0.2, 0.003, 0.3
+_FLOOR, _TRACKER_HEAD, _CONE, _BEAM, _HANDLE = 5.0, 0.05, 0.2, 0.003, 0.3
 """Shares of the robot's reach: edge of the floor, radius of the tracker, length of the cone, width of the beam, size of
 the arrows for dragging objects."""
 
@@ -94,7 +94,7 @@ class SessionScene:
         self._ghost.visible = state.next_pose is not None
         if state.next_pose is not None:
             pose, T = state.next_pose, self._poses(state.next_pose.q)
-            self._body.draw(self._scene, "/ghost/robot", pose.q, NEXT, GHOST)
+            self._body.draw(self._scene, "/ghost/robot", pose.q, NEXT, _GHOST)
             self._label("/next/label", f"next: pose {pose.number}", T[:3, 3])
             draw_sight(self._scene, "/next", self._arm.surroundings, T, self._robot.reach)
             if self._sight is not None and self._sight.is_fixed:
@@ -147,7 +147,7 @@ class SessionScene:
             self._dots("/rows/measured", position[~rows.check], colors[~rows.check])
         if rows.check.any():
             self._dots("/rows/check", position[rows.check], colors[rows.check], shape="diamond")
-        for row in np.flatnonzero(rows.alarmed)[:MAX_LABELS]:
+        for row in np.flatnonzero(rows.alarmed)[:_MAX_LABELS]:
             self._label(f"/rows/alarm_{row}", f"line {rows.line[row]}", position[row])
         self._arrows(position, rows, colors, magnification)
         return position
@@ -162,7 +162,7 @@ class SessionScene:
         self._begin("/predicted")
         if errors is not None:
             colors = error_colors(errors.p95.numpy(), top)
-            self._dots("/predicted/errors", errors.position.numpy(), colors, CLOUD_DOT)
+            self._dots("/predicted/errors", errors.position.numpy(), colors, _CLOUD_DOT)
 
     def add_rows(self, q: Float64[np.ndarray, "rows dof"]) -> None:
         """Draw new rows in grey at the tool of the nominal robot, until all rows are drawn again.
@@ -184,17 +184,17 @@ class SessionScene:
         if not judged.any() or magnification == 0:
             return
         lengths = magnification * np.linalg.norm(rows.error, axis=1, keepdims=True)
-        arrow = magnification * rows.error * np.minimum(1.0, MAX_ARROW * reach / np.maximum(lengths, 1e-12))
+        arrow = magnification * rows.error * np.minimum(1.0, _MAX_ARROW * reach / np.maximum(lengths, 1e-12))
         ends = np.stack([position, position + arrow], axis=1)
-        if judged.sum() > MAX_ARROWS:
+        if judged.sum() > _MAX_ARROWS:
             both = np.repeat(colors[judged][:, None], 2, axis=1)
-            self._scene.add_line_segments("/rows/errors", ends[judged], both, thickness=SHAFT * reach)
+            self._scene.add_line_segments("/rows/errors", ends[judged], both, thickness=_SHAFT * reach)
             return
         self._scene.add_arrows(
             "/rows/errors",
             ends[judged],
             colors[judged],
-            shaft_radius=SHAFT * reach,
+            shaft_radius=_SHAFT * reach,
             head_radius=HEAD * reach,
             head_length=3 * HEAD * reach,
         )
@@ -221,7 +221,7 @@ class SessionScene:
         size: float = 1.0,
         shape: Literal["circle", "diamond"] = "circle",
     ) -> None:
-        diameter = size * DOT * self._robot.reach
+        diameter = size * _DOT * self._robot.reach
         self._scene.add_point_cloud(
             name, position, colors, point_size=diameter, point_shape=shape, precision="float32"
         )
@@ -244,9 +244,9 @@ def draw_board(scene: "viser.SceneApi", name: str, board: Board) -> None:
     left, top, right, bottom = board_sheet(board)
     ends = np.array([[left, top, 0.0], [right, top, 0.0], [right, bottom, 0.0], [left, bottom, 0.0]])
     faces = np.array([[0, 1, 2], [0, 2, 3]])
-    scene.add_mesh_simple(f"{name}/sheet", ends, faces, color=SHEET, side="double", cast_shadow=False)
-    size = CORNER_DOT * board.square
-    scene.add_point_cloud(f"{name}/corners", board.corners, PRINT, point_size=size, precision="float32")
+    scene.add_mesh_simple(f"{name}/sheet", ends, faces, color=_SHEET, side="double", cast_shadow=False)
+    size = _CORNER_DOT * board.square
+    scene.add_point_cloud(f"{name}/corners", board.corners, _PRINT, point_size=size, precision="float32")
 
 
 def draw_surroundings(
@@ -260,7 +260,7 @@ def draw_surroundings(
         reach: reach of the robot [m].
         is_movable: whether floor (height), boxes (with their yaw), tracker, and camera or board can be dragged.
     """
-    edge, fixed, free = FLOOR * reach, (0.0, 0.0), (-1000.0, 1000.0)
+    edge, fixed, free = _FLOOR * reach, (0.0, 0.0), (-1000.0, 1000.0)
     height = 0.0 if surroundings.floor_mm is None else surroundings.floor_mm / 1e3
 
     def node(
@@ -273,7 +273,7 @@ def draw_surroundings(
         along_x, along_y, along_z = (free if axis in moves else fixed for axis in "xyz")
         return scene.add_transform_controls(
             name,
-            HANDLE * reach,
+            _HANDLE * reach,
             disable_rotations=not turns,
             active_axes=("x" in moves, "y" in moves, "z" in moves),
             translation_limits=(along_x, along_y, along_z),
@@ -290,7 +290,7 @@ def draw_surroundings(
         scene.add_box(f"{name}/box", FORBIDDEN, edges, opacity=0.35, cast_shadow=False)
         scene.add_label(f"{name}/label", box.name, position=(0, 0, edges[2] / 2), anchor="bottom-center")
     if surroundings.tracker is not None:
-        head, size = surroundings.tracker.position.numpy(), TRACKER_HEAD * reach
+        head, size = surroundings.tracker.position.numpy(), _TRACKER_HEAD * reach
         handles["tracker"] = node("/tracker", head)
         scene.add_icosphere("/tracker/head", size, TRACKER)
         if (stand := float(head[2] - height)) > 0:
@@ -329,9 +329,9 @@ def draw_sight(
     if surroundings.tracker is None:
         return
     beam = np.stack([surroundings.tracker.position.numpy(), T_base_tool[:3, 3]])
-    scene.add_line_segments(f"{name}/beam", beam[None], SIGHT, thickness=BEAM * reach)
+    scene.add_line_segments(f"{name}/beam", beam[None], SIGHT, thickness=_BEAM * reach)
     if surroundings.reflector is not None:
-        cone = acceptance_cone(surroundings.reflector, CONE * reach).transformed(
+        cone = acceptance_cone(surroundings.reflector, _CONE * reach).transformed(
             T_base_tool[:3, :3], T_base_tool[:3, 3]
         )
         scene.add_mesh_simple(

@@ -22,17 +22,17 @@ if TYPE_CHECKING:  # names in full, which type checkers at run time find without
     import viser
     import viser.uplot
 
-ERROR_SHARE = 0.15
+_ERROR_SHARE = 0.15
 """Drawn length of an error at the end of the colour scale, as a share of the robot's reach."""
-FIELD, RISE, AROUND_ROBOT, CLOSER = 0.8, 0.5, 0.7, 0.92
+FIELD, _RISE, _AROUND_ROBOT, _CLOSER = 0.8, 0.5, 0.7, 0.92
 """First view: field of view [rad], downward slope, radius around the robot as a share of the reach, and distance of the
 camera as a share of that at which this radius is visible."""
 MAGNIFICATIONS = (0, 2000, 10)
 """Smallest and largest magnification of errors, and its step."""
-MAX_ALARMS = 8
+_MAX_ALARMS = 8
 """Latest alarms that are shown."""
 
-CURVES: tuple["viser.uplot.Series", ...] = (
+_CURVES: tuple["viser.uplot.Series", ...] = (
     {"label": "poses"},
     {"label": "predicted RMS", "stroke": "#1f5fa8", "width": 2},
     {"label": "predicted 95 %", "stroke": "#1f5fa8", "width": 1, "dash": (2, 3)},
@@ -135,12 +135,12 @@ class SessionView:
 def first_view(arm: ArmInSurroundings) -> tuple[Float64[np.ndarray, " 3"], Float64[np.ndarray, " 3"]]:
     """Return camera position and target of a view with robot and tracker side by side [m]."""
     tracker = np.zeros(3) if arm.surroundings.tracker is None else arm.surroundings.tracker.position.numpy()
-    around = AROUND_ROBOT * arm.robot.reach
+    around = _AROUND_ROBOT * arm.robot.reach
     low, high = np.minimum(tracker, (-around, -around, 0.0)), np.maximum(tracker, around)
     middle, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
     sideways = np.array([tracker[1], -tracker[0], 0.0]) if tracker[:2].any() else np.array([1.0, -1.0, 0.0])
-    direction = sideways / np.linalg.norm(sideways) + np.array([0.0, 0.0, RISE])
-    return middle + CLOSER * radius / np.sin(FIELD / 2) * direction / np.linalg.norm(direction), middle
+    direction = sideways / np.linalg.norm(sideways) + np.array([0.0, 0.0, _RISE])
+    return middle + _CLOSER * radius / np.sin(FIELD / 2) * direction / np.linalg.norm(direction), middle
 
 
 def arrow_magnification(top: float, reach: float) -> int:
@@ -151,7 +151,7 @@ def arrow_magnification(top: float, reach: float) -> int:
         reach: reach of the robot [m].
     """
     low, high, step = MAGNIFICATIONS
-    return step * round(float(np.clip(ERROR_SHARE * reach / top, low + step, high)) / step)
+    return step * round(float(np.clip(_ERROR_SHARE * reach / top, low + step, high)) / step)
 
 
 def top_of_scale(rows: RowsSoFar) -> float:
@@ -184,7 +184,7 @@ class SessionPanel:
         self._advice = gui.add_html("")
         self._curve = gui.add_uplot(
             _curves((), limit),
-            CURVES,
+            _CURVES,
             title="Accuracy over the task",
             scales=_scales(()),
             axes=({"label": "poses", "incrs": (1, 2, 5, 10, 20, 50, 100, 200, 500)}, {"label": "mm"}),
@@ -203,7 +203,7 @@ class SessionPanel:
         """
         self._advice.content = str(self._text.advice(state, self._robot.axes, self._limit))
         self._rows.content = str(
-            self._text.rows(state, self._robot.axes, state.alarms[: -MAX_ALARMS - 1 : -1], top, RAMP)
+            self._text.rows(state, self._robot.axes, state.alarms[: -_MAX_ALARMS - 1 : -1], top, RAMP)
         )
         points = (*state.expected, *state.reached)
         curves = _curves(points, self._limit)
@@ -221,7 +221,7 @@ def _curves(
         (p.predicted_rms, p.predicted_p95, p.cross_validated_rms, p.random_rms, line)
         for _, p in sorted(by_poses.items())
     ]
-    columns = np.array(rows, dtype=np.float64).reshape(-1, len(CURVES) - 1).T * 1e3
+    columns = np.array(rows, dtype=np.float64).reshape(-1, len(_CURVES) - 1).T * 1e3
     return np.array(sorted(by_poses), dtype=np.float64), *columns
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64, Int64
 
-AROUND = 24
+_AROUND = 24
 """Points around the axis of revolution."""
 
 
@@ -40,10 +40,10 @@ def revolve(radii: Float64[np.ndarray, " rings"], heights: Float64[np.ndarray, "
         radii: radii of the rings [m]; the surface is closed at radius 0.
         heights: heights of the rings along the axis, ascending [m].
     """
-    angles = np.linspace(0.0, 2 * np.pi, AROUND, endpoint=False)
-    circle = np.stack([np.cos(angles), np.sin(angles), np.zeros(AROUND)], axis=1)
+    angles = np.linspace(0.0, 2 * np.pi, _AROUND, endpoint=False)
+    circle = np.stack([np.cos(angles), np.sin(angles), np.zeros(_AROUND)], axis=1)
     points = radii[:, None, None] * circle + heights[:, None, None] * np.array([0.0, 0.0, 1.0])
-    index = np.arange(points.shape[0] * AROUND).reshape(-1, AROUND)
+    index = np.arange(points.shape[0] * _AROUND).reshape(-1, _AROUND)
     low, high = index[:-1], index[1:]
     right, above = np.roll(low, -1, axis=1), np.roll(high, -1, axis=1)
     faces = np.concatenate([np.stack([low, right, above], -1), np.stack([low, above, high], -1)])

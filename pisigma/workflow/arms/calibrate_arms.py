@@ -30,7 +30,7 @@ from pisigma.workflow.settings.calibration import CalibrationSettings
 
 FRAMES_FILE = "frames.yaml"
 """File with the bases of the arms relative to each other, next to the folders of their models."""
-MAX_POSTURES = 200
+_MAX_POSTURES = 200
 """Number of postures of every arm at which the distances between tools are judged."""
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
 
@@ -149,7 +149,7 @@ def posterior_of(name: str, calibration: Calibration) -> ArmPosterior:
 
 def postures_of(calibration: Calibration) -> Postures:
     """Return the postures of some rows of a calibration, in random order."""
-    rows = calibration.rows.select(randomly_chosen_rows(calibration.rows.rows, MAX_POSTURES))
+    rows = calibration.rows.select(randomly_chosen_rows(calibration.rows.rows, _MAX_POSTURES))
     arm = calibration.model.hybrid
     return Postures(
         JointState.from_measurements(rows), rows.q if arm is None else corrected_joints(arm, rows)

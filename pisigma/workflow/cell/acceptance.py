@@ -16,9 +16,9 @@ from pisigma.workflow.cell.cell import Cell
 from pisigma.workflow.cell.setup_names import ModelRows
 from pisigma.workflow.evaluate import evaluate
 
-JUDGED = frozenset(("position", "rotation", "pose", "corner"))
+_JUDGED = frozenset(("position", "rotation", "pose", "corner"))
 """Kinds of readings that give positions."""
-NO_SESSION = "no session that the model was not fitted to was measured since its calibration."
+_NO_SESSION = "no session that the model was not fitted to was measured since its calibration."
 
 
 def acceptance_of(cell: Cell) -> Acceptance:
@@ -47,7 +47,7 @@ def acceptance_of(cell: Cell) -> Acceptance:
         )
     new = known[-1]
     seen = cell.sessions.rows_with_model_names(entry, cell.sessions.as_measured(new), new.day)
-    measured, problem = _measured(cell, entry, new, seen) if later else (None, NO_SESSION)
+    measured, problem = _measured(cell, entry, new, seen) if later else (None, _NO_SESSION)
     instrument = document.instrument or Instrument()
     repeats = tuple(
         pose
@@ -87,7 +87,7 @@ def _measured(
     cell: Cell, entry: ModelEntry, session: SessionEntry, seen: ModelRows
 ) -> tuple[MeasuredAccuracy | None, str]:
     """Evaluate the model on a session; return a reason if that is not possible."""
-    if others := seen.rows.kinds - JUDGED:
+    if others := seen.rows.kinds - _JUDGED:
         return None, f"session {session.name} has readings without a position ({', '.join(sorted(others))})."
     settings = seen.settings_to_fit(cell.file.settings_of_step("evaluate"))
     try:

@@ -54,11 +54,11 @@ MEASURED_JOINTS = (
     "The rows contain joint values that the encoders read, so the model corrects these and not the deviation of the "
     "controller: a commanded pose is reached if the encoders then read the corrected joint values."
 )
-MAX_WIDTH = 100
+_MAX_WIDTH = 100
 _COMMENT: Mapping[str, Any] = {"initial_indent": "# ", "subsequent_indent": "# "}
 
 SensorName = Literal["tracker", "camera", "sockets", "draw-wire", "touch"]
-PLANNED_SENSORS: dict[SensorName, str] = {"camera": "camera", "draw-wire": "distance"}
+_PLANNED_SENSORS: dict[SensorName, str] = {"camera": "camera", "draw-wire": "distance"}
 """Names that `pisigma plan` uses for the sensors that do not measure positions."""
 
 Group = TypeVar("Group")
@@ -214,7 +214,7 @@ class CellFile:
         shared: dict[str, Any] = {}
         if self.document.limit_mm is not None and "limit_mm" in STATED_ABOVE.get(step, ()):
             shared["limit_mm"] = self.document.limit_mm
-        sensor = PLANNED_SENSORS.get(self.document.sensor, "position")
+        sensor = _PLANNED_SENSORS.get(self.document.sensor, "position")
         if self.document.camera is not None and (step != "plan" or sensor == "camera"):
             shared |= self.document.camera.model_dump(exclude_defaults=True)
         if step == "plan":
@@ -362,7 +362,7 @@ def cell_template(document: Mapping[str, Any], calibrate: Mapping[str, Any] | No
         if document.get(key) is not None:
             lines.append(f"{key}: {_yaml(document[key])}")
         else:
-            lines += textwrap.wrap(f"{key}:  # {meaning[key]}", MAX_WIDTH, **_COMMENT)
+            lines += textwrap.wrap(f"{key}:  # {meaning[key]}", _MAX_WIDTH, **_COMMENT)
     lines.append("# instrument:  # for the uncertainty budget of `pisigma report`; texts in quotation marks")
     for key, text in attributes_of(Instrument).items():
         lines.append(f"#   {key}:  # {text}")
@@ -379,7 +379,7 @@ def cell_template(document: Mapping[str, Any], calibrate: Mapping[str, Any] | No
             key = setting.key
             if key in (*CAMERA_KEYS, *STATED_ABOVE.get(step, ())):
                 continue
-            lines += textwrap.wrap(setting.help, MAX_WIDTH, initial_indent="  # ", subsequent_indent="  # ")
+            lines += textwrap.wrap(setting.help, _MAX_WIDTH, initial_indent="  # ", subsequent_indent="  # ")
             lines.append(f"  # {key}: {_yaml(setting.default)}".rstrip())
     return "\n".join([*lines, ""])
 

@@ -23,7 +23,7 @@ from pisigma.workflow.cell.cell import Cell
 from pisigma.workflow.import_rows import ImportedRows, ImportProposal, import_rows, propose_import
 from pisigma.workflow.settings.importing import ImportSettings
 
-SIZES = {
+_SIZES = {
     "mm": 1e-3,
     "m": 1.0,
     "cm": 1e-2,
@@ -33,7 +33,7 @@ SIZES = {
     "gon": np.pi / 200,
 }
 """Sizes of the units that are confused [m or rad]."""
-MISNAMED = {"mm_named_m": 1e-3, "m_named_mm": 1e3}
+_MISNAMED = {"mm_named_m": 1e-3, "m_named_mm": 1e3}
 """Ratio of correct to stated values by the cause of a finding that has no other figures."""
 
 
@@ -176,7 +176,7 @@ class IncomingRows:
 def _corrected(mapping: FileMapping, finding: Diagnostic) -> Mapping[str, str]:
     """Return the meanings of the columns of a file that correct a finding, by heading; empty without a repair."""
     kinds, values = set(finding.cause.split("+")) - {"frame", "tool"}, finding.values
-    columns, ratio = values.get("columns"), values.get("ratio", MISNAMED.get(finding.cause))
+    columns, ratio = values.get("columns"), values.get("ratio", _MISNAMED.get(finding.cause))
     targets: list[tuple[MappedColumn, Target]] = []
     if isinstance(columns, tuple) and kinds <= {"joint_order", "joint_sign"}:
         for joint, logged in enumerate(columns, 1):
@@ -207,4 +207,4 @@ def _unit(stated: str, ratio: float) -> str | None:
     """Return the unit that is larger than a stated unit by a ratio; None if there is no such unit."""
     kinds = (("mm", "m", "cm", "in"), ("deg", "rad", "gon"))
     likely = next((kind for kind in kinds if stated in kind), ())
-    return next((one for one in likely if np.isclose(SIZES[one], ratio * SIZES[stated])), None)
+    return next((one for one in likely if np.isclose(_SIZES[one], ratio * _SIZES[stated])), None)

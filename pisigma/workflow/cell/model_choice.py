@@ -26,7 +26,7 @@ from pisigma.workflow.settings.calibration import WITH_PRIOR, CalibrationSetting
 from pisigma.workflow.settings.evaluation import EvaluationSettings
 from pisigma.workflow.settings.recalibration import RecalibrationSettings
 
-MIN_ROWS = 10
+_MIN_ROWS = 10
 """Minimum number of rows of the newest session, which is held out."""
 Value = TypeVar("Value")
 Result = TypeVar("Result", bound=Calibration | Recalibration)
@@ -54,8 +54,8 @@ def is_better(
     newest, older, folder = sessions[-1], list(sessions[:-1]), stored.folder.parent / MODELS / in_use.name
     if not is_unchanged(folder, in_use.sha256):
         return False, f"model '{in_use.name}', which is in use, was changed or removed"
-    if newest.name in in_use.made_of or newest.rows < MIN_ROWS or not older:
-        return False, f"there is no session of {MIN_ROWS} rows or more to compare it with '{in_use.name}'"
+    if newest.name in in_use.made_of or newest.rows < _MIN_ROWS or not older:
+        return False, f"there is no session of {_MIN_ROWS} rows or more to compare it with '{in_use.name}'"
     progress("calibration without the newest session")
     alone = replace(settings, cameras=None, folds=0, hold_out=None)
     without = calibrate(stored.robot, stored.rows_of(older), alone)
@@ -135,7 +135,7 @@ def check_entry(
     check = replace(check, verdict=judged.verdict, summary=judged.sentence, rms_mm=judged.rms * 1e3)
     if judged.recalibrate or judged.verdict == "moved":
         return replace(check, recalibrate=True)
-    if session.rows < MIN_ROWS:
+    if session.rows < _MIN_ROWS:
         return check
     tried = recalibrate(found.model, seen.rows, seen.settings_to_recalibrate(settings))
     if not (tried.trusted and tried.gate.updates):

@@ -8,7 +8,7 @@ from pathlib import Path
 from pisigma.files.errors import OutputError, Place
 from pisigma.files.scratch import FILE, scratch_beside
 
-MAX_NAMES = 10_000
+_MAX_NAMES = 10_000
 """Largest number of files with the date of one day in a folder."""
 
 
@@ -18,12 +18,14 @@ def free_path(folder: Path, name: str, suffix: str, taken: Collection[str] = ())
     Raises:
         OutputError: all names are taken.
     """
-    for number in range(1, MAX_NAMES):
+    for number in range(1, _MAX_NAMES):
         stem = name if number == 1 else f"{name}-{number}"
         path = folder / f"{stem}{suffix}"
         if not path.exists() and stem not in taken:
             return path
-    raise OutputError(f"the folder already contains {MAX_NAMES:,} files named after {name}", at=Place(folder))
+    raise OutputError(
+        f"the folder already contains {_MAX_NAMES:,} files named after {name}", at=Place(folder)
+    )
 
 
 def output_path(cell: str | os.PathLike[str], part: str, suffix: str) -> Path:

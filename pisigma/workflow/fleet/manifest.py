@@ -21,9 +21,9 @@ from pisigma.workflow.settings.calibration import CalibrationSettings
 
 COLUMNS = ("id", "robot", "data", "date", "model", "options", "camera", "board")
 """Columns of a manifest; `id` and `data` are required."""
-ROBOT_FILES = ("robot.yaml", "robot.yml", "robot.urdf")
+_ROBOT_FILES = ("robot.yaml", "robot.yml", "robot.urdf")
 """Names of the robot description in a folder with the rows of a robot."""
-NO_VALIDATION = {"folds": 0}
+_NO_VALIDATION = {"folds": 0}
 """Settings of calibrations unless the manifest states others: many robots are calibrated without a cross-validation."""
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 _EXPECTED_NAME = "1 to 100 letters, digits, '.', '_' or '-', starting with a letter or digit"
@@ -148,7 +148,7 @@ def _in_folder(path: Path) -> Iterator[_Row]:
     for entry in sorted(path.iterdir()):
         if entry.name.startswith("."):
             continue
-        robot = next((os.fspath(entry / one) for one in ROBOT_FILES if (entry / one).is_file()), "")
+        robot = next((os.fspath(entry / one) for one in _ROBOT_FILES if (entry / one).is_file()), "")
         files = sorted(entry.glob("*.csv")) if entry.is_dir() else [entry] * (entry.suffix.lower() == ".csv")
         for file in files:
             name = entry.name if entry.is_dir() else entry.stem
@@ -182,7 +182,7 @@ def _cell(rows: list[_Row], common: NewCell) -> NewCell:
     robot, model, options, camera, board = ((stated[key] or [""])[0] for key in ("robot", *COLUMNS[4:]))
     if not (robot or common.robot or model):
         place = replace(at, column="robot" if at.line else None)
-        remedy = f"name it, add one of {', '.join(ROBOT_FILES)} to its folder, or state a robot for all"
+        remedy = f"name it, add one of {', '.join(_ROBOT_FILES)} to its folder, or state a robot for all"
         raise FleetError("the robot is not stated", at=place, remedy=remedy)
     if bool(camera) != bool(board):
         place = replace(at, column="board" if camera else "camera")
@@ -199,7 +199,7 @@ def _cell(rows: list[_Row], common: NewCell) -> NewCell:
         cameras=CameraFiles(tuple(camera.split("; ")), tuple(board.split("; ")))
         if camera
         else common.cameras,
-        calibrate=NO_VALIDATION | settings,
+        calibrate=_NO_VALIDATION | settings,
         sessions=tuple(_sessions(rows)),
     )
     return cell_from_model(Path(model), cell) if model else cell

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from pisigma.model.calibrated_model import CalibratedModel
     from pisigma.workflow.cell.cell import Cell
 
-CELLS_PER_CHUNK = 4
+_CELLS_PER_CHUNK = 4
 """Number of cells that a worker processes at once, which takes some seconds."""
 _LOST = "the process that worked on it ended twice; check the memory and its files."
 RESULTS = "results.parquet"
@@ -250,7 +250,7 @@ def run_fleet(
     parameters = dict(read_parameters(path))
     work = functools.partial(_advance, prior=settings.prior)
     with _engine(settings, len(waiting)) as engine:
-        results = engine.results(work, waiting, CELLS_PER_CHUNK) if waiting else iter(())
+        results = engine.results(work, waiting, _CELLS_PER_CHUNK) if waiting else iter(())
         for number, (cell, result) in enumerate(results, len(cells) - len(waiting) + 1):
             reason, found = (_LOST, {}) if result is None else result
             parameters |= found

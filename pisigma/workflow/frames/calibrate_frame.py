@@ -23,7 +23,7 @@ from pisigma.validation.held_out.distillation_summary import ParentFigures
 from pisigma.validation.held_out.frame_summary import FrameSummary, frame_summary
 from pisigma.workflow.result import AbstractModelResult
 
-CHOICES: tuple[FrameChoice, ...] = ("tool", "base", "hand-eye")
+_CHOICES: tuple[FrameChoice, ...] = ("tool", "base", "hand-eye")
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +82,7 @@ def calibrate_frame(
         PoseError: the joint values do not fit the robot.
     """
     started = time.perf_counter()
-    check_choice(IdentificationError, "only", only, CHOICES)
+    check_choice(IdentificationError, "only", only, _CHOICES)
     model, parent = _model_of(robot)
     arm = _drawn(robot) if model is None else model.robot
     rows, _ = read_rows(data, arm, cameras).split_sets()

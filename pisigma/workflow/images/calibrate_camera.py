@@ -24,17 +24,17 @@ from pisigma.measurement.sensors.intrinsics import CAMERA_UNITS
 from pisigma.reporting.result_text import Table
 from pisigma.workflow.settings.images import IntrinsicsSettings
 
-OBLIQUE = np.deg2rad(15.0)
+_OBLIQUE = np.deg2rad(15.0)
 """Angle [rad] that a third of the images have to exceed, as frontal views do not separate focal length and distance."""
-MIN_IMAGES = 10
+_MIN_IMAGES = 10
 """Number of images below which a warning is given."""
-CORNER = 2
+_CORNER = 2
 """Number of cells of a corner of the image along each axis, a quarter of its width and height."""
 CORNERS = {
-    "upper left": (slice(None, CORNER), slice(None, CORNER)),
-    "upper right": (slice(None, CORNER), slice(-CORNER, None)),
-    "lower left": (slice(-CORNER, None), slice(None, CORNER)),
-    "lower right": (slice(-CORNER, None), slice(-CORNER, None)),
+    "upper left": (slice(None, _CORNER), slice(None, _CORNER)),
+    "upper right": (slice(None, _CORNER), slice(-_CORNER, None)),
+    "lower left": (slice(-_CORNER, None), slice(None, _CORNER)),
+    "lower right": (slice(-_CORNER, None), slice(-_CORNER, None)),
 }
 
 
@@ -78,9 +78,9 @@ class CameraCalibration:
                 f"No corner of the board is in the {' and '.join(empty)} of the image, where the distortion is "
                 "extrapolated; take images with the board there."
             )
-        if np.quantile(calibration.tilts, 2 / 3) < OBLIQUE:
+        if np.quantile(calibration.tilts, 2 / 3) < _OBLIQUE:
             warnings.append(
-                f"Most images are frontal (two thirds are tilted by less than {np.rad2deg(OBLIQUE):.0f} deg), so "
+                f"Most images are frontal (two thirds are tilted by less than {np.rad2deg(_OBLIQUE):.0f} deg), so "
                 "focal lengths can hardly be distinguished from distances; take images tilted by 20 to 40 deg."
             )
         if calibration.disagrees:
@@ -89,9 +89,9 @@ class CameraCalibration:
                 "board is not flat, or the lens needs --set k3=true. Standard deviations are enlarged by this factor, "
                 "not for errors that all images share; glue the board onto something flat."
             )
-        if len(calibration.tilts) < MIN_IMAGES:
+        if len(calibration.tilts) < _MIN_IMAGES:
             warnings.append(
-                f"With {len(calibration.tilts)} images, one bad image distorts the result; take {MIN_IMAGES} or more."
+                f"With {len(calibration.tilts)} images, one bad image distorts the result; take {_MIN_IMAGES} or more."
             )
         return tuple(warnings)
 

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from pisigma.measurement.splits import SplitBy
     from pisigma.robot.robot_class import ClassName
 
-MAX_REPEATS = 1000
+_MAX_REPEATS = 1000
 
 ModelKind = Literal["hybrid", "geometric"]
 
@@ -169,9 +169,9 @@ class CalibrationSettings:
             )
         if not 0 <= self.seed < 2**63:
             raise MeasurementError(expected="an integer from 0 to 2^63 - 1", value=self.seed, option="seed")
-        if (self.repeats or 0) > MAX_REPEATS:
+        if (self.repeats or 0) > _MAX_REPEATS:
             raise MeasurementError(
-                expected=f"at most {MAX_REPEATS:,} repeats", value=self.repeats, option="repeats"
+                expected=f"at most {_MAX_REPEATS:,} repeats", value=self.repeats, option="repeats"
             )
         if self.jobs is not None and self.jobs < 1:
             raise MeasurementError(expected="an integer >= 1", value=self.jobs, option="jobs")

@@ -10,9 +10,9 @@ from pisigma.calibration.geometric.problem.least_squares import Linearisation
 from pisigma.calibration.geometric.problem.noise import sensor_view_of
 from pisigma.calibration.geometric.problem.problem import CalibrationProblem
 
-ROUNDING = 1e-12
+_ROUNDING = 1e-12
 """Ratio of an eigenvalue of the information to the largest one below which it is zero up to rounding."""
-SHOWN = 0.25
+_SHOWN = 0.25
 """Component of a direction above which the sentence names its parameter."""
 
 
@@ -93,7 +93,7 @@ def find_weak_directions(problem: CalibrationProblem, here: Linearisation[Tensor
     names = [problem.space.names[i] for i in problem.active[arm].tolist()]
     end = "it stays near its nominal value" if held else "without a prior it is undetermined"
     sentences = []
-    rounding = ROUNDING * float(values[-1])
+    rounding = _ROUNDING * float(values[-1])
     for value, vector in zip(values.tolist(), vectors.t(), strict=True):
         if value >= max(1.0, rounding):
             break
@@ -111,7 +111,7 @@ def direction_in_words(vector: Tensor, names: list[str]) -> str:
     text = ""
     for index in order:
         part = sign * float(vector[index])
-        if text and abs(part) < SHOWN:
+        if text and abs(part) < _SHOWN:
             break
         term = names[index] if abs(part) > 0.97 else f"{abs(part):.2f} {names[index]}"
         text += f" {'-' if part < 0 else '+'} {term}" if text else term

@@ -8,9 +8,9 @@ from jaxtyping import Float64
 from pisigma.calibration.geometric.identifiability.redundancy import NO_EFFECT, selection_weights
 from pisigma.calibration.geometric.problem.information import Information
 
-CORRELATION_TOLERANCE = 1e-6
+_CORRELATION_TOLERANCE = 1e-6
 """Largest difference from ±1 of a correlation that is treated as ±1."""
-PAPER_ORDER = ("a", "d", "alpha", "theta", "beta", "base", "tool")
+_PAPER_ORDER = ("a", "d", "alpha", "theta", "beta", "base", "tool")
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +46,7 @@ class PairwiseRedundancy:
             first one.
         no_effect: parameters that change no measured value.
         kept: all parameters that are not redundant, with one of each set.
-        tolerance: see `CORRELATION_TOLERANCE`.
+        tolerance: see `_CORRELATION_TOLERANCE`.
     """
 
     lengths: CorrelationTable
@@ -60,7 +60,7 @@ class PairwiseRedundancy:
 def find_pairwise_redundancy(
     information: Information,
     sizes: Float64[np.ndarray, " parameters"],
-    tolerance: float = CORRELATION_TOLERANCE,
+    tolerance: float = _CORRELATION_TOLERANCE,
 ) -> PairwiseRedundancy:
     """Find pairs of parameters whose columns of the Jacobian have |r| = 1 (Park et al. 2022, section 3.2).
 
@@ -70,13 +70,13 @@ def find_pairwise_redundancy(
     Args:
         information: the condensed Jacobian.
         sizes: nominal values, see `find_redundancy`.
-        tolerance: see `CORRELATION_TOLERANCE`.
+        tolerance: see `_CORRELATION_TOLERANCE`.
     """
     columns = information.jacobian
     lengths = np.linalg.norm(columns, axis=0)
     acting = lengths > NO_EFFECT * max(lengths.max(initial=0.0), 1e-300)
     parameters, preference = information.parameters, selection_weights(information.parameters, sizes)
-    order = sorted(range(len(parameters)), key=lambda i: (PAPER_ORDER.index(parameters[i].group), i))
+    order = sorted(range(len(parameters)), key=lambda i: (_PAPER_ORDER.index(parameters[i].group), i))
     tables, sets, dropped = [], [], set()
     for unit in ("m", "rad"):
         chosen = [i for i in order if parameters[i].unit == unit]

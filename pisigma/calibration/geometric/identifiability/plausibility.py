@@ -14,18 +14,18 @@ from pisigma.files.errors import ImplausibleError, Place
 IMPLAUSIBLE_SHARE = 0.01
 """Median residual, as a share of the reach, above which a fitted arm is implausible."""
 
-DISTANCES = ("distance", "pair")
+_DISTANCES = ("distance", "pair")
 """Sensors that measure distances, which are tested like positions."""
 
-LONG_SHARE = 0.1
+_LONG_SHARE = 0.1
 """Length of a link, as a share of the reach, above which the link is long."""
-RUINED_SHARE = 0.5
+_RUINED_SHARE = 0.5
 """Relative change of the length of a long link above which the fit is implausible."""
-FAR_OFF = 10.0
+_FAR_OFF = 10.0
 """Ratio of a residual to the median residual of the other frames above which the row does not fit."""
-NOTICED = 1e-6
+_NOTICED = 1e-6
 """Residual below which a row always fits [m]."""
-OFF_SHARE = 0.2
+_OFF_SHARE = 0.2
 """Share of a frame's rows that must not fit before a warning is given."""
 
 
@@ -48,7 +48,7 @@ def refuse_implausible(problem: CalibrationProblem, here: Linearisation[Tensor],
     judged = [
         sensor.present
         for sensor in problem.sensors
-        if sensor.unit == "m" and (sensor.components == 3 or sensor.name in DISTANCES)
+        if sensor.unit == "m" and (sensor.components == 3 or sensor.name in _DISTANCES)
     ]
     if not judged or robot.reach == 0 or not bool((problem.active < problem.space.arm_size).any()):
         return
@@ -75,8 +75,8 @@ def _refuse_ruined_links(problem: CalibrationProblem, point: Tensor, source: str
     robot = problem.space.robot
     is_length = problem.space.is_length.numpy()
     nominal, fitted = robot.dh.ravel(), point.cpu().numpy()[: problem.space.arm_size]
-    long = is_length[: len(nominal)] & (np.abs(nominal) > LONG_SHARE * robot.reach)
-    ruined = long & (np.abs(fitted - nominal) > RUINED_SHARE * np.abs(nominal))
+    long = is_length[: len(nominal)] & (np.abs(nominal) > _LONG_SHARE * robot.reach)
+    ruined = long & (np.abs(fitted - nominal) > _RUINED_SHARE * np.abs(nominal))
     for number in np.flatnonzero(ruined)[:1].tolist():
         name = problem.space.names[number]
         raise ImplausibleError(
@@ -108,9 +108,9 @@ def misfitting_frames(
         rest = sizes[(problem.frame != number) & torch.isfinite(sizes)]
         if len(theirs) == 0 or len(rest) == 0:
             continue
-        usual = max(float(rest.median()), NOTICED)
-        wrong = theirs > FAR_OFF * usual
-        if float(wrong.double().mean()) > OFF_SHARE:
+        usual = max(float(rest.median()), _NOTICED)
+        wrong = theirs > _FAR_OFF * usual
+        if float(wrong.double().mean()) > _OFF_SHARE:
             off.append((number, float(theirs[wrong].median()), int(wrong.sum()), len(theirs)))
             others.append(usual)
     return tuple(

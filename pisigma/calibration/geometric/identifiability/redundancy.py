@@ -10,20 +10,20 @@ from jaxtyping import Float64, Int64
 from pisigma.calibration.geometric.problem.information import Information
 from pisigma.calibration.geometric.problem.parameters import Parameter
 
-RANK_TOLERANCE = 1e-6
+_RANK_TOLERANCE = 1e-6
 """Ratio of a singular value of the column-scaled Jacobian to the largest one below which it is treated as zero."""
 NO_EFFECT = 1e-9
 """Ratio of the length of a column to the longest one below which it is treated as zero."""
-PREFERENCE = ("base", "tool", "theta", "a", "d", "alpha", "beta")
+_PREFERENCE = ("base", "tool", "theta", "a", "d", "alpha", "beta")
 """Order in which kinds of parameters are preferred; each has ten times the weight of the next."""
-_WEIGHT = {group: 10.0**-rank for rank, group in enumerate(PREFERENCE)}
-CLEARLY_SEEN = 1.0
+_WEIGHT = {group: 10.0**-rank for rank, group in enumerate(_PREFERENCE)}
+_CLEARLY_SEEN = 1.0
 """Standard deviation [mm or mrad] from the data alone below which a parameter is added."""
-EXPLAINED = 0.5
+_EXPLAINED = 0.5
 """Share of the residual sum of squares that further parameters must explain in order to be added."""
-SIGNIFICANT = 20.0
+_SIGNIFICANT = 20.0
 """F statistic that further parameters must reach in order to be added."""
-VISIBLE = 1e-7
+_VISIBLE = 1e-7
 """Share of a column's length orthogonal to the kept columns below which it is treated as dependent."""
 
 
@@ -110,7 +110,7 @@ class RankFindings:
 
 
 def find_redundancy(
-    information: Information, sizes: Float64[np.ndarray, " parameters"], tolerance: float = RANK_TOLERANCE
+    information: Information, sizes: Float64[np.ndarray, " parameters"], tolerance: float = _RANK_TOLERANCE
 ) -> Redundancy:
     """Find the rank, an identifiable subset of the parameters, and the dependencies of the other parameters on it.
 
@@ -121,7 +121,7 @@ def find_redundancy(
         information: the condensed Jacobian.
         sizes: nominal values. Of parameters with equal columns, the one with the larger value is kept: of parallel
             axes, the d that is a real offset.
-        tolerance: see `RANK_TOLERANCE`.
+        tolerance: see `_RANK_TOLERANCE`.
     """
     jacobian, names = information.jacobian, np.array(information.names)
     lengths, preference = _lengths(jacobian), selection_weights(information.parameters, sizes)
@@ -245,8 +245,8 @@ def additional_columns(information: Information, kept: int) -> list[int]:
     """
     # Below the rows of the kept columns, the triangle contains the components orthogonal to these columns.
     rest, left = information.jacobian[kept:, kept:], information.residual[kept:]
-    pivots = _pivots(rest, VISIBLE * np.linalg.norm(information.jacobian[:, kept:], axis=0))
-    clear = sum(size >= 1 / CLEARLY_SEEN for _, size in pivots)
+    pivots = _pivots(rest, _VISIBLE * np.linalg.norm(information.jacobian[:, kept:], axis=0))
+    clear = sum(size >= 1 / _CLEARLY_SEEN for _, size in pivots)
     if _needed(rest[:, [i for i, _ in pivots]], left, information.values - kept):
         clear = len(pivots)
     return [kept + i for i, _ in pivots[:clear]]
@@ -278,4 +278,4 @@ def _needed(columns: np.ndarray, left: np.ndarray, freedom: int) -> bool:
     total = float(left @ left)
     explained = float(np.square(basis.T @ left).sum())
     unexplained = max(total - explained, 1e-30 * total) / (freedom - extra)
-    return explained >= EXPLAINED * total and explained / extra >= SIGNIFICANT * unexplained
+    return explained >= _EXPLAINED * total and explained / extra >= _SIGNIFICANT * unexplained

@@ -42,22 +42,22 @@ class CalibrationWarning:
     sentence: str
 
 
-LITTLE_MOTION = 0.1
+_LITTLE_MOTION = 0.1
 """Range of a joint [rad or m] below which its errors are hardly identifiable."""
-NEAR_AXIS = 5e-3
+_NEAR_AXIS = 5e-3
 """Distance of a target from the last axis, as a share of the reach, below which errors of this joint have little
 effect."""
-GOOD_RATIO = 3
+_GOOD_RATIO = 3
 """Number of values per parameter that a calibration should have."""
-MIN_EFFECT = 1e-3
+_MIN_EFFECT = 1e-3
 """Ratio of the length of a parameter's column to the longest one above which the parameter can determine the scale."""
-SAME_FACE = 1e-6
+_SAME_FACE = 1e-6
 """Largest difference of coordinates [m] on one face."""
-TOUCHES_WITHOUT_SCALE = (
+_TOUCHES_WITHOUT_SCALE = (
     "the touches of every frame and axis are at one coordinate, which a robot of any size fits, so the scale stays "
     "nominal; touch faces at different coordinates along an axis."
 )
-SOCKETS_WITHOUT_SCALE = (
+_SOCKETS_WITHOUT_SCALE = (
     "sockets alone fit a robot of any size, so the scale stays nominal; give the distance between two sockets "
     "(socket_distances), or measure a length with another sensor."
 )
@@ -115,7 +115,7 @@ def measurement_advice(setup: CalibrationSetup, estimated: int) -> tuple[Calibra
     problem = setup.problem
     values = distinct_values(problem)
     few = []
-    if values < GOOD_RATIO * estimated:
+    if values < _GOOD_RATIO * estimated:
         sentence = (
             f"there are only {values} values for {estimated} free parameters; measure about "
             f"{_missing_poses(problem, estimated)} more poses."
@@ -132,7 +132,7 @@ def measurement_advice(setup: CalibrationSetup, estimated: int) -> tuple[Calibra
 
 def _missing_poses(problem: CalibrationProblem, estimated: int) -> int:
     values = distinct_values(problem)
-    return int(np.ceil((GOOD_RATIO * estimated - values) / (values / max(distinct_rows(problem), 1))))
+    return int(np.ceil((_GOOD_RATIO * estimated - values) / (values / max(distinct_rows(problem), 1))))
 
 
 def distinct_rows(problem: CalibrationProblem) -> int:
@@ -151,7 +151,7 @@ def _unexcited_joints(robot: Robot, problem: CalibrationProblem) -> list[Calibra
     span = (problem.q.amax(0) - problem.q.amin(0)).tolist()
     warnings = []
     for joint, moved in zip(robot.joints, span, strict=True):
-        if moved < LITTLE_MOTION:
+        if moved < _LITTLE_MOTION:
             text = f"{np.rad2deg(moved):.3g} deg" if joint.type == "revolute" else f"{moved * 1e3:.3g} mm"
             sentence = (
                 f"joint {joint.name} moves by only {text}, so its errors cannot be distinguished from those of its "
@@ -174,7 +174,7 @@ def _targets_on_axis(robot: Robot, problem: CalibrationProblem) -> list[Calibrat
         T = forward_kinematics(end, torch.zeros(1, dtype=torch.float64))
         names.append(name)
         offs.append(float(torch.hypot(T[0, 3], T[1, 3])))
-    if max(offs) >= NEAR_AXIS * robot.reach:
+    if max(offs) >= _NEAR_AXIS * robot.reach:
         return []
     which = f"target {names[int(np.argmax(offs))]}" if len(names) > 1 else "the target"
     sentence = (
@@ -205,7 +205,7 @@ def determines_scale(setup: CalibrationSetup) -> bool:
         for frame, axis, value in zip(data.frame, data.touch_axis, data.touch.tolist(), strict=True):
             if axis:
                 faces.setdefault((frame, axis), []).append(value)
-    return any(max(values) - min(values) > SAME_FACE for values in faces.values())
+    return any(max(values) - min(values) > _SAME_FACE for values in faces.values())
 
 
 def candidates_at_start(
@@ -231,7 +231,7 @@ def candidates_at_start(
     size = np.linalg.norm(at_start.jacobian, axis=0)
     values = np.abs(setup.start.cpu().numpy()[candidates])
     arm = [parameter.group in ("d", "a") for parameter in at_start.parameters]
-    lengths = np.where(np.array(arm) & (size > MIN_EFFECT * size.max(initial=0.0)), values, 0.0)
+    lengths = np.where(np.array(arm) & (size > _MIN_EFFECT * size.max(initial=0.0)), values, 0.0)
     if not lengths.any():
         return candidates, at_start
     longest = int(lengths.argmax())
@@ -285,8 +285,8 @@ def _scale(setup: CalibrationSetup) -> list[CalibrationWarning]:
     if determines_scale(setup):
         return []
     if "touch" in setup.measurements.kinds:
-        return [CalibrationWarning("scale_of_touches", "", TOUCHES_WITHOUT_SCALE)]
-    return [CalibrationWarning("scale_of_sockets", "", SOCKETS_WITHOUT_SCALE)]
+        return [CalibrationWarning("scale_of_touches", "", _TOUCHES_WITHOUT_SCALE)]
+    return [CalibrationWarning("scale_of_sockets", "", _SOCKETS_WITHOUT_SCALE)]
 
 
 def _touched_frames(setup: CalibrationSetup) -> list[CalibrationWarning]:

@@ -26,9 +26,9 @@ from pisigma.robot.se3 import (
     skew,
 )
 
-GUESS_STEPS = 2
+_GUESS_STEPS = 2
 """Number of steps that refine a closed-form guess with large residuals."""
-CLEAR_FIT = 5e-3
+_CLEAR_FIT = 5e-3
 """RMS residual, as a share of the reach, below which a result is accepted without trying other starts."""
 
 
@@ -134,8 +134,8 @@ def guess_base_and_tool(
     """
     problem = build_base_and_tool_problem(robot, measurements, free_base, free_tool)
     state = next(base_and_tool_starts(robot, problem))
-    if _rms_position(problem, state) >= CLEAR_FIT * robot.reach:
-        state = _solved(robot, problem, GUESS_STEPS).linearisation.point
+    if _rms_position(problem, state) >= _CLEAR_FIT * robot.reach:
+        state = _solved(robot, problem, _GUESS_STEPS).linearisation.point
     return _base_and_tools(robot, problem, state)
 
 
@@ -177,7 +177,7 @@ def _off(robot: Robot, problem: BaseToolProblem, solution: Solution[BaseToolStat
     turn = (
         robot.reach * _rms_rotation(problem, solution.linearisation.point) if problem.has_rotations else 0.0
     )
-    return math.hypot(shift, turn), shift < CLEAR_FIT * robot.reach
+    return math.hypot(shift, turn), shift < _CLEAR_FIT * robot.reach
 
 
 def _rms_position(problem: BaseToolProblem, state: BaseToolState) -> float:
@@ -189,15 +189,15 @@ def _rms_rotation(problem: BaseToolProblem, state: BaseToolState) -> float:
     return float(turn.square().sum(-1).mean().sqrt())
 
 
-MIN_TOUCHES = 4
+_MIN_TOUCHES = 4
 """Smallest number of touches along an axis that determine its direction."""
-MIN_SPREAD_RATIO = 0.03
+_MIN_SPREAD_RATIO = 0.03
 """Ratio of the smallest to the largest spread of the tips that is needed to determine a direction."""
-REFINEMENTS = 10
+_REFINEMENTS = 10
 """Number of Gauss-Newton steps after the linear solution of a touched frame."""
-MAX_RMS_SHARE = 0.05
+_MAX_RMS_SHARE = 0.05
 """Largest RMS residual of the touches for an accepted guess, as a share of the reach."""
-BASE_UNKNOWNS = 6
+_BASE_UNKNOWNS = 6
 
 
 def fit_base_to_touches(
@@ -237,11 +237,11 @@ def _linear_rotation(tip: Tensor, axis: Tensor, touch: Tensor) -> Tensor | None:
     for k in range(3):
         points, values = tip[axis == k], touch[axis == k]
         rows.append(None)
-        if len(points) < MIN_TOUCHES:
+        if len(points) < _MIN_TOUCHES:
             continue
         centred = points - points.mean(0)
         singular = torch.linalg.svdvals(centred)
-        if float(singular[-1]) > MIN_SPREAD_RATIO * float(singular[0]):
+        if float(singular[-1]) > _MIN_SPREAD_RATIO * float(singular[0]):
             row = torch.linalg.lstsq(centred, (values - values.mean())[:, None]).solution[:, 0]
             rows[k] = row / row.norm().clamp(min=1e-12)
     for k in range(3):
@@ -256,7 +256,7 @@ def _refined(tip: Tensor, axis: Tensor, touch: Tensor, R: Tensor, p: Tensor) -> 
     rows = torch.arange(len(tip))
     eye = torch.eye(3).to(tip)[axis]
     residual = touch - (tip @ R.mT + p)[rows, axis]
-    for _ in range(REFINEMENTS):
+    for _ in range(_REFINEMENTS):
         turned = tip @ R.mT
         J = torch.cat([eye, (-skew(turned))[rows, axis]], -1)
         step = torch.linalg.pinv(J, rtol=1e-6) @ residual
@@ -271,7 +271,7 @@ def check_touched_base(measurements: Measurements, name: str, rms: float, reach:
     Raises:
         IdentificationError: the RMS residual of the touches is too large.
     """
-    if rms <= MAX_RMS_SHARE * reach:
+    if rms <= _MAX_RMS_SHARE * reach:
         return
     counts = ", ".join(f"{(measurements.touch_axis or ()).count(axis)} along {axis}" for axis in "xyz")
     raise IdentificationError(
@@ -297,13 +297,13 @@ def check_touched_frames(measurements: Measurements, names: tuple[str, ...]) -> 
     for name in names:
         rows = [row for row, frame in enumerate(measurements.frame) if frame == name]
         touches = sum(touch[row] for row in rows)
-        if not touches or any(other[row] for row in rows) or touches > BASE_UNKNOWNS:
+        if not touches or any(other[row] for row in rows) or touches > _BASE_UNKNOWNS:
             continue
         raise IdentificationError(
-            f"expected more than {BASE_UNKNOWNS} touches of frame '{name}', which has {BASE_UNKNOWNS} unknowns, got "
+            f"expected more than {_BASE_UNKNOWNS} touches of frame '{name}', which has {_BASE_UNKNOWNS} unknowns, got "
             f"{touches}",
-            expected=f"more than {BASE_UNKNOWNS} touches of frame '{name}'",
+            expected=f"more than {_BASE_UNKNOWNS} touches of frame '{name}'",
             value=touches,
             at=Place(measurements.source),
-            remedy=f"touch it about {3 * BASE_UNKNOWNS} times along x, y and z, or omit its rows",
+            remedy=f"touch it about {3 * _BASE_UNKNOWNS} times along x, y and z, or omit its rows",
         )

@@ -12,13 +12,13 @@ from pisigma.robot.description import Robot
 from pisigma.robot.se3 import nearest_rotation, rotation_from_rpy
 
 MAX_ITERATIONS = 60
-LINEAR_ROWS = 13
+_LINEAR_ROWS = 13
 """Smallest number of rows that determine base and tool by a linear system."""
-DEPENDENT = 1e-9
+_DEPENDENT = 1e-9
 """Ratio of a singular value of the linear system to the largest one below which it is treated as zero."""
-UNDETERMINED = 1e-9
+_UNDETERMINED = 1e-9
 """Relative weight of the given rotation, which is used for what points do not determine."""
-SINGLE = 0.9
+_SINGLE = 0.9
 """Ratio of the second to the first singular value above which the rotations may not be unique."""
 
 
@@ -92,7 +92,7 @@ def start_from_poses(
     _, singular, Vh = torch.linalg.svd(K)
     leading = Vh[0].reshape(3, 3)
     starts = torch.stack([leading, -leading])
-    if float(singular[1]) > SINGLE * float(singular[0]):
+    if float(singular[1]) > _SINGLE * float(singular[0]):
         starts = torch.cat([R_tool_nominal.mT[None], starts, _cube_rotations(K)])
     Z = nearest_rotation(starts)
     agreement = torch.zeros(len(Z)).to(K)
@@ -125,7 +125,7 @@ def starts_from_positions(
     Yields:
         R_base, p_base [m], point [m].
     """
-    if position.shape[0] >= LINEAR_ROWS:
+    if position.shape[0] >= _LINEAR_ROWS:
         yield start_from_products(R_flange, p_flange, position, nominal_point)
     along = 0.1 * reach * torch.eye(3).to(position)
     assumed = torch.cat([nominal_point[None], torch.zeros_like(nominal_point)[None], along, -along])
@@ -193,7 +193,7 @@ def _mean_turn(R_base: Tensor, R_flange: Tensor, rotation: Tensor) -> Tensor:
 def _procrustes(points: Tensor, position: Tensor, like: Tensor | None = None) -> Tensor:
     """Fit the rotation of the points to the positions, both relative to their means; see `fit_base_to_points`."""
     M = (position - position.mean(0)).mT @ (points - points.mean(0))
-    return nearest_rotation(M if like is None else M + like * (UNDETERMINED * M.norm()).clamp(min=1e-12))
+    return nearest_rotation(M if like is None else M + like * (_UNDETERMINED * M.norm()).clamp(min=1e-12))
 
 
 def _least_squares(
@@ -205,8 +205,8 @@ def _least_squares(
     """
     Q, R = torch.linalg.qr(A)
     inverse = torch.linalg.solve_triangular(R, torch.eye(R.shape[-1]).to(R), upper=True)
-    if not bool(inverse.norm() * R.norm() < 1 / DEPENDENT):
-        inverse = torch.linalg.pinv(R, rtol=DEPENDENT)
+    if not bool(inverse.norm() * R.norm() < 1 / _DEPENDENT):
+        inverse = torch.linalg.pinv(R, rtol=_DEPENDENT)
     solution: Tensor = inverse @ (Q.mT @ b)
     return solution
 

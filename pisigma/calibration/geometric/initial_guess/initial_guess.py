@@ -32,11 +32,11 @@ from pisigma.robot.se3 import (
     transform_from_xyzrpy,
 )
 
-GUESS_ROWS = 1_024
+_GUESS_ROWS = 1_024
 """Largest number of rows used to guess base and tool."""
-MIN_POSITIONS = 9
+_MIN_POSITIONS = 9
 """Number of positions below which a frame's base is guessed with the tools of other frames."""
-MIN_POSITIONS_TOUCHED = 5
+_MIN_POSITIONS_TOUCHED = 5
 """Number of positions in a touched frame that are sufficient for base and tool in closed form."""
 MIN_TURN = 0.02
 """Singular value per row below which orientations in sockets do not determine a direction of the tool, which then
@@ -143,20 +143,20 @@ def _from_positions(
     for number in sorted(range(len(space.frames)), key=lambda number: -count[number]):
         name, rows = space.frames[number], (positions & (frame == number)).nonzero()[:, 0]
         if len(rows) == 0 or (
-            len(rows) < MIN_POSITIONS_TOUCHED and bool((touches & (frame == number)).any())
+            len(rows) < _MIN_POSITIONS_TOUCHED and bool((touches & (frame == number)).any())
         ):
             continue
         robot = space.robot if name not in stated else space.robot.with_geometry(base=stated[name])
         part = measurements
-        if len(rows) < measurements.rows or len(rows) > GUESS_ROWS:
+        if len(rows) < measurements.rows or len(rows) > _GUESS_ROWS:
             part = measurements.select(
-                rows[randomly_chosen_rows(len(rows), GUESS_ROWS)].to(measurements.q.device)
+                rows[randomly_chosen_rows(len(rows), _GUESS_ROWS)].to(measurements.q.device)
             )
         if part.pair is not None:
             part = replace(part, pair=None, distance=None)
         find_base = free_base and name not in stated
         turned = bool(part.is_measured("pose").any())
-        if find_base and 3 <= len(rows) < MIN_POSITIONS and not turned and set(part.target) <= set(tools):
+        if find_base and 3 <= len(rows) < _MIN_POSITIONS and not turned and set(part.target) <= set(tools):
             bases[name] = _base_by_tools(robot, part, tools)
             continue
         base, guessed = guess_base_and_tool(robot, part, find_base, free_tool)

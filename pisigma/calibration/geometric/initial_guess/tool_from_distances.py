@@ -25,27 +25,27 @@ from pisigma.robot.robot_class import RobotClass
 from pisigma.robot.se3 import rotation_from_rpy, rpy_from_rotation
 
 MAX_ITERATIONS = 60
-CONVERGENCE_TOLERANCE = 1e-6
+_CONVERGENCE_TOLERANCE = 1e-6
 """Length of a step at convergence [m]."""
-WEAK = 0.01
+_WEAK = 0.01
 """Weight per row of the nominal tool, which determines directions that distances hardly determine."""
-HELD = 1e4
+_HELD = 1e4
 """Weight per row of the nominal tool if the tool is known."""
-OUTLYING = 3.0
+_OUTLYING = 3.0
 """Ratio of an error to the median error above which the weight of a distance is reduced, so that single mistakes
 have little effect."""
-FAR_START = 0.3
+_FAR_START = 0.3
 """Distance of further starts from the nominal tool, in both directions of its axes, as a share of the reach."""
-MAX_SHIFT, MAX_CLEAR_SHIFT = 0.35, 1.0
+_MAX_SHIFT, _MAX_CLEAR_SHIFT = 0.35, 1.0
 """Largest distance of a tool from the nominal tool, as a share of the reach: in general, and if many distances agree
 clearly with it."""
-MANY_TIMES = 3
+_MANY_TIMES = 3
 """Number of distances per unknown above which a tool is accepted at a larger distance from the nominal tool."""
-DOUBTFUL = 0.01
+_DOUBTFUL = 0.01
 """Ratio of the median error of the distances to the median motion of the tool above which other units are tried."""
-COLLAPSED = 0.25
+_COLLAPSED = 0.25
 """Largest share of the errors that may remain in another unit."""
-MAX_WRONG_SHARE = 0.25
+_MAX_WRONG_SHARE = 0.25
 """Share of the distances that may be off by more than `MAX_NOMINAL_ERROR`, or by the usual zeros of servos."""
 
 
@@ -114,7 +114,7 @@ class _Distances:
         doubtful = self.is_doubtful(tool, residual).nonzero()[:, 0]
         if held or not len(doubtful):
             return tool, residual
-        ways = torch.cat([torch.eye(3), -torch.eye(3)]).double() * FAR_START * reach
+        ways = torch.cat([torch.eye(3), -torch.eye(3)]).double() * _FAR_START * reach
         several = replace(self, measured=in_units.measured[doubtful, None].expand(-1, len(ways), -1))
         far = several._refined((nominal_tool + ways).expand(len(doubtful), -1, -1), nominal_tool, held)
         for unit, tools, residuals in zip(doubtful.tolist(), *far, strict=True):
@@ -132,7 +132,7 @@ class _Distances:
         """Return whether the median error is large relative to the motion of the tool."""
         points = self.points(tool)
         motion = (points - points.mean(-2, keepdim=True)).norm(dim=-1).median(-1).values
-        doubtful: Tensor = residual.abs().median(-1).values > DOUBTFUL * motion
+        doubtful: Tensor = residual.abs().median(-1).values > _DOUBTFUL * motion
         return doubtful
 
     def _refined(
@@ -141,11 +141,11 @@ class _Distances:
         """Refine a batch of tools by robust Levenberg-Marquardt steps; return the tools and the residuals [m]."""
         unknown = self.start(start)
         pull, nominal = torch.zeros(2, unknown.shape[-1]).double()
-        pull[:3], nominal[:3] = (HELD if held else WEAK) ** 2 * self.measured.shape[-1], nominal_tool
+        pull[:3], nominal[:3] = (_HELD if held else _WEAK) ** 2 * self.measured.shape[-1], nominal_tool
         damping = torch.full_like(unknown[..., :1], 1e-3)
         residual, J = self.linearised(unknown)
         for _ in range(MAX_ITERATIONS):
-            limit = OUTLYING * residual.abs().median(-1, keepdim=True).values.clamp(min=1e-9)
+            limit = _OUTLYING * residual.abs().median(-1, keepdim=True).values.clamp(min=1e-9)
             weighted = J.mT * (limit / residual.abs()).clamp(max=1.0)[..., None, :]  # weights of Huber's loss
             normal = weighted @ J + torch.diag(pull)
             gradient = weighted @ residual[..., None] - (pull * (unknown - nominal))[..., None]
@@ -157,7 +157,7 @@ class _Distances:
             residual = torch.where(better, trial_residual, residual)
             J = torch.where(better[..., None], trial_J, J)
             damping = torch.where(better, (damping / 10).clamp(min=1e-9), damping * 10)
-            if float(step.abs().max()) < CONVERGENCE_TOLERANCE:
+            if float(step.abs().max()) < _CONVERGENCE_TOLERANCE:
                 break
         return unknown[..., :3], residual
 
@@ -194,7 +194,7 @@ def tools_from_distances(
         _refuse_other_units(space.robot, distances, (tool, residual), (position, held), measurements.source)
         limit = max(MAX_NOMINAL_ERROR, RobotClass.from_robot(space.robot).usual.joint_offset) * reach
         off = int((residual.abs() > limit).sum())
-        if off > MAX_WRONG_SHARE * len(residual):
+        if off > _MAX_WRONG_SHARE * len(residual):
             raise ImplausibleError(
                 f"expected distances of robot '{space.robot.name}' at these joint values, got {off} of {len(residual)} "
                 f"that are off by more than {limit * 1e3:.3g} mm for any tool",
@@ -204,8 +204,10 @@ def tools_from_distances(
                 remedy="check that distances and joint values belong to the same rows, and that this robot was "
                 "measured",
             )
-        clear = len(residual) >= MANY_TIMES * distances.unknowns and not distances.is_doubtful(tool, residual)
-        largest = (MAX_CLEAR_SHIFT if clear else MAX_SHIFT) * reach
+        clear = len(residual) >= _MANY_TIMES * distances.unknowns and not distances.is_doubtful(
+            tool, residual
+        )
+        largest = (_MAX_CLEAR_SHIFT if clear else _MAX_SHIFT) * reach
         if not held and float((tool - position).norm()) <= largest:
             tools[name] = np.concatenate([tool.numpy(), nominal_tool[3:]])
     return tools
@@ -264,7 +266,7 @@ def _refuse_other_units(
     miss, (factor, are, named) = min(
         zip(misses, MISNAMED_UNITS, strict=True), key=lambda one: one[0] / one[1][0]
     )
-    if miss < MAX_NOMINAL_ERROR * robot.reach and miss / factor < COLLAPSED * typical:
+    if miss < MAX_NOMINAL_ERROR * robot.reach and miss / factor < _COLLAPSED * typical:
         raise ImplausibleError(
             f"expected distances of robot '{robot.name}' at these joint values, got {are} that are named {named}: the "
             f"median error is {typical * 1e3:.3g} mm, and {miss * 1e3:.3g} mm for distances multiplied by {factor:.4g}",

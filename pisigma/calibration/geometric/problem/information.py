@@ -13,7 +13,7 @@ from pisigma.calibration.geometric.problem.noise import SensorView
 from pisigma.calibration.geometric.problem.parameters import Parameter
 from pisigma.calibration.geometric.problem.problem import CalibrationProblem
 
-DEPENDENT = 1e-10
+_DEPENDENT = 1e-10
 """Share of a column's length outside the span of other columns below which the column is treated as dependent."""
 
 
@@ -75,14 +75,14 @@ class Information:
         # Columns have different units, so they are scaled before their rank is decided.
         lengths = np.linalg.norm(taken, axis=0)
         U, singular, _ = np.linalg.svd(taken / np.where(lengths > 0, lengths, 1.0), full_matrices=False)
-        U = U[:, singular > DEPENDENT * singular.max(initial=0.0)]
+        U = U[:, singular > _DEPENDENT * singular.max(initial=0.0)]
         kept = [i for i in range(len(self.parameters)) if i not in set(nuisance)]
         rest = np.delete(self.root, nuisance, 1)
         sizes = np.linalg.norm(rest, axis=0)
         for _ in range(2):  # one projection leaves rounding errors relative to the column's length
             rest = rest - U @ (U.T @ rest)
         # The remainder of a dependent column is a rounding error, which must not look identifiable.
-        rest[:, np.linalg.norm(rest, axis=0) <= DEPENDENT * sizes] = 0.0
+        rest[:, np.linalg.norm(rest, axis=0) <= _DEPENDENT * sizes] = 0.0
         rest[:, [kept.index(column) for column in silent]] = 0.0
         root: np.ndarray = np.linalg.qr(rest, mode="r")  # type: ignore[assignment]
         parameters = tuple(self.parameters[i] for i in kept)

@@ -13,12 +13,12 @@ from torch import Tensor
 from pisigma.files.errors import IdentificationError
 
 Point = TypeVar("Point")
-START_DAMPING = 1e-3
-SMALLEST_DAMPING = 1e-9
-LARGEST_DAMPING = 1e12
+_START_DAMPING = 1e-3
+_SMALLEST_DAMPING = 1e-9
+_LARGEST_DAMPING = 1e12
 MAX_NOISE_UPDATES = 50
 """Number of steps after which the noise is no longer updated; with few rows it may oscillate between two estimates."""
-MAX_UPHILL_STEPS = 2
+_MAX_UPHILL_STEPS = 2
 """Number of steps that may raise the cost before the search returns to the best point."""
 SHORTEST_STEP = 1e-3
 """Length of a step, in standard errors, below which the search has converged."""
@@ -167,7 +167,7 @@ class _Search(Generic[Point]):
     def __init__(self, problem: AbstractLeastSquares[Point], best: Linearisation[Point]) -> None:
         self.problem, self.here, self.best = problem, best, best
         self.iterations, self.at_best, self.uphill = 0, True, 0
-        self.damping, self.decrement, self.step = START_DAMPING, 0.0, best.descent
+        self.damping, self.decrement, self.step = _START_DAMPING, 0.0, best.descent
         self.path = [float(problem.rms(best))]
 
     def propose_step(self) -> None:
@@ -192,7 +192,7 @@ class _Search(Generic[Point]):
         if self.iterations <= MAX_NOISE_UPDATES:
             there, settled = self.problem.with_updated_noise(there)
         self.best = self.here = there
-        self.damping = max(self.damping / 10, SMALLEST_DAMPING)
+        self.damping = max(self.damping / 10, _SMALLEST_DAMPING)
         self.uphill, self.at_best = 0, True
         self.path.append(float(self.problem.rms(there)))
         return settled
@@ -204,11 +204,11 @@ class _Search(Generic[Point]):
             return SolutionStatus.EXACT
         if self.at_best and small:
             return SolutionStatus.CONVERGED
-        if self.damping > LARGEST_DAMPING:
+        if self.damping > _LARGEST_DAMPING:
             return SolutionStatus.STALLED
         # The descent is zero, for example, if the loss rejects every row.
         going = math.isfinite(float(there.cost)) and bool(there.descent.any())
-        self.at_best = not (going and self.uphill < MAX_UPHILL_STEPS)
+        self.at_best = not (going and self.uphill < _MAX_UPHILL_STEPS)
         if self.at_best:
             self.here, self.uphill, self.damping = self.best, 0, max(100 * self.damping, 0.1)
         else:

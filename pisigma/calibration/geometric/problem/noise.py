@@ -23,7 +23,7 @@ ALWAYS_GOOD = 1e-10
 
 UNDETERMINED = 1e-12
 """Information, relative to the total, that is added in directions that lengths do not determine."""
-MAX_DISAGREEMENT = 1e6
+_MAX_DISAGREEMENT = 1e6
 """Largest factor on the variance of angles, with which angles have no effect."""
 
 
@@ -281,7 +281,7 @@ def _angle_disagreement(
         moved = share * lengths - (1 - share) * angles * math.exp(-logarithm)
         return float(moved @ Q @ moved) - float(Q.diagonal() @ share)
 
-    low, high = 0.0, math.log(MAX_DISAGREEMENT)
+    low, high = 0.0, math.log(_MAX_DISAGREEMENT)
     if excess(low) <= 0:
         return 1.0
     # Bisection keeps excess > 0 at low, and excess <= 0 at high unless that is the largest factor.

@@ -20,14 +20,14 @@ from pisigma.robot.kinematics.parameter_jacobian import motion_order
 from pisigma.robot.row import DH_COLUMNS, FRAME_COLUMNS
 
 LENGTHS = frozenset({"d", "a", "x", "y", "z"})
-EVERYWHERE, NOWHERE = -1, -2
+EVERYWHERE, _NOWHERE = -1, -2
 """Values instead of the index of a frame or target: the parameter moves the tool in all rows, or in no row."""
 USUAL_LENGTH = 1e-3
 """Scale of length parameters without a prior [m]."""
 USUAL_ANGLE = 1e-3
 """Scale of angle parameters without a prior [rad]."""
-USUAL_ERRORS: dict[ParameterUnit, float] = {"m": USUAL_LENGTH, "rad": USUAL_ANGLE, "px": 1.0, "1": 1e-3}
-SMALLEST_PRIOR = 1e-12
+_USUAL_ERRORS: dict[ParameterUnit, float] = {"m": USUAL_LENGTH, "rad": USUAL_ANGLE, "px": 1.0, "1": 1e-3}
+_SMALLEST_PRIOR = 1e-12
 """Smallest prior standard deviation [m or rad]; parameters that are more certain should not be in `free`."""
 
 PriorSizes = Literal["stated", "widened", "estimated"]
@@ -58,11 +58,11 @@ class Prior:
         """Refuse invalid standard deviations."""
         for name in DH_COLUMNS:
             value = getattr(self, name)
-            if not (math.isfinite(value) and value >= SMALLEST_PRIOR):
+            if not (math.isfinite(value) and value >= _SMALLEST_PRIOR):
                 unit = "m" if name in LENGTHS else "rad"
                 raise IdentificationError(
                     option=f"prior '{name}'",
-                    expected=f"a standard deviation >= {SMALLEST_PRIOR:g} {unit}",
+                    expected=f"a standard deviation >= {_SMALLEST_PRIOR:g} {unit}",
                     value=value,
                     remedy="use prior=None for no prior",
                 )
@@ -87,7 +87,7 @@ class Parameter:
     @property
     def usual_error(self) -> float:
         """Usual size of the parameter's error, for scaling: 1 mm, 1 mrad, 1 px or 1e-3."""
-        return USUAL_ERRORS[self.unit]
+        return _USUAL_ERRORS[self.unit]
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,8 +155,8 @@ class ParameterSpace:
         columns = arm + order[-12:-6] * frames + order[-6:] * targets + [0] * others
         in_frames = [f for f in range(frames) for _ in range(6)]
         at_targets = [t for t in range(targets) for _ in range(6)]
-        frame = [EVERYWHERE] * len(arm) + in_frames + [EVERYWHERE] * 6 * targets + [NOWHERE] * others
-        target = [EVERYWHERE] * (len(arm) + 6 * frames) + at_targets + [NOWHERE] * others
+        frame = [EVERYWHERE] * len(arm) + in_frames + [EVERYWHERE] * 6 * targets + [_NOWHERE] * others
+        target = [EVERYWHERE] * (len(arm) + 6 * frames) + at_targets + [_NOWHERE] * others
         return torch.tensor([columns, frame, target])
 
     @cached_property

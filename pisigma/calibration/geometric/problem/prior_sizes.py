@@ -8,9 +8,9 @@ from torch import Tensor
 
 from pisigma.calibration.geometric.problem.least_squares import covariance_of
 
-MAX_ITERATIONS, CONVERGENCE_TOLERANCE = 8, 1e-3
+MAX_ITERATIONS, _CONVERGENCE_TOLERANCE = 8, 1e-3
 """Largest number of iterations of the prior scales at a point, and their relative change at convergence."""
-MIN_EFFECTIVE = 0.1
+_MIN_EFFECTIVE = 0.1
 """Effective number of parameters of a group below which its prior scale is not estimated."""
 SMALLEST_PRIOR = 0.03
 """Smallest estimated prior scale."""
@@ -110,7 +110,7 @@ def prior_scales(
         floor: smallest scale; with 1, errors that are smaller than stated do not narrow the prior.
     """
     squares = _group_totals(off.square() * precision, group)
-    least = 1.0 if floor == 1.0 else MIN_EFFECTIVE
+    least = 1.0 if floor == 1.0 else _MIN_EFFECTIVE
     effective = effective_parameters(precision, group, before, covariance)
     sized = (squares / effective).clamp(min=floor**2).sqrt()
     return torch.where(effective > least, sized, before)
@@ -141,7 +141,7 @@ def converged_prior_scales(
         held.diagonal().add_(scaled_precision(precision, group, before))
         covariance = covariance_of(held)
         scale = prior_scales(covariance @ pull, precision, group, before, covariance, floor)
-        if has_converged(before, scale, CONVERGENCE_TOLERANCE):
+        if has_converged(before, scale, _CONVERGENCE_TOLERANCE):
             break
     return scale
 

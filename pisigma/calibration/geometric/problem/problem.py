@@ -39,8 +39,8 @@ from pisigma.measurement.conditions import JointState
 from pisigma.measurement.sensors.sensor import AbstractSensor, Unknowns
 from pisigma.robot.kinematics.parameter_jacobian import JACOBIAN_CHUNK, ToolMotion, tool_motion
 
-CERTAIN_LOSS = SquaredLoss()
-CONVERGENCE_TOLERANCE = 1e-2
+_CERTAIN_LOSS = SquaredLoss()
+_CONVERGENCE_TOLERANCE = 1e-2
 """Relative change of noise and prior scales between points at convergence."""
 
 
@@ -211,7 +211,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
             for one in (view, renewed)
         )
         return self.combine_contributions(linearisation.point, renewed), has_converged(
-            before, after, CONVERGENCE_TOLERANCE
+            before, after, _CONVERGENCE_TOLERANCE
         )
 
     def _prior_scales(
@@ -242,7 +242,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
 
     def loss_for_sensor(self, sensor: AbstractSensor) -> AbstractLoss:
         """Return the loss function of a sensor."""
-        return CERTAIN_LOSS if sensor.certain else self.loss
+        return _CERTAIN_LOSS if sensor.certain else self.loss
 
     def chunks(self) -> list[slice]:
         """Return the rows in chunks that are processed together."""

@@ -26,7 +26,7 @@ from pisigma.measurement.sensors.socket import PairOfSockets, SocketDistanceSens
 from pisigma.robot.description import Robot
 from pisigma.robot.se3 import invert, rotation_from_rpy, rpy_from_rotation, transform_from_xyzrpy
 
-MULTIPLIER, FACTOR = 6_364_136_223_846_793_005, 1_442_695_040_888_963_407
+_MULTIPLIER, _FACTOR = 6_364_136_223_846_793_005, 1_442_695_040_888_963_407
 """Constants of the linear congruential generator that hashes joint values (Knuth, MMIX)."""
 
 
@@ -221,11 +221,11 @@ def number_repeats(q: Tensor, *names: Tensor) -> Tensor | None:
 def _mixed_keys(q: Float64[Tensor, "rows dof"], *names: Tensor) -> Int64[Tensor, " rows"]:
     """Return a hash of every row's joint values (to 1e-9) and names."""
     keys, dof = (q * 1e9).round().long(), q.shape[1]
-    factors = [FACTOR * pow(MULTIPLIER, dof - 1 - joint, 2**64) for joint in range(dof)]
+    factors = [_FACTOR * pow(_MULTIPLIER, dof - 1 - joint, 2**64) for joint in range(dof)]
     signed = [(factor + 2**63) % 2**64 - 2**63 for factor in factors]
     mixed: Tensor = (keys * torch.tensor(signed, device=q.device)).sum(1)  # integers wrap around
     for name in names:
-        mixed = mixed * MULTIPLIER + name * FACTOR
+        mixed = mixed * _MULTIPLIER + name * _FACTOR
     return mixed
 
 

@@ -16,7 +16,7 @@ from pisigma.lifetime.cell.exports import Contents
 from pisigma.robot.description import Robot
 from pisigma.robot.row import FRAME_COLUMNS, in_file_units
 
-CONDITIONS = frozenset(("payload_kg", "temperature_c"))
+_CONDITIONS = frozenset(("payload_kg", "temperature_c"))
 _NUMBER = r"-?\d+(?:\.\d+)?(?:e[-+]?\d+)?"
 
 
@@ -126,7 +126,7 @@ class ControllerFile:
             self.contents,
             self.suffixes,
             self.write,
-            self.options | CONDITIONS,
+            self.options | _CONDITIONS,
             self.refuse,
             self.contains,
         )

@@ -20,10 +20,10 @@ MAX_CHANGE = 5.0
 """Largest plausible mean distance [mm] between the tools of a calibrated and the nominal robot on the same base; the
 largest of five published calibrations of Universal Robots is 4.2 mm."""
 
-LEVER = 0.1
+_LEVER = 0.1
 """Distance from the flange of points to which the limit also applies, so that rotations of the flange count [m]."""
 
-READERS: dict[str, ControllerFile | None] = {
+_READERS: dict[str, ControllerFile | None] = {
     ".conf": universal_robots.FILE,
     ".cfx": staubli.FILE,
     ".csv": None,
@@ -62,31 +62,31 @@ def read_controller_file(path: Path, nominal: Robot, max_change: float = MAX_CHA
         nominal: robot of the controller without the file, for names and limits, and for base and tool if the file has
             none.
         max_change: largest accepted mean distance [mm] between the two tools in the same frame, and between points at
-            `LEVER` from them due to their rotations.
+            `_LEVER` from them due to their rotations.
 
     Raises:
         RobotError: the file cannot be read, is of another kind, does not match the robot, or changes it by more than
             `max_change`.
     """
     suffix = path.suffix.lower()
-    if suffix not in READERS:
+    if suffix not in _READERS:
         raise RobotError(
-            expected=f"a file of a controller with the suffix {', '.join(READERS)}",
+            expected=f"a file of a controller with the suffix {', '.join(_READERS)}",
             value=suffix,
             at=Place(path),
         )
     text = read_text(path, RobotError, "text")
     kinematics = suffix != ".csv" and any(line.startswith("kinematics:") for line in text.splitlines())
-    file = ur_ros.FILE if kinematics else READERS[suffix]
+    file = ur_ros.FILE if kinematics else _READERS[suffix]
     read = read_offsets if file is None or file.read is None else file.read
     robot = read(text, str(path), nominal)
     convention = file.convention(nominal) if file else Convention(nominal)
     # The base and tool of the file define the frames of its poses and are not treated as changes by the calibration.
     there = nominal.with_geometry(base=robot.base, tool=robot.tool)
     change = departure_from_nominal(robot, with_frames(convention.nominal, text) if file else there)
-    if not max(change.mean_mm, LEVER * change.mean_mrad) <= max_change:
+    if not max(change.mean_mm, _LEVER * change.mean_mrad) <= max_change:
         raise RobotError(
-            f"expected a calibration that moves the tool by at most {max_change:g} mm and {max_change / LEVER:g} mrad "
+            f"expected a calibration that moves the tool by at most {max_change:g} mm and {max_change / _LEVER:g} mrad "
             f"on average, got {change.mean_mm:.4g} mm and {change.mean_mrad:.4g} mrad relative to robot "
             f"'{nominal.name}'",
             expected=f"a mean change of at most {max_change:g} mm",

@@ -28,7 +28,7 @@ from pisigma.robot.urdf_frames import Frame
 KEYS = {"delta_theta": 0, "delta_a": 2, "delta_d": 1, "delta_alpha": 3}
 """Column of `DH_COLUMNS` for every key of the file; radians and metres."""
 
-TILTED = 1e-6
+_TILTED = 1e-6
 """Sine of the angle between two axes below which they are treated as parallel: otherwise their common normal would be
 1,000 km away, and rounding of such large numbers would move the tool."""
 
@@ -46,9 +46,9 @@ def without_beta(origins: list[Frame], own: Robot) -> Robot:
         origins: frames of the joints, see `ControllerGeometry.origins`.
         own: nominal robot with the base and tool that belong to them.
     """
-    plain = robot_of_origins(own, origins, np.eye(4), TILTED)
+    plain = robot_of_origins(own, origins, np.eye(4), _TILTED)
     dh = plain.dh.copy()
-    dh[:, 4] = 0.0  # axes that are parallel up to `TILTED`
+    dh[:, 4] = 0.0  # axes that are parallel up to `_TILTED`
     turned = 0.0
     for joint, (row, theta) in enumerate(zip(dh, own.dh[:, 0].tolist(), strict=True), 1):
         row[0] = theta + math.remainder(row[0] + turned - theta, 2 * math.pi)

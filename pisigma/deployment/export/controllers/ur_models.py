@@ -32,7 +32,7 @@ _D_AND_A = {
 The UR30 is from UniversalRobots/Universal_Robots_ROS2_Description, config/ur30/default_kinematics.yaml."""
 _ALPHA = np.array([1.0, 0.0, 0.0, 1.0, -1.0, 0.0]) * np.pi / 2
 
-FARTHEST = 5e-3
+_FARTHEST = 5e-3
 """[m] Largest mean distance of the tool up to which a description belongs to a model: factory calibrations move it by 1
 to 4 mm, and the models differ by 10 mm and more."""
 _EXACT = 1e-9
@@ -146,7 +146,7 @@ def controller_geometry(described: Robot) -> ControllerGeometry:
     check_robot(described)
     candidates = [_placed(model, _robot(described, model), described) for model in _D_AND_A]
     distance, own = min(candidates, key=lambda candidate: candidate[0])
-    if distance <= FARTHEST:
+    if distance <= _FARTHEST:
         return own
     if _has_own_convention(described):
         plain = described.with_geometry(base=np.zeros(6), tool=np.zeros(6))
@@ -208,7 +208,7 @@ def _placed(model: str, own: Robot, described: Robot) -> tuple[float, Controller
         return float((forward_kinematics(robot, q) - T)[:, :3, 3].norm(dim=-1).mean()), robot
 
     distance, robot = described_with(base, tool)
-    if _EXACT < distance < 4 * FARTHEST:
+    if _EXACT < distance < 4 * _FARTHEST:
         robot, _ = solve_approximation(ApproximationProblem(robot, q, T, ()))
         base, tool = _right(frame_of(robot.base)), _right(frame_of(robot.tool))
         distance, robot = described_with(base, tool)

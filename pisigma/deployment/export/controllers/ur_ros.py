@@ -75,7 +75,7 @@ class KinematicsDocument(Section):
     kinematics: KinematicsSection
 
 
-LINKS = tuple(KinematicsSection.model_fields)[:JOINTS]
+_LINKS = tuple(KinematicsSection.model_fields)[:JOINTS]
 
 
 ORDER = "Rotations are RotZ(yaw) RotY(pitch) RotX(roll), as URDF reads them."
@@ -87,7 +87,7 @@ def write_kinematics(content: FileContent) -> str:
     origins, own = controller_geometry(content.nominal).origins(content.robot)
     links: dict[str, object] = {
         link: {column: float(value) + 0.0 for column, value in zip(COLUMNS, xyzrpy_of(origin), strict=True)}
-        for link, origin in zip(LINKS, origins, strict=True)
+        for link, origin in zip(_LINKS, origins, strict=True)
     }
     links["hash"] = calibration_hash(without_beta(origins, own))
     return header_comment((*content.comments, *frame_sentences(own))) + yaml_text({"kinematics": links})
@@ -109,7 +109,7 @@ def read_kinematics(text: str, source: str, nominal: Robot) -> Robot:
     own = controller_geometry(nominal).robot
     links = parse_yaml(text, KinematicsDocument, RobotError, source).kinematics
     first = ORDER in " ".join(text.replace("#", " ").split())
-    candidates = [[getattr(links, link).frame(order) for link in LINKS] for order in (first, not first)]
+    candidates = [[getattr(links, link).frame(order) for link in _LINKS] for order in (first, not first)]
     found = (c for c in candidates if calibration_hash(without_beta(c, own)) == links.hash)
     origins = next(found, candidates[0])
     return robot_of_origins(with_frames(own, text), origins, np.eye(4))

@@ -30,7 +30,7 @@ COUNTING = (
     "Joint values have the zeros and directions of the robot description '{robot}'; the controller has to use the "
     "same."
 )
-CARTESIAN = (
+_CARTESIAN = (
     "Poses are those of the nominal robot at the corrected joint values: the controller has to compute with the "
     "nominal robot, and its accuracy options have to be off.",
     "Frame and tool are those of the model, relative to the origin and to the last row of the robot description, which "
@@ -66,7 +66,7 @@ class Program:
     def from_targets(targets: Targets, name: str, cartesian: bool, config: str = "") -> "Program":
         """Return the program that moves to targets, of which no target may be missing."""
         sentences = [targets.title, TEST, COUNTING.format(robot=targets.robot.name)]
-        sentences += [*CARTESIAN, *targets.remarks] if cartesian else []
+        sentences += [*_CARTESIAN, *targets.remarks] if cartesian else []
         sentences += [targets.domain_warning] if targets.domain_warning else []
         labels = [
             f"line {line}{' OUTSIDE DOMAIN' if status == Status.OUTSIDE_DOMAIN else ''}"
@@ -181,7 +181,7 @@ def reserved_words(text: str) -> frozenset[str]:
     return frozenset(text.upper().split())
 
 
-FILES_OF_SYSTEMS = reserved_words("con prn aux nul") | {
+_FILES_OF_SYSTEMS = reserved_words("con prn aux nul") | {
     f"{p}{i}" for p in ("COM", "LPT") for i in range(1, 10)
 }
 """Names that some controllers' file systems reserve for devices."""
@@ -205,7 +205,7 @@ KRL = Language(
     name="KRL",
     template="krl.j2",
     longest=24,
-    reserved=FILES_OF_SYSTEMS
+    reserved=_FILES_OF_SYSTEMS
     | reserved_words(
         "and anin anout b_and b_exor b_not b_or bool brake bas case ccomp channel char circ circ_rel confirm "
         "const continue ct_i decl def default defdat deffct digin do else end enddat endfct endfor endif "
@@ -230,7 +230,7 @@ FANUC = Language(
     name="FANUC",
     template="fanuc.j2",
     longest=36,
-    reserved=FILES_OF_SYSTEMS,
+    reserved=_FILES_OF_SYSTEMS,
     most_lines=9999,
     capitals=True,
     configuration=re.compile(r"[NF] ([LR] )?[UD] [TB], -?\d, -?\d, -?\d"),

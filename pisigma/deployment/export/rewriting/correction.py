@@ -17,17 +17,17 @@ from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.kinematics.status import Status
 from pisigma.robot.se3 import invert, rotation_from_vector, rotation_vector, transform, transform_from_xyzrpy
 
-SPACING = 0.01
+_SPACING = 0.01
 """Largest distance between points at which a path is evaluated [m]."""
-STEP_ANGLE = 0.035
+_STEP_ANGLE = 0.035
 """Largest rotation between points at which a path is evaluated, two degrees [rad]."""
 MAX_STEPS = 512
-LEVER = 0.1
+_LEVER = 0.1
 """Distance from the tool at which a rotational deviation from the path is converted to a length [m]."""
 
 
 _LINE_NUMBER = re.compile(r"(?m)^ *\d+:")
-STRAIGHT = 1e-4
+_STRAIGHT = 1e-4
 """Sine of the angle between the chords to the second and the third point below which they define no arc."""
 
 COLLINEAR = "the points of the arc are collinear or coincide, so it has no waypoints"
@@ -169,7 +169,7 @@ class ProgramCorrection:
             return COLLINEAR
         arc = CircularArcs.through_points(*(T[:, :3, 3] for T in (start, via, end)))
         between = start[:, :3, :3] @ rotation_from_vector(arc.passing / arc.angle * _turn(start, end))
-        if LEVER * float(rotation_vector(between.mT @ via[:, :3, :3]).norm()) > self.tolerance:
+        if _LEVER * float(rotation_vector(between.mT @ via[:, :3, :3]).norm()) > self.tolerance:
             return OTHER_ORIENTATION
         length = float(arc.angle * arc.radius.norm())
         return _round(start, via, end, _steps(start, end, length))[0]
@@ -220,14 +220,14 @@ def _off(T: Float64[Tensor, "points 4 4"], stride: int, circular: bool) -> float
     )
     interpolated = interpolated[:, :-1].flatten(0, 1)
     turn = rotation_vector(interpolated[:, :3, :3].mT @ T[:-1, :3, :3]).norm(dim=-1)
-    return float(((interpolated - T[:-1])[:, :3, 3].norm(dim=-1) + LEVER * turn).max())
+    return float(((interpolated - T[:-1])[:, :3, 3].norm(dim=-1) + _LEVER * turn).max())
 
 
 def _steps(start: Float64[Tensor, "1 4 4"], end: Float64[Tensor, "1 4 4"], length: float) -> int:
     """Return a power of two as the number of steps of a path, short enough to resolve the correction."""
     angle = float(_turn(start, end).norm())
     steps = 8
-    while steps < MAX_STEPS and steps < max(length / SPACING, angle / STEP_ANGLE):
+    while steps < MAX_STEPS and steps < max(length / _SPACING, angle / _STEP_ANGLE):
         steps *= 2
     return steps
 
@@ -311,7 +311,7 @@ class CircularArcs:
 def is_straight(first: Points, second: Points, third: Points) -> bool:
     """Return whether three points of any arc are collinear, or two of them coincide."""
     u, v = second - first, third - first
-    bends = torch.linalg.cross(u, v).norm(dim=-1) > STRAIGHT * u.norm(dim=-1) * v.norm(dim=-1)
+    bends = torch.linalg.cross(u, v).norm(dim=-1) > _STRAIGHT * u.norm(dim=-1) * v.norm(dim=-1)
     return not bool(bends.all())
 
 

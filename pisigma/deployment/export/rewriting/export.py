@@ -27,9 +27,9 @@ SCANNERS: dict[str, Callable[[str, FrameFile], ScannedProgram]] = {
 }
 """Scanners by the suffix of the file."""
 
-TOLERANCE_MM = 0.1
+_TOLERANCE_MM = 0.1
 MAX_BYTES = 2**24
-MAX_JOINTS = 6
+_MAX_JOINTS = 6
 TEST = (
     "TEST IT AT LOW SPEED FIRST: the controller has to compute with the nominal robot, its accuracy options have to be "
     "off, and its origin and flange have to be those of the robot description. Targets given as joint values, outputs, "
@@ -87,16 +87,16 @@ def rewrite_program(request: ExportRequest) -> Exported:
     solver = load(request.model)
     if request.conditions:
         solver = solver.under(**request.conditions)
-    if solver.model.robot.dof > MAX_JOINTS:
+    if solver.model.robot.dof > _MAX_JOINTS:
         raise OutputError(
-            f"expected a robot with at most {MAX_JOINTS} joints, got {solver.model.robot.dof}, because the poses of a "
+            f"expected a robot with at most {_MAX_JOINTS} joints, got {solver.model.robot.dof}, because the poses of a "
             "program do not determine further joints",
-            expected=f"at most {MAX_JOINTS} joints",
+            expected=f"at most {_MAX_JOINTS} joints",
             value=solver.model.robot.dof,
             option="--program",
             remedy="export --poses with joint values instead",
         )
-    tolerance = TOLERANCE_MM if request.tolerance_mm is None else request.tolerance_mm
+    tolerance = _TOLERANCE_MM if request.tolerance_mm is None else request.tolerance_mm
     corrected = ProgramCorrection(solver, request.branch, tolerance / 1e3).correct_program(scanned)
     return _exported(request, solver.model, scanned, corrected, tolerance)
 

@@ -42,7 +42,7 @@ _TOOL = "the tool"
 _TURNING = re.compile(r"mode\s*=\s*(?!0$)")
 _Span = tuple[int, int]
 
-BLEND = 1e-3
+_BLEND = 1e-3
 """Blend radius at waypoints, which is smaller if they are close together [m]."""
 
 
@@ -161,7 +161,7 @@ class _Reader:
         start, count = self.scan.line_start(call.start()), len(operands)
         ends = torch.stack([*poses[count - 1 :: count], pose.T])[:, :3, 3]
         nearest = float((ends[1:] - ends[:-1]).norm(dim=-1).min())
-        radius = f"r={number(min(BLEND, nearest / 4), 6)}"
+        radius = f"r={number(min(_BLEND, nearest / 4), 6)}"
         named = [index for index, argument in enumerate(rest) if re.match(r"r\s*=", argument)]
         rest = [radius if index in named else argument for index, argument in enumerate(rest)]
         rest += [] if named else [radius]

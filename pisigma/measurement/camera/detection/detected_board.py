@@ -13,34 +13,34 @@ from pisigma.measurement.camera.board_pose import MIN_CORNERS
 
 Image = UInt8[np.ndarray, "height width"]
 """Gray values of an image; the centre of the first pixel is at u = v = 0."""
-ALONG = np.linspace(0.2, 0.8, 9)
+_ALONG = np.linspace(0.2, 0.8, 9)
 """Positions along an edge, relative to its length, at which it is sampled, away from other edges."""
-ACROSS = np.linspace(-1.0, 1.0, 41)
+_ACROSS = np.linspace(-1.0, 1.0, 41)
 """Positions of the samples across an edge, relative to half the sampled width."""
-FOLLOWED = 0.7
+_FOLLOWED = 0.7
 """Half the sampled width relative to the clearance of an edge; it is < 1 because neighbouring edges are blurred,
 too."""
-ENDS = 0.7
+_ENDS = 0.7
 """Relative position across an edge beyond which the samples are fully black or white."""
-SMOOTHING = 1.5
+_SMOOTHING = 1.5
 """Standard deviation [px] of the smoothing before gradients are computed, less in small windows; the best value on
 rendered images."""
-WINDOW = 0.8
+_WINDOW = 0.8
 """Half the side of the window around a corner, relative to the clearance."""
-MIN_SQUARE = 16.0
+_MIN_SQUARE = 16.0
 """Smallest area of a square in the image whose corners are refined [px²]."""
 _STOP = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 100, 1e-4)
-MAX_HALF_WINDOW = 16
+_MAX_HALF_WINDOW = 16
 """Largest half side of a window [px], within which lines distorted by a lens are straight to some thousandths of a
 pixel."""
-ITERATIONS = 4
-DAMPING = 1e-9
+_ITERATIONS = 4
+_DAMPING = 1e-9
 """Damping of the normal matrices, whose diagonals are scaled to 1, for windows without contrast."""
-LOG_BLURS = np.log((0.2, 6.0))
+_LOG_BLURS = np.log((0.2, 6.0))
 """Logarithms of the smallest and largest blur [px] of a fit."""
-MAX_SHIFT = 0.5
+_MAX_SHIFT = 0.5
 """Shift of a corner [px] above which a fit is discarded, because it has fitted another structure."""
-INITIAL_BLUR = 1.0
+_INITIAL_BLUR = 1.0
 """Initial standard deviation of the blur in a fit [px]."""
 
 
@@ -95,10 +95,10 @@ def refine_corners(image: Image, detected: DetectedBoard, board: Board) -> Detec
     """
     ends = edge_pixels(detected, board)
     shortest = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).min(initial=np.inf)
-    half = max(round(WINDOW * board.clearance * shortest), 2) if len(ends) else 2
+    half = max(round(_WINDOW * board.clearance * shortest), 2) if len(ends) else 2
     start = np.ascontiguousarray(detected.pixels, dtype=np.float32).reshape(-1, 1, 2)
     # without smoothing, gradients of a sharp image are biased by some hundredths of a pixel
-    smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), min(SMOOTHING, half / 4))
+    smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), min(_SMOOTHING, half / 4))
     moved = cv2.cornerSubPix(smooth, start, (half, half), (-1, -1), _STOP)
     pixels = np.asarray(moved, dtype=np.float64).reshape(-1, 2)
     inside = (np.abs(pixels - np.array(image.shape[::-1]) / 2) < np.array(image.shape[::-1]) / 2 - half).all(
@@ -107,7 +107,7 @@ def refine_corners(image: Image, detected: DetectedBoard, board: Board) -> Detec
     corners, pixels = detected.corners[inside], pixels[inside]
     axes = _axes_of_squares(board.corners[corners, :2] / board.square, pixels)
     if axes is not None:
-        pixels = fit_saddles(image.astype(np.float64), pixels, axes, WINDOW * board.clearance)
+        pixels = fit_saddles(image.astype(np.float64), pixels, axes, _WINDOW * board.clearance)
     return DetectedBoard(corners, pixels)
 
 
@@ -120,7 +120,7 @@ def _axes_of_squares(
         return None
     projected = grid @ H[:, :2].T + H[:, 2]
     axes = (H[:2, :2] - (projected[:, :2] / projected[:, 2:])[..., None] * H[2, :2]) / projected[:, 2:, None]
-    return axes if (np.abs(np.linalg.det(axes)) > MIN_SQUARE).all() else None
+    return axes if (np.abs(np.linalg.det(axes)) > _MIN_SQUARE).all() else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,14 +148,14 @@ class EdgeProfiles:
                 `Board.clearance`.
         """
         along = ends[:, 1] - ends[:, 0]
-        across = FOLLOWED * clearance * np.stack([-along[:, 1], along[:, 0]], -1)
-        at = ends[:, :1] + ALONG[:, None] * along[:, None]
-        sampled = at[:, :, None] + ACROSS[:, None] * across[:, None, None]
+        across = _FOLLOWED * clearance * np.stack([-along[:, 1], along[:, 0]], -1)
+        at = ends[:, :1] + _ALONG[:, None] * along[:, None]
+        sampled = at[:, :, None] + _ACROSS[:, None] * across[:, None, None]
         gray = map_coordinates(
             image.astype(np.float64), [sampled[..., 1], sampled[..., 0]], order=1, mode="nearest"
         )
         first, last = (
-            gray[..., side].mean((1, 2))[:, None, None] for side in (ACROSS < -ENDS, ACROSS > ENDS)
+            gray[..., side].mean((1, 2))[:, None, None] for side in (_ACROSS < -_ENDS, _ACROSS > _ENDS)
         )
         contrast = np.where(np.abs(last - first) < 1.0, np.nan, last - first)
         return EdgeProfiles(at, across, (gray - first) / contrast)
@@ -167,7 +167,7 @@ class EdgeProfiles:
         The area between a step from 0 to 1 and the step blurred with the standard deviation σ is `σ sqrt(2/π)`. Motion
         blurs only the edges across it, so the third quartile of all edges is returned.
         """
-        missing = np.where(ACROSS < 0, self.profile, 1 - self.profile).mean((1, 2))
+        missing = np.where(_ACROSS < 0, self.profile, 1 - self.profile).mean((1, 2))
         blur = 2 * np.linalg.norm(self.across, axis=1) * missing / np.sqrt(2 / np.pi)
         return float(np.nanquantile(blur, 0.75)) if np.isfinite(blur).any() else np.nan
 
@@ -203,26 +203,26 @@ def fit_saddles(
         share: distance from a corner within which no other edge is printed, relative to a square.
 
     Returns:
-        The corners; those that a fit would move by more than `MAX_SHIFT` are not changed.
+        The corners; those that a fit would move by more than `_MAX_SHIFT` are not changed.
     """
     x, weight = _windows(gray.shape, pixels, axes, share)
     values = gray[x[..., 1], x[..., 0]]
     x = x - pixels[:, None]
     state = np.zeros((len(pixels), 9))
-    state[:, 2:4], state[:, 4] = np.arctan2(axes[:, 1], axes[:, 0]), np.log(INITIAL_BLUR)
+    state[:, 2:4], state[:, 4] = np.arctan2(axes[:, 1], axes[:, 0]), np.log(_INITIAL_BLUR)
     saddle = weight * _saddle(x, state)[0]
     state[:, 5] = (weight * values).sum(1) / np.maximum(weight.sum(1), 1.0)
     state[:, 6] = (saddle * (values - state[:, 5, None])).sum(1) / np.maximum((saddle**2).sum(1), 1.0)
-    for _ in range(ITERATIONS):
+    for _ in range(_ITERATIONS):
         predicted, J = _predicted(x, state)
         weighted = (weight[..., None] * J).swapaxes(1, 2)
         normal, right = weighted @ J, weighted @ (values - predicted)[..., None]
         scale = np.sqrt(np.maximum(normal.diagonal(axis1=1, axis2=2), 1e-12))
-        normal = normal / scale[:, :, None] / scale[:, None] + DAMPING * np.eye(9)
+        normal = normal / scale[:, :, None] / scale[:, None] + _DAMPING * np.eye(9)
         state += np.linalg.solve(normal, right / scale[..., None])[..., 0] / scale
-        state[:, 4] = np.clip(state[:, 4], *LOG_BLURS)
+        state[:, 4] = np.clip(state[:, 4], *_LOG_BLURS)
     moved = state[:, :2]
-    kept = np.linalg.norm(moved, axis=1, keepdims=True) < MAX_SHIFT
+    kept = np.linalg.norm(moved, axis=1, keepdims=True) < _MAX_SHIFT
     return np.where(kept, pixels + moved, pixels)
 
 
@@ -233,7 +233,7 @@ def _windows(
     share: float,
 ) -> tuple[Int64[np.ndarray, "corners window 2"], Float64[np.ndarray, "corners window"]]:
     """Return the pixels around every corner, and their weights: 1 within the squares of the corner, otherwise 0."""
-    side = np.arange(-MAX_HALF_WINDOW, MAX_HALF_WINDOW + 1)
+    side = np.arange(-_MAX_HALF_WINDOW, _MAX_HALF_WINDOW + 1)
     offsets = np.stack(np.meshgrid(side, side), -1).reshape(-1, 2)
     x = np.rint(pixels)[:, None].astype(int) + offsets
     in_squares = np.linalg.solve(axes, (x - pixels[:, None]).swapaxes(1, 2))

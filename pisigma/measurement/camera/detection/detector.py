@@ -30,7 +30,7 @@ from pisigma.measurement.camera.detection.video import (
     still_frames,
 )
 
-MIN_PIECE = 3
+_MIN_PIECE = 3
 """Smallest number of rows and columns of corners of a piece of a board that is recognised."""
 
 
@@ -70,7 +70,7 @@ def _numbered(
 
 def _missing(image: Image, board: Board) -> NoBoard:
     """Return why no complete board was found: only a piece of it is visible, or nothing."""
-    size = (MIN_PIECE, MIN_PIECE)
+    size = (_MIN_PIECE, _MIN_PIECE)
     there, _, piece = cv2.findChessboardCornersSBWithMeta(image, size, cv2.CALIB_CB_LARGER)
     expected = f"{board.rows} x {board.columns} corners"
     if there:
@@ -85,7 +85,7 @@ DETECTORS: dict[BoardKind, Callable[[Image, Board], DetectedBoard | NoBoard]] = 
     "charuco": detect_charuco,
     "apriltag": detect_apriltags,
 }
-ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".webp")
+_ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".webp")
 """File name extensions of the images in a folder that are read."""
 
 
@@ -110,10 +110,10 @@ def image_files(
             files += _frames(path, video_start)
             continue
         inside = sorted(path.iterdir()) if path.is_dir() else ()
-        files += [one for one in inside if one.suffix.lower() in ENDINGS] if path.is_dir() else [path]
+        files += [one for one in inside if one.suffix.lower() in _ENDINGS] if path.is_dir() else [path]
     if not files:
         raise MeasurementError(
-            expected=f"images ({', '.join(ENDINGS)})", value="none", at=Place(", ".join(map(str, paths)))
+            expected=f"images ({', '.join(_ENDINGS)})", value="none", at=Place(", ".join(map(str, paths)))
         )
     of_name: dict[str, Path] = {}
     for file in files:

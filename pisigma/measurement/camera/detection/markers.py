@@ -14,7 +14,7 @@ from pisigma.measurement.camera.detection.detected_board import (
     refine_corners,
 )
 
-ITERATIONS = 2
+_ITERATIONS = 2
 """Number of searches for the sides of tags; the sides that OpenCV returns may be off by a pixel."""
 
 
@@ -40,7 +40,7 @@ def detect_apriltags(image: Image, board: Board) -> DetectedBoard | NoBoard:
     if not len(used):
         return NoBoard(f"no AprilTag of family {board.dictionary} of the board is found in it")
     tags = np.asarray(quads, dtype=np.float64).reshape(-1, 4, 2)[used]
-    for _ in range(ITERATIONS):
+    for _ in range(_ITERATIONS):
         tags = _crossings(image, tags, board.clearance)
     corners = 4 * number[used, None] + np.arange(4)
     return DetectedBoard(corners.ravel(), tags.reshape(-1, 2))

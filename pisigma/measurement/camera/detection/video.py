@@ -15,19 +15,19 @@ from pisigma.files.errors import MeasurementError, Place
 from pisigma.files.input_file import read_input
 from pisigma.measurement.camera.detection.detected_board import Image
 
-ENDINGS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
+_ENDINGS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 """File name extensions of videos."""
 FRAME = ".frame"
 """Beginning of the extension of a frame's path, such as VIDEO.mp4/0003.frame182."""
-BLOCKS = (16, 12)
+_BLOCKS = (16, 12)
 """Number of blocks of an image along u and v; any block that changes shows that the arm moves."""
-BLOCK_PIXELS = 24
+_BLOCK_PIXELS = 24
 """Width and height of a block after the reduction of the image [px]."""
 LAG = 0.1
 """Time between frames that are compared [s]; slow motions change neighbouring frames too little."""
-MIN_STILL = 0.4
+_MIN_STILL = 0.4
 """Shortest time at rest of a stop [s]."""
-NOISE_SHARE, NOISE_FACTOR, NOISE_GRAY = 0.2, 1.5, 2.0
+_NOISE_SHARE, _NOISE_FACTOR, _NOISE_GRAY = 0.2, 1.5, 2.0
 """The change of frames at rest is this quantile of all changes; larger changes are motions if they exceed it by this
 factor and this gray level."""
 
@@ -60,12 +60,12 @@ def still_frames(path: str | os.PathLike[str]) -> tuple[StillFrame, ...]:
     stops = list[StillFrame]()
     for run in range(1, count + 1):
         chosen = np.flatnonzero(runs == run)
-        if times[chosen[-1]] - times[chosen[0]] + LAG >= MIN_STILL:
+        if times[chosen[-1]] - times[chosen[0]] + LAG >= _MIN_STILL:
             best = int(chosen[sharpness[chosen].argmax()])
             stops.append(StillFrame(best, float(times[best])))
     if not stops:
         raise MeasurementError(
-            expected=f"a video in which the arm rests for {MIN_STILL:g} s or more at every pose",
+            expected=f"a video in which the arm rests for {_MIN_STILL:g} s or more at every pose",
             value="no such time",
             at=Place(path),
             remedy="let the arm rest for a second at every pose, and fix the phone",
@@ -75,7 +75,7 @@ def still_frames(path: str | os.PathLike[str]) -> tuple[StillFrame, ...]:
 
 def is_video(path: Path) -> bool:
     """Return whether a file is a video, by its extension."""
-    return path.suffix.lower() in ENDINGS
+    return path.suffix.lower() in _ENDINGS
 
 
 def frame_path(video: Path, frame: StillFrame, name: str) -> Path:
@@ -104,8 +104,8 @@ def read_frame(path: Path) -> Image:
 
 def _is_still(changes: Float64[np.ndarray, " frames"]) -> Bool[np.ndarray, " frames"]:
     """Return whether the changes of frames are not larger than their noise."""
-    noise = np.quantile(changes[np.isfinite(changes)], NOISE_SHARE) if np.isfinite(changes).any() else 0.0
-    still: np.ndarray = changes <= NOISE_FACTOR * noise + NOISE_GRAY
+    noise = np.quantile(changes[np.isfinite(changes)], _NOISE_SHARE) if np.isfinite(changes).any() else 0.0
+    still: np.ndarray = changes <= _NOISE_FACTOR * noise + _NOISE_GRAY
     return still
 
 
@@ -113,7 +113,7 @@ def _changes(path: str | os.PathLike[str]) -> Iterator[tuple[float, float, float
     """Return time [s], largest change of a block since `LAG` (infinite at the start), and sharpness of every frame."""
     with _opened(path) as video:
         rate = video.get(cv2.CAP_PROP_FPS) or 30.0
-        size, before, number = tuple(BLOCK_PIXELS * n for n in BLOCKS), list[np.ndarray](), 0
+        size, before, number = tuple(_BLOCK_PIXELS * n for n in _BLOCKS), list[np.ndarray](), 0
         lag = max(round(LAG * rate), 1)
         while (read := video.read())[0]:
             gray = _gray(read[1])
@@ -121,7 +121,7 @@ def _changes(path: str | os.PathLike[str]) -> Iterator[tuple[float, float, float
             change = np.inf
             if len(before) == lag:
                 change = float(
-                    cv2.resize(np.abs(small - before.pop(0)), BLOCKS, interpolation=cv2.INTER_AREA).max()
+                    cv2.resize(np.abs(small - before.pop(0)), _BLOCKS, interpolation=cv2.INTER_AREA).max()
                 )
             before.append(small)
             time = video.get(cv2.CAP_PROP_POS_MSEC) / 1e3
