@@ -31,7 +31,7 @@ def complete_export(incomplete: str) -> list[str]:
 
 
 ModelOrCell = Annotated[
-    Path, typer.Argument(metavar="MODEL|CELL", help="Model folder, or a cell.", autocompletion=complete_model)
+    Path, typer.Argument(metavar="MODEL|CELL", help="Model folder or cell.", autocompletion=complete_model)
 ]
 """Argument of commands that read a model; for a cell, the model in use."""
 

@@ -36,7 +36,7 @@ RobotName = Annotated[
     str,
     typer.Argument(
         metavar="ROBOT|CELL",
-        help="Catalogue name, robot file (YAML or URDF), or a cell.",
+        help="Catalogue name, robot file (YAML or URDF) or cell.",
         autocompletion=complete_robot,
     ),
 ]
@@ -49,7 +49,8 @@ Tip = Annotated[str | None, typer.Option(help="Tool link of a URDF file. [defaul
 Prior = Annotated[
     Path | None,
     typer.Option(
-        help="Model folder of `pisigma fleet prior` to start from if this prior predicts held-out rows better.",
+        help="Model folder written by `pisigma fleet prior`, to start from if held-out rows are predicted better with "
+        "it than without.",
         autocompletion=complete_model,
     ),
 ]

@@ -24,7 +24,7 @@ _MAX_LINES = 12
 
 
 def status(
-    cell: Annotated[Path, typer.Argument(metavar="CELL|FOLDER", help="A cell, or a folder of cells.")],
+    cell: Annotated[Path, typer.Argument(metavar="CELL|FOLDER", help="Cell or folder of cells.")],
     exit_code: Annotated[
         bool, typer.Option("--exit-code", help="Exit with status 3 if a step is due.")
     ] = False,
@@ -214,7 +214,7 @@ def event(
     date: Annotated[str, typer.Option(help="Day of the event, such as 2026-11-22. [default: today]")] = "",
     note: Annotated[str, typer.Option(help="Free text.")] = "",
     by: Annotated[
-        str, typer.Option(help="Name of the person who accepted the model or reports the change.")
+        str, typer.Option(help="Name of the person who accepted the model or reported the change.")
     ] = "",
     export: Annotated[
         Path | None,

@@ -33,22 +33,22 @@ Form = Annotated[
 Like = Annotated[
     Path | None,
     typer.Option(
-        help="File to update: a URDF file for urdf, mjcf and xacro (default: file of the robot), a drawn MJCF model "
-        "for mjcf, the controller's file for ur-calibration, staubli and rsi."
+        help="File to update: a URDF file for urdf, mjcf and xacro (default: file of the robot), an MJCF model for "
+        "mjcf, or the controller's file for ur-calibration, staubli and rsi."
     ),
 ]
 Tip = Annotated[str | None, typer.Option(help="With --like, tool link that was used to load the robot.")]
 Geometry = Annotated[
     str | None,
     typer.Option(
-        help="With urdf, mjcf and dh, geometry to write: geometric (from the geometric calibration, default) or hybrid "
-        "(fitted together with the joint correction, for use with --format onnx)."
+        help="With --format urdf, mjcf or dh, geometry to write: geometric (from the geometric calibration, default) "
+        "or hybrid (fitted together with the joint correction, for use with --format onnx)."
     ),
 ]
 Poses = Annotated[
     Path | None,
     typer.Option(
-        help="With targets, CSV file of poses: x_mm,y_mm,z_mm,roll_deg,pitch_deg,yaw_deg or qx,qy,qz,qw."
+        help="With --format targets, CSV file of poses: x_mm,y_mm,z_mm with roll_deg,pitch_deg,yaw_deg or qx,qy,qz,qw."
     ),
 ]
 TargetKind = Annotated[
@@ -58,7 +58,9 @@ TargetKind = Annotated[
         "robot."
     ),
 ]
-Branch = Annotated[str | None, typer.Option(help="With targets, branch to use instead of the default.")]
+Branch = Annotated[
+    str | None, typer.Option(help="With --format targets, branch to use instead of the default.")
+]
 Config = Annotated[
     str | None,
     typer.Option(
@@ -68,7 +70,8 @@ Config = Annotated[
 Program = Annotated[
     Path | None,
     typer.Option(
-        help="With targets, existing program (.script, .src or .dat, .mod, .ls) whose pose targets are corrected."
+        help="With --format targets, existing program (.script, .src or .dat, .mod, .ls) whose pose targets are "
+        "corrected."
     ),
 ]
 Frames = Annotated[
@@ -84,13 +87,13 @@ ToleranceMm = Annotated[
 CountsPerTurn = Annotated[
     str | None,
     typer.Option(
-        help="With epson and fanuc-mastering, encoder counts per turn of each joint (including the gear ratio), or "
-        "per mm of a prismatic joint, such as 8388608,8388608,524288,1048576."
+        help="With --format epson or fanuc-mastering, encoder counts per turn of each joint (including the gear "
+        "ratio), or per mm of a prismatic joint, such as 8388608,8388608,524288,1048576."
     ),
 ]
 PresentCounts = Annotated[
     str | None,
-    typer.Option(help="With epson and fanuc-mastering, counts that the controller uses at present."),
+    typer.Option(help="With --format epson or fanuc-mastering, counts that the controller uses at present."),
 ]
 
 

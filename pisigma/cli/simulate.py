@@ -45,7 +45,7 @@ def simulate(
     read = read_recipe(recipe)
     if (out is None) == (images is None):
         raise RecipeError(
-            "expected either --out, a CSV file of measurements, or --images, a folder", option="--out"
+            "expected either --out (a CSV file of measurements) or --images (a folder)", option="--out"
         )
     if at is not None and (held_out or images is not None):
         raise RecipeError(

@@ -1,4 +1,4 @@
-"""Detect conflicts of an output with an input of the same call or with a model folder."""
+"""Detect conflicts between an output and an input of the same call or a model folder."""
 
 import os
 from collections.abc import Iterable

@@ -95,7 +95,7 @@ class GravityTorques(AbstractFeature):
         super().__init__(robot)
         norm = float(np.linalg.norm(gravity))
         if not norm > 0 or not np.isfinite(norm):
-            raise ValueError(f"expected a direction of gravity, got {gravity}.")
+            raise ValueError(f"expected a finite, non-zero direction of gravity, got {gravity}.")
         # A unit vector is not normalised again, so that restored features are identical to the last bit.
         scale = 1.0 if abs(norm - 1) < 1e-12 else norm
         x, y, z = (float(value / scale) for value in gravity)

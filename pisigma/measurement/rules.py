@@ -107,7 +107,7 @@ def _check_shapes(data: MeasuredFields) -> None:
     for name, entries in {**data.texts, "line": data.line}.items():
         if name not in (*TEXTS, "line", *reading_texts()):
             raise MeasurementError(
-                f"no sensor has a text '{name}'",
+                f"no sensor has a text column '{name}'",
                 option="readings",
                 value=name,
                 at=Place(source),

@@ -94,7 +94,7 @@ class PlanSettings:
         sigma_mm: standard deviation of a measured length [mm]. None: of laser trackers.
         criterion: optimality criterion: I (uncertainty of the tool's position over the task) or D (uncertainty of all
             unknowns).
-        limit_mm: limit of the 95 % quantile of the tool's position errors over the task [mm], as in `measure`. The plan
+        limit_mm: limit on the 95 % quantile of the tool's position errors over the task [mm], as in `measure`. The plan
             then states the number of poses needed.
         candidates: number of random candidate poses to choose from.
         candidates_from: CSV file of candidate joint values to choose from, instead of random ones.

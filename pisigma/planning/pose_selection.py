@@ -235,7 +235,7 @@ class PoseSelection:
         return _Change(sign, half, U, self._S - sign * U @ U.mT, P)
 
     def _take(self, change: _Change) -> None:
-        """Apply a change of the selection."""
+        """Apply a change to the selection."""
         half, U, self._S, self._P = change.half, change.along, change.S, change.P
         self._C -= change.sign * half.t() @ half
         if self._criterion == "I":

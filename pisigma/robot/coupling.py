@@ -237,7 +237,7 @@ def _driven(bar: FourBar, turn: np.ndarray, stops: tuple[float, float], joint: i
             expected="a linkage that closes within the limits",
             value=joint + 1,
             option="coupling",
-            remedy="give the joint stops (limits_deg in its entry), or correct its lengths",
+            remedy="give the limits of the joint (limits_deg in its entry), or correct the lengths of the linkage",
         )
     return float(u[0]), float(u[-1])
 

@@ -155,7 +155,7 @@ class AbstractCommandedJoints(Section):
         return self
 
     def commanded_joints(self, robot: TrueRobot) -> Float64[Tensor, "rows dof"]:
-        """Return the joint values to command [rad or m], the same at every call; see `joints_for_poses`."""
+        """Return the joint values to command [rad or m], the same for every call; see `joints_for_poses`."""
         if isinstance(self.poses, JointsRandom):
             return self.poses.joints(robot.nominal)
         assert self.branch is not None  # the validator has checked this

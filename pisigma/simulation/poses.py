@@ -95,7 +95,7 @@ class JointsRandom(Section):
     range_mm: dict[str, Range] = Field(default_factory=dict)
 
     def joints(self, robot: Robot) -> Float64[Tensor, "count dof"]:
-        """Return the joint values to command [rad or m], the same at every call.
+        """Return the joint values to command [rad or m], the same for every call.
 
         The controller's values are drawn and converted to joint values.
 
@@ -174,7 +174,7 @@ class AbstractPoses(Section, ABC):
         return self
 
     def transforms(self) -> Float64[Tensor, "count 4 4"]:
-        """Return the desired T_base_tool [m], the same at every call."""
+        """Return the desired T_base_tool [m], the same for every call."""
         generator = None if self.seed is None else torch.Generator().manual_seed(self.seed)
         positions = self._positions(generator)
         return transform(self.orientation.rotations(len(positions), generator), positions)

@@ -47,7 +47,7 @@ class ArmPosterior:
         return self.uncertainty.geometry.values_of(self.space)
 
     def base_rows(self, frame: str) -> range:
-        """Return the indices of the base in a frame."""
+        """Return the indices of the parameters of the base in a frame."""
         first = self.space.indices_of("base").start + 6 * self.space.frames.index(frame)
         return range(first, first + 6)
 

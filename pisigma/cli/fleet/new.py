@@ -40,7 +40,7 @@ def new(
         str, typer.Option(help="Sensor: tracker, camera, sockets, draw-wire or touch.")
     ] = "tracker",
     limit_mm: Annotated[
-        float | None, typer.Option(help="Limit of the 95 % quantile of the position errors [mm].")
+        float | None, typer.Option(help="Limit on the 95 % quantile of the position errors [mm].")
     ] = None,
     base: Annotated[str | None, typer.Option(help="Base link of a URDF file, to which poses refer.")] = None,
     tip: Annotated[str | None, typer.Option(help="Tool link of a URDF file.")] = None,

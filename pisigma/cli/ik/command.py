@@ -22,7 +22,7 @@ IgnoreAxes = Annotated[
     str | None,
     typer.Option(
         help="Axes of the tool to ignore: x, y, z, roll, pitch, yaw (about the tool's x, y, z) or none, separated by "
-        "commas. [default: by the number of joints]"
+        "commas. [default: depends on the number of joints]"
     ),
 ]
 ToleranceMm = Annotated[
@@ -41,7 +41,9 @@ def ik(
     ] = None,
     poses: Annotated[
         Path | None,
-        typer.Option(help="CSV file of poses: x_mm,y_mm,z_mm,roll_deg,pitch_deg,yaw_deg or qx,qy,qz,qw."),
+        typer.Option(
+            help="CSV file of poses: x_mm,y_mm,z_mm with roll_deg,pitch_deg,yaw_deg or qx,qy,qz,qw."
+        ),
     ] = None,
     out: Annotated[Path | None, typer.Option(help="CSV file of joint values to write, with --poses.")] = None,
     branch: Annotated[str | None, typer.Option(help="Branch to use instead of the default.")] = None,

@@ -23,7 +23,7 @@ First = Annotated[
     str,
     typer.Argument(
         metavar="A|CELL",
-        help="Model folder, 'nominal' or 'geometric', or a cell.",
+        help="Model folder, 'nominal', 'geometric' or cell.",
         autocompletion=complete_model,
     ),
 ]

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 Model = Annotated[
     Path | None,
-    typer.Argument(metavar="[MODEL|CELL]", help="Model folder, or a cell.", autocompletion=complete_model),
+    typer.Argument(metavar="[MODEL|CELL]", help="Model folder or cell.", autocompletion=complete_model),
 ]
 Pin = Annotated[
     bool,

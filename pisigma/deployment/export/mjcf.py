@@ -1,4 +1,4 @@
-"""The calibrated geometry as MJCF: the drawn model with calibrated bodies, or a new one of the calibrated URDF."""
+"""The calibrated geometry as MJCF: an existing model with calibrated bodies, or a new one of the calibrated URDF."""
 
 import itertools
 import math
@@ -30,7 +30,7 @@ from pisigma.robot.urdf_rows import rows_of_chain
 from pisigma.robot.writing import comment_text, robot_to_urdf, unused_name
 
 _SAME = 2e-3
-"""Largest difference from rows of the drawn model, which may be rounded to millimetres [m or rad]."""
+"""Largest difference from rows of the existing model, which may be rounded to millimetres [m or rad]."""
 _SNAP = 1e-5
 """Deviations of drawn right angles [rad] up to this are due to rounding."""
 _DIGITS = 6
@@ -220,7 +220,7 @@ def update_mjcf(
     tip: str | None = None,
     comments: tuple[str, ...] = (),
 ) -> str:
-    """Return a drawn MJCF model with calibrated bodies; meshes, inertias, actuators and all else remain.
+    """Return an existing MJCF model with calibrated bodies; meshes, inertias, actuators and all else remain.
 
     Every moved body after the first has its calibrated pose in the preceding body. Two sites are added:
     `calibrated_frame`, in the body before the first joint, is the frame of the model's poses, and `calibrated_tool`, in

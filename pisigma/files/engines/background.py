@@ -112,7 +112,7 @@ class BackgroundProcess:
 
 def serve() -> None:
     """Compute the requests of the process at the other end of stdin and stdout, until that process ends."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the other process handles interruptions
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the other process handles interrupts
     requests, answers = sys.stdin.buffer, os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # what functions print must not get among the answers
 

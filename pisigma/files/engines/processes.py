@@ -84,7 +84,7 @@ class ProcessEngine(AbstractEngine):
 
 
 def _start_worker(*_: Any) -> None:
-    """Ignore interruptions, which the parent process handles, and end whenever the parent ends."""
+    """Ignore interrupts, which the parent process handles, and exit when the parent exits."""
     with contextlib.suppress(ValueError):
         signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()

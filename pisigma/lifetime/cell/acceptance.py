@@ -62,7 +62,7 @@ class Acceptance:
 
     Attributes:
         model: name of the model in use.
-        limit_mm: limit of the 95 % quantile of the position errors [mm]; None if the cell has none.
+        limit_mm: limit on the 95 % quantile of the position errors [mm]; None if the cell has none.
         instrument: the instrument, as far as it is stated.
         repeatability_mm: pose repeatability RP that the maker of the robot states [mm]; None if it is not stated.
         temperatures: mean temperature of every valid session [deg C], by its name; None if unknown.

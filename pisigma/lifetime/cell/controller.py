@@ -58,8 +58,8 @@ _MEANING = {
     ("calibrate", "same_zeros"): "the model is valid only while they are active",
     ("measure", "other_zeros"): "the rows will differ from the model by these joint zeros",
     ("import", "other_zeros"): "the rows differ from the model by these joint zeros",
-    ("monitor", "other_zeros"): "the motion that is found includes the change of the joint zeros",
-    ("recalibrate", "other_zeros"): "the motion that is found includes the change of the joint zeros",
+    ("monitor", "other_zeros"): "the motion that is found includes the shift of the joint zeros",
+    ("recalibrate", "other_zeros"): "the motion that is found includes the shift of the joint zeros",
 }
 _ELSE: dict[Situation, str] = {
     "kinematics": "command the joint values as joint motions; if a pose is computed from them and commanded, "

@@ -57,7 +57,7 @@ def check_event(kind: str, day: str, person: str) -> None:
     Args:
         kind: kind of the event.
         day: day of the event (ISO 8601).
-        person: who accepted the model or reports the change.
+        person: who accepted the model or reported the change.
 
     Raises:
         MeasurementError: the kind is unknown, the day is not a valid date, or the person who accepted is not named.

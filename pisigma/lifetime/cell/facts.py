@@ -44,7 +44,7 @@ class CellFacts:
         models: all models in the order in which they were made.
         checks: all checks in the order in which they were made.
         in_use: the model in use; None if there is none.
-        limit_mm: limit of the 95 % quantile of the position errors [mm]; None if there is none.
+        limit_mm: limit on the 95 % quantile of the position errors [mm]; None if there is none.
         today: day (ISO 8601).
         not_taken_in: names of the files in `sessions/` that are not in the history yet, by their dates.
         not_read: names of the files in `sessions/` that are not measurement files and were not imported.

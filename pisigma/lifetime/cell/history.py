@@ -151,7 +151,7 @@ class Use:
 
 @dataclass(frozen=True)
 class MonitoredSession:
-    """Result of comparing a session with a model over the months.
+    """Result of comparing one session with a model.
 
     Attributes:
         model_sha256: SHA-256 of the `model.yaml` of the model.
@@ -325,7 +325,7 @@ class History:
             kind: kind of the event.
             day: day of the event (ISO 8601); "" for today.
             note: free text.
-            person: who accepted the model or reports the change.
+            person: who accepted the model or reported the change.
 
         Raises:
             MeasurementError: the kind is unknown, the day is not a valid date, or the person who accepted is not named.

@@ -132,7 +132,7 @@ def _check_explained(model: CalibratedModel, rms: float) -> None:
     limit = RobotClass.from_robot(model.robot).remaining * model.robot.reach
     if rms > limit:
         raise MeasurementError(
-            "no changes of the joint zeros explain the positions",
+            "no shifts of the joint zeros explain the positions",
             expected=f"residuals below {limit * 1e3:.2g} mm RMS",
             value=f"{rms * 1e3:.3g} mm",
             option="position",
@@ -201,7 +201,7 @@ def compare_paired_arms(
 
 
 def _change(zeros: ZeroChanges | None, index: int) -> tuple[float, float] | None:
-    """Return the change of the zero of a joint [rad] and its variance [rad²]; None if it was not measured."""
+    """Return the shift of the zero of a joint [rad] and its variance [rad²]; None if it was not measured."""
     return None if zeros is None else (float(zeros.values[index]), float(zeros.covariance[index, index]))
 
 

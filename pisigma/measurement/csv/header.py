@@ -58,7 +58,7 @@ class Layout:
 
     @property
     def per_joint(self) -> tuple[Column, ...]:
-        """Columns of the fields of `PER_JOINT`."""
+        """Columns with one value per joint, see `PER_JOINT`."""
         return tuple(column for column in self.columns if column.joint_field[1])
 
     def column(self, quantity: str) -> Column:

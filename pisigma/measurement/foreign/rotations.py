@@ -83,7 +83,7 @@ def _about(axis: int, angle: Float64[Tensor, " rows"]) -> _Rotations:
 
 
 def _quaternion(name: str, meaning: str, values: str, order: str, *aliases: str) -> RotationEncoding:
-    """Return the encoding of a quaternion whose values are in the `order`, such as "wxyz"."""
+    """Return the encoding of a quaternion whose values are in the order `order`, such as "wxyz"."""
 
     def to_rotation(quaternion: _Values) -> _Rotations:
         return rotation_from_quaternion(quaternion[:, [order.index(part) for part in "xyzw"]])

@@ -109,7 +109,8 @@ def check_restarts(
             expected="time stamps of one clock",
             value=f"{times[row]:g} s after {times[row - 1]:g} s",
             at=Place(source, lines[row]),
-            remedy="join one recording after the other, or join by point; those of LeRobot restart in every episode",
+            remedy="join one recording after the other, or join by point; the time stamps of LeRobot restart in every "
+            "episode",
         )
 
 

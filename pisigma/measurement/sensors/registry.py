@@ -63,7 +63,7 @@ def register_sensor(sensor: type[AbstractSensor]) -> type[AbstractSensor]:
             for name in (f"{column.name}_{unit}" if unit else column.name for unit in column.units):
                 if find_column(name) is not None:
                     raise MeasurementError(
-                        f"measurement files already have a column '{name}' of the sensor '{sensor.name}'",
+                        f"column '{name}' of sensor '{sensor.name}' already exists in measurement files",
                         value=name,
                         remedy="choose another name",
                     )
@@ -129,7 +129,8 @@ def measured_errors(
         error of an image is the error of its pose. Sensors without rows are left out.
 
     Raises:
-        IdentificationError: the rows of an owner that was not calibrated do not determine its unknowns.
+        IdentificationError: the rows of a socket, anchor or other owner of unknowns that was not calibrated do not
+            determine them.
     """
     rows = sort_pairs_first(measurements, torch.arange(measurements.rows, device=T.device))
     data = replace(as_poses(measurements, unknowns or {}), sigma_position=None, sigma_rotation=None).select(

@@ -274,10 +274,10 @@ def _uncertainty(
     robot, bases, tools = place
     groups = [_unknowns(section) for section in known.unknowns]
     if len({group.name for group in groups}) < len(groups):
-        raise MisfitError("a group of unknown sensor parameters appears twice", column="uncertainty.unknowns")
+        raise MisfitError("a group of sensor unknowns appears twice", column="uncertainty.unknowns")
     if elsewhere := {frame for group in groups for frame in group.frames} - {*bases}:
         raise MisfitError(
-            f"unknown sensor parameters are in the frame '{min(elsewhere)}', which the model does not have",
+            f"sensor unknowns refer to the frame '{min(elsewhere)}', which the model does not have",
             column="uncertainty.unknowns",
             value=min(elsewhere),
         )

@@ -32,7 +32,7 @@ def unreadable_alarm(row: UnusableRow) -> Alarm:
 
 
 def alarm_of_all_rows(sentence: str) -> Alarm:
-    """Return the alarm about a fault of all rows, for example in the header of the file."""
+    """Return the alarm about a fault that affects all rows, for example in the header of the file."""
     return Alarm(1, "setup", f"line 1: {sentence} Correct this before you continue to measure.", repeat=False)
 
 

@@ -283,7 +283,7 @@ def stopping_advice(
     """Return the advice whether to continue measuring or to stop, with the reason.
 
     Args:
-        limit_mm: limit of the 95 % quantile of the errors [mm]; None for no limit.
+        limit_mm: limit on the 95 % quantile of the errors [mm]; None for no limit.
         least_gain_mm: decrease of that quantile by the next `_AHEAD` poses below which to stop [mm].
         reached: accuracy so far. The limit is reached when the last two points are below it: estimates from few rows
             scatter, so a first point is often below the limit by chance.

@@ -143,7 +143,7 @@ class Advice:
     """Advice about what to do next.
 
     Attributes:
-        action: "measure" the next pose, "repeat" a pose, "correct" a fault of all rows, or "stop".
+        action: "measure" the next pose, "repeat" a pose, "correct" a fault that affects all rows, or "stop".
         sentence: the reason.
     """
 

@@ -123,7 +123,7 @@ class Capsules:
         return torch.stack([first, second], -1)[checked]
 
     def random_joints(self) -> Float64[Tensor, "poses dof"]:
-        """Draw joint values within the limits [rad or m], the same at every call."""
+        """Draw joint values within the limits [rad or m], the same for every call."""
         generator = torch.Generator().manual_seed(0)
         limits = torch.from_numpy(self.robot.axis_limits).clamp(-np.pi, np.pi)
         draws = torch.rand(_SAMPLES, len(limits), generator=generator, dtype=torch.float64)

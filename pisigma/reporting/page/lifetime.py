@@ -60,7 +60,7 @@ def monitoring_page(
         warnings: sentences that warn of problems.
         refused: date, file and reason of every session that must not be trusted.
         marks: days that are marked in the chart of each quantity; days under the key "" are marked in all charts.
-        limit_mm: limit of the RMS error [mm]; None if there is none.
+        limit_mm: limit on the RMS error [mm]; None if there is none.
     """
     days = [datetime.date.fromisoformat(one.date) for one in records]
     return html_page(

@@ -55,7 +55,7 @@ class RandomViews(Section):
     def joints(
         self, robot: Robot, camera: Camera, board: Board, is_fixed: bool = False
     ) -> Float64[Tensor, "count dof"]:
-        """Return the joint values to command [rad or m]; they are the same at every call.
+        """Return the joint values to command [rad or m]; they are the same for every call.
 
         Args:
             robot: the robot, with its base from the board to the base and its tool from the flange to the camera (for
@@ -215,7 +215,7 @@ class SimulatedImages(Section):
         return self.board.name if self.camera.is_fixed else self.camera.name
 
     def measure(self, robot: TrueRobot) -> Measurements:
-        """Simulate the corners of all images, the same at every call; see `image_measurements`."""
+        """Simulate the corners of all images, the same for every call; see `image_measurements`."""
         q, is_fixed = self._joints(robot), self.camera.is_fixed
         noise = ImageNoise(self.noise.corner_px, self.noise.repeatability)
         actual = robot.actual_joints(q)
@@ -229,7 +229,7 @@ class SimulatedImages(Section):
         return self._read(self._joints(robot))
 
     def render(self, robot: TrueRobot) -> Iterator[UInt8[np.ndarray, "height width"]]:
-        """Render the images pixel by pixel, the same at every call; the noise of corners is that of their detection."""
+        """Render the images pixel by pixel, always the same; the noise of corners is that of their detection."""
         camera, board = self._true()
         q, rng = robot.actual_joints(self._joints(robot)), np.random.default_rng(self.noise.seed)
         poses = draw_board_poses(

@@ -16,7 +16,7 @@ def nominal_model(model: CalibratedModel, turned: bool) -> CalibratedModel:
 
     Base and tool of an identified geometry belong to that geometry and would increase the errors of the nominal arm.
     Therefore they are fitted again, to the target poses that the model predicts at its stored joint values of training
-    rows; the rows under test are not used. A model with nominal geometry already has such base and tool.
+    rows; the rows under test are not used. A model with nominal geometry already has such a base and tool.
 
     Args:
         model: a model of any kind.
@@ -34,7 +34,7 @@ def nominal_model(model: CalibratedModel, turned: bool) -> CalibratedModel:
             f"model '{model.name}': base and tool of the nominal robot cannot be fitted to the {len(model.starts)} "
             f"stored joint vectors of the model ({' '.join(str(problem).rstrip('.').split())})",
             value=len(model.starts),
-            remedy="compare models by name",
+            remedy="evaluate two or more model folders, without 'nominal'",
         ) from problem
     robot = model.robot.with_geometry(base=fitted.robot.base, tool=fitted.robot.tool)
     return replace(

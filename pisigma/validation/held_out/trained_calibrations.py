@@ -199,7 +199,8 @@ def judgeable_rows(measurements: Measurements, test: Tensor, training: Measureme
     ]
     if not any(rows_judged):
         raise IdentificationError(
-            "neither this row nor any other row held out with it has a target and an anchor that other rows have",
+            "neither this row nor any other row held out with it has both a target and an anchor that occur in the "
+            "training rows",
             at=measurements.place_of(rows[0]),
             remedy="measure more poses with each, or omit the cross-validation",
         )

@@ -65,7 +65,7 @@ class SessionView:
         Args:
             arm: the robot in its cell.
             body: appearance of the robot; None for capsules.
-            limit: limit of the 95 % quantile of the errors [m]; None for no limit.
+            limit: limit on the 95 % quantile of the errors [m]; None for no limit.
             host: address to listen on; at 127.0.0.1 only this machine can open the page.
             port: port to listen on; if it is in use, the next free port.
             sight: camera and board; None without a camera.
@@ -174,7 +174,7 @@ class SessionPanel:
         Args:
             gui: GUI of the server.
             robot: robot with the names and units of the joints.
-            limit: limit of the 95 % quantile of the errors [m]; None for no limit.
+            limit: limit on the 95 % quantile of the errors [m]; None for no limit.
         """
         self._robot, self._limit = robot, limit
         environment = template_environment(

@@ -93,7 +93,7 @@ class CellDocument(Section):
         base: base link of the URDF file; poses are in its frame. None for its root.
         tip: tool link of the URDF file; None for its only end.
         sensor: sensor that measures the robot.
-        limit_mm: limit of the 95 % quantile of the position errors [mm]; None for no limit.
+        limit_mm: limit on the 95 % quantile of the position errors [mm]; None for no limit.
         joint_values: whether rows contain the joint values that were commanded (the default) or those that the encoders
             read ("measured"), to which the controller then has to move without a deviation.
         instrument: measuring instrument and its calibration certificate; None if it is not stated.

@@ -105,7 +105,7 @@ class IncomingRows:
 
     @cached_property
     def unchecked_rows(self) -> Measurements:
-        """The rows, which need not be possible for the robot.
+        """The rows, not yet checked against the robot's limits.
 
         Raises:
             MeasurementError: the files cannot be read, or see `import_rows`.

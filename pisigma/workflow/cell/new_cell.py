@@ -32,7 +32,7 @@ class NewCell:
     Attributes:
         robot: the nominal robot, a catalogue name, or a robot file (YAML or URDF), which is copied into the cell.
         sensor: "tracker", "camera", "sockets", "draw-wire" or "touch".
-        limit_mm: limit of the 95 % quantile of the position errors [mm]; None for no limit.
+        limit_mm: limit on the 95 % quantile of the position errors [mm]; None for no limit.
         base: base link of the URDF file; poses are in its frame. None for its root.
         tip: tool link of the URDF file; None for its only end.
         cameras: cameras and boards, whose files are copied into the cell.

@@ -249,7 +249,7 @@ class Sessions:
         facts = facts_of(self.folder.parent)
         if not facts.valid_sessions:
             raise MeasurementError(
-                "the cell has no session since the arm or its joint zeros were last changed",
+                "the cell has no session measured since the arm or its joint zeros were last changed",
                 at=Place(self.folder),
                 remedy="measure rows and import them",
             )

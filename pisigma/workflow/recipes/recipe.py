@@ -67,7 +67,7 @@ class SingularRows(Section):
 
     Attributes:
         rule: "keep" all rows, or "leave_out" rows whose smallest singular value is below `below`.
-        below: limit of the smallest singular value of the Jacobian, whose translations are divided by the
+        below: limit on the smallest singular value of the Jacobian, whose translations are divided by the
             characteristic length.
     """
 

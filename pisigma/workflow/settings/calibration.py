@@ -178,7 +178,7 @@ class CalibrationSettings:
         for name in ("features", "gravity"):
             if (value := getattr(self, name)) is not None and self.model != "hybrid":
                 raise IdentificationError(
-                    f"a geometric calibration does not use it, got {value}",
+                    f"a geometric calibration does not use this setting (got {value})",
                     value=value,
                     option=name,
                     remedy="omit it, or choose the model hybrid",

@@ -27,10 +27,10 @@ class Limits:
     """Limits of acceptance; None if there is no limit.
 
     Attributes:
-        mean_mm: limit of the mean position error [mm].
-        p95_mm: limit of the 95 % quantile of the position error [mm].
-        max_mm: limit of the largest position error [mm].
-        mean_deg: limit of the mean orientation error [deg].
+        mean_mm: limit on the mean position error [mm].
+        p95_mm: limit on the 95 % quantile of the position error [mm].
+        max_mm: limit on the largest position error [mm].
+        mean_deg: limit on the mean orientation error [deg].
 
     Raises:
         MeasurementError: a limit is not positive and finite.
@@ -61,7 +61,7 @@ class Limits:
         A model that cannot predict some of the rows misses every limit.
 
         Raises:
-            MeasurementError: there is a limit of the orientation error, but no orientations were measured.
+            MeasurementError: there is a limit on the orientation error, but no orientations were measured.
         """
         from pisigma.reporting.tables import figure_text
 

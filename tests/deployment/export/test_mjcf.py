@@ -1,4 +1,4 @@
-"""A calibrated robot in a drawn MJCF model: exact forward kinematics, other content unchanged."""
+"""A calibrated robot in an existing MJCF model: exact forward kinematics, other content unchanged."""
 
 import copy
 

@@ -64,7 +64,7 @@ class Program:
 
     @staticmethod
     def from_targets(targets: Targets, name: str, cartesian: bool, config: str = "") -> "Program":
-        """Return the program that moves to targets, of which no target may be missing."""
+        """Return the program that moves to the targets, none of which may be missing."""
         sentences = [targets.title, TEST, COUNTING.format(robot=targets.robot.name)]
         sentences += [*_CARTESIAN, *targets.remarks] if cartesian else []
         sentences += [targets.domain_warning] if targets.domain_warning else []
