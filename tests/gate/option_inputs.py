@@ -2,6 +2,7 @@
 
 import re
 import shutil
+import socket
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from testing.simulated_arm import simulate
 from testing.two_arms import UR5, measured_positions
 from testing.urdf import UrdfJoint, urdf_text
 
+from pisigma.deployment.export.rsi import rsi_configuration
 from pisigma.joint_correction.conditions import ConditionFeatures
 from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.measurement.camera.board import Board
@@ -45,7 +47,10 @@ def prepare(folder: Path) -> None:
 
 
 def copy_files(folder: Path) -> None:
-    """Copy exports of instruments, a data set and a calibration file of LeRobot, and recipes."""
+    """Copy exports of instruments, a data set and a calibration file of LeRobot, and recipes; name a free RSI port."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("127.0.0.1", 0))
+        (folder / "here.xml").write_text(rsi_configuration(*free.getsockname()))
     shutil.copytree(DATA_SETS / "v3.0", folder / "lerobot_data")
     (folder / "follower.json").write_text(motors_text(SO101))
     shutil.copytree(REPOSITORY / "tests" / "measurement" / "foreign" / "exports", folder / "exports")
@@ -131,8 +136,8 @@ def _sockets(folder: Path) -> None:
 
     tool = arm.true.with_geometry(arm.true.dh, base=np.zeros(6), tool=np.array([0.06, -0.04, 0.13, 0, 0, 0]))
     for place, corner in (("a", (0.45, 0.1, 0.3)), ("b", (0.1, 0.5, 0.2)), ("c", (-0.4, 0.2, 0.4))):
-        for socket in (0, 1):
-            ball = torch.tensor([[corner[0] + 0.05 * socket, corner[1], corner[2]]]).double()
+        for ball_seat in (0, 1):
+            ball = torch.tensor([[corner[0] + 0.05 * ball_seat, corner[1], corner[2]]]).double()
             found = 0
             while found < 8:
                 R = rotation_from_rpy(torch.from_numpy(rng.uniform((-3, -0.6, 2.6), (3, 0.6, 3.6), (1, 3))))
@@ -143,7 +148,7 @@ def _sockets(folder: Path) -> None:
                     continue
                 found += 1
                 lines.append(
-                    ",".join(f"{value:.8f}" for value in torch.rad2deg(q).tolist()) + f",{place}/{socket}"
+                    ",".join(f"{value:.8f}" for value in torch.rad2deg(q).tolist()) + f",{place}/{ball_seat}"
                 )
     header = ",".join([*(f"q{k}_deg" for k in range(1, robot.dof + 1)), "socket"])
     (folder / "sockets.csv").write_text("\n".join([header, *lines]) + "\n")

@@ -211,7 +211,10 @@ def _if_moved(
     turn = rotation_from_vector(motion[3:])
     J = eye.clone()
     J[:3, 3:] = -skew(origin)
-    shift = turn @ origin + motion[:3] - origin
+    moved = (
+        turn @ motion[:3] if kind == "frame" else motion[:3]
+    )  # the inverse of the motion that the arms see
+    shift = turn @ origin + moved - origin
     covariance = J @ inverse @ inverse.mT @ J.mT
     return MovedBody(kind, name, shift, motion[3:], covariance, float(explained.square().sum()) / 2)
 

@@ -75,6 +75,14 @@ def test_bumped_body_is_named_with_its_motion(body):
     assert_close(error[:3].norm(), 0.0, atol=2e-4)
 
 
+@pytest.mark.parametrize("body", ["right", "hall"])
+def test_shift_of_a_large_motion_is_not_linearised(body):
+    M = bump(30.0, 80.0)
+    origin = pose_of({"right": BASES[1], "hall": FRAMES["hall"]}[body])[:3, 3]
+    (one,) = moved(0, M, body).named
+    assert_close(one.shift, M[:3, :3] @ origin + M[:3, 3] - origin, atol=3e-4)
+
+
 def test_larger_motion_is_that_of_one_body_only():
     found = moved(1, bump(30.0, 20.0), "right")
     (one,) = found.named

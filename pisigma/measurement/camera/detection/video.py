@@ -1,9 +1,11 @@
 """Sharp frames of videos of an arm that stops at every pose."""
 
 import os
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import cv2
@@ -94,12 +96,49 @@ def read_frame(path: Path) -> Image:
     Raises:
         MeasurementError: the frame cannot be read.
     """
-    with _opened(path.parent) as video:
-        video.set(cv2.CAP_PROP_POS_FRAMES, int(path.suffix.removeprefix(FRAME)))
-        is_read, frame = video.read()
-    if not is_read:
+    video = path.parent
+    with _LOCK:
+        frame = _frame_reader(video, video.stat().st_mtime_ns).read(int(path.suffix.removeprefix(FRAME)))
+    if frame is None:
         raise MeasurementError("the frame cannot be read", at=Place(path), remedy="copy the video again")
-    return _gray(frame)
+    return frame
+
+
+class _FrameReader:
+    """Reads frames by decoding all frames before them.
+
+    OpenCV seeks by the mean frame rate and would return other frames of videos with a variable rate, as phones record.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Open a video.
+
+        Raises:
+            MeasurementError: the file cannot be read, or is not a video.
+        """
+        self._path, self._next = path, 0
+        self._video = _open(path)
+
+    def read(self, number: int) -> Image | None:
+        """Return the gray values of a frame, or None if it cannot be decoded; ascending numbers need one pass."""
+        if number < self._next:
+            self._video, self._next = _open(self._path), 0
+        while self._next <= number:
+            if not self._video.grab():
+                return None
+            self._next += 1
+        is_read, frame = self._video.retrieve()
+        return _gray(frame) if is_read else None
+
+
+_LOCK = threading.Lock()
+"""Held while a frame is read, because all threads share one reader."""
+
+
+@lru_cache(maxsize=1)
+def _frame_reader(path: Path, mtime_ns: int) -> _FrameReader:
+    """Return the reader of a video, which is the same until another video is read or the file changes."""
+    return _FrameReader(path)
 
 
 def _is_still(changes: Float64[np.ndarray, " frames"]) -> Bool[np.ndarray, " frames"]:
@@ -136,18 +175,25 @@ def _opened(path: str | os.PathLike[str]) -> Iterator[cv2.VideoCapture]:
     Raises:
         MeasurementError: the file cannot be read, or is not a video.
     """
-    if not os.path.isfile(path):
-        read_input(path, MeasurementError)
-    video = cv2.VideoCapture(os.fspath(path))
+    video = _open(path)
     try:
-        video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
-        if not video.isOpened() or video.get(cv2.CAP_PROP_FRAME_COUNT) < 1:
-            raise MeasurementError(
-                expected="a video that OpenCV reads", at=Place(path), remedy="convert it to MP4 (H.264)"
-            )
         yield video
     finally:
         video.release()
+
+
+def _open(path: str | os.PathLike[str]) -> cv2.VideoCapture:
+    """Open a video, see `_opened`; whoever has it last closes it."""
+    if not os.path.isfile(path):
+        read_input(path, MeasurementError)
+    video = cv2.VideoCapture(os.fspath(path))
+    video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
+    if not video.isOpened() or video.get(cv2.CAP_PROP_FRAME_COUNT) < 1:
+        video.release()
+        raise MeasurementError(
+            expected="a video that OpenCV reads", at=Place(path), remedy="convert it to MP4 (H.264)"
+        )
+    return video
 
 
 def _gray(frame: np.ndarray) -> Image:

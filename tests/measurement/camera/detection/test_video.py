@@ -1,5 +1,6 @@
 """Videos: the sharpest frame of every stop, by number or by time."""
 
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -80,3 +81,33 @@ def test_files_without_stops_are_refused(tmp_path):
         still_frames(tmp_path / "text.mp4")
     with refused(MeasurementError):
         still_frames(tmp_path / "missing.mp4")
+
+
+def with_two_rates(content: bytes, first: int) -> bytes:
+    """Return an MP4 file in which frames from number `first` on last twice as long (ISO/IEC 14496-12, 8.6.1.2)."""
+    here = content.index(b"stts") - 4
+    count, duration = struct.unpack(">II", content[here + 16 : here + 24])
+    entries = struct.pack(">IIIII", 2, first, duration, count - first, 2 * duration)
+    new = bytearray(content[:here] + struct.pack(">I4sI", 32, b"stts", 0) + entries + content[here + 24 :])
+    for box in (
+        b"moov",
+        b"trak",
+        b"mdia",
+        b"minf",
+        b"stbl",
+    ):  # they contain the table, which is 8 bytes longer now
+        at = content.index(box) - 4
+        new[at : at + 4] = struct.pack(">I", struct.unpack(">I", content[at : at + 4])[0] + 8)
+    return bytes(new)
+
+
+def test_frames_of_a_variable_rate_are_read_by_their_number(tmp_path):
+    path = tmp_path / "steady.mp4"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), RATE, (160, 120))
+    for number in range(80):
+        writer.write(np.full((120, 160, 3), 3 * number, np.uint8))
+    writer.release()
+    changed = tmp_path / "changed.mp4"
+    changed.write_bytes(with_two_rates(path.read_bytes(), 40))
+    read = [read_image(changed / f"pose.frame{number}").mean() / 3 for number in (10, 55, 50)]
+    assert_close(read, np.array([10, 55, 50]), atol=1.0)
