@@ -98,7 +98,7 @@ def months() -> None:
     )
 
 
-def _alarmed(monitoring: pisigma.Monitoring) -> list[bool]:
+def _alarmed(monitoring: pisigma.MonitoringResult) -> list[bool]:
     """Return, per session, whether a chart is outside its limits or a motion is reported."""
     outside = torch.stack(
         [one for chart in monitoring.charts for one in chart.sessions_outside.values()]

@@ -40,7 +40,7 @@ _NAMES = {
     "workflow.fleet.prior": "estimate_fleet_prior",
     "workflow.import_rows": "import_rows",
     "workflow.load": "load",
-    "workflow.monitor": "Monitoring monitor",
+    "workflow.monitor": "MonitoringResult monitor",
     "workflow.plan": "Plan plan",
     "workflow.recalibrate": "Recalibration recalibrate",
     "workflow.report": "report",

@@ -40,7 +40,7 @@ from pisigma.workflow.frames.calibrate_frame import FrameCalibration as FrameCal
 from pisigma.workflow.frames.calibrate_frame import calibrate_frame as calibrate_frame
 from pisigma.workflow.import_rows import import_rows as import_rows
 from pisigma.workflow.load import load as load
-from pisigma.workflow.monitor import Monitoring as Monitoring
+from pisigma.workflow.monitor import MonitoringResult as MonitoringResult
 from pisigma.workflow.monitor import monitor as monitor
 from pisigma.workflow.plan import Plan as Plan
 from pisigma.workflow.plan import plan as plan

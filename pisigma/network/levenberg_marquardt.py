@@ -18,7 +18,7 @@ _WINDOW = 5
 """Number of iterations between checks of convergence."""
 CONVERGED_SHARE = 0.02
 """Relative decrease of the cost within a window below which a problem has converged."""
-CONVERGED_COST = 1e-11
+CONVERGED_COST_DECREASE = 1e-11
 """Decrease of the cost within a window below which a problem has converged: an RMS of 4e-6 of the range of the
 targets, in the scaling of `build_network`."""
 
@@ -212,7 +212,9 @@ class LevenbergMarquardt(nn.Module):
         self.iterations = self.iterations + 1
         if int(self.iterations) % _WINDOW == 0:
             gain = self.window_cost - self.cost
-            self.moving = self.moving & (gain > CONVERGED_SHARE * self.cost) & (gain > CONVERGED_COST)
+            self.moving = (
+                self.moving & (gain > CONVERGED_SHARE * self.cost) & (gain > CONVERGED_COST_DECREASE)
+            )
             self.window_cost = self.cost.clone()
 
     def _remember(self, patterns: Patterns, residual: Tensor, changed: Tensor) -> None:

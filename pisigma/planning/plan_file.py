@@ -23,7 +23,7 @@ from pisigma.planning.surroundings.arm_in_surroundings import ArmInSurroundings
 from pisigma.planning.surroundings.surroundings import Surroundings
 from pisigma.robot.description import Robot
 from pisigma.robot.robot_file import RobotDocument
-from pisigma.robot.row import Bounded
+from pisigma.robot.row import BoundedFloat
 from pisigma.robot.writing import robot_document
 
 YAML_SUFFIX = ".plan.yaml"
@@ -39,7 +39,7 @@ class Waypoint(Section):
     """
 
     before: int = Field(ge=1)
-    joints: tuple[Bounded, ...]
+    joints: tuple[BoundedFloat, ...]
 
 
 class PlanDocument(Section):

@@ -29,7 +29,7 @@ def chart_table(charts: Sequence[Chart]) -> Table:
 
 def _chart_row(chart: Chart) -> tuple[str, ...]:
     last = float(chart.values[-1])
-    shares = (f"{float(share[-1]):.2f}" for share in (chart.ewma_share, chart.cusum_share))
+    shares = (f"{float(share[-1]):.2f}" for share in (chart.ewma_of_limit, chart.cusum_of_limit))
     value = f"{last:z.4f}" if last == last else "unobservable"
     return (chart.what, value, chart.unit, *shares, " and ".join(chart.kinds) or "no")
 

@@ -9,7 +9,7 @@ from pydantic import Field
 from pisigma.files.errors import RobotError, nearest_choice
 from pisigma.files.yaml_file import Section
 from pisigma.robot.coupling import Coupling, FourBar, dh_limits
-from pisigma.robot.row import MAX_MAGNITUDE, Bounded, Row
+from pisigma.robot.row import MAX_MAGNITUDE, BoundedFloat, Row
 
 
 class FourBarSection(Section):
@@ -27,7 +27,7 @@ class FourBarSection(Section):
     crank_mm: float = Field(gt=0, le=MAX_MAGNITUDE)
     coupler_mm: float = Field(gt=0, le=MAX_MAGNITUDE)
     rocker_mm: float = Field(gt=0, le=MAX_MAGNITUDE)
-    zero_deg: Bounded
+    zero_deg: BoundedFloat
 
     def to_si(self) -> FourBar:
         """Return the linkage in SI units."""
@@ -52,12 +52,12 @@ class CoupledJointSection(Section):
     """
 
     joint: str
-    factors: dict[str, Bounded] = Field(min_length=1)
-    offset_deg: Bounded = 0.0
-    offset_mm: Bounded = 0.0
+    factors: dict[str, BoundedFloat] = Field(min_length=1)
+    offset_deg: BoundedFloat = 0.0
+    offset_mm: BoundedFloat = 0.0
     four_bar: FourBarSection | None = None
-    limits_deg: tuple[Bounded, Bounded] | None = None
-    limits_mm: tuple[Bounded, Bounded] | None = None
+    limits_deg: tuple[BoundedFloat, BoundedFloat] | None = None
+    limits_mm: tuple[BoundedFloat, BoundedFloat] | None = None
 
 
 def rows_and_coupling(

@@ -13,10 +13,10 @@ from pisigma.files.errors import RobotError, UnknownRobotError, nearest_choice
 from pisigma.files.yaml_file import Section, parse_yaml, read_yaml
 from pisigma.robot.coupling_section import CoupledJointSection, rows_and_coupling
 from pisigma.robot.robot_fields import RobotFields
-from pisigma.robot.row import MAX_ROWS, Bounded, JointType, Row
+from pisigma.robot.row import MAX_ROWS, BoundedFloat, JointType, Row
 from pisigma.robot.urdf_frames import frame_of, rotation, translation, xyzrpy_of
 
-Limits = Annotated[tuple[Bounded, Bounded], Field(description="lower and upper")]
+Limits = Annotated[tuple[BoundedFloat, BoundedFloat], Field(description="lower and upper")]
 
 
 class ParameterSection(Section):
@@ -30,11 +30,11 @@ class ParameterSection(Section):
         beta_deg: rotation about y, for nearly parallel axes [deg].
     """
 
-    theta_deg: Bounded = 0.0
-    d_mm: Bounded = 0.0
-    a_mm: Bounded = 0.0
-    alpha_deg: Bounded = 0.0
-    beta_deg: Bounded = 0.0
+    theta_deg: BoundedFloat = 0.0
+    d_mm: BoundedFloat = 0.0
+    a_mm: BoundedFloat = 0.0
+    alpha_deg: BoundedFloat = 0.0
+    beta_deg: BoundedFloat = 0.0
 
     def to_si(self) -> Float64[np.ndarray, " 5"]:
         """Return the parameters in the order of `DH_COLUMNS` [rad or m]."""
@@ -50,7 +50,7 @@ class RowSection(ParameterSection):
     direction: Literal[1, -1] = 1
     limits_deg: Limits | None = None
     limits_mm: Limits | None = None
-    drawn_at_mm: tuple[Bounded, Bounded, Bounded] = (0.0, 0.0, 0.0)
+    drawn_at_mm: tuple[BoundedFloat, BoundedFloat, BoundedFloat] = (0.0, 0.0, 0.0)
 
     @model_validator(mode="after")
     def _limits_fit_type(self) -> "RowSection":
@@ -97,12 +97,12 @@ class FrameSection(Section):
         yaw_deg: rotation about x [deg].
     """
 
-    x_mm: Bounded = 0.0
-    y_mm: Bounded = 0.0
-    z_mm: Bounded = 0.0
-    roll_deg: Bounded = 0.0
-    pitch_deg: Bounded = 0.0
-    yaw_deg: Bounded = 0.0
+    x_mm: BoundedFloat = 0.0
+    y_mm: BoundedFloat = 0.0
+    z_mm: BoundedFloat = 0.0
+    roll_deg: BoundedFloat = 0.0
+    pitch_deg: BoundedFloat = 0.0
+    yaw_deg: BoundedFloat = 0.0
 
     def to_si(self) -> np.ndarray:
         """Return x, y, z [m], roll, pitch, yaw [rad]."""

@@ -19,7 +19,7 @@ FRAME_COLUMNS = ("x", "y", "z", "roll", "pitch", "yaw")
 MAX_MAGNITUDE = 1e9
 """Largest magnitude of any number of a robot, pose or measurement, in the unit of the file (mm or deg)."""
 
-Bounded = Annotated[float, Field(ge=-MAX_MAGNITUDE, le=MAX_MAGNITUDE)]
+BoundedFloat = Annotated[float, Field(ge=-MAX_MAGNITUDE, le=MAX_MAGNITUDE)]
 """A number in a robot file, finite and of limited magnitude."""
 
 MAX_ROWS = 1000

@@ -87,7 +87,7 @@ class UntrustedSession:
 
 
 @dataclass(frozen=True, eq=False)
-class Monitoring:
+class MonitoringResult:
     """Result of `monitor`: sessions of a robot, and its changes over the months.
 
     Attributes:
@@ -227,7 +227,7 @@ def monitor(
     sessions: Sequence[Measurements | str | os.PathLike[str]],
     settings: MonitorSettings = MonitorSettings(),
     progress: Progress = lambda what: None,
-) -> Monitoring:
+) -> MonitoringResult:
     """Determine for every session whether the robot is unchanged or what moved, and chart all sessions.
 
     Args:
@@ -294,7 +294,7 @@ def monitor(
             if not is_date(one.date)
         ]
         records = tuple(one for one in records if is_date(one.date))
-    return Monitoring(
+    return MonitoringResult(
         model=loaded,
         sessions=new,
         records=records,

@@ -10,7 +10,7 @@ from pisigma.reporting.derived_cards import candidate_names, candidate_table
 from pisigma.reporting.lifetime_tables import chart_table, session_table
 from pisigma.reporting.result_text import ResultText, sentences, table_block
 from pisigma.reporting.verdict import Verdict, count_text, rounded, uncapitalised
-from pisigma.workflow.monitor import Monitoring
+from pisigma.workflow.monitor import MonitoringResult
 from pisigma.workflow.plan import Plan
 from pisigma.workflow.recalibrate import Recalibration
 from pisigma.workflow.report import Report
@@ -165,7 +165,7 @@ def _errors(name: str, rms: float, p95: float) -> str:
     return "" if rms != rms else f"{name} {rounded(rms * 1e3)} and {rounded(p95 * 1e3)} mm"
 
 
-def monitoring_text(monitoring: Monitoring, closing: Sequence[str] = ()) -> ResultText:
+def monitoring_text(monitoring: MonitoringResult, closing: Sequence[str] = ()) -> ResultText:
     """Lay out a monitoring: the verdict, a line for every session, and the conclusions from all sessions.
 
     Args:
@@ -196,7 +196,7 @@ def monitoring_text(monitoring: Monitoring, closing: Sequence[str] = ()) -> Resu
     )
 
 
-def _monitoring_verdict(monitoring: Monitoring, advice: str) -> Verdict:
+def _monitoring_verdict(monitoring: MonitoringResult, advice: str) -> Verdict:
     """Judge a robot by its sessions; `advice` states how to recalibrate it if that pays."""
     sessions, untrusted = monitoring.sessions, len(monitoring.untrusted)
     changed = [one for one in sessions if one.session.verdict != "unchanged"]

@@ -48,7 +48,7 @@ def test_a_representable_target_is_met_exactly_and_the_solver_stops(orders, gene
 
 @pytest.mark.parametrize("ridge", [0.0, 1e-3])
 def test_the_cost_is_scipys_or_lower_from_the_same_start(ridge, generator, monkeypatch):
-    for name in ("CONVERGED_SHARE", "CONVERGED_COST"):
+    for name in ("CONVERGED_SHARE", "CONVERGED_COST_DECREASE"):
         monkeypatch.setattr(levenberg_marquardt, name, 0.0)
     network = truth((1, 2), generator)
     data = patterns(network, generator, noise=0.1)

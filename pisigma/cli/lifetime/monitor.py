@@ -17,7 +17,7 @@ from pisigma.workflow.settings.monitoring import MonitorSettings
 if TYPE_CHECKING:
     from pisigma.lifetime.cell.status import CellStatus
     from pisigma.workflow.cell.cell import Cell
-    from pisigma.workflow.monitor import Monitoring
+    from pisigma.workflow.monitor import MonitoringResult
 
 Sessions = Annotated[
     list[Path] | None,
@@ -82,7 +82,7 @@ def _monitor_cell(
 
 
 def _print(
-    monitoring: "Monitoring",
+    monitoring: "MonitoringResult",
     page: Path | None,
     as_json: bool,
     verbose: bool,

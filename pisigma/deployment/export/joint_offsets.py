@@ -60,13 +60,13 @@ def fit_joint_offsets(model: CalibratedModel) -> JointOffsets:
     )
 
 
-def offsets_between(nominal: Robot, moved: Robot) -> Float64[np.ndarray, " axes"]:
-    """Return offsets of the zero positions of a robot from nominal, per axis of the controller [rad or m].
+def offsets_between(nominal: Robot, corrected: Robot) -> Float64[np.ndarray, " axes"]:
+    """Return offsets of the zero positions of a corrected robot from nominal, per axis of the controller [rad or m].
 
     Raises:
         RobotError: see `joints_by_axes`.
     """
-    change = (moved.dh - nominal.dh).reshape(-1)[list(joint_offsets(nominal))]
+    change = (corrected.dh - nominal.dh).reshape(-1)[list(joint_offsets(nominal))]
     offsets: np.ndarray = np.linalg.solve(joints_by_axes(nominal), change)
     return offsets
 

@@ -89,7 +89,7 @@ def fleet_prior(name: str, robot: Robot, fleet: Sequence[Measurements]) -> Fleet
         )
     posterior = RobotPosterior.from_robot(robot)
     space = posterior.uncertainty.space
-    first = population = class_population(robot)
+    first = population = robot_class_population(robot)
     usual = first.covariance.diagonal()
     noise = CalibrationNoise({"position": Instrument().sigma})
     odd: tuple[int, ...] = ()
@@ -104,7 +104,7 @@ def fleet_prior(name: str, robot: Robot, fleet: Sequence[Measurements]) -> Fleet
     return FleetPrior(model, population, space.names[: space.arm_size], odd)
 
 
-def class_population(robot: Robot) -> Population:
+def robot_class_population(robot: Robot) -> Population:
     """Return the distribution of errors of a robot's class, see `pisigma.robot.robot_class`."""
     uncertainty = RobotPosterior.from_robot(robot).uncertainty
     usual = select_arm_rows(uncertainty.root, uncertainty.space).square().sum(1)
@@ -260,7 +260,7 @@ class FleetConsistency:
         evidence = evidence_of(model, mean, rows)
         fleet = Population(mean, root @ root.t(), posterior.space.arm_size)
         square, count = fleet.squared_distance(evidence)
-        gain = fleet.log_evidence(evidence) - class_population(nominal).log_evidence(evidence)
+        gain = fleet.log_evidence(evidence) - robot_class_population(nominal).log_evidence(evidence)
         return FleetConsistency(float(chi2.sf(square, count)), gain)
 
     @property

@@ -28,7 +28,7 @@ class CommonFigures(Section):
     deviation: float
 
 
-class SpectrumFigures(Section):
+class WeightSpreadFigures(Section):
     """Standard deviation between robots of the weights of a feature.
 
     Attributes:
@@ -61,7 +61,7 @@ class FleetPriorSummary(AbstractSummary):
     remarks: tuple[str, ...] = ()
     rows: int
     parameters: tuple[CommonFigures, ...]
-    spectrum: tuple[SpectrumFigures, ...]
+    spectrum: tuple[WeightSpreadFigures, ...]
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -93,7 +93,7 @@ def summarise_prior(prior: FleetPrior, ids: Sequence[str]) -> FleetPriorSummary:
         start += len(group)
         for number, what in enumerate(feature.group_names):
             size = float(chosen[group == number].square().mean().sqrt())
-            spectrum.append(SpectrumFigures(group=f"{feature.name}: {what}", deg=math.degrees(size)))
+            spectrum.append(WeightSpreadFigures(group=f"{feature.name}: {what}", deg=math.degrees(size)))
     return FleetPriorSummary(
         robots=len(ids) - len(prior.odd),
         odd=tuple(ids[number] for number in prior.odd),

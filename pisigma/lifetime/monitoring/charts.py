@@ -84,19 +84,19 @@ class Chart:
         return torch.tensor(sums, dtype=torch.float64).reshape(-1, 2)
 
     @property
-    def ewma_share(self) -> Float64[Tensor, " sessions"]:
+    def ewma_of_limit(self) -> Float64[Tensor, " sessions"]:
         """Ratio of the moving average to its limit; a value above 1 is an alarm."""
         return (self.ewma if self.one_sided else self.ewma.abs()) / self.limits.ewma
 
     @property
-    def cusum_share(self) -> Float64[Tensor, " sessions"]:
+    def cusum_of_limit(self) -> Float64[Tensor, " sessions"]:
         """Ratio of the larger cumulative sum to its limit; a value above 1 is an alarm."""
         return (self.cusum[:, 0] if self.one_sided else self.cusum.amax(1)) / self.limits.cusum
 
     @cached_property
     def sessions_outside(self) -> dict[AlarmKind, Bool[Tensor, " sessions"]]:
         """Sessions at which each statistic is outside its limit."""
-        return {"EWMA": self.ewma_share > 1, "CUSUM": self.cusum_share > 1}
+        return {"EWMA": self.ewma_of_limit > 1, "CUSUM": self.cusum_of_limit > 1}
 
     @property
     def alarm(self) -> int | None:
@@ -120,8 +120,8 @@ class Chart:
             f"values_{self.unit}": self.values,
             f"deviations_{self.unit}": self.deviations,
             "scores": self.scores,
-            "ewma_of_limit": self.ewma_share,
-            "cusum_of_limit": self.cusum_share,
+            "ewma_of_limit": self.ewma_of_limit,
+            "cusum_of_limit": self.cusum_of_limit,
         }
         numbers = {
             name: [None if math.isnan(one) else one for one in those.tolist()]

@@ -40,7 +40,7 @@ def names_images(path: str | os.PathLike[str]) -> bool:
     return "image" in read_table(path).header
 
 
-def join_joints(
+def join_joint_values(
     names: Sequence[str], path: str | os.PathLike[str], within: float, stops: int = 0
 ) -> JoinedJoints:
     """Return the joint values at which every image was taken.

@@ -13,7 +13,7 @@ Unit = str
 _Values = Float64[Tensor, "rows values"]
 _Rotations = Float64[Tensor, "rows 3 3"]
 
-MAX_SKEWNESS = 1e-3
+ORTHONORMALITY_TOLERANCE = 1e-3
 """Largest deviation of `R^T R` of a matrix from the identity, and of the squared norm of a quaternion from 1."""
 
 
@@ -50,7 +50,9 @@ class RotationEncoding:
             return values.isfinite().all(1)
         R = values.reshape(-1, 3, 3) if len(self.values) == 9 else values[:, :, None]
         identity = torch.eye(R.shape[2], dtype=R.dtype)
-        orthonormal = ((R.mT @ R - identity).abs().amax((1, 2)) < MAX_SKEWNESS) & values.isfinite().all(1)
+        orthonormal = (
+            (R.mT @ R - identity).abs().amax((1, 2)) < ORTHONORMALITY_TOLERANCE
+        ) & values.isfinite().all(1)
         return orthonormal & (torch.linalg.det(R) > 0) if len(self.values) == 9 else orthonormal
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pisigma.files.errors import PoseError, check_choice
-from pisigma.model.inverse.joint_input import fault_error, joint_rows, numbers
+from pisigma.model.inverse.joint_input import as_float_array, fault_error, joint_rows
 from pisigma.model.inverse.solution import AbstractInverse, Solution
 from pisigma.robot.kernels import arrays
 from pisigma.robot.kernels.array_kinematics import address_of
@@ -119,7 +119,7 @@ class CompiledIK:
         Raises:
             PoseError: the matrix is not a valid pose, a shape is wrong, or the branch is unknown.
         """
-        T = numbers(T_base_tool, "T_base_tool", throw)
+        T = as_float_array(T_base_tool, "T_base_tool", throw)
         if T.shape != (4, 4):
             raise PoseError(
                 expected="one homogeneous transform of shape (4, 4)", value=T.shape, option="T_base_tool"
@@ -367,7 +367,7 @@ class CompiledIK:
         return self.branches.index(name)
 
     def _poses(self, T_base_tool: Any, throw: bool) -> Any:
-        T = numbers(T_base_tool, "T_base_tool", throw)
+        T = as_float_array(T_base_tool, "T_base_tool", throw)
         if T.ndim < 2 or T.shape[-2:] != (4, 4):
             raise PoseError(
                 expected="homogeneous transforms of shape (*batch, 4, 4)", value=T.shape, option="T_base_tool"

@@ -80,7 +80,7 @@ def pose_array(values: Any) -> tuple[Any, bool, Any]:
     return T, given.dtype == np.float32, tensor
 
 
-def numbers(values: Any, what: str, throw: bool) -> Any:
+def as_float_array(values: Any, what: str, throw: bool) -> Any:
     """Return values as a contiguous float64 array, without a copy if possible.
 
     Values that are not numbers become NaN with `throw` False.
@@ -101,9 +101,9 @@ def joint_rows(values: Any, batch: tuple[int, ...], what: str, throw: bool, join
     """Return joint values or approach directions with the shape `(1 or poses, dof)`.
 
     Raises:
-        PoseError: the shape does not match the joints or the poses, or the values are not numbers, see `numbers`.
+        PoseError: the shape does not match the joints or the poses, or the values are not numbers (`as_float_array`).
     """
-    rows, dof = numbers(values, what, throw), len(joints)
+    rows, dof = as_float_array(values, what, throw), len(joints)
     if rows.shape[-1:] != (dof,):
         raise PoseError(
             f"expected {dof} columns, got shape {rows.shape}",

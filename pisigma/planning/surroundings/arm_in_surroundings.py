@@ -60,7 +60,7 @@ class ArmInSurroundings:
         robot: nominal robot with the reflector as its tool.
         surroundings: surroundings of the robot.
         capsules: capsules along the links.
-        pairs: pairs of capsules that may touch each other.
+        capsule_pairs: pairs of capsules that may touch each other.
         room: distance to keep between the capsules of each pair [m].
         beam_blockers: capsules that may block the tracker's beam: not those of the link with the reflector, and not
             those so near to the reflector that they touch every beam.
@@ -71,7 +71,7 @@ class ArmInSurroundings:
     robot: Robot
     surroundings: Surroundings
     capsules: Capsules
-    pairs: Int64[Tensor, "pairs 2"]
+    capsule_pairs: Int64[Tensor, "pairs 2"]
     room: Float64[Tensor, " pairs"]
     beam_blockers: Int64[Tensor, " pieces"]
     limits: Float64[Tensor, "axes 2"]
@@ -120,7 +120,7 @@ class ArmInSurroundings:
         usual = self.surroundings.model_copy(update={"links": LinkSection(), "tool": tool}).capsules(
             self.nominal
         )
-        looked_at = set(map(tuple, self.pairs.tolist()))
+        looked_at = set(map(tuple, self.capsule_pairs.tolist()))
         lost = [
             pair
             for pair in usual.pairs_to_check(self.surroundings.clearance / 2).tolist()
@@ -201,7 +201,7 @@ class ArmInSurroundings:
 
     def _apart(self, segments: Float64[Tensor, "poses pieces 2 3"]) -> Float64[Tensor, "poses pairs"]:
         """Compute the distance between the capsules of every pair [m]."""
-        first, second = self.pairs.unbind(-1)
+        first, second = self.capsule_pairs.unbind(-1)
         radius = self.capsules.radius
         return segment_distance(segments[:, first], segments[:, second]) - radius[first] - radius[second]
 

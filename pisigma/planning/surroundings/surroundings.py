@@ -14,13 +14,13 @@ from pisigma.files.yaml_file import Section, place_of_key, read_yaml
 from pisigma.planning.surroundings.capsules import TOOL_RADIUS, Capsules
 from pisigma.robot.description import Robot
 from pisigma.robot.robot_file import FrameSection, Limits
-from pisigma.robot.row import Bounded
+from pisigma.robot.row import BoundedFloat
 from pisigma.robot.se3 import rotation_from_rpy, transform_from_xyzrpy, xyzrpy_from_transform
 from pisigma.simulation.errors.source import stated_joints
 
-Positive = Annotated[Bounded, Field(gt=0)]
-NotNegative = Annotated[Bounded, Field(ge=0)]
-Point = tuple[Bounded, Bounded, Bounded]
+Positive = Annotated[BoundedFloat, Field(gt=0)]
+NotNegative = Annotated[BoundedFloat, Field(ge=0)]
+Point = tuple[BoundedFloat, BoundedFloat, BoundedFloat]
 
 
 class JointSection(Section):
@@ -81,7 +81,7 @@ class Box(Section):
     name: str = Field(min_length=1)
     center_mm: Point
     size_mm: tuple[Positive, Positive, Positive]
-    yaw_deg: Bounded = 0.0
+    yaw_deg: BoundedFloat = 0.0
 
     @property
     def center(self) -> Float64[Tensor, " 3"]:
@@ -134,9 +134,9 @@ class TrackerSection(Section):
         z_mm: position along z [mm].
     """
 
-    x_mm: Bounded
-    y_mm: Bounded
-    z_mm: Bounded
+    x_mm: BoundedFloat
+    y_mm: BoundedFloat
+    z_mm: BoundedFloat
 
     @property
     def position(self) -> Float64[Tensor, " 3"]:
@@ -258,7 +258,7 @@ class Surroundings(Section):
     """
 
     clearance_mm: NotNegative = 20.0
-    floor_mm: Bounded | None = None
+    floor_mm: BoundedFloat | None = None
     joints: JointSection = JointSection()
     boxes: tuple[Box, ...] = Field(default=(), max_length=100)
     links: LinkSection = LinkSection()

@@ -185,16 +185,16 @@ def draw_statistics(chart: Chart, days: Sequence[datetime.date], marks: Sequence
     with drawing_style():
         figure, axes = make_panel()
         for share, name, color, line in (
-            (chart.ewma_share, "EWMA", AFTER, "o-"),
-            (chart.cusum_share, "CUSUM", OTHER, "s--"),
+            (chart.ewma_of_limit, "EWMA", AFTER, "o-"),
+            (chart.cusum_of_limit, "CUSUM", OTHER, "s--"),
         ):
             axes.plot(days, share.numpy(), line, color=color, label=name, markersize=3.5)  # type: ignore[arg-type]
         axes.axhline(1.0, color=BEFORE, linewidth=1.2, label="limit")
         _mark(axes, marks, days)
-        axes.set(ylabel="share of the limit", ylim=(min(0.0, float(chart.ewma_share.min()) * 1.1), None))
+        axes.set(ylabel="share of the limit", ylim=(min(0.0, float(chart.ewma_of_limit.min()) * 1.1), None))
         axes.legend(ncols=3, loc="lower left", bbox_to_anchor=(0, 1), borderaxespad=0.1)
         _dates(axes)
-    largest = float(np.maximum(chart.ewma_share.numpy()[-1], chart.cusum_share.numpy()[-1]))
+    largest = float(np.maximum(chart.ewma_of_limit.numpy()[-1], chart.cusum_of_limit.numpy()[-1]))
     alt = (
         f"EWMA and CUSUM of {chart.what} over their limits; the larger is {largest:.2f} at the last session."
     )

@@ -24,12 +24,12 @@ class LostMotion:
 
     Attributes:
         play: backlash of the joints by their index [rad or m].
-        factor: errors of the rows over those without the backlash [1].
+        error_ratio: errors of the rows over those without the backlash [1].
         log_bayes_factor: logarithm of the odds of backlash in these joints against none.
     """
 
     play: dict[int, float]
-    factor: float
+    error_ratio: float
     log_bayes_factor: float
 
 
@@ -115,7 +115,7 @@ def unstated_backlash(calibrator: GeometricCalibrator, rows: Measurements) -> Di
     except IdentificationError:
         return None  # the calibration itself refuses these rows
     found = None if ordered is None else find_backlash(ordered, rows)
-    if ordered is None or found is None or found.log_bayes_factor < LIKELY or found.factor < NOTICED:
+    if ordered is None or found is None or found.log_bayes_factor < LIKELY or found.error_ratio < NOTICED:
         return None
     lag = find_lag(ordered, rows)
     if lag is not None and lag.log_bayes_factor > found.log_bayes_factor:
@@ -137,14 +137,14 @@ def _diagnostic(robot: Robot, rows: Measurements, found: LostMotion) -> Diagnost
         severity="warning",
         sentence=f"{joints_text(joints).capitalize()}: a backlash of about "
         f"{join_words(f'{size:.2g} {unit}' for size, unit in sizes)}, because the errors depend on the direction of "
-        f"the last motion, which makes them {found.factor:.3g} times as large. The directions were taken from the "
+        f"the last motion, which makes them {found.error_ratio:.3g} times as large. The directions were taken from the "
         "order "
         "of the rows, and errors of held-out rows are errors with known directions; without them, commanded poses have "
         f"further errors of {length_text(error)} RMS. {remedy}",
         cause="unstated",
         values={
             "joints": tuple(joint + 1 for joint in joints),
-            "factor": found.factor,
+            "factor": found.error_ratio,
             "log_odds": found.log_bayes_factor,
             "error_mm": error * 1e3,
         }

@@ -64,17 +64,17 @@ def setup_diagnostics(robot: Robot, rows: Measurements) -> tuple[Diagnostic, ...
     return ()
 
 
-def check_setup_of_rows(judged: RowsUnderModel) -> Iterator[Diagnostic]:
+def check_setup_of_rows(rows: RowsUnderModel) -> Iterator[Diagnostic]:
     """Look for setup faults that explain the errors of a model; see `find_setup_faults`.
 
     A moved base, tool or zero of one joint is not a fault if it may have moved. If base and tool may not have moved,
     their motion is reported even if it is small.
     """
-    if judged.has_large_errors:
-        faults = judged.setup_faults
+    if rows.has_large_errors:
+        faults = rows.setup_faults
     else:
-        faults = () if {"frame", "tool"} <= judged.may_move else judged.moved_frames
-    if faults and not any(map(judged.is_allowed_motion, faults)):
+        faults = () if {"frame", "tool"} <= rows.may_move else rows.moved_frames
+    if faults and not any(map(rows.is_allowed_motion, faults)):
         yield combine_alternatives(faults).diagnostic()
 
 

@@ -39,13 +39,13 @@ class BinTest:
         p: probability of such differences by chance.
         low: smallest RMS error of a bin.
         high: largest RMS error of a bin, in the unit of the errors.
-        edges: joint values that bound the bin with the largest RMS error, in the unit of the joint.
+        worst_bin_edges: joint values that bound the bin with the largest RMS error, in the unit of the joint.
     """
 
     p: float
     low: float
     high: float
-    edges: tuple[float, float]
+    worst_bin_edges: tuple[float, float]
 
     @property
     def significant(self) -> bool:

@@ -6,7 +6,7 @@ from pydantic import Field, field_validator
 
 from pisigma.files.yaml_file import Section
 from pisigma.measurement.dates import EXPECTED_DATE, is_date
-from pisigma.robot.row import Bounded
+from pisigma.robot.row import BoundedFloat
 
 
 class Instrument(Section):
@@ -25,8 +25,8 @@ class Instrument(Section):
     serial: str | None = None
     certificate: str | None = None
     calibrated: str | None = None
-    expanded_uncertainty_mm: Annotated[Bounded, Field(gt=0)] | None = None
-    coverage_factor: Annotated[Bounded, Field(ge=1, le=10)] | None = None
+    expanded_uncertainty_mm: Annotated[BoundedFloat, Field(gt=0)] | None = None
+    coverage_factor: Annotated[BoundedFloat, Field(ge=1, le=10)] | None = None
 
     @field_validator("calibrated")
     @classmethod

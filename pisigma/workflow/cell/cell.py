@@ -42,7 +42,7 @@ from pisigma.workflow.cell.new_files import free_path, save_new
 from pisigma.workflow.cell.sessions import Sessions
 from pisigma.workflow.cell.setup_names import ModelRows
 from pisigma.workflow.evaluate import Evaluation, evaluate
-from pisigma.workflow.monitor import Monitoring, monitor
+from pisigma.workflow.monitor import MonitoringResult, monitor
 from pisigma.workflow.plan import Plan, plan
 from pisigma.workflow.recalibrate import Recalibration, recalibrate
 from pisigma.workflow.settings.calibration import CalibrationSettings
@@ -251,7 +251,7 @@ class Cell:
             self.history.add(Use(entry.name, now(), f"verified with session '{chosen.name}'"))
         return found, entry
 
-    def monitor(self, progress: Progress = lambda what: None, **changed: Any) -> Monitoring:
+    def monitor(self, progress: Progress = lambda what: None, **changed: Any) -> MonitoringResult:
         """Compare every session that is newer than the model in use with this model, to detect moved parts.
 
         Args:
@@ -267,7 +267,7 @@ class Cell:
         """
         entry = self._candidate(None)
         warnings, sessions = self.controller_warnings("monitor", entry), self.sessions.new_to(entry)
-        found: Monitoring | None = None
+        found: MonitoringResult | None = None
         for one in sessions:
             seen = self.sessions.rows_with_model_names(entry, self.sessions.as_measured(one), one.day)
             moved = {"moved": ",".join(seen.moved)} if seen.moved else {}

@@ -23,7 +23,7 @@ from pisigma.planning.surroundings.arm_in_surroundings import ArmInSurroundings
 from pisigma.planning.surroundings.surroundings import Surroundings
 from pisigma.robot.description import Robot
 from pisigma.robot.robot_file import robot_file
-from pisigma.robot.row import Bounded
+from pisigma.robot.row import BoundedFloat
 from pisigma.validation.uncertainty.instrument import Instrument
 from pisigma.workflow.settings.calibration import CalibrationSettings
 from pisigma.workflow.settings.comparison import ComparisonSettings
@@ -81,8 +81,8 @@ class CameraSection(Section):
     board: tuple[str, ...]
     fixed_camera: bool = False
     intrinsics: Literal["fixed", "prior", "free"] = "prior"
-    repeatability_mm: Annotated[Bounded, Field(ge=0)] = 0.02
-    repeatability_deg: Annotated[Bounded, Field(ge=0)] = 0.01
+    repeatability_mm: Annotated[BoundedFloat, Field(ge=0)] = 0.02
+    repeatability_deg: Annotated[BoundedFloat, Field(ge=0)] = 0.01
 
 
 class CellDocument(Section):
@@ -118,11 +118,11 @@ class CellDocument(Section):
     base: str | None = None
     tip: str | None = None
     sensor: SensorName = "tracker"
-    limit_mm: Annotated[Bounded, Field(gt=0)] | None = None
+    limit_mm: Annotated[BoundedFloat, Field(gt=0)] | None = None
     joint_values: Literal["commanded", "measured"] = "commanded"
     instrument: Instrument | None = None
-    pose_repeatability_mm: Annotated[Bounded, Field(gt=0)] | None = None
-    expansion_per_k: Annotated[Bounded, Field(ge=0, le=1e-3)] | None = None
+    pose_repeatability_mm: Annotated[BoundedFloat, Field(gt=0)] | None = None
+    expansion_per_k: Annotated[BoundedFloat, Field(ge=0, le=1e-3)] | None = None
     camera: CameraSection | None = None
     surroundings: Surroundings | None = None
     plan: _Steps = None

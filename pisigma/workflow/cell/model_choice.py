@@ -20,7 +20,7 @@ from pisigma.workflow.cell.sessions import Sessions
 from pisigma.workflow.cell.setup_names import ModelRows, newest_day, setup_name
 from pisigma.workflow.evaluate import evaluate
 from pisigma.workflow.frames.calibrate_frame import FrameCalibration
-from pisigma.workflow.monitor import Monitoring
+from pisigma.workflow.monitor import MonitoringResult
 from pisigma.workflow.recalibrate import Recalibration, recalibrate
 from pisigma.workflow.settings.calibration import WITH_PRIOR, CalibrationSettings
 from pisigma.workflow.settings.evaluation import EvaluationSettings
@@ -111,7 +111,7 @@ def _of_day(values: Mapping[str, Value], day: str) -> dict[str, Value]:
 
 
 def check_entry(
-    found: Monitoring,
+    found: MonitoringResult,
     entry: ModelEntry,
     session: SessionEntry,
     seen: ModelRows,

@@ -14,7 +14,7 @@ from pisigma.measurement.camera.camera import Camera
 from pisigma.measurement.camera.detection.detected_boards import DetectedBoards, predict_boards
 from pisigma.measurement.camera.detection.detector import detect_boards, image_files
 from pisigma.measurement.camera.detection.video import is_frame
-from pisigma.measurement.foreign.image_joints import JoinedJoints, join_joints, names_images
+from pisigma.measurement.foreign.image_joints import JoinedJoints, join_joint_values, names_images
 from pisigma.reporting.result_text import Table
 from pisigma.workflow.settings.images import DetectionSettings
 
@@ -109,7 +109,7 @@ def detect(
         images: image files, folders of them, or videos of an arm that stops at every pose.
         board: file of the board; see `Board.load`.
         camera: file of the camera; see `Camera.load`.
-        joints: CSV file of the joint values of the images; see `join_joints`. None: added later.
+        joints: CSV file of the joint values of the images; see `join_joint_values`. None: added later.
         settings: see `DetectionSettings`.
         progress: called with the name of every image.
 
@@ -128,7 +128,7 @@ def detect(
             remedy="use a board with an odd sum of rows and columns, or a ChArUco board",
         )
     names, stops = [file.stem for file in files], sum(map(is_frame, files))
-    joined = None if joints is None else join_joints(names, joints, settings.within, stops)
+    joined = None if joints is None else join_joint_values(names, joints, settings.within, stops)
     detected = detect_boards(files, of_board, settings.most_blur, progress)
     result = DetectedCorners(
         predict_boards(detected, of_camera, of_board), joined, (of_camera.name, of_board.name)

@@ -8,7 +8,7 @@ from testing.lerobot_arm import DATA_SETS, MOTORS, RANGES, SO101
 from testing.refusals import refused
 
 from pisigma.files.errors import MeasurementError
-from pisigma.measurement.foreign.image_joints import join_joints
+from pisigma.measurement.foreign.image_joints import join_joint_values
 from pisigma.measurement.foreign.lerobot_dataset import joint_motors
 from pisigma.measurement.foreign.lerobot_log import read_joint_log
 from pisigma.measurement.foreign.lerobot_motors import check_values, motors_text
@@ -26,7 +26,7 @@ def test_the_joints_of_every_frame_are_found_by_the_name_of_its_image(layout, tm
     assert log.left_out == ("gripper.pos",)
     log.save(tmp_path / "joints.csv")
     images = [f"episode-{episode:06d}-frame-{frame:06d}" for episode in range(2) for frame in range(6)]
-    joined = join_joints(images, tmp_path / "joints.csv", within=0.2)
+    joined = join_joint_values(images, tmp_path / "joints.csv", within=0.2)
     values = np.array([joined.cells[image] for image in images], dtype=float)
     assert_close(values, recorded(layout)[:, :5] * 4095 / 4096, atol=1e-6)
 

@@ -229,7 +229,7 @@ def dependency_sentence(members: list[Parameter], coefficients: list[float]) -> 
     return f"{text} is identified, the single values are not"
 
 
-def additional_columns(information: Information, kept: int) -> list[int]:
+def additional_columns(information: Information, kept_count: int) -> list[int]:
     """Find columns that the data determine in addition to the kept columns.
 
     Nominal axes are exactly parallel or intersect exactly, but real axes do not, so dependencies of the nominal
@@ -238,18 +238,18 @@ def additional_columns(information: Information, kept: int) -> list[int]:
 
     Args:
         information: information on all candidates near the solution, with rows in standard deviations.
-        kept: number of leading columns that are already estimated.
+        kept_count: number of leading columns that are already estimated.
 
     Returns:
         Columns to add, the best determined first.
     """
     # Below the rows of the kept columns, the triangle contains the components orthogonal to these columns.
-    rest, left = information.jacobian[kept:, kept:], information.residual[kept:]
-    pivots = _pivots(rest, _VISIBLE * np.linalg.norm(information.jacobian[:, kept:], axis=0))
+    rest, left = information.jacobian[kept_count:, kept_count:], information.residual[kept_count:]
+    pivots = _pivots(rest, _VISIBLE * np.linalg.norm(information.jacobian[:, kept_count:], axis=0))
     clear = sum(size >= 1 / _CLEARLY_SEEN for _, size in pivots)
-    if _needed(rest[:, [i for i, _ in pivots]], left, information.values - kept):
+    if _needed(rest[:, [i for i, _ in pivots]], left, information.values - kept_count):
         clear = len(pivots)
-    return [kept + i for i, _ in pivots[:clear]]
+    return [kept_count + i for i, _ in pivots[:clear]]
 
 
 def _pivots(rest: np.ndarray, rounding: np.ndarray) -> list[tuple[int, float]]:

@@ -22,7 +22,7 @@ from pisigma.files.errors import RobotError
 from pisigma.files.yaml_file import Section, parse_yaml, yaml_text
 from pisigma.robot.chains import robot_of_origins
 from pisigma.robot.description import Robot
-from pisigma.robot.row import Bounded
+from pisigma.robot.row import BoundedFloat
 from pisigma.robot.urdf_frames import Frame, frame_of, rotation, translation, xyzrpy_of
 
 COLUMNS = ("x", "y", "z", "yaw", "pitch", "roll")
@@ -32,12 +32,12 @@ COLUMNS = ("x", "y", "z", "yaw", "pitch", "roll")
 class LinkSection(Section):
     """A joint's frame in that of the previous joint: x, y, z [m], roll about x, pitch about y, yaw about z [rad]."""
 
-    x: Bounded = 0.0
-    y: Bounded = 0.0
-    z: Bounded = 0.0
-    roll: Bounded = 0.0
-    pitch: Bounded = 0.0
-    yaw: Bounded = 0.0
+    x: BoundedFloat = 0.0
+    y: BoundedFloat = 0.0
+    z: BoundedFloat = 0.0
+    roll: BoundedFloat = 0.0
+    pitch: BoundedFloat = 0.0
+    yaw: BoundedFloat = 0.0
 
     def frame(self, as_urdf: bool) -> Frame:
         """Return the frame.

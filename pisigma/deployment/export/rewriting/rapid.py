@@ -28,7 +28,7 @@ from pisigma.deployment.export.rewriting.scan import (
     numbers_in,
     waypoint_groups,
 )
-from pisigma.measurement.foreign.rotations import MAX_SKEWNESS
+from pisigma.measurement.foreign.rotations import ORTHONORMALITY_TOLERANCE
 from pisigma.robot.se3 import rotation_from_quaternion, transform
 
 _Read = TypeVar("_Read", Pose, Frame)
@@ -258,7 +258,7 @@ def _not_normalised(text: str) -> str:
     """Return the reason why position and quaternion do not form a frame; "" if they form a frame."""
     quaternion = numbers_in(text)[3:]
     norm = math.hypot(*quaternion)
-    if abs(norm - 1) <= MAX_SKEWNESS:
+    if abs(norm - 1) <= ORTHONORMALITY_TOLERANCE:
         return ""
     written = ", ".join(f"{value:g}" for value in quaternion)
     return f"expected a quaternion of norm 1, got [{written}] with norm {norm:g}"

@@ -6,7 +6,7 @@ import pytest
 from testing.refusals import refused
 
 from pisigma.files.errors import MeasurementError
-from pisigma.measurement.foreign.image_joints import join_joints
+from pisigma.measurement.foreign.image_joints import join_joint_values
 
 
 def log(folder: Path, text: str) -> Path:
@@ -18,7 +18,7 @@ def test_by_name_with_or_without_extension(tmp_path: Path) -> None:
     path = log(
         tmp_path, "image,q1_deg,q2_deg,payload_kg,note\na/0001.png,1.5,2,3,\n0002,4.25,5,3,\n0009,7,8,3,\n"
     )
-    joined = join_joints(["0001", "0002", "0003"], path, 0.2)
+    joined = join_joint_values(["0001", "0002", "0003"], path, 0.2)
     assert joined.columns == ("q1_deg", "q2_deg", "payload_kg")
     assert joined.cells == {"0001": ("1.5", "2", "3"), "0002": ("4.25", "5", "3")}
     assert "line 3 (0003)" in joined.remarks[0]
@@ -28,7 +28,7 @@ def test_by_name_with_or_without_extension(tmp_path: Path) -> None:
 
 def test_by_time_in_seconds_and_nanoseconds(tmp_path: Path) -> None:
     path = log(tmp_path, "time,q1_deg\n1700000000.0,1\n1700000001.0,2\n1700000005.0,3\n")
-    joined = join_joints(["1700000001100000000", "1700000005.05", "1700000003.0"], path, 0.2)
+    joined = join_joint_values(["1700000001100000000", "1700000005.05", "1700000003.0"], path, 0.2)
     assert joined.cells == {"1700000001100000000": ("2",), "1700000005.05": ("3",)}
 
 
@@ -45,4 +45,4 @@ def test_invalid_logs_are_refused(
     tmp_path: Path, text: str, line: int | None, column: str | None, value: str
 ) -> None:
     with refused(MeasurementError, line=line, column=column, value=value):
-        join_joints(["0001"], log(tmp_path, text), 0.2)
+        join_joint_values(["0001"], log(tmp_path, text), 0.2)

@@ -9,7 +9,7 @@ from testing.closeness import assert_close
 from testing.refusals import refused
 
 from pisigma.files.errors import MeasurementError
-from pisigma.measurement.foreign.image_joints import join_joints
+from pisigma.measurement.foreign.image_joints import join_joint_values
 
 cv2 = pytest.importorskip("cv2", reason="opencv-python-headless is not installed")
 
@@ -65,14 +65,14 @@ def test_stops_are_paired_only_if_every_row_is_one(video, tmp_path):
     log = tmp_path / "joints.csv"
     log.write_text("image,q1_deg\n1,10\n2,20\n3,30\n")
     names = [file.stem for file in image_files([video])]
-    assert join_joints(names, log, 0.2, len(names)).cells == {
+    assert join_joint_values(names, log, 0.2, len(names)).cells == {
         "0001": ("10",),
         "0002": ("20",),
         "0003": ("30",),
     }
     log.write_text("image,q1_deg\n1,10\n2,20\n")
     with refused(MeasurementError, value=3):
-        join_joints(names, log, 0.2, len(names))
+        join_joint_values(names, log, 0.2, len(names))
 
 
 def test_files_without_stops_are_refused(tmp_path):
