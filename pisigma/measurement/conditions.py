@@ -23,7 +23,8 @@ TORQUE = "torque"
 """Key of `JointState.stated`: `(*batch, dof)`, measured torques of the drives [Nm; N for prismatic joints]; NaN if not
 given."""
 _TORQUE_STEP = 0.2
-"""Difference of torques, over their standard deviation in all rows, that is another load of the arm."""
+"""Difference of torques that is another load of the arm, over the standard deviation in all rows of the torque that
+varies most; a joint that gravity does not load varies by its noise only."""
 _MIN_MOTION = 1e-3
 """[rad or m] Smaller motions of a joint need not take up the play of its gear."""
 
@@ -96,7 +97,7 @@ def repeat_key(measurements: Measurements) -> Float64[Tensor, "rows _key"]:
         first = torch.full_like(group, len(group)).scatter_reduce(
             0, group, torch.arange(len(group), device=group.device), "amin"
         )
-        step = _TORQUE_STEP * torque.std(0, correction=0).clamp(min=_MIN_SPREAD)
+        step = _TORQUE_STEP * torque.std(0, correction=0).max().clamp(min=_MIN_SPREAD)
         columns.append(((torque - torque[first[group]]) / step).round())
     return torch.cat(columns, 1)
 

@@ -195,7 +195,9 @@ def test_a_folder_states_that_torques_are_modelled(tmp_path):
 def test_rows_with_another_load_are_not_repeats_of_a_pose_and_noise_of_torques_is_not_a_load():
     poses = measured(20, 3)
     rows = join([poses, poses, poses])
-    noise = 0.01 * poses.torque.std(0) * torch.from_numpy(np.random.default_rng(0).normal(size=(20, 6)))
+    noise = (
+        0.005 * poses.torque.std(0).max() * torch.from_numpy(np.random.default_rng(0).normal(size=(20, 6)))
+    )
     loaded = poses.torque + torch.tensor([0.0, 30.0, 10.0, 0.0, 0.0, 0.0], dtype=torch.float64)
     rows = dataclasses.replace(rows, torque=torch.cat([poses.torque, poses.torque + noise, loaded]))
     key = number_repeats(repeat_key(rows)).view(3, 20)
