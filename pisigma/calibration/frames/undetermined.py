@@ -25,6 +25,10 @@ determined.
 Noise that shifts the tool also turns it, by the shift over a lever of about 400 mm. These turns look like information,
 even on directions that no row determines, with a standard deviation of 400 mm per row whatever the noise is. Below
 60 mm per row, errors are at most 1.25 times the stated ones for 4 to 12 touches."""
+_LEVER = 400.0
+"""That lever [mm]. Noise shifts an estimate by about this, times the share of the information that it imitates."""
+_IMPROBABLE = 5.0
+"""Number of standard deviations, in addition to this shift, beyond which the rows contradict a value before."""
 _ROUNDING = 1e-9
 """Information on a direction over that on the best determined one below which it is a rounding error."""
 _CONTRADICTED = 3.0
@@ -81,6 +85,16 @@ class FrameDirections:
         length = vectors.norm(dim=0)
         return vectors / length, length
 
+    def distances(
+        self, solved: SolvedCalibration, before: Float64[Tensor, " parameters"]
+    ) -> Float64[Tensor, " frames"]:
+        """Return how far the values before are from a solution along every direction, in units of 1 mm and 1 mrad."""
+        space, units = solved.problem.space, torch.from_numpy(solved.problem.space.usual_errors)
+        vectors, length = self.in_user_coordinates(solved)
+        off = before - solved.geometry.values_of(space)
+        off = torch.where(space.is_length, off, wrap_to_pi(off)) / units
+        return (vectors.t() @ off) / length
+
 
 def hold_undetermined(
     solved: SolvedCalibration, frames: Sequence[int], bases: Frames, tools: Frames
@@ -88,7 +102,8 @@ def hold_undetermined(
     """Fit again with all directions held at the values before that the rows do not determine.
 
     A direction is not determined if its standard deviation is infinite, or larger than `_LARGEST_SPREAD` for the number
-    of rows unless the rows contradict its value before.
+    of rows unless the rows contradict its value before. The standard deviation of a held value includes its distance
+    from the estimate of the rows, because nothing else says how wrong it is.
 
     Args:
         solved: fit in which all coordinates were free.
@@ -101,10 +116,14 @@ def hold_undetermined(
     """
     found, space = FrameDirections.at_solution(solved, frames), solved.problem.space
     unknown = int(torch.isinf(found.deviation).sum())
-    weak = int((found.deviation * solved.problem.rows**0.5 > _LARGEST_SPREAD).sum())
-    before = values_before(space, bases, tools)
+    before, rows = values_before(space, bases, tools), solved.problem.rows
+    distance = found.distances(solved, before).abs()
+    plausible = distance <= _IMPROBABLE * found.deviation + rows * found.deviation**2 / _LEVER
+    # The less determined directions come first; none is held after one that is not.
+    weak = int(((found.deviation * rows**0.5 > _LARGEST_SPREAD) & plausible).cumprod(0).sum())
+    deviation = found.deviation.hypot(distance)
     for count in range(weak, 0, -1):
-        held = _with_held(solved, frames, found.deviation[:count], before)
+        held = _with_held(solved, frames, deviation[:count], before)
         if count <= unknown or not _contradicts(held, solved):
             return held
     return solved
@@ -125,14 +144,10 @@ def _with_held(
     before: Float64[Tensor, " parameters"],
 ) -> SolvedCalibration:
     """Shift the least determined directions to the values before, and fit the others again, until nothing changes."""
-    space, units = solved.problem.space, torch.from_numpy(solved.problem.space.usual_errors)
     for _ in range(_MAX_SHIFTS):
         found = FrameDirections.at_solution(solved, frames)
         held = HeldDirections(found.directions[:, : len(deviation)], deviation)
-        vectors, length = found.in_user_coordinates(solved)
-        off = before - solved.geometry.values_of(space)
-        off = torch.where(space.is_length, off, wrap_to_pi(off)) / units
-        missing = (vectors.t() @ off)[: len(deviation)] / length[: len(deviation)]
+        missing = found.distances(solved, before)[: len(deviation)]
         if solved.problem.held is not None and float(missing.abs().max()) < _SMALL:
             break
         problem = replace(solved.problem, held=held)

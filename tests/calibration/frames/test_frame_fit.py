@@ -142,6 +142,23 @@ def test_value_before_that_the_rows_contradict_is_not_held():
     assert_close(fit.solved.geometry.robot.base[3:], BASE[3:], atol=0.2)
 
 
+@pytest.mark.parametrize(("count", "held"), [(1600, False), (400, True)])
+def test_many_rows_of_similar_orientations_state_the_error_of_the_tool(count, held):
+    """Coarse positions hardly turn the tool, whose value before is off by 60 mm."""
+    rng = np.random.default_rng(1)
+    true = UR5.with_geometry(tool=np.array([0.06, 0.0, 0.1, 0.0, 0.0, 0.0]))
+    a = rng.uniform(-0.5, 0.5, (count, 3))
+    q = np.array([0, -1.5, 1.5, -1.5, -1.5, 0]) + np.c_[a, -a[:, 1] - a[:, 2], np.zeros(count), a[:, 0]]
+    q[:, 3:] += rng.normal(0, 0.05, (count, 3))
+    joints = torch.from_numpy(q)
+    place = forward_kinematics(true, joints)[:, :3, 3] + torch.from_numpy(rng.normal(0, 3e-3, (count, 3)))
+    known = UR5.with_geometry(tool=np.array([0.0, 0.0, 0.1, 0.0, 0.0, 0.0]))
+    fit = fit_frames(known, Measurements(q=joints, position=place), "hand-eye")
+    assert any(one.held for one in fit.weak_directions) == held
+    error = fit.estimates[-3:] - true.tool[:3]
+    assert (np.abs(error) < 3 * np.sqrt(fit.covariance.diagonal()[-3:])).all()
+
+
 def test_hand_eye_of_poses_gives_back_base_and_tool():
     true = UR5.with_geometry(base=BASE, tool=np.array([0.02, 0.03, 0.1, 0.3, -0.1, 0.2]))
     T = forward_kinematics(true, POINTS)
