@@ -118,7 +118,10 @@ def motions_between_rows(
     """
     q, order = measurements.q.cpu().numpy(), order_of_rows(measurements)
     file = np.array(measurements.origin or ("",) * len(q))[order]
-    follows = (file[1:] == file[:-1]) & (np.diff(np.array(measurements.line)[order]) <= 1)
+    first, last = (
+        np.array(lines)[order] for lines in (measurements.line, measurements.last_line or measurements.line)
+    )
+    follows = (file[1:] == file[:-1]) & (first[1:] - last[:-1] <= 1)
     step = np.where(follows[:, None], np.diff(q[order], axis=0), np.nan)
     unknown = np.full((1, q.shape[1]), np.nan)
     before, after = np.empty_like(q), np.empty_like(q)

@@ -24,6 +24,9 @@ from pisigma.measurement.rules import check_fields
 from pisigma.robot import Robot
 from pisigma.robot.se3 import transform
 
+_ORIGIN = ("line", "source", "left_out", "origin", "last_line")
+"""Fields that state where the rows come from."""
+
 
 @dataclass(frozen=True, eq=False)
 class Measurements:
@@ -64,6 +67,7 @@ class Measurements:
         source: the file, or a name for the origin of the rows.
         left_out: rows of the file that could not be used, and why.
         origin: per row, the file that it was read from, if rows come from several files; otherwise empty.
+        last_line: per row, its last line in the file, as of an image with a line per corner; empty if it is `line`.
 
     Raises:
         MeasurementError: the fields do not fit together, or a value is impossible; `column` is the field, `line` or the
@@ -96,6 +100,7 @@ class Measurements:
     source: str = "memory"
     left_out: tuple[UnusableRow, ...] = ()
     origin: tuple[str, ...] = ()
+    last_line: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         """Fill in missing names, and check that the fields fit together."""
@@ -124,17 +129,13 @@ class Measurements:
         present = {
             item.name: value
             for item in fields(self)
-            if item.name not in ("line", "source", "left_out", "origin", "readings")
-            and (value := getattr(self, item.name)) is not None
+            if item.name not in ("readings", *_ORIGIN) and (value := getattr(self, item.name)) is not None
         }
         present |= dict(sorted(self.readings.items()))
         return MeasuredFields(
             numbers={name: value for name, value in present.items() if isinstance(value, Tensor)},
             texts={name: value for name, value in present.items() if not isinstance(value, Tensor)},
-            line=self.line,
-            source=self.source,
-            left_out=self.left_out,
-            origin=self.origin,
+            **{name: getattr(self, name) for name in _ORIGIN},
         )
 
     @staticmethod
@@ -149,10 +150,7 @@ class Measurements:
         return Measurements(
             **{name: values for name, values in columns.items() if name in built_in},
             readings={name: values for name, values in columns.items() if name not in built_in},
-            line=data.line,
-            source=data.source,
-            left_out=data.left_out,
-            origin=data.origin,
+            **{name: getattr(data, name) for name in _ORIGIN},
         )
 
     @property

@@ -78,6 +78,7 @@ class MeasuredFields:
         source: the file, or a name for the origin of the rows.
         left_out: rows of the file that could not be used, and why.
         origin: per row, the file that it was read from, if rows come from several files; otherwise empty.
+        last_line: per row, its last line in the file, as of an image with a line per corner; empty if it is `line`.
     """
 
     numbers: Mapping[str, Tensor]
@@ -86,6 +87,7 @@ class MeasuredFields:
     source: str
     left_out: tuple[UnusableRow, ...] = field(default=())
     origin: tuple[str, ...] = ()
+    last_line: tuple[int, ...] = ()
 
     @property
     def rows(self) -> int:
@@ -159,6 +161,7 @@ class MeasuredFields:
             numbers={name: values[rows] for name, values in self.numbers.items()},
             texts={name: tuple(texts[row] for row in chosen) for name, texts in self.texts.items()},
             line=tuple(self.line[row] for row in chosen),
+            last_line=tuple(self.last_line[row] for row in chosen) if self.last_line else (),
             origin=tuple(self.origin[row] for row in chosen) if self.origin else (),
         )
 
@@ -183,6 +186,9 @@ def joined_fields(data: Sequence[MeasuredFields]) -> MeasuredFields:
             for name in dict.fromkeys(name for one in data for name in one.texts)
         },
         line=tuple(line for one in data for line in one.line),
+        last_line=tuple(line for one in data for line in one.last_line or one.line)
+        if any(one.last_line for one in data)
+        else (),
         source=" + ".join(sources),
         left_out=tuple(row for one in data for row in one.left_out),
         origin=tuple(name for one in data for name in one.origin or (one.source,) * one.rows)

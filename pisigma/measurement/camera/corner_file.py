@@ -81,7 +81,8 @@ def corners_of(table: Table, robot: Robot, files: CameraFiles) -> Measurements:
             files.intrinsics,
         )
         conditions = {name: getattr(stated.select(first), name) for name in _CONDITIONS}
-        measured.append(replace(solved, **conditions))
+        last = dict(zip(stated.image or (), stated.line, strict=True))
+        measured.append(replace(solved, last_line=tuple(last[name] for name in images.names), **conditions))
     joined = join([one for one in measured if one.rows])
     return joined.select(torch.tensor(joined.line).argsort(stable=True))
 

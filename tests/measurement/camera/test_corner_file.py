@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import yaml
 from testing.camera_cell import BOARD, CAMERA, camera_cell, corner_lines
 from testing.closeness import assert_close
@@ -15,6 +16,7 @@ from pisigma.measurement.camera.board import Board
 from pisigma.measurement.camera.camera import Camera
 from pisigma.measurement.camera.camera_files import CameraFiles, Repeatability
 from pisigma.measurement.camera.corner_file import read_rows
+from pisigma.measurement.conditions import approach_by_order
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.sensors.intrinsics import boards, without_stated_priors
 from pisigma.robot.kinematics.forward import forward_kinematics
@@ -54,6 +56,8 @@ def test_exact_corners_give_the_poses_of_the_target(tmp_path: Path, is_fixed: bo
     assert (rows.frame[0], rows.target[0]) == (("wrist", "board") if is_fixed else ("board", "wrist"))
     assert_close(rows.T, forward_kinematics(cell.true, cell.images.q), atol=1e-7)
     assert rows.place(1) == f"{path}, line {2 + len(cell.images.corners[0])}, image '0001'"
+    assert torch.isfinite(approach_by_order(rows)[1:]).all()
+    assert torch.isnan(approach_by_order(rows.select(torch.tensor([0, 2])))).all()
     rows.write_csv(tmp_path / "rows.csv", cell.nominal)
     again = Measurements.read_csv(tmp_path / "rows.csv", cell.nominal)
     assert again.kinds == {"pose", "corner"}
