@@ -6,17 +6,18 @@ from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Float, Float64, Int64
 from torch import Tensor
 
 from pisigma.joint_correction.feature import AbstractFeature, FeatureOptions, FeatureSection
 from pisigma.joint_correction.gravity_torques import Direction, GravityTorques
 from pisigma.measurement.conditions import TORQUE, JointState
+from pisigma.measurement.groups import groups_of_equal_joints
 from pisigma.robot.description import Robot
 
-_MIN_ROWS = 30
-"""Rows with a torque of a joint that its model of gravity torques needs: about twice the number of masses and centres
-of mass that the torque of a joint of a six-axis arm depends on."""
+_MIN_POSES = 30
+"""Distinct joint values with a torque of a joint that its model of gravity torques needs: about twice the number of
+masses and centres of mass that the torque of a joint of a six-axis arm depends on."""
 _MIN_TORQUE = 1e-6
 """[Nm or N] A joint whose torque varies less has no deflection that could be identified."""
 _RIDGES = (1e-6, 1e-4, 1e-2, 1.0)
@@ -44,7 +45,8 @@ class JointTorques(AbstractFeature):
     Where no torque is stated, τ_j is the modelled gravity torque `Σ_m g_jm m_jm`, with the columns g of
     `GravityTorques`, and m fitted to the measured torques of the calibration (ridge regression). A payload that differs
     from the mean of the calibration is not a part of it; `unstated_root` contains the differences of measured torques
-    from modelled ones, each modelled without its own row. They are correlated, because a payload loads several joints.
+    from modelled ones, each modelled without the rows of its joint values. They are correlated,
+    because a payload loads several joints.
 
     Source: Dumas, Caro, Garnier and Furet, Robotics and Computer-Integrated Manufacturing 27(4), 2011, 881-888: joint
     stiffness from torques; measured torques instead of modelled ones are our choice.
@@ -104,11 +106,11 @@ class JointTorques(AbstractFeature):
         missed = torch.zeros_like(torque)
         for joint, measured in enumerate(torque.t()):
             rows = torch.isfinite(measured)
-            y, X = measured[rows], columns[rows, joint]
-            if len(y) >= _MIN_ROWS and float(y.std()) > _MIN_TORQUE:
+            y, X, pose = measured[rows], columns[rows, joint], groups_of_equal_joints(state.q[rows])
+            if len(torch.unique(pose)) >= _MIN_POSES and float(y.std()) > _MIN_TORQUE:
                 scale[joint] = float(y.std())
                 masses, left_out = min(
-                    (_fit(X, y, ridge) for ridge in _RIDGES), key=lambda fit: fit[1].norm()
+                    (_fit(X, y, pose, ridge) for ridge in _RIDGES), key=lambda fit: fit[1].norm()
                 )
                 model[joint], missed[rows, joint] = masses.cpu(), left_out / math.sqrt(len(y))
         if not any(scale):
@@ -165,11 +167,19 @@ class JointTorques(AbstractFeature):
 
 
 def _fit(
-    X: Float64[Tensor, "rows columns"], y: Float64[Tensor, " rows"], ridge: float
+    X: Float64[Tensor, "rows columns"],
+    y: Float64[Tensor, " rows"],
+    pose: Int64[Tensor, " rows"],
+    ridge: float,
 ) -> tuple[Float64[Tensor, " columns"], Float64[Tensor, " rows"]]:
-    """Return the masses of a ridge regression, and the differences of every row from a fit without this row."""
+    """Return the masses of a ridge regression, and the differences of rows from a fit without their pose."""
     penalty = ridge * X.square().sum(0).mean().clamp(min=1e-12)
     solved = torch.linalg.solve(X.T @ X + penalty * torch.eye(X.shape[1]).to(X), X.T)
-    leverage = (X * solved.T).sum(1)
     masses = solved @ y
-    return masses, (y - X @ masses) / (1 - leverage).clamp(min=1e-9)
+    residual = y - X @ masses
+    # rows of a pose have equal columns, so the sum of their leverages and the mean of their residuals are sufficient
+    leverage = (X * solved.T).sum(1)
+    count = torch.bincount(pose)
+    mean = (torch.zeros_like(count, dtype=y.dtype).index_add(0, pose, residual) / count)[pose]
+    total = leverage * count[pose]
+    return masses, residual + mean * total / (1 - total).clamp(min=1e-9)

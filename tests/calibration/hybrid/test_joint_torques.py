@@ -205,6 +205,17 @@ def test_rows_with_another_load_are_not_repeats_of_a_pose_and_noise_of_torques_i
     assert not bool((key[0] == key[2]).any())
 
 
+def test_modelled_torques_are_judged_at_poses_that_their_fit_has_not_seen():
+    def candidates(poses: int, repeats: int) -> tuple[JointTorques, ...]:
+        rows = measured(poses, 1)
+        state = JointState(rows.q.repeat(repeats, 1), {"torque": rows.torque.repeat(repeats, 1)})
+        return JointTorques.candidates(ROBOT, FeatureOptions((), (0.0, 0.0, -1.0), poses), state)
+
+    assert candidates(20, 5) == ()
+    (once,), (often,) = candidates(40, 1), candidates(40, 5)
+    assert_close(np.array(often.covariance), np.array(once.covariance), rtol=1e-6)
+
+
 def test_without_torques_nothing_is_tried():
     rows = dataclasses.replace(measured(60, 1), torque=torch.full((60, 6), torch.nan).double())
     result = HybridCalibrator(ROBOT, features=("torques",), products=False).fit(rows)
