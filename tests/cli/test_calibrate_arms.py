@@ -27,6 +27,8 @@ from pisigma.files.model_files import model_hash
 from pisigma.files.yaml_file import read_yaml
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.folder.model_folder import load_model
+from pisigma.robot import Robot
+from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.se3 import pose_error, transform_from_xyzrpy
 from pisigma.validation.held_out.arms_summary import ArmsSummary
 from pisigma.workflow.arms.arms_cell import arms_of_cell, calibrate_arms_of_cell
@@ -86,7 +88,7 @@ def test_every_arm_has_a_model_and_the_file_has_their_bases(calibrated):
     assert_close(
         covariance.diagonal().sqrt(), torch.tensor(base.standard_errors, dtype=torch.float64), rtol=1e-9
     )
-    assert (written.redundancy, len(written.diagnostics)) == (6, 0)
+    assert (written.redundancy, len(written.diagnostics), written.sums) == (6, 0, ())
 
 
 def test_frame_that_moved_between_the_arms_is_not_trusted(disagreeing, tmp_path):
@@ -103,6 +105,25 @@ def test_accepted_arms_are_written_once(disagreeing, tmp_path):
     assert read_yaml(tmp_path / "models" / FRAMES_FILE, ArmsSummary, PlanningError) == written
     with refused(OutputError, file=str(tmp_path / "models")):
         disagreeing.save(tmp_path / "models", accept_implausible=True)
+
+
+def test_sum_of_base_and_tool_is_named():
+    """All axes of a SCARA are parallel, so its base along z and the length of its tool have the same effect."""
+    scara = Robot.load("kiro3")
+    q = torch.from_numpy(
+        np.random.default_rng(0).uniform(*np.clip(scara.limits, -2.2, 2.2).T, (30, scara.dof))
+    )
+    arms = []
+    for name, length in (("left", 0.0), ("right", 0.005)):
+        longer = scara.with_geometry(tool=scara.tool + np.array([0, 0, length, 0, 0, 0]))
+        rows = Measurements(q=q, position=forward_kinematics(longer, q)[:, :3, 3], frame=("hall",) * len(q))
+        arms.append(Arm(name, scara, rows, QUICK))
+    found = calibrate_arms(arms)
+    (base,) = found.summary.bases
+    assert_close(base.z_mm, 5.0, atol=0.01)
+    assert len(found.summary.sums) == 2
+    assert all("tool_z" in sentence for sentence in found.summary.sums)
+    assert set(found.summary.sums) <= set(found.warnings)
 
 
 def test_other_commands_ask_for_one_arm(calibrated, refuses):

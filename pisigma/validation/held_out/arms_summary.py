@@ -7,6 +7,7 @@ import numpy as np
 
 from pisigma.calibration.frames.arm_bases import ArmBases, Disagreement
 from pisigma.calibration.frames.tool_to_tool import Postures, tool_to_tool_deviation
+from pisigma.calibration.geometric.result import CalibrationResult
 from pisigma.files.yaml_file import Section
 from pisigma.robot.se3 import xyzrpy_from_transform
 from pisigma.validation.held_out.diagnostic import Diagnostic
@@ -87,6 +88,7 @@ class ArmsSummary(Section):
         redundancy: number of independent differences, those that the bases do not absorb.
         probability: probability of a larger misfit of arms without faults.
         diagnostics: what the arms disagree on.
+        sums: what of the bases is known only in a sum with parameters of a tool, one sentence each.
     """
 
     arms: tuple[ModelFile, ...]
@@ -96,6 +98,7 @@ class ArmsSummary(Section):
     redundancy: int
     probability: float
     diagnostics: tuple[Diagnostic, ...] = ()
+    sums: tuple[str, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
         """Return all figures as JSON values, by name."""
@@ -139,13 +142,29 @@ def disagreement_diagnostic(found: ArmBases, one: Disagreement) -> Diagnostic:
     )
 
 
-def arms_summary(found: ArmBases, robots: tuple[str, ...], postures: tuple[Postures, ...]) -> ArmsSummary:
+def sums_with_tool(arm: str, result: CalibrationResult) -> tuple[str, ...]:
+    """Return what of the bases of an arm is known only in a sum with parameters of its tool, one sentence each."""
+    in_a_sum = {one.name for one in result.parameters if one.label.startswith("in a sum")}
+    return tuple(
+        f"{one.names[0]} of arm '{arm}' is known only in a sum with {', '.join(one.names[1:])}; errors of these shift "
+        "or turn its base relative to other arms, and the standard errors do not include them."
+        for one in result.redundancy.dependencies
+        if one.names[0].startswith("base_")
+        and one.names[0] in in_a_sum
+        and any(name.startswith("tool_") for name in one.names[1:])
+    )
+
+
+def arms_summary(
+    found: ArmBases, robots: tuple[str, ...], postures: tuple[Postures, ...], sums: tuple[str, ...]
+) -> ArmsSummary:
     """Gather the figures of arms.
 
     Args:
         found: the arms with their bases.
         robots: names of their robots.
         postures: postures of every arm.
+        sums: sentences of `sums_with_tool` of all arms.
     """
     names = [arm.name for arm in found.arms]
     count = len(names)
@@ -165,4 +184,5 @@ def arms_summary(found: ArmBases, robots: tuple[str, ...], postures: tuple[Postu
         redundancy=found.conditioned.redundancy,
         probability=found.probability,
         diagnostics=tuple(disagreement_diagnostic(found, one) for one in found.disagreements),
+        sums=sums,
     )

@@ -23,7 +23,7 @@ from pisigma.measurement.conditions import JointState
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import corrected_joints
 from pisigma.robot.description import Robot
-from pisigma.validation.held_out.arms_summary import ArmsSummary, arms_summary
+from pisigma.validation.held_out.arms_summary import ArmsSummary, arms_summary, sums_with_tool
 from pisigma.validation.held_out.trained_calibrations import geometric_result
 from pisigma.workflow.calibrate import Calibration, calibrate
 from pisigma.workflow.settings.calibration import CalibrationSettings
@@ -71,8 +71,8 @@ class ArmsCalibration:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Warnings of the arms, one sentence each, after the names of the arms."""
-        return tuple(
+        """Sums of bases and tools, and warnings of the arms after their names, one sentence each."""
+        return self.summary.sums + tuple(
             f"{name}: {sentence}" for name, one in self.calibrations.items() for sentence in one.warnings
         )
 
@@ -186,7 +186,12 @@ def calibrate_arms(arms: Sequence[Arm], progress: Progress = lambda what: None) 
         found[arm.name] = calibrate(arm.robot, arm.data, arm.settings, of_arm)
     bases = fit_arm_bases([posterior_of(name, one) for name, one in found.items()])
     robots = tuple(one.model.robot.name for one in found.values())
-    summary = arms_summary(bases, robots, tuple(map(postures_of, found.values())))
+    sums = tuple(
+        sentence
+        for name, one in found.items()
+        for sentence in sums_with_tool(name, geometric_result(one.result))
+    )
+    summary = arms_summary(bases, robots, tuple(map(postures_of, found.values())), sums)
     return ArmsCalibration(found, bases, summary, time.perf_counter() - started)
 
 
