@@ -113,6 +113,8 @@ class BackgroundProcess:
 def serve() -> None:
     """Compute the requests of the process at the other end of stdin and stdout, until that process ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the other process handles interrupts
+    if hasattr(os, "nice"):
+        os.nice(10)  # what the user sees comes first
     requests, answers = sys.stdin.buffer, os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # what functions print must not get among the answers
 

@@ -1,6 +1,7 @@
 """A process that computes for this one: results, errors, progress, and an end at any time."""
 
 import math
+import os
 import pickle
 import threading
 import time
@@ -29,6 +30,11 @@ def test_it_computes_what_this_process_computes(process):
             compute(partial(math.sqrt, -1))
         compute(REPORTS, said.append)
         assert said == ["fold 1 of 2"]
+
+
+@pytest.mark.skipif(not hasattr(os, "nice"), reason="no priorities on this system")
+def test_it_leaves_the_processor_to_this_process(process):
+    assert process.compute(partial(os.nice, 0)) == min(os.nice(0) + 10, 19)
 
 
 def test_progress_that_raises_ends_the_function_only(process):
