@@ -2,7 +2,7 @@
  *
  *     gcc -I DIR library_example.c -L DIR -lpisigma_ik -lm -Wl,-rpath,DIR -o example && ./example DIR/model.psik < poses.txt
  *
- * A line contains the 16 numbers of a pose T_base_tool, row by row [m], and a joint value to stay near to for every joint
+ * A line contains the 16 numbers of a pose T_base_tool, row by row [m], and a joint value to stay close to for every joint
  * [rad or m], or nan for none. Printed are the status, the joint values, the two residuals, and the resulting pose.
  */
 #include <math.h>

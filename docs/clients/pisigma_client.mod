@@ -1,6 +1,6 @@
 MODULE PisigmaClient
     ! Corrected joint values from "pisigma serve": lines of JSON over a socket.
-    ! Written from ABB's published description of RAPID, not tried on a controller. It needs the option PC Interface.
+    ! Written from ABB's published description of RAPID, not tested on a controller. It needs the option PC Interface.
     VAR socketdev pisigma;
 
     PROC PisigmaConnect(string host, num port)

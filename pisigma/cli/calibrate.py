@@ -49,8 +49,7 @@ Tip = Annotated[str | None, typer.Option(help="Tool link of a URDF file. [defaul
 Prior = Annotated[
     Path | None,
     typer.Option(
-        help="Model folder written by `pisigma fleet prior`, to start from if held-out rows are predicted better with "
-        "it than without.",
+        help="Model folder written by `pisigma fleet prior`; used if it improves the prediction of held-out rows.",
         autocompletion=complete_model,
     ),
 ]
@@ -63,7 +62,7 @@ Only = Annotated[
         metavar="FRAME", help="Fit only the tool, base or hand-eye transform; ROBOT may be a model."
     ),
 ]
-_NOT_STORED = "no model was stored, because the result must not be trusted, for the reasons above."
+_NOT_STORED = "no model was stored, because the result must not be trusted (see the reasons above)."
 _ARM_AS_GIVEN = "with --only, the arm is used as given and no row is held out"
 
 

@@ -219,7 +219,8 @@ def event(
     export: Annotated[
         Path | None,
         typer.Option(
-            help="With controller, file of `pisigma export CELL` that the controller uses from this day, or none."
+            help="With controller, file written by `pisigma export CELL` that the controller uses from this day, "
+            "or none."
         ),
     ] = None,
     as_json: AsJson = False,

@@ -106,7 +106,7 @@ def exit_with_problem(problem: BaseException, as_json: bool = False) -> None:
         _print_no_more()
         if problem.errno == errno.EPIPE:
             raise typer.Exit(_NO_READER)
-        exit_with_error(f"the standard output cannot be written ({problem.strerror}); print to another file.")
+        exit_with_error(f"cannot write to standard output ({problem.strerror}); redirect it to another file.")
     if os.environ.get(TRACEBACK):
         raise problem
     exit_with_error(_defect(problem), DEFECT)
@@ -129,9 +129,9 @@ def _defect(problem: BaseException) -> str:
     """Return a sentence about an unexpected problem."""
     frame = traceback.extract_tb(problem.__traceback__)[-1]
     return (
-        f"a defect of pisigma ended the command ({type(problem).__name__}: {problem}; {Path(frame.filename).name}, "
+        f"a defect in pisigma ended the command ({type(problem).__name__}: {problem}; {Path(frame.filename).name}, "
         f"line {frame.lineno}). Nothing was left half written. Please report it with the command and its files; "
-        f"{TRACEBACK}=1 before the command prints where it happened."
+        f"{TRACEBACK}=1 before the command shows where it happened."
     )
 
 

@@ -53,7 +53,7 @@ def evaluate(
         refuse_with_cell(__sha256=sha256)
         return _tell(cell.evaluate(**report_overrides(cell, "evaluate", settings)), verbose, as_json)
     if len(paths) < 2:
-        raise typer.BadParameter("expected a model folder and, last, a file of measurements")
+        raise typer.BadParameter("expected one or more model folders followed by a measurement file")
     chosen = settings.build()
     folders = [path for path in paths[:-1] if path not in workflow.REFERENCES]
     if sha256 and len(sha256) != len(folders):
@@ -92,7 +92,7 @@ def _print(evaluation: "Evaluation", verbose: bool) -> None:
     verdict = Verdict(
         f"RMS of {rows} rows: {errors}{kind}.",
         _trust(evaluation),
-        "correct what is named above, and evaluate again."
+        "correct the problem named above, and evaluate again."
         if evaluation.diagnostics
         else "recalibrate with these rows (`pisigma recalibrate`), or calibrate with more."
         if evaluation.missed

@@ -93,7 +93,7 @@ CountsPerTurn = Annotated[
 ]
 PresentCounts = Annotated[
     str | None,
-    typer.Option(help="With --format epson or fanuc-mastering, counts that the controller uses at present."),
+    typer.Option(help="With --format epson or fanuc-mastering, present encoder counts of the controller."),
 ]
 
 

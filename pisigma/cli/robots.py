@@ -160,9 +160,10 @@ def _check(robot: str, base: str | None, tip: str | None, as_json: bool) -> None
     )
     print_lines(
         [
-            "Move the robot to these values, with the tool and frame of the description, and compare what the teach "
-            "pendant shows; the rotation is RotZ(roll) RotY(pitch) RotX(yaw). If the first difference comes with an "
-            "axis, check its row and the following ones, its direction and its coupling.",
+            "Move the robot to these values, with the tool and frame of the description, and compare the poses "
+            "with those on the teach pendant; the rotation is RotZ(roll) RotY(pitch) RotX(yaw). If the first "
+            "difference appears when an axis is moved, check its row and the following ones, its direction and "
+            "its coupling.",
             "Nominal inverse kinematics are solved numerically."
             if form is None
             else f"Nominal inverse kinematics have the closed form {form.name} with {len(form.branches)} branches.",

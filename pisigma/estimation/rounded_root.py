@@ -66,7 +66,7 @@ class RoundedRoot:
         except OSError as problem:
             raise ValueError(f"expected numbers compressed by bz2: {problem}") from None
         if len(planes) != 2 * len(cells[0]):
-            raise ValueError(f"expected {len(cells[0]):,} compressed numbers, got another count")
+            raise ValueError(f"expected {len(cells[0]):,} compressed numbers, got a different number")
         low, high = np.frombuffer(planes, np.uint8).astype(np.int32).reshape(2, -1)
         unsigned = low | high << 8
         result.numbers.numpy()[cells] = unsigned >> 1 ^ -(unsigned & 1)

@@ -301,7 +301,7 @@ def missing_extra(problem: ImportError) -> MissingExtraError | None:
         return MissingExtraError(
             f"this needs the package {module}, which is not installed with pisigma-ik",
             value=module,
-            remedy="`pip uninstall pisigma-ik` and `pip install pisigma`, which has all commands",
+            remedy="run `pip uninstall pisigma-ik` and `pip install pisigma`, which includes all commands",
         )
     package = _PACKAGES.get(module, module)
     if package not in EXTRAS:

@@ -29,7 +29,7 @@ def check_output(
     """
     if suffixes and path.suffix.lower() not in suffixes:
         endings = " or ".join(suffixes)
-        problem = f"{what} goes into a {endings} file"
+        problem = f"{what} must be written to a {endings} file"
         raise _refusal(path, problem, expected=f"a {endings} file", value=path.suffix)
     try:
         if path.is_dir():

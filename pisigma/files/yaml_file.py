@@ -234,7 +234,7 @@ def _load(text: str, error: type[PisigmaError], source: str) -> tuple[yaml.Node 
         at = Place(source, mark.line + 1 if mark else None)
         raise error(what, expected="valid YAML", at=at, remedy="correct the YAML there") from None
     except RecursionError:
-        what = "the document is nested too deeply or within itself"
+        what = "the document is nested too deeply or contains itself"
         raise error(what, expected="valid YAML", at=Place(source), remedy="correct the YAML") from None
 
 

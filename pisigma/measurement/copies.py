@@ -366,7 +366,7 @@ def without_copies(rows: MeasuredFields, robot: Robot) -> MeasuredFields:
     left_out = tuple(
         CopiedRow(
             rows.line[row],
-            "the row is a copy of another one",
+            "the row is a copy of another",
             place=rows.place_text(row),
             original=rows.place_text(int(original[row])),
         )
@@ -390,8 +390,8 @@ def copy_warnings(left_out: Sequence[UnusableRow]) -> tuple[str, ...]:
         return ()
     named = ", ".join(f"{one.place} (of {one.original})" for one in copies[:MAX_NAMED])
     more = f" and {len(copies) - MAX_NAMED} more" if len(copies) > MAX_NAMED else ""
-    verb = "row is a copy of another one" if len(copies) == 1 else "rows are copies of other ones"
+    verb = "row is a copy of another" if len(copies) == 1 else "rows are copies of others"
     return (
-        f"{len(copies)} {verb}, with the same joint values and readings to the coarser rounding, and left out: "
-        f"{named}{more}. Give every measurement once.",
+        f"{len(copies)} {verb} (equal joint values and readings to the coarser rounding) and "
+        f"{'is' if len(copies) == 1 else 'are'} left out: {named}{more}. Give every measurement once.",
     )

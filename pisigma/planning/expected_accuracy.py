@@ -237,8 +237,7 @@ class CameraProspects:
         what = limits[min(better, key=lambda name: better[name])]
         changes = ", ".join(f"{name} to {rms * 1e3:.3f} mm" for name, rms in better.items())
         return (
-            f"The RMS position error of {self.rms * 1e3:.3f} mm would be lower with {changes}; "
-            f"{what} limits it most.",
+            f"The RMS position error of {self.rms * 1e3:.3f} mm would fall with {changes}; {what} limits it most.",
             *self.unidentifiable,
             "The scale comes from the board alone: squares 0.1 % too large make the robot 0.1 % too large, which only "
             "a known distance reveals.",

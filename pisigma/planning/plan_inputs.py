@@ -159,6 +159,6 @@ def check_measured(model: CalibratedModel | None, settings: PlanSettings, robot:
             option="--measured",
             remedy="plan with the model alone",
         )
-    twice = "they count twice, and the expected errors are too small"
+    twice = "the measurements count twice, and the expected errors are too small"
     known = () if model is None else training_row_warnings(model, rows, consequence=twice)
     return (*row_warnings(robot, rows), *known)

@@ -23,9 +23,9 @@ class CameraSettings:
     """Camera and board of a plan.
 
     Attributes:
-        camera: YAML file of the camera (of pisigma, ROS or OpenCV), for the sensor camera.
-        board: YAML file of the board, for the sensor camera.
-        is_fixed: state that the camera is fixed and the board is on the flange (default: the opposite).
+        camera: camera file (YAML of pisigma, ROS or OpenCV), for the sensor camera.
+        board: board file (YAML), for the sensor camera.
+        is_fixed: the camera is fixed and the board is on the flange, not the other way round.
         sigma_px: standard deviation of u and v of a detected corner [px].
         repeatability_mm: standard deviation of the robot's position repeatability, per axis [mm].
         repeatability_deg: standard deviation of the robot's orientation repeatability, per axis [deg].
@@ -91,14 +91,14 @@ class PlanSettings:
         sensor: what is measured: position (of a reflector), pose, distance (from a fixed point) or camera (corners of a
             board).
         camera: camera and board, for the sensor camera only.
-        sigma_mm: standard deviation of a measured length [mm]. None: of laser trackers.
+        sigma_mm: standard deviation of a measured length [mm]. None: that of a laser tracker.
         criterion: optimality criterion: I (uncertainty of the tool's position over the task) or D (uncertainty of all
             unknowns).
         limit_mm: limit on the 95 % quantile of the tool's position errors over the task [mm], as in `measure`. The plan
             then states the number of poses needed.
         candidates: number of random candidate poses to choose from.
         candidates_from: CSV file of candidate joint values to choose from, instead of random ones.
-        box_mm: box of reflector positions, smallest and then largest x, y, z in the robot's base frame [mm].
+        box_mm: box of reflector positions: minimum, then maximum x, y, z in the robot's base frame [mm].
         task: CSV file of joint values or tool poses where the robot has to be accurate. Poses refer to the tool of the
             nominal robot or of the model. None: the whole workspace.
         measured: existing measurements (CSV).

@@ -51,8 +51,8 @@ def contradiction(acceptance: Acceptance) -> str:
     """Return a sentence that the measured errors are larger than the budget explains."""
     session = "" if acceptance.measured is None else f" of session {acceptance.measured.session}"
     return (
-        f"The measured errors{session} are larger than the budget explains: it lacks a component, or the robot "
-        "has changed since its calibration."
+        f"The measured errors{session} are larger than the budget explains: the budget lacks a component, or the "
+        "robot has changed since its calibration."
     )
 
 

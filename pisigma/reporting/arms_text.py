@@ -65,10 +65,10 @@ def arms_text(
         for name, one in calibrations.items()
     ]
     agreement = (
-        f"The differences between the arms are {math.sqrt(summary.misfit / summary.redundancy):.2g} times their "
-        f"standard deviations RMS ({summary.redundancy} differences)."
+        f"The RMS difference between the arms is {math.sqrt(summary.misfit / summary.redundancy):.2g} standard "
+        f"deviations ({summary.redundancy} differences)."
         if summary.redundancy
-        else "Nothing that the arms share checks the bases; share a second frame, or four sockets, to check them."
+        else "The arms share too little to check their bases; share a second frame, or four sockets."
     )
     return ResultText(
         _verdict(summary, calibrations, folder, len(warnings)),
@@ -103,7 +103,7 @@ def _verdict(
     return Verdict(
         f"tool to tool {rounded(between, 0)} mm RMS, as predicted from the uncertainty of the calibrations.",
         trust,
-        "correct what the first warning names."
+        "correct the problem that the first warning names."
         if summary.diagnostics or doubtful or folder is None
         else f"verify every arm with other poses: `pisigma verify {folder}/ARM ROWS.csv`.",
     )

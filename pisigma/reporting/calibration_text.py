@@ -97,7 +97,7 @@ def _trust(summary: CalibrationSummary, warnings: int) -> str:
         return f"no: {implausible[0].sentence}"
     judged = summary.validation_errors
     if judged is None:
-        return "not known: no row was held out, so nothing judged the calibration."
+        return "not known: no row was held out, so the calibration was not validated."
     share = judged.coverage
     covered = share is None or share >= _MIN_COVERAGE
     cautions = ["the sensor's scale may be wrong"] if scale_matters(summary) else []
@@ -116,7 +116,7 @@ def _trust(summary: CalibrationSummary, warnings: int) -> str:
 def _next_step(summary: CalibrationSummary, folder: Path | None, warnings: int) -> str:
     if folder is None or any(one.severity == "implausible" for one in summary.diagnostics):
         unwritten = "; no model was written" if folder is None else ""
-        return f"correct what is named above and calibrate again{unwritten}."
+        return f"correct the problem named above and calibrate again{unwritten}."
     if summary.validation_errors is None:
         return "measure more poses and calibrate again, or start from the prior of a fleet (--prior)."
     first = "follow the warnings, then verify" if warnings else "verify"

@@ -59,5 +59,5 @@ def fleet_verdict(status: FleetStatus) -> Verdict:
         if due
         else f"`{first.step.command}`."
         if first is not None
-        else "measure the next sessions in time.",
+        else "measure the next sessions when they are due.",
     )

@@ -71,7 +71,7 @@ def cause_sentence(summary: FrameSummary) -> tuple[str, ...]:
         if not one.named and one.log_bayes_factor > first.log_bayes_factor - CLEAR
     ]
     which = " and the ".join(f"{CAUSES[one.cause]}, {one.size}" for one in named)
-    unclear = f" The rows can hardly tell it from: {', '.join(rivals)}." if rivals else ""
+    unclear = f" The rows hardly distinguish this cause from: {', '.join(rivals)}." if rivals else ""
     remedies = ", and ".join(_REMEDIES[one.cause] for one in named)
     return (
         f"The residuals are larger than their noise because of the {which}.{unclear} Remedy: {remedies}.",
@@ -138,6 +138,6 @@ def _verdict(summary: FrameSummary, folder: Path | None, warnings: int) -> Verdi
         if one.severity == "implausible":
             unwritten = "; no model was written" if folder is None else ""
             trust = f"no: {one.sentence}"
-            follow = f"correct what is named above and calibrate again{unwritten}."
+            follow = f"correct the problem named above and calibrate again{unwritten}."
             break
     return Verdict(f"largest standard error {accuracy or 'unknown'}, with the arm {arm}.", trust, follow)

@@ -155,7 +155,7 @@ class Jobs:
                 traceback.print_exc(file=sys.stderr)
             found = Outcome(
                 refusal=fault
-                or f"a defect of pisigma ended the step ({type(problem).__name__}: {problem}). Nothing was left "
+                or f"a defect in pisigma ended the step ({type(problem).__name__}: {problem}). Nothing was left "
                 "half written. Please report it with the last lines of the terminal."
             )
         with self._lock:

@@ -62,7 +62,7 @@ Form = Mapping[str, str]
 _WIDTH = 200
 """Width of tables before models are divided among several [characters]."""
 _EXPORT_OPTIONS = ("geometry", "targets", "branch", "config")
-_NEEDS_ACTION = "the robot needs attention, for the reasons below."
+_NEEDS_ACTION = "the robot needs attention (see the reasons below)."
 _NOT_STORED = "no model was stored, because the result must not be trusted, for the reasons below."
 
 
@@ -277,7 +277,7 @@ def export(cell: Cell, form: Form, files: Mapping[str, Path]) -> Outcome:
         out = out.with_name(file_name(stated))
         if out.exists():
             raise OutputError(
-                "there is an export with this name", at=Place(out), remedy="choose another name"
+                "an export with this name already exists", at=Place(out), remedy="choose another name"
             )
     options: dict[str, Any] = dict(files)
     options |= {key: form[key].strip() for key in _EXPORT_OPTIONS if form.get(key, "").strip()}
@@ -292,7 +292,7 @@ def export(cell: Cell, form: Form, files: Mapping[str, Path]) -> Outcome:
     blocks = (
         sentences("remarks", exported.remarks),
         table_block("What was changed", ("line", "before", "after"), changed),
-        table_block("Poses that were left alone", ("line", "reason"), alone),
+        table_block("Poses that were left unchanged", ("line", "reason"), alone),
     )
     text = ResultText(
         verdict, exported.warnings, tuple(one for one in blocks if one.rows or one.what == "remarks")

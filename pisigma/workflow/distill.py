@@ -164,7 +164,7 @@ def _check_parent(parent: CalibratedModel) -> None:
             f"model '{parent.name}' has no identified geometry with measured joint values",
             expected="a model with an identified geometry",
             value=parent.name,
-            remedy="give a model of `pisigma calibrate`",
+            remedy="give a model written by `pisigma calibrate`",
         )
     if parent.robot.coupling is not None:
         raise ModelError(
@@ -231,9 +231,9 @@ def _warnings(held_out: DistilledErrors, rows: int, joints: int) -> tuple[str, .
     for key, what, unit in (("rms_mm", "position", "mm"), ("rms_deg", "orientation", "deg")):
         if distilled[key] > _MAX_ERROR_SHARE * nominal[key]:
             sentences.append(
-                f"It removes only {100 * max(1 - distilled[key] / nominal[key], 0):.0f} % of the nominal {what} error "
-                f"({distilled[key]:.3g} of {nominal[key]:.3g} {unit} RMS remain): the region is too large for this "
-                "network; give a smaller --region, more --poses, or use the parent."
+                f"The network removes only {100 * max(1 - distilled[key] / nominal[key], 0):.0f} % of the nominal "
+                f"{what} error ({distilled[key]:.3g} of {nominal[key]:.3g} {unit} RMS remain): the region is too "
+                "large for this network; give a smaller --region, more --poses, or use the parent."
             )
     if rows < _MIN_ROWS_PER_JOINT * joints:
         sentences.append(
@@ -249,8 +249,8 @@ def _limitations(
     """Return the properties of the full solution that the distilled model does not have, one sentence each."""
     sentences = [
         f"Exactness: on held-out poses of the region the tool is {errors.rms_mm:.4f} mm RMS (95 % within "
-        f"{errors.p95_mm:.4f} mm, at most {errors.max_mm:.4f} mm) from the position of the full solution. "
-        "The errors of the parent model come in addition."
+        f"{errors.p95_mm:.4f} mm, at most {errors.max_mm:.4f} mm) from the position of the full solution. The "
+        "errors of the parent model add to these."
     ]
     features = () if parent.hybrid is None else parent.hybrid.correction.features
     harmonics = max((one.fastest for one in features), default=1)
@@ -275,8 +275,8 @@ def _limitations(
         *sentences,
         "Reach: poses that only the calibrated robot can reach have no nominal joint values to correct, and poses near "
         f"a singularity (measure below {SINGULAR_BELOW}) were not learned.",
-        "Validity: it is valid in its region and on its branches only; elsewhere the status is OUTSIDE_DOMAIN. It does "
-        "not predict its accuracy; the parent does.",
+        "Validity: the model is valid only in its region and on its branches; elsewhere the status is "
+        "OUTSIDE_DOMAIN. It does not predict its own accuracy; the parent does.",
     )
 
 

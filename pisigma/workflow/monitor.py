@@ -162,9 +162,8 @@ class MonitoringResult:
             if self.cell is not None:  # the cell would never use a model folder that it does not know
                 command = shlex.join(["pisigma", "recalibrate", os.fspath(self.cell)])
             advice = (
-                f"Recalibrating pays: errors like those of {best.file} are expected to fall from "
-                f"{best.session.rms * 1e3:.3f} to {best.session.rms_after * 1e3:.3f} mm; run "
-                f"`{command}`.",
+                f"Recalibration is worthwhile: errors like those of {best.file} are expected to fall from "
+                f"{best.session.rms * 1e3:.3f} to {best.session.rms_after * 1e3:.3f} mm; run `{command}`.",
             )
         lines = (*(one.sentence for one in self.untrusted), *alarms, *moves, *forecast, *advice)
         return tuple(f"{line[:1].upper()}{line[1:]}" for line in lines)
@@ -280,7 +279,8 @@ def monitor(
         ]
         if day.rows < _MIN_ROWS:
             warnings.append(
-                f"{trusted[-1].file}: {day.rows} rows show little of what moved; measure {_MIN_ROWS} poses or more."
+                f"{trusted[-1].file}: {day.rows} rows reveal little about what moved; measure {_MIN_ROWS} poses or "
+                "more."
             )
     if not (trusted or untrusted):
         raise MeasurementError(f"expected new rows, got none: {' '.join(warnings)}", expected="new rows")

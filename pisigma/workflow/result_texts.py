@@ -26,8 +26,8 @@ _NEXT_STEPS = {
     "not_better": "check that the controller applies the correction once, then measure again or recalibrate.",
     "undecided": "measure more poses that differ, and verify again.",
     "moved": "recalibrate the model with these rows.",
-    "setup_fault": "correct what is named above and measure again.",
-    "implausible": "correct what is named above and measure again.",
+    "setup_fault": "correct the problem named above and measure again.",
+    "implausible": "correct the problem named above and measure again.",
 }
 """Next step after each verdict of a verification."""
 
@@ -73,7 +73,7 @@ def _plan_verdict(planned: Plan, file: Path) -> Verdict:
     checked = f"; {count_text(planned.checks, 'pose')} will check it" if planned.checks else ""
     more = "" if planned.curve[0].poses else "more "
     return Verdict(
-        f"{rounded(last.rms * 1e3)} mm RMS and {rounded(last.p95 * 1e3)} mm for 95 % expected of the tool's position "
+        f"{rounded(last.rms * 1e3)} mm RMS and {rounded(last.p95 * 1e3)} mm (95 %) expected for the tool position "
         f"with {planned.poses} {more}poses; {rounded(last.random_rms * 1e3)} mm RMS with random poses.",
         f"{cautions}, if the sensor scatters as stated{checked}.",
         f"measure the poses, about {planned.travel / 60:.0f} min at {settings.speed_deg_s:g} deg/s and "
@@ -253,7 +253,7 @@ def _recalibration_verdict(recalibration: Recalibration, folder: Path | None) ->
         if folder is not None
         else "run it with --out DIR instead of --dry-run to write this model."
         if recalibration.trusted
-        else "correct what is named above and recalibrate again; no model was written.",
+        else "correct the problem named above and recalibrate again; no model was written.",
     )
 
 

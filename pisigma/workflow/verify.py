@@ -315,7 +315,7 @@ def _sentence(
     if count < _MIN_CONFIGURATIONS or interval is None:
         return f"{start}: {figures}, but {_MIN_CONFIGURATIONS} or more different joint values are needed."
     return (
-        f"{start}: {figures}, it differs by {interval[0]:.3g} to {interval[1]:.3g} mm with "
+        f"{start}: {figures}; it differs by {interval[0]:.3g} to {interval[1]:.3g} mm with "
         f"{100 * comparison.bootstrap.confidence:.0f} % confidence, and it is smaller in "
         f"{100 * difference.better_share:.0f} % of {count} configurations."
     )

@@ -126,7 +126,7 @@ def test_a_full_disk_for_the_standard_output(arguments):
         )
     assert done.returncode == 2
     assert done.stderr == (
-        "pisigma: the standard output cannot be written (No space left on device); print to another file.\n"
+        "pisigma: cannot write to standard output (No space left on device); redirect it to another file.\n"
     )
 
 

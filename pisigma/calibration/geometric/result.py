@@ -309,9 +309,9 @@ def _warnings(solved: SolvedCalibration) -> tuple[CalibrationWarning, ...]:
     warnings = []
     if disagreement > _DISAGREEING:
         sentence = (
-            "the measured angles disagree with the measured lengths by far more than their noise, so their weight was "
-            f"reduced to 1/{disagreement:.2g}; check for a wobbling wrist, or an orientation error of the sensor that "
-            "depends on the pose."
+            "the measured angles disagree with the measured lengths by far more than the noise of either, so the "
+            f"weight of the angles was reduced to 1/{disagreement:.2g}; check for a wobbling wrist, or an "
+            "orientation error of the sensor that depends on the pose."
         )
         warnings.append(CalibrationWarning("angle_disagreement", "", sentence))
     return (*warnings, *misfitting_frames(solved.problem, solved.refined))

@@ -57,8 +57,8 @@ _GROSS = 50.0
 _NOTHING_FOUND = "The data show nothing beyond the geometry, so the geometric calibration is kept."
 
 _TOO_FEW_ROWS = (
-    "A joint correction would use up nearly all degrees of freedom of the few rows, so the geometric calibration is "
-    "kept; measure more poses."
+    "A joint correction would use up nearly all degrees of freedom of these few rows, so the geometric "
+    "calibration is kept; measure more poses."
 )
 
 _NOTHING_HELPS = (

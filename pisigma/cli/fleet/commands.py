@@ -157,8 +157,8 @@ def _print_run(result: "FleetRun") -> None:
         f"no: {count_text(refused, 'cell')} need attention."
         if refused
         else "see `pisigma fleet status` for the errors of each robot.",
-        f"{'correct what is named below and run it again' if refused else 'see the summary'}: "
-        f"`pisigma fleet status {folder}`.",
+        f"{'correct the problems named below and run it again' if refused else 'see the summary'}: `pisigma fleet "
+        f"status {folder}`.",
         "Done",
     )
     lines = [f"{cell}: {reason}" for cell, reason in result.refused]
@@ -186,7 +186,7 @@ def _print_status(seen: "FleetStatus", page: Path | None, verbose: bool) -> None
         ],
         [
             table_block("all cells", *cell_table([] if few else seen.cells)),
-            sentences("which errors these are", [ERRORS_NOTE] if worst else []),
+            sentences("meaning of the errors", [ERRORS_NOTE] if worst else []),
         ],
         [] if page is None else [f"Page written to {page}."],
         verbose,

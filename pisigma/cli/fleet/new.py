@@ -48,7 +48,7 @@ def new(
     board: Annotated[list[Path] | None, typer.Option(help="Board file (YAML); may be repeated.")] = None,
     fixed_camera: Annotated[
         bool,
-        typer.Option("--fixed-camera", help="State that the camera is fixed and the board is on the flange."),
+        typer.Option("--fixed-camera", help="The camera is fixed and the board is on the flange."),
     ] = False,
     as_json: AsJson = False,
 ) -> None:

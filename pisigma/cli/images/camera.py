@@ -49,7 +49,7 @@ def _verdict(calibrated: "CameraCalibration", out: Path) -> Verdict:
         f"corners fit to {rounded(detection.rms)} px RMS of u and v in {len(detection.boards)} of "
         f"{len(detection.images)} images; focal length {fx:.5g} +- {sigma:.2g} px.",
         trust_text(
-            len(calibrated.warnings), f"yes: corners are in {100 * covered:.0f} % of the cells of the image."
+            len(calibrated.warnings), f"yes: corners cover {100 * covered:.0f} % of the cells of the image."
         ),
         (
             "take the images that the warnings ask for"

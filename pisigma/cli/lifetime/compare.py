@@ -130,12 +130,12 @@ def _verdict(compared: "ComparedModels") -> Verdict:
     else:
         trust = f"{which}; {f'{better} predicts' if better else 'neither clearly predicts'} the rows better."
     return Verdict(
-        f"{second} has the tool {rounded(errors['rms_mm'])} mm RMS from where {first} has it over the workspace, "
-        f"{rounded(errors['max_mm'])} mm at most.",
+        f"over the workspace, {second} places the tool {rounded(errors['rms_mm'])} mm RMS from where {first} "
+        f"places it, {rounded(errors['max_mm'])} mm at most.",
         trust,
         "measure rows and compare again with --rows."
         if compared.rows is None
-        else "correct what is named above."
+        else "correct the problem named above."
         if compared.diagnostics
         else f"use {better}."
         if better

@@ -105,7 +105,7 @@ def recalibrate_into(
         _print(recalibration, None, as_json, verbose)
         if not (recalibration.trusted or accept_implausible):
             raise AcceptanceError(
-                "the result must not be trusted, for the reasons above; nothing would be written."
+                "the result must not be trusted (see the reasons above); nothing would be written."
             )
         return
     with saved_model_folder(
@@ -130,7 +130,7 @@ def _recalibrate_cell(
     _print(recalibration, folder, as_json, verbose, cell)
     if entry is None:
         raise AcceptanceError(
-            "no model was stored, because the result must not be trusted, for the reasons above."
+            "no model was stored, because the result must not be trusted (see the reasons above)."
         )
 
 

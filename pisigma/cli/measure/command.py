@@ -32,7 +32,7 @@ PlanFile = Annotated[
     Path,
     typer.Argument(
         metavar="PLAN|CELL",
-        help="Plan of `pisigma plan` (.csv or .plan.yaml), or a cell, whose newest plan is used.",
+        help="Plan written by `pisigma plan` (.csv or .plan.yaml), or a cell, whose newest plan is used.",
     ),
 ]
 RowsFile = Annotated[
@@ -112,7 +112,7 @@ def serve_session_page(
         print_line(f"The session is shown at {view.url}", to_stderr=True)
         yield view.show_state
         if sys.stderr.isatty():
-            print_line("The page stays until Ctrl-C.", to_stderr=True)
+            print_line("The page is served until you press Ctrl-C.", to_stderr=True)
             threading.Event().wait()
 
 

@@ -58,7 +58,8 @@ def open_(
         else:
             print_line(bench.url)
             print_line(
-                "Only people who have this link can open the page. It stays until Ctrl-C.", to_stderr=True
+                "Only people who have this link can open the page. It is served until you press Ctrl-C.",
+                to_stderr=True,
             )
         sys.stdout.flush()
         with tempfile.TemporaryDirectory(prefix="pisigma-") as folder:

@@ -136,7 +136,7 @@ def _print(distillation: "Distillation", out: Path, as_json: bool, verbose: bool
     verdict = Verdict(
         f"{rms_text(errors.distilled, count)} RMS from the full model at {count} held-out poses; nominal "
         f"{rms_text(errors.nominal, count)}.",
-        f"{cautions}, in the region of the poses only; errors of {summary.parent.name} come in addition.",
+        f"{cautions}, in the region of the poses only; the errors of {summary.parent.name} add to these.",
         f"export it: `pisigma export {out} --format onnx --out MODEL.onnx`.",
     )
     head, rows = pose_rows(errors.models)

@@ -191,9 +191,9 @@ def onnx_remarks(model: CalibratedModel) -> tuple[str, ...]:
             "not rejected.",
         )
     return (
-        "The graph corrects joint values for forward kinematics: the pose is that of the hybrid geometry (--format "
-        "urdf or dh --geometry hybrid), not of the geometric fit, at q + correction. To convert nominal to commanded "
-        "joint values, export a model of `pisigma distill`.",
+        "The graph corrects joint values for forward kinematics: the pose is that of the hybrid geometry "
+        "(--format urdf or dh --geometry hybrid), not of the geometric fit, at q + correction. To convert nominal "
+        "to commanded joint values, export a model written by `pisigma distill`.",
         *condition_remarks(model),
     )
 
@@ -233,7 +233,7 @@ def _forward(model: CalibratedModel, arm: HybridArm, sha256: str) -> bytes:
         add_distance_outside(graph, arm.coverage, q),
         "beyond_measured",
         [1],
-        "0 inside the measured joint values, else the largest angle of a joint outside of them [rad]",
+        "0 within the measured joint values, otherwise the largest angle by which a joint is outside them [rad]",
     )
     doc = (
         f"Joint corrections of robot {model.robot.name}, model {model.name}, at the mean conditions of the "

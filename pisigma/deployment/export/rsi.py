@@ -26,7 +26,7 @@ _REMARKS = (
     "with its nominal kinematics: RSI_ON(#ABSOLUTE). With #RELATIVE they would add up in every cycle.",
     "In the RSI context, connect the outputs 1 to 6 of ETHERNET to the inputs A1 to A6 of AXISCORR, set the limits of "
     "AXISCORR and AXISCORRMON to the largest correction that you accept, and Timeout of ETHERNET to 10 packets.",
-    "Not tried on a controller: test it at low speed, with small limits of AXISCORR, away from obstacles.",
+    "Not tested on a controller: try it first at low speed, with small limits of AXISCORR, away from obstacles.",
 )
 
 

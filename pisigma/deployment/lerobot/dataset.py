@@ -109,7 +109,7 @@ def _record(source: LeRobotDataset, prefix: str) -> dict[str, Any]:
     record = _json(path, read_text(path, MeasurementError, "JSON"))
     if any(other.startswith(prefix) or prefix.startswith(other) for other in record):
         raise MeasurementError(
-            "the data set was corrected already",
+            "the data set has already been corrected",
             value=", ".join(map(repr, record)),
             at=Place(path),
             remedy="correct the original data set, or state the prefix of the other arm",

@@ -209,7 +209,7 @@ class JsonLines(AbstractProtocol):
             sentence = "the request is nested too deeply."
         else:
             sentence = make_printable(
-                f"this is a defect of pisigma ({type(problem).__name__}: {problem}); please report it."
+                f"this is a defect in pisigma ({type(problem).__name__}: {problem}); please report it."
             )
         reply = _line({"id": request.get("id"), "error": sentence})
         self._metrics.count("refused", begun)

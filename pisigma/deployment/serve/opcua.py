@@ -214,7 +214,7 @@ class _Robot:
                 "Pose", ua.ObjectIds.Double, "x, y, z [mm], roll, pitch, yaw [deg] of the tool in the base", 6
             ),
             _argument(
-                "Near", ua.ObjectIds.Double, "joint values to stay near to [deg or mm]; NaN for none", dof
+                "Near", ua.ObjectIds.Double, "joint values to stay close to [deg or mm]; NaN for none", dof
             ),
         ]
         outputs = [
@@ -333,7 +333,7 @@ def _make_own_certificate(folder: Path, uri: str) -> None:
 
     present = [name for name in (_CERTIFICATE, _KEY) if (folder / name).exists()]
     if len(present) == 1:
-        raise _invalid_pair(folder, f"only {present[0]} is there")
+        raise _invalid_pair(folder, f"only {present[0]} exists")
     if present:
         return
     key, host = cert_gen.generate_private_key(), socket.gethostname()
@@ -364,7 +364,7 @@ def _invalid_pair(folder: Path, why: str) -> OutputError:
         f"expected {_CERTIFICATE} (DER) and its key {_KEY} (PEM): {why}",
         at=Place(folder),
         option="--opcua-certificates",
-        remedy="give both files, or remove them to have new ones made",
+        remedy="give both files, or remove them to generate new ones",
     )
 
 

@@ -77,10 +77,10 @@ class RsiCounts:
         """Summary of a stream."""
         p50, p99 = np.quantile(self.seconds or [math.nan], [0.5, 0.99]) * 1e3
         return (
-            f"RSI stream ended: {self.answered} cycles answered, {self.unanswered} lost or late, {self.outside_domain} "
-            f"outside the domain, {self.ignored} packets of other senders; corrections at most {self.largest_deg:.4f} "
-            f"deg; answers after {p50:.3f} ms (median), {p99:.3f} ms (99 %), "
-            f"{self.slowest * 1e3:.3f} ms (most)."
+            f"RSI stream ended: {self.answered} cycles answered, {self.unanswered} lost or late, "
+            f"{self.outside_domain} outside the domain, {self.ignored} packets of other senders; corrections at "
+            f"most {self.largest_deg:.4f} deg; answers after {p50:.3f} ms (median), {p99:.3f} ms (99 %), "
+            f"{self.slowest * 1e3:.3f} ms (maximum)."
         )
 
 

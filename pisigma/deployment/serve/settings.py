@@ -56,7 +56,7 @@ class ServeSettings:
             certificates of clients in the subfolder `trusted`. Required if other machines can reach the server.
         token: token that every client has to send first; on a command line, a file that contains the token.
         client_timeout: see `_CLIENT_TIMEOUT`.
-        rsi: file of `pisigma export --format rsi`, to serve only a KUKA controller over RSI.
+        rsi: file written by `pisigma export --format rsi`, to serve only a KUKA controller over RSI.
         rsi_max_correction: largest correction of a joint over RSI [rad]; a larger correction ends the stream.
         polling: time to busy-poll for the next request [s] (0: sleep at once). The server polls only if requests
             arrive at least that often and no other program needs the processor.

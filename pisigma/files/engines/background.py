@@ -105,8 +105,8 @@ class BackgroundProcess:
     def _ended(self) -> EndedError:
         status = self._process.poll()
         return EndedError(
-            "the background process ended before it returned a result"
-            f"{'' if status is None else f' (exit status {status})'}"
+            "the background process ended without returning a "
+            f"result{'' if status is None else f' (exit status {status})'}"
         )
 
 

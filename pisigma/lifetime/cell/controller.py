@@ -54,7 +54,7 @@ _MEANING = {
         "export joint_zeros",
         "kinematics",
     ): f"{_TWICE}, because these kinematics already contain the offsets of the joints",
-    ("export joint_zeros", "same_zeros"): "the exported offsets are to be added to these",
+    ("export joint_zeros", "same_zeros"): "the exported offsets must be added to these",
     ("calibrate", "same_zeros"): "the model is valid only while they are active",
     ("measure", "other_zeros"): "the rows will differ from the model by these joint zeros",
     ("import", "other_zeros"): "the rows differ from the model by these joint zeros",
@@ -300,7 +300,7 @@ def record_controller(history: History, sha256: str, day: str, note: str) -> Con
         raise MeasurementError(expected=f"a day no later than {today}", value=day, option="--date")
     if sha256 and sha256 not in exports:
         raise MeasurementError(
-            expected="an unchanged file of `pisigma export CELL`, or none",
+            expected="an unchanged file written by `pisigma export CELL`, or none",
             value=f"SHA-256 {sha256[:16]}",
             option="--export",
             remedy="export it again",

@@ -179,7 +179,7 @@ def _no_session(facts: CellFacts) -> Step | None:
     if facts.valid_sessions:
         return None
     ended = [one for one in facts.events if one.kind in ARM_EVENTS] if facts.sessions else []
-    why = f"{ended[-1].kind} on {ended[-1].day} ended the validity of all sessions" if ended else ""
+    why = f"{ended[-1].kind} on {ended[-1].day} invalidated all sessions" if ended else ""
     if any(not one.set_aside and not facts.controller.matches_session(one) for one in facts.sessions):
         why = "all sessions were measured with joint zeros other than those that are active on the controller"
     if not facts.plans or why:
@@ -346,8 +346,8 @@ def _outside_limit(facts: CellFacts, model: ModelEntry) -> Step | None:
     if scatter > limit:
         return Step(
             "limit_below_scatter",
-            f"{missed}; the scatter of the sensor and of the robot alone makes {scatter:.3f} mm, which more poses do "
-            "not reduce; use a more accurate sensor, or raise limit_mm",
+            f"{missed}; the scatter of the sensor and of the robot alone accounts for {scatter:.3f} mm, which more "
+            "poses cannot reduce; use a more accurate sensor, or raise limit_mm",
         )
     return Step(
         "outside_limit",

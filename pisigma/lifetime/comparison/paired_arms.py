@@ -117,7 +117,7 @@ def _check_rows(rows: Float64[np.ndarray, "rows columns"], option: str) -> None:
     if len(rows) < _MIN_ROWS or not np.isfinite(rows).all():
         finite = int(np.isfinite(rows).all(1).sum())
         raise MeasurementError(
-            expected=f"at least {_MIN_ROWS} rows, all of numbers",
+            expected=f"at least {_MIN_ROWS} rows of finite numbers",
             value=f"{finite} of {len(rows)}",
             option=option,
         )
@@ -136,8 +136,8 @@ def _check_explained(model: CalibratedModel, rms: float) -> None:
             expected=f"residuals below {limit * 1e3:.2g} mm RMS",
             value=f"{rms * 1e3:.3g} mm",
             option="position",
-            remedy="give positions in m in the frame of the model, and the joint values of the same rows in rad; "
-            "calibrate this arm again if they are right",
+            remedy="give positions in m in the frame of the model, and the joint values of the same rows in rad; if "
+            "they are right, calibrate this arm again",
         )
 
 

@@ -47,7 +47,7 @@ class Difference:
     @property
     def sentence(self) -> str:
         """Clause such as "joint 3 by 0.25 ± 0.01 deg"."""
-        alike = f" (or {' or '.join(self.alike)}, to the same effect)" if self.alike else ""
+        alike = f" (or, equivalently, {' or '.join(self.alike)})" if self.alike else ""
         return f"{self.shift.what}{alike} by {self.shift.size}"
 
     def to_json(self) -> dict[str, object]:

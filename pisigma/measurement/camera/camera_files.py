@@ -40,12 +40,12 @@ class CameraFiles:
     """Cameras and boards of files of detected corners (columns image, corner, u_px, v_px and joint values).
 
     Attributes:
-        cameras: YAML file of a camera (of pisigma, ROS or OpenCV), if the rows are corners of boards in images.
-            Needs a board. With several cameras, the column camera contains their names.
-        boards: YAML file of a board (rows, columns, square_mm). With several boards, the column board contains their
-            names.
-        is_fixed: state that all cameras are fixed and the boards are on the flange (default: the opposite). If only
-            some are fixed, state is_fixed in their files instead.
+        cameras: camera file (YAML of pisigma, ROS or OpenCV) for rows that are corners of boards in images. Requires a
+            board. With several cameras, the column camera of the rows names them.
+        boards: board file (YAML: rows, columns, square_mm). With several boards, the column board of the rows names
+            them.
+        is_fixed: all cameras are fixed and the boards are on the flange, not the other way round. If only some cameras
+            are fixed, state is_fixed in their files instead.
         repeatability: repeatability of the robot.
         intrinsics: treatment of the cameras' intrinsics: fixed (as in the camera files), prior (within the stated
             standard deviations) or free. If none are stated, those of a typical calibration are used.

@@ -299,7 +299,7 @@ def _check_resolution(table: Table, pixels: Float64[np.ndarray, "rows 2"], camer
     """
     if (pixels.max(0) < np.array([camera.width, camera.height]) / 2).all():
         raise MeasurementError(
-            expected=f"corners in all of the {camera.width} x {camera.height} px of camera '{camera.name}'",
+            expected=f"corners across the {camera.width} x {camera.height} px of camera '{camera.name}'",
             value=f"corners within {pixels[:, 0].max():.0f} x {pixels[:, 1].max():.0f} px",
             at=Place(table.source),
             remedy=_RESOLUTION_REMEDY,

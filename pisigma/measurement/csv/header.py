@@ -149,7 +149,7 @@ def check_separators(name: str, place: Place) -> None:
                 expected="commas between fields",
                 value=called,
                 at=replace(place, column=name),
-                remedy="save the file with commas between fields and points in numbers",
+                remedy="save the file with commas between fields and decimal points in numbers",
             )
 
 

@@ -379,7 +379,7 @@ def load(folder: str | os.PathLike[str]) -> CorrectedIK:
 
         if model_hash(path) != stated:
             raise ModelError(
-                "the model was changed after it was loaded", at=Place(path), remedy="load it again"
+                "the model has been changed since it was loaded", at=Place(path), remedy="load it again"
             )
         return load_model(path)
 

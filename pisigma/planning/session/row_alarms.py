@@ -33,7 +33,7 @@ def unreadable_alarm(row: UnusableRow) -> Alarm:
 
 def alarm_of_all_rows(sentence: str) -> Alarm:
     """Return the alarm about a fault that affects all rows, for example in the header of the file."""
-    return Alarm(1, "setup", f"line 1: {sentence} Correct this before you continue to measure.", repeat=False)
+    return Alarm(1, "setup", f"line 1: {sentence} Correct this before you continue measuring.", repeat=False)
 
 
 def cleared_message(line: int) -> Alarm:
@@ -142,9 +142,9 @@ def contradiction_alarm(
         return Alarm(line, "swapped", text, repeat=True)
     advice = "Check the reflector, its seat and the line of sight, and measure the pose again."
     if bool(rows.is_measured("corner")[row]):
-        advice = "Check the image and that robot and board were at rest, and take it again."
+        advice = "Check the image, make sure that robot and board are at rest, and take it again."
     if rows.rows <= _AMBIGUOUS_ROWS:
-        advice = f"With so few rows, another one may be wrong instead. {advice}"
+        advice = f"With so few rows, another row may be the wrong one. {advice}"
     return Alarm(line, "off", f"{what}. {advice}", repeat=True)
 
 

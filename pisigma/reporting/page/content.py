@@ -288,11 +288,11 @@ def _missing_parameters(
 ) -> tuple[str, ...]:
     """Return sentences on figures of parameters that the folder does not store."""
     if summary is not None:
-        text = "The model folder does not keep the correlations as numbers; calibrate again to have them."
+        text = "The model folder does not store the correlations as numbers; calibrate again to store them."
         return () if correlations.tables else (text,)
     if model.calibrated is None:
         return ("This model has no identified parameters: its geometry is the nominal one.",)
-    return ("The model folder does not keep the figures of its parameters; calibrate again.",)
+    return ("The model folder does not store the figures of its parameters; calibrate again to store them.",)
 
 
 def _learned(summary: CalibrationSummary | None) -> tuple[str, ...]:

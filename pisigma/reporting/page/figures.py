@@ -144,7 +144,7 @@ def check_figures(folder: Path, inputs: Iterable[Input] = ()) -> None:
             f"there is no folder {folder.parent}",
             at=Place(folder),
             option="--figures",
-            remedy="make it or choose another",
+            remedy="create it or choose another",
         )
     if not os.access(folder if folder.exists() else folder.parent, os.W_OK):
         raise OutputError(

@@ -131,16 +131,18 @@ def _diagnostic(robot: Robot, rows: Measurements, found: LostMotion) -> Diagnost
     sizes = [(size * factor, unit) for size, (factor, unit) in zip(play, per_unit, strict=True)]
     J = joint_jacobian(robot, rows.q)[1][:, :3, list(joints)]
     error = float((J * J.new_tensor(play) / 2).square().sum((1, 2)).mean().sqrt())
-    remedy = "State from which side the joints come (docs/how-to/backlash.md), also for the poses to command."
+    remedy = (
+        "State the side from which each joint approaches (docs/how-to/backlash.md), also for the poses to "
+        "command."
+    )
     return Diagnostic(
         kind="backlash",
         severity="warning",
         sentence=f"{joints_text(joints).capitalize()}: a backlash of about "
-        f"{join_words(f'{size:.2g} {unit}' for size, unit in sizes)}, because the errors depend on the direction of "
-        f"the last motion, which makes them {found.error_ratio:.3g} times as large. The directions were taken from the "
-        "order "
-        "of the rows, and errors of held-out rows are errors with known directions; without them, commanded poses have "
-        f"further errors of {length_text(error)} RMS. {remedy}",
+        f"{join_words(f'{size:.2g} {unit}' for size, unit in sizes)}. The errors depend on the direction of "
+        f"the last motion and are {found.error_ratio:.3g} times as large as without this effect. The "
+        "directions were taken from the order of the rows, and errors of held-out rows are errors with known "
+        f"directions; without them, commanded poses have further errors of {length_text(error)} RMS. {remedy}",
         cause="unstated",
         values={
             "joints": tuple(joint + 1 for joint in joints),

@@ -71,9 +71,9 @@ def view_warnings(
     if most < _FRONTAL:
         yield _warning(
             "frontal_views",
-            f"90 % of the images show the board at less than {np.rad2deg(most):.0f} deg from frontal, which "
-            "hardly determines the distance and the tilt of the camera and doubles the error; take images at up to 40 "
-            "deg.",
+            f"90 % of the images show the board at less than {np.rad2deg(most):.0f} deg from frontal. Such views "
+            "hardly determine the distance and the tilt of the camera, and they double the error; take images at "
+            "up to 40 deg.",
             tilt_deg=float(np.rad2deg(most)),
         )
     solver = closed_form_solver(robot)
@@ -82,8 +82,8 @@ def view_warnings(
         yield _warning(
             "one_branch",
             f"{100 * share:.0f} % of the images were taken in one branch of the arm (the same configuration of "
-            "shoulder, elbow and wrist); the errors look small there and are up to three times as large in other "
-            "configurations; take images in other branches.",
+            "shoulder, elbow and wrist); the errors look small in this branch and are up to three times as large "
+            "in other configurations; take images in other branches.",
             share=share,
         )
 
@@ -101,8 +101,8 @@ def _intrinsics(images: Measurements, result: CalibrationResult) -> Iterator[Dia
         if not sigma.any():
             yield _warning(
                 "intrinsics_fixed",
-                f"The intrinsics of camera '{camera}' were fixed at the values of its file; if these are off by as "
-                "much as a usual calibration leaves, they double the error over the workspace (0.1 mm for a UR5). "
+                f"The intrinsics of camera '{camera}' were fixed at the values of its file; if these have the "
+                "errors of a typical calibration, they double the error over the workspace (0.1 mm for a UR5). "
                 "Estimate them under their prior, or check them.",
                 camera=camera,
             )
@@ -112,9 +112,9 @@ def _intrinsics(images: Measurements, result: CalibrationResult) -> Iterator[Dia
         if sigma[0] > _WIDE:
             yield _warning(
                 "intrinsics_free",
-                f"The intrinsics of camera '{camera}' were estimated without a prior, so a bow of the board appears as "
-                "distortion (a bow of 0.3 mm changes k1 and the distance); give a calibration of the camera if there "
-                "is one, and mount the board on glass.",
+                f"The intrinsics of camera '{camera}' were estimated without a prior, so a bow of the board "
+                "appears as distortion (a bow of 0.3 mm changes k1 and the distance); give a calibration of the "
+                "camera if you have one, and mount the board on glass.",
                 camera=camera,
             )
         elif np.abs(off).max() > _CONTRADICTED:
@@ -153,10 +153,10 @@ def _limit(images: Measurements, result: CalibrationResult) -> Iterator[Diagnost
     ]
     yield _warning(
         "camera_limits",
-        f"The camera limits this calibration: its images scatter by {ratio:.2f} times what their corners and "
-        f"the repeatability explain, and a position is predicted to {total * 1e3:.2g} mm RMS over the joint space"
-        f"{', ' + ' and '.join(parts) if parts else ''}. More images, a larger or nearer board and more pixels improve "
-        "it.",
+        f"The camera limits this calibration: its images scatter by {ratio:.2f} times what their corners and the "
+        f"repeatability explain, and the predicted standard deviation of a position is {total * 1e3:.2g} mm RMS "
+        f"over the joint space{', ' + ' and '.join(parts) if parts else ''}. More images, a larger or nearer board "
+        "and more pixels improve it.",
         scatter=float(ratio),
         predicted_mm=total * 1e3,
         **{f"share_{what.split()[-1]}": share for what, share in shares.items()},

@@ -54,7 +54,7 @@ def check_lag(checked: CheckedCalibration) -> Iterator[Diagnostic]:
         kind="lag",
         severity="implausible" if lag.factor > _LARGE else "warning",
         sentence=f"The joint values were logged {when}: they differ from those at the measurement by "
-        f"{abs(lag.share):.2g} of the motion {motion}, which makes the errors {lag.factor:.3g} times as large; log "
+        f"{abs(lag.share):.2g} of the motion {motion} and make the errors {lag.factor:.3g} times as large; log "
         "them when the robot has stopped.",
         cause="before_arrival" if lag.before else "after_departure",
         values={"share": lag.share, "factor": lag.factor, "log_odds": lag.log_bayes_factor},

@@ -156,9 +156,9 @@ def check_joint_zero(checked: CheckedCalibration) -> Iterator[Diagnostic]:
         yield Diagnostic(
             kind="joint_zero",
             severity="warning",
-            sentence=f"The zero of joint {joint} is estimated {math.degrees(one.change):.3g} deg away from the "
-            f"nominal one (standard error {math.degrees(one.standard_error):.2g} deg), which is more than robots "
-            f"usually have; check the zero of joint {joint} and how its values were logged (the calibration is "
-            "valid for joint values that are logged in the same way).",
+            sentence=f"The zero of joint {joint} is estimated {math.degrees(one.change):.3g} deg away from its nominal "
+            f"value (standard error {math.degrees(one.standard_error):.2g} deg), more than is usual for "
+            f"robots; check the zero of joint {joint} and how its values were logged (the calibration is valid "
+            "for joint values that are logged in the same way).",
             values={"joint": joint, "change_deg": math.degrees(one.change)},
         )

@@ -89,18 +89,18 @@ def check_position_size(robot: Robot, rows: Measurements) -> Iterator[Diagnostic
     )
     arm = _ARM_SHARE * robot.reach
     if measured > _SCALE * (nominal + arm):
-        cause, mistake = "mm_named_m", "x, y and z are millimetres that are named metres"
+        cause, mistake = "mm_named_m", "x, y and z are in millimetres but labelled as metres"
     elif _SCALE * measured < nominal > arm:
         cause = "m_named_mm"
-        mistake = "x, y and z are metres that are named millimetres, or do not change with the robot"
+        mistake = "x, y and z are in metres but labelled as millimetres, or do not follow the robot"
     else:
         return
     yield Diagnostic(
         kind="setup_fault",
         severity="implausible",
         sentence=f"The measured positions are {measured * 1e3:,.1f} mm RMS from their mean, but those of robot "
-        f"'{robot.name}' at these joint values are {nominal * 1e3:,.1f} mm: {mistake}; check the column names and the "
-        "instrument.",
+        f"'{robot.name}' at these joint values should be {nominal * 1e3:,.1f} mm: {mistake}; check the column "
+        "names and the instrument.",
         cause=cause,
         values={"measured_mm": measured * 1e3, "nominal_mm": nominal * 1e3},
     )

@@ -51,10 +51,10 @@ def check_unexplained(checked: CheckedCalibration) -> Iterator[Diagnostic]:
             severity="implausible",
             sentence=f"The errors of the {what} are {left:.3g} mm RMS ({nominal:.3g} mm for the nominal robot), but "
             f"robots of class {usual.name} and this size have less than "
-            f"{(usual.remaining if far else large) * reach:.2g} mm after a calibration"
-            f"{'' if far else ', and calibration hardly helped'}. Mixed populations, a moved frame or tool, joint "
-            "values that were logged too early or rounded, and a scale do not explain them; check the sensor, and "
-            "what else differs between the rows.",
+            f"{(usual.remaining if far else large) * reach:.2g} mm after a "
+            f"calibration{'' if far else ', and calibration hardly helped'}. Mixed populations, a moved frame "
+            "or tool, joint values that were logged too early or rounded, and a wrong scale do not explain "
+            "them; check the sensor, and what else differs between the rows.",
             values={"rms_mm": left, "nominal_rms_mm": nominal},
         )
 
@@ -127,8 +127,8 @@ def check_residual(checked: CheckedCalibration) -> Iterator[Diagnostic]:
             yield Diagnostic(
                 kind="residual",
                 severity="implausible",
-                sentence=f"With the best fit, the median residual of {sensor} is still {size} per axis "
-                f"({before:.3g} times as large for the nominal robot '{robot.name}'), which no calibration error "
+                sentence=f"With the best fit, the median residual of {sensor} is still {size} per axis ({before:.3g} "
+                f"times as large for the nominal robot '{robot.name}'), more than any calibration error "
                 f"explains; check units, order, signs and zeros of the joint columns, whether {rows} belong "
                 f"together, {'the lengths of the board, ' if by_images else ''}and whether this robot was "
                 "measured.",

@@ -116,8 +116,8 @@ def coordinate_figures(fit: FrameFit, arm_variance: tuple[float, ...]) -> tuple[
 def weak_direction_sentences(fit: FrameFit) -> tuple[str, ...]:
     """Return what the rows hardly determine, one sentence each."""
     return tuple(
-        f"the rows do not determine {one.words} (in mm and mrad; {_deviation_text(one.deviation)}); it keeps its value "
-        "before, measure other orientations"
+        f"the rows do not determine {one.words} (in mm and mrad; {_deviation_text(one.deviation)}); it keeps its "
+        "previous value; measure other orientations"
         if one.held
         else f"the rows determine {one.words} (in mm and mrad) only to {one.deviation:.2g}"
         for one in fit.weak_directions

@@ -31,8 +31,8 @@ def nominal_model(model: CalibratedModel, turned: bool) -> CalibratedModel:
         fitted = base_and_tool(GeometricCalibrator(model.robot)).fit(_predicted(model, turned))
     except IdentificationError as problem:
         raise ModelError(
-            f"model '{model.name}': base and tool of the nominal robot cannot be fitted to the {len(model.starts)} "
-            f"stored joint vectors of the model ({' '.join(str(problem).rstrip('.').split())})",
+            f"model '{model.name}': the base and tool of the nominal robot cannot be fitted to the "
+            f"{len(model.starts)} stored joint vectors of the model ({' '.join(str(problem).rstrip('.').split())})",
             value=len(model.starts),
             remedy="evaluate two or more model folders, without 'nominal'",
         ) from problem

@@ -255,7 +255,7 @@ def measured_pose_faults(
         advice = "use the images as the camera's sensor takes them, not flipped"
     else:
         for factor, are, named in MISNAMED_UNITS:
-            clause = f"x, y and z are {are} that are named {named}"
+            clause = f"x, y and z are in {are} but labelled as {named}"
             yield (
                 replace(measured, position=measured.position * factor),
                 Cause("position_unit", clause, "correct the unit in the column names", 1.0, amount=factor),
@@ -311,7 +311,7 @@ def other_conventions(
             product = " · ".join(f"Rot{axis}({name})" for axis, name in zip(order, columns, strict=True))
             clause = f"roll, pitch and yaw are angles of another order, the Euler angles of {product}"
             yield _matrices(Rotation.from_euler(order, turned)), clause, 1.0
-            clause += " in radians that are named degrees"
+            clause += " in radians but labelled as degrees"
             yield _matrices(Rotation.from_euler(order, np.rad2deg(turned))), clause, 1.0
     for signs in itertools.product((1, -1), repeat=3):
         names = ", ".join(("-" if sign < 0 else "") + name for sign, name in zip(signs, RPY, strict=True))

@@ -207,7 +207,7 @@ def _unit_causes(factor: list[float], robot: Robot) -> list[Cause]:
                 named, are = (large, small) if too_large else (small, large)
                 if _GRADIANS <= abs(factor[wrong[0]]) <= 1 / _GRADIANS:
                     named, are = ("degrees", "gradians") if too_large else ("gradians", "degrees")
-                clause = f"the values of {joints_text(wrong)} are {are} that are named {named}"
+                clause = f"the values of {joints_text(wrong)} are in {are} but labelled as {named}"
                 size = 1.0 if list(wrong) == joints else len(wrong) + 0.5
                 advice = "correct the unit in the column names"
                 causes.append(Cause("joint_unit", clause, advice, size, wrong, amount=abs(factor[wrong[0]])))

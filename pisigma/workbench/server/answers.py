@@ -35,7 +35,7 @@ def with_error_answers(function: Callable[[Any, web.Request], Awaitable[web.Stre
             job = self.jobs.running
             who = "somebody" if job is None else f"{job.person}: {job.step}"
             return web.json_response(
-                {"error": f"another step is running ({who}); wait for its end."}, status=409
+                {"error": f"another step is running ({who}); wait until it ends."}, status=409
             )
 
     return answer

@@ -18,7 +18,7 @@ from pisigma.workflow.evaluate import evaluate
 
 _JUDGED = frozenset(("position", "rotation", "pose", "corner"))
 """Kinds of readings that give positions."""
-_NO_SESSION = "no session that the model was not fitted to was measured since its calibration."
+_NO_SESSION = "no independent session has been measured since the calibration of the model."
 
 
 def acceptance_of(cell: Cell) -> Acceptance:

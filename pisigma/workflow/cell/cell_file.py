@@ -71,7 +71,7 @@ class CameraSection(Section):
     Attributes:
         camera: camera files (YAML of pisigma, ROS or OpenCV).
         board: board files (YAML: rows, columns, square_mm).
-        fixed_camera: whether the cameras are fixed and the boards are on the flange (default: the opposite).
+        fixed_camera: whether the cameras are fixed and the boards are on the flange, not the other way round.
         intrinsics: fixed, prior or free.
         repeatability_mm: standard deviation of the robot's position repeatability, per axis [mm].
         repeatability_deg: standard deviation of the robot's orientation repeatability, per axis [deg].

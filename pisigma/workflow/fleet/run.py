@@ -30,7 +30,10 @@ if TYPE_CHECKING:
 
 _CELLS_PER_CHUNK = 4
 """Number of cells that a worker processes at once, which takes some seconds."""
-_LOST = "the process that worked on it ended twice; check the memory and its files."
+_LOST = (
+    "the process that worked on this cell ended unexpectedly twice; check the free memory and the files of the "
+    "cell."
+)
 RESULTS = "results.parquet"
 """Name of the table in the folder of the cells."""
 
@@ -284,7 +287,7 @@ def _advance(folder: Path, prior: Path | None) -> tuple[str, dict[str, list[Para
         reason = step.reason if step.state in ATTENTION else ""
     except Exception as problem:  # a fault of one cell must not stop other cells; a later call tries again
         known = isinstance(problem, PisigmaError | OSError | MemoryError)
-        defect = f"a defect of pisigma ({type(problem).__name__}: {problem}); please report it."
+        defect = f"a defect in pisigma ({type(problem).__name__}: {problem}); please report it."
         reason = str(problem) if known else defect
     try:
         return reason, _parameters(status_of(folder).facts)

@@ -85,9 +85,10 @@ class CameraCalibration:
             )
         if calibration.disagrees:
             warnings.append(
-                f"Images disagree on the camera by {calibration.disagreement:.2f} times the noise of corners: the "
-                "board is not flat, or the lens needs --set k3=true. Standard deviations are enlarged by this factor, "
-                "not for errors that all images share; glue the board onto something flat."
+                f"The images disagree about the camera by {calibration.disagreement:.2f} times the noise of "
+                "corners: the board is not flat, or the lens needs --set k3=true. Standard deviations are "
+                "enlarged by this factor, which does not cover errors common to all images; glue the board onto "
+                "something flat."
             )
         if len(calibration.tilts) < _MIN_IMAGES:
             warnings.append(

@@ -107,11 +107,11 @@ class CalibrationSettings:
         prior_length: prior standard deviation of length errors [m] (0: no prior).
         prior_angle: prior standard deviation of angle errors [rad] (0: no prior).
         robot_class: expected size of the geometric errors: industrial, cobot, hobby (also for old and surgical arms)
-            or servo (arms of servos). None: from the maker and the data.
+            or servo (arms built from hobby servos). None: from the maker and the data.
         robust: down-weight outliers.
         features: features of the joint correction to try, such as gravity,lines,series. None: all that apply.
-        gravity: direction of gravity in the robot's base frame, such as 0,0,-1. None: found from the data.
-        new_frame_at: first line measured after the instrument was moved. From this line, rows are in a new frame.
+        gravity: direction of gravity in the robot's base frame, such as 0,0,-1. None: estimated from the data.
+        new_frame_at: first line measured after the instrument was moved; the rows from there on are in a new frame.
         socket_distances: known distance between two sockets [m], such as */0,*/1,50. An asterisk stands for the same
             text in both names, here for every placement.
         cameras: cameras and boards, for files of detected board corners.

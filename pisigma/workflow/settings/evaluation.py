@@ -81,7 +81,7 @@ class Limits:
             if not value <= limit:
                 text = figure_text(value) if figure_text(value) != figure_text(limit) else value
                 sentences.append(
-                    f"the {what} of {model.name} is {text} {unit}, --{option} allows {limit:g} {unit}"
+                    f"the {what} of {model.name} is {text} {unit}; --{option} allows {limit:g} {unit}"
                 )
         if self.stated and model.rows_not_predicted:
             sentences.append(f"{model.name} predicts nothing for {model.rows_not_predicted} of the rows")

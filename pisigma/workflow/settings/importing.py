@@ -48,7 +48,7 @@ class ImportSettings:
         join: how to join joint values of one file with measurements of another: by point, order or time. None:
             the files are concatenated.
         within: maximum difference between joined time stamps [s].
-        new_frame_at: first line measured after the instrument was moved. From this line, rows are in a new frame.
+        new_frame_at: first line measured after the instrument was moved; the rows from there on are in a new frame.
         lerobot_units: units of the joint values of a LeRobot data set, degrees or normalized (-100 to 100).
         lerobot_calibration: calibration file of LeRobot with which normalized values were recorded.
         lerobot_prefix: start of the names of the arm in a LeRobot data set of two arms, such as left_.

@@ -20,7 +20,7 @@ class MonitorSettings:
             file name, otherwise from the modification time.
         moved: what was moved after the model was made: base, tool or base,tool (empty: neither). None: detected from
             the rows.
-        limit_mm: limit on the RMS error [mm]; the date of crossing it is predicted.
+        limit_mm: limit on the RMS error [mm]; the date on which it will be exceeded is predicted.
         history: do not read or write the history of the model, which stores the sessions of all calls.
         cameras: cameras and boards, for files of detected board corners.
 

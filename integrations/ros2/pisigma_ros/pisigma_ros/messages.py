@@ -57,7 +57,7 @@ def solution(stamped, near, arm, solve):
 
     Args:
         stamped: desired pose of the tool in the base frame.
-        near: joint values to stay near to, in the order of the model; None for none.
+        near: joint values to stay close to, in the order of the model; None for none.
         arm: The arm.
         solve: Function that asks the server, such as `FrameClient.solve`; an OSError becomes COMMUNICATION_FAILURE.
 
@@ -91,7 +91,7 @@ def answer(request, response, arm, solve):
     """Fill the response of a GetPositionIK service, and return it.
 
     Args:
-        request: Request with `ik_request.pose_stamped` and, for joint values to stay near to,
+        request: Request with `ik_request.pose_stamped` and, for joint values to stay close to,
             `ik_request.robot_state`.
         response: Response that gets `solution.joint_state` and `error_code`; only an error code if the pose is not
             reached.

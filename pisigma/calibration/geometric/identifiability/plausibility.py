@@ -56,9 +56,9 @@ def refuse_implausible(problem: CalibrationProblem, here: Linearisation[Tensor],
     size = float(sizes.median()) if len(sizes) else 0.0
     if size > IMPLAUSIBLE_SHARE * robot.reach:
         raise ImplausibleError(
-            f"with the best fit, the median residual is still {size * 1e3:.3g} mm per axis, "
-            f"{100 * size / robot.reach:.1f} % of the reach of robot '{robot.name}', which no calibration error "
-            "explains",
+            f"with the best fit, the median residual is still {size * 1e3:.3g} mm per axis "
+            f"({100 * size / robot.reach:.1f} % of the reach of robot '{robot.name}'), more than any calibration "
+            "error explains",
             value=size,
             at=Place(source),
             remedy="check the units (millimetres in a _m column?), stated distances, order and directions of the "
@@ -81,7 +81,7 @@ def _refuse_ruined_links(problem: CalibrationProblem, point: Tensor, source: str
         name = problem.space.names[number]
         raise ImplausibleError(
             f"the best fit makes {name} of robot '{robot.name}' {float(fitted[number]) * 1e3:.4g} mm instead of "
-            f"{float(nominal[number]) * 1e3:.4g} mm, which no calibration error explains",
+            f"{float(nominal[number]) * 1e3:.4g} mm, a difference that no calibration error explains",
             value=name,
             at=Place(source),
             remedy="check the units (metres in a _mm column?), stated distances, order and directions of the joints, "
@@ -117,9 +117,9 @@ def misfitting_frames(
         CalibrationWarning(
             "frame_misfit",
             frames[number],
-            f"{wrong} of {count} rows of frame '{frames[number]}' are off by {size * 1e3:.3g} mm, while the median of "
-            f"the other frames is {usual * 1e3:.3g} mm; check whether rows have the wrong frame name, or whether this "
-            "frame was moved.",
+            f"{wrong} of {count} rows of frame '{frames[number]}' are off by {size * 1e3:.3g} mm, while the median "
+            f"error of the other frames is {usual * 1e3:.3g} mm; check whether rows have the wrong frame name, or "
+            "whether this frame was moved.",
         )
         for (number, size, wrong, count), usual in zip(off, others, strict=True)
     )

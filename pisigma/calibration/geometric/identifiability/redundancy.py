@@ -226,7 +226,7 @@ def dependency_sentence(members: list[Parameter], coefficients: list[float]) -> 
             factor = f"{abs(coefficient):.4g}{units} · "
         sign = "-" if coefficient < 0 else "+"
         text += f" {sign} {factor}{member.name}" if text else f"{factor}{member.name}"
-    return f"{text} is identified, the single values are not"
+    return f"{text} is identified; the individual values are not"
 
 
 def additional_columns(information: Information, kept_count: int) -> list[int]:

@@ -54,8 +54,8 @@ _MIN_EFFECT = 1e-3
 _SAME_FACE = 1e-6
 """Largest difference of coordinates [m] on one face."""
 _TOUCHES_WITHOUT_SCALE = (
-    "the touches of every frame and axis are at one coordinate, which a robot of any size fits, so the scale stays "
-    "nominal; touch faces at different coordinates along an axis."
+    "in every frame, all touches along an axis are at one coordinate; a robot of any size fits them, so the scale "
+    "stays nominal. Touch faces at different coordinates along an axis."
 )
 _SOCKETS_WITHOUT_SCALE = (
     "sockets alone fit a robot of any size, so the scale stays nominal; give the distance between two sockets "
@@ -260,7 +260,7 @@ def _scale_of_boards(setup: CalibrationSetup) -> str:
     """Yield a warning if only boards determine the scale, which states how accurately."""
     stated = [float(text) for text in texts_of(setup.measurements, SCALE_COLUMN) if text]
     how_sure = (
-        f"the stated standard deviation of its squares is {max(stated):.2g} of their length, which is "
+        f"the stated standard deviation of its squares is {max(stated):.2g} of their length, or "
         f"{max(stated) * setup.problem.space.robot.reach * 1e3:.2g} mm at the reach of the robot"
         if stated
         else "the standard deviation of its squares is not stated (square_sigma_mm), so no predicted error includes it"

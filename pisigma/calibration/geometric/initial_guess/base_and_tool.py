@@ -71,8 +71,9 @@ class BaseToolFit:
         if rank == free:
             return self.solution.status.value
         return (
-            f"{self.solution.status.value}; the data determine only {rank} of the {free} unknowns of base and tool, "
-            "the others keep their start values (poses with more different wrist orientations would determine them)"
+            f"{self.solution.status.value}; the data determine only {rank} of the {free} unknowns of base and "
+            "tool; the others keep their initial values (poses with more different wrist orientations would "
+            "determine them)"
         )
 
 

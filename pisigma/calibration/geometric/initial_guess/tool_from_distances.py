@@ -268,8 +268,9 @@ def _refuse_other_units(
     )
     if miss < MAX_NOMINAL_ERROR * robot.reach and miss / factor < _COLLAPSED * typical:
         raise ImplausibleError(
-            f"expected distances of robot '{robot.name}' at these joint values, got {are} that are named {named}: the "
-            f"median error is {typical * 1e3:.3g} mm, and {miss * 1e3:.3g} mm for distances multiplied by {factor:.4g}",
+            f"expected distances of robot '{robot.name}' at these joint values, got {are} labelled as {named}: the "
+            f"median error is {typical * 1e3:.3g} mm, and {miss * 1e3:.3g} mm for distances multiplied by "
+            f"{factor:.4g}",
             expected=f"distances in {named}",
             value=are,
             at=Place(source),

@@ -199,7 +199,7 @@ def usable_rows(measurements: Measurements) -> tuple[Tensor, Measurements]:
     q = chosen.q
     if q.shape[0] > 1 and float((q - q[0]).abs().max()) < 1e-9:
         raise IdentificationError(
-            f"all {q.shape[0]} rows have the same joint values, which determine the noise but no parameter",
+            f"all {q.shape[0]} rows have the same joint values, so they determine the noise but no parameter",
             expected="different joint values",
             value=q.shape[0],
             at=Place(measurements.source),

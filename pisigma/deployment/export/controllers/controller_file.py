@@ -172,7 +172,7 @@ class ControllerFile:
 
 def untested_on_controller(source: str) -> str:
     """Return the sentence on a file that was not tested on a controller."""
-    return f"Written from the published description ({source}), not tried on a controller."
+    return f"Written from the published description ({source}), not tested on a controller."
 
 
 def frame_sentences(robot: Robot) -> tuple[str, ...]:

@@ -313,8 +313,8 @@ def program_text(targets: Targets, path: Path, cartesian: bool, config: str | No
     if cartesian and not language.keeps_branch and len(set(targets.branch)) > 1:
         other = next(row for row, name in enumerate(targets.branch) if name != targets.branch[0])
         raise OutputError(
-            f"the target is on branch {targets.branch[other]}, that of line {targets.line[0]} on branch "
-            f"{targets.branch[0]}, which poses of a {language.name} program cannot distinguish",
+            f"the target is on branch {targets.branch[other]} and that of line {targets.line[0]} on branch "
+            f"{targets.branch[0]}, but poses of a {language.name} program cannot distinguish them",
             expected=f"a target on branch {targets.branch[0]}",
             value=targets.branch[other],
             at=Place(targets.source, targets.line[other]),

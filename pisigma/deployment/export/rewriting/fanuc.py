@@ -140,7 +140,7 @@ class _Reader:
         match = self.positions[name]
         values = _VALUES.match(self.text, match.start("body"))
         if values is None or "GP2" in match["body"]:
-            return f"the values of P[{name}] are not understood"
+            return f"the values of P[{name}] cannot be read"
         if used := external_axes(dict(_EXTERNAL.findall(match["body"])), self.axes_in_use):
             return f"{used} (P[{name}], line {self.scan.line_number(match.start())})"
         six = torch.tensor([float(match[2]) for match in _VALUE.finditer(values["six"])], dtype=torch.float64)

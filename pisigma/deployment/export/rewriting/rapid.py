@@ -160,7 +160,7 @@ class _Reader:
         kind = re.match(r"Move([JLC])", match["move"], re.IGNORECASE)
         count = 2 if kind and kind[1].upper() == "C" else 1
         if kind is None or len(spans) < count + 3:
-            self.scan.add_move(match.start(), "this kind of move is not understood", IDENTITY, IDENTITY)
+            self.scan.add_move(match.start(), "this kind of move is not supported", IDENTITY, IDENTITY)
             return
         frame, tool = self._frames(self.text[slice(*spans[count + 2])])
         if displaced := _DISPLACED.search(self.text):

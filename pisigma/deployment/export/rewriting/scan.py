@@ -236,7 +236,7 @@ class Scan:
             self.mark_not_understood(pose)
         for span, target in self._targets.items():
             if span in self._unclear:
-                self._left.setdefault(target.line, "the pose is also used in a way that is not understood")
+                self._left.setdefault(target.line, "the pose is also used in a way that is not supported")
         kept = {span: target for span, target in self._targets.items() if span not in self._unclear}
         moves = [
             replace(move, start=_among(kept, move.start), via=_among(kept, move.via))

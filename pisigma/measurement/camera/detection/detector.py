@@ -75,7 +75,7 @@ def _missing(image: Image, board: Board) -> NoBoard:
     expected = f"{board.rows} x {board.columns} corners"
     if there:
         rows, columns = piece.shape
-        reason = f"only a piece of {rows} x {columns} corners of a board of {expected} is found"
+        reason = f"only {rows} x {columns} corners of a board of {expected} are found"
         return NoBoard(reason, piece=(rows, columns))
     return NoBoard(f"no board of {expected} is found in it")
 

@@ -68,7 +68,7 @@ def still_frames(path: str | os.PathLike[str]) -> tuple[StillFrame, ...]:
     if not stops:
         raise MeasurementError(
             expected=f"a video in which the arm rests for {_MIN_STILL:g} s or more at every pose",
-            value="no such time",
+            value="no such pause",
             at=Place(path),
             remedy="let the arm rest for a second at every pose, and fix the phone",
         )
