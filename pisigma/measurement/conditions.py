@@ -1,4 +1,4 @@
-"""Conditions of a measurement in addition to the joint values: payload, temperature, approach and torques."""
+"""Conditions of a measurement other than the joint values: payload, temperature, approach and torques."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -17,16 +17,16 @@ _MIN_SPREAD = 1e-9
 """Smallest range of a condition [kg or deg C] over which its effect can be identified."""
 APPROACH = "approach"
 """Key of `JointState.stated`: `(*batch, dof)`, +1 if the joint's value increased before it stopped, -1 if it decreased;
-0 or NaN if not given."""
+0 or NaN if not stated."""
 
 TORQUE = "torque"
 """Key of `JointState.stated`: `(*batch, dof)`, measured torques of the drives [Nm; N for prismatic joints]; NaN if not
-given."""
+stated."""
 _TORQUE_STEP = 0.2
-"""Difference of torques that is another load of the arm, over the standard deviation in all rows of the torque that
-varies most; a joint that gravity does not load varies by its noise only."""
+"""Difference of torques that shows a different load of the arm, relative to the standard deviation, over all rows, of
+the torque that varies most; the torque of a joint that gravity does not load varies only by its noise."""
 _MIN_MOTION = 1e-3
-"""[rad or m] Smaller motions of a joint need not take up the play of its gear."""
+"""Smallest motion of a joint that is certain to take up the play of its gear [rad or m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,10 +82,10 @@ def conditions_of(measurements: Measurements, names: Sequence[str]) -> Float64[T
 
 
 def repeat_key(measurements: Measurements) -> Float64[Tensor, "rows _key"]:
-    """Return the values that repeats of a pose have in common: joint values, payload, approach (0 if not given), load.
+    """Return the values that repeats of a pose have in common: joint values, payload, approach (0 if not stated), load.
 
-    The payload is included if every row states one and it varies. The load is the difference of the torques from those
-    of the first row at these values, in steps of `_TORQUE_STEP`; smaller differences are noise.
+    The payload is included if every row states one and the values vary. The load is the difference of the torques from
+    those of the first row at the same values, in steps of `_TORQUE_STEP`; smaller differences are noise.
     """
     loaded = tuple(name for name in stated_conditions(measurements) if name == "payload_kg")
     columns = [measurements.q, conditions_of(measurements, loaded)]
@@ -111,10 +111,10 @@ def order_of_rows(measurements: Measurements) -> Int64[np.ndarray, " rows"]:
 def motions_between_rows(
     measurements: Measurements,
 ) -> tuple[Float64[np.ndarray, "rows dof"], Float64[np.ndarray, "rows dof"]]:
-    """Compute the motions [rad or m] from the previous row, and from the next row back.
+    """Compute the motions [rad or m] from the previous row to each row, and from the next row back to it.
 
-    They are NaN if they are not known: at the ends of a file, and next to lines of the file without a row, because a
-    row that was left out or not selected may have been measured there.
+    Unknown motions are NaN: those at the ends of a file and next to lines of the file without a row, because a row that
+    was left out or not selected may have been measured there.
     """
     q, order = measurements.q.cpu().numpy(), order_of_rows(measurements)
     file = np.array(measurements.origin or ("",) * len(q))[order]

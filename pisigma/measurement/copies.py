@@ -1,4 +1,4 @@
-"""Find duplicate rows: the same joint values and readings, perhaps rounded, in another unit or order."""
+"""Find duplicate rows: the same joint values and readings, perhaps rounded, reordered or in another unit."""
 
 import itertools
 import math
@@ -47,8 +47,8 @@ class CopiedRow(UnusableRow):
     """A row that is left out because another row contains the same measurement.
 
     Attributes:
-        place: place of the row.
-        original: place of the row that is kept.
+        place: file and line of the row.
+        original: file and line of the row that is kept.
     """
 
     place: str = ""
@@ -64,7 +64,7 @@ class RowValues:
             the first two columns of the measured rotation. NaN where nothing was measured.
         steps: rounding steps of revolute axes [rad], prismatic axes [m], length [m] and rotation [rad].
         kind: for every column of `numbers`, its column of `steps`.
-        file: index of the file that a row comes from.
+        file: index of the file from which a row comes.
     """
 
     numbers: Float64[Tensor, "rows numbers"]
@@ -112,7 +112,7 @@ class RowValues:
 
     @property
     def column_steps(self) -> Float64[Tensor, "rows numbers"]:
-        """Rounding step of every number; entries of a rotation vary with the steps of all three angles together."""
+        """Rounding step of every number; the entries of a rotation depend on the steps of all three angles together."""
         return (self.steps * torch.tensor([1, 1, 1, 3**0.5]))[:, self.kind]
 
     @property
@@ -175,7 +175,7 @@ def original_rows(values: RowValues, known: int = 0) -> Int64[Tensor, " rows"]:
 
     Args:
         values: values of all rows.
-        known: if not 0, only copies of the first `known` rows are searched for.
+        known: if nonzero, only copies of the first `known` rows are searched for.
     """
     count = len(values.numbers)
     own = torch.arange(count)
@@ -250,7 +250,7 @@ class _SameJoints:
     def count_partners(
         self, rank: Int64[Tensor, " rows"], known: int, standing: bool
     ) -> Int64[Tensor, " rows"]:
-        """Return to how many rows every row might be equal: in its run if `standing`, otherwise in other runs."""
+        """Return the number of rows that each row might equal, in its run if `standing`, otherwise in other runs."""
         if known:
             there = torch.bincount(self.group[:known], minlength=len(rank))[self.group]
             return torch.where(torch.arange(len(rank)) < known, 0, 0 if standing else there)
@@ -292,7 +292,7 @@ def _chance_of_equal(step: Float64[Tensor, "*shape"], deviation: float) -> Float
 
 
 def _equal_pairs(values: RowValues) -> tuple[Int64[Tensor, " pairs"], Int64[Tensor, " pairs"]]:
-    """Return the pairs of rows (lower number first) whose numbers agree to the coarser of both roundings.
+    """Return the pairs of rows (lower index first) whose numbers agree to within the coarser of both roundings.
 
     Rows are sorted by a weighted sum of their numbers, so that only neighbours need to be compared.
     """
@@ -318,7 +318,7 @@ def _equal_pairs(values: RowValues) -> tuple[Int64[Tensor, " pairs"], Int64[Tens
 
 
 def _agree(values: Float64[Tensor, "2 pairs"], steps: Float64[Tensor, "2 pairs"]) -> Bool[Tensor, " pairs"]:
-    """Return whether two values may be roundings of one value, to the same or to two different steps."""
+    """Return whether two values may be roundings of one value, to the same step or to two different steps."""
     fine, coarse = steps.amin(0), steps.amax(0)
     largest = torch.where(coarse - fine > _GRID_TOLERANCE * coarse, coarse + fine, coarse) * (
         0.5 + _GRID_TOLERANCE
@@ -353,7 +353,7 @@ def copies_of_known(rows: MeasuredFields, robot: Robot, known: RowValues) -> Boo
 
 
 def without_copies(rows: MeasuredFields, robot: Robot) -> MeasuredFields:
-    """Return the rows without copies of other rows; the row with the most digits is kept, see `CopiedRow`.
+    """Return the rows without copies of other rows; the copy with the most digits is kept, see `CopiedRow`.
 
     The two rows of a pair are left out together.
     """
@@ -377,7 +377,7 @@ def without_copies(rows: MeasuredFields, robot: Robot) -> MeasuredFields:
 
 
 def places_text(rows: MeasuredFields, chosen: Bool[Tensor, " rows"]) -> str:
-    """Return a text with the places of the chosen rows, at most `MAX_NAMED` of them."""
+    """Return a text that lists files and lines of the chosen rows, at most `MAX_NAMED` of them."""
     numbers = chosen.nonzero()[:, 0].tolist()
     named = ", ".join(rows.place_text(number) for number in numbers[:MAX_NAMED])
     return f"{named} and {len(numbers) - MAX_NAMED} more" if len(numbers) > MAX_NAMED else named

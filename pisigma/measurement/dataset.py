@@ -25,16 +25,16 @@ from pisigma.robot import Robot
 from pisigma.robot.se3 import transform
 
 _ORIGIN = ("line", "source", "left_out", "origin", "last_line")
-"""Fields that state where the rows come from."""
+"""Fields that state the origin of the rows."""
 
 
 @dataclass(frozen=True, eq=False)
 class Measurements:
     """Measurements of a robot in SI units, one per row.
 
-    Values that were not measured in a row are NaN, and names that are not given are ""; a field that no row has is
-    None. A row contains at most one length: a position, a touch, a socket or a distance. It may contain an orientation
-    in addition. A second sensor's reading at the same joint values is a second row.
+    Values that were not measured in a row are NaN, and missing names are ""; a field that no row has is None. A row
+    contains at most one length: a position, a touch, a socket or a distance. It may also contain an orientation. A
+    second sensor's reading at the same joint values is a second row.
 
     Attributes:
         q: commanded joint values [rad or m], with the sign and zero of the controller.
@@ -43,35 +43,36 @@ class Measurements:
         frame: per row, the frame in which the sensor measures; "" if the file names none.
         target: per row, the reflector on the tool that was measured; "" if the file names none.
         sigma_position: per row, standard deviation of the measured length (of every coordinate of a position) [m]; NaN
-            if not given.
-        sigma_rotation: per row, standard deviation of a measured angle [rad]; NaN if not given.
+            if not stated.
+        sigma_rotation: per row, standard deviation of a measured angle [rad]; NaN if not stated.
         split: per row, "train" or "test" (column `set`).
-        payload: per row [kg].
-        temperature: per row [deg C].
+        payload: per row, mass of the payload [kg].
+        temperature: per row, temperature [deg C].
         socket: per row, the socket in which the target's ball sits; all rows of a socket share one unknown point.
         touch_axis: per row, the axis ("x", "y" or "z") of the row's frame along which the target's tip touched.
-        touch: per row, the coordinate at which it touched [m].
-        distance: per row [m], from the anchor to the target, or between the targets of the two rows of a pair, given in
-            both.
+        touch: per row, the coordinate at which the tip touched [m].
+        distance: per row, distance from the anchor to the target, or between the targets of the two rows of a pair,
+            stated in both [m].
         anchor: per row, the fixed point from which the distance is measured; all rows of an anchor share one point and
             one zero offset.
         anchor_place: per row, position of the anchor in the row's frame [m]; NaN if it is to be identified.
         pair: per row, the pair to which it belongs; a pair has exactly two rows, in one frame.
-        approach: per row and joint, +1 if the joint value increased before it stopped, -1 if it decreased, NaN unknown.
-        torque: per row and joint, torque of the drive towards larger joint values [Nm or N]; NaN if not given.
-        date: per row, the day of the measurement (ISO 8601, such as "2026-11-22"); "" if not given.
+        approach: per row and joint, +1 if the joint value increased before it stopped, -1 if it decreased, NaN if
+            unknown.
+        torque: per row and joint, torque of the drive towards larger joint values [Nm or N]; NaN if not stated.
+        date: per row, the date of the measurement (ISO 8601, such as "2026-11-22"); "" if not stated.
         image: per row, the name of the image from which it was measured; "" if there is no image.
         readings: readings of registered sensors (see `pisigma.measurement.sensors.register_sensor`), by column: one
             number [SI] or one name per row.
-        line: per row, the line of the file that it was read from; 0 for rows that were not read from a file.
+        line: per row, the line of the file from which it was read; 0 for rows that were not read from a file.
         source: the file, or a name for the origin of the rows.
-        left_out: rows of the file that could not be used, and why.
-        origin: per row, the file that it was read from, if rows come from several files; otherwise empty.
-        last_line: per row, its last line in the file, as of an image with a line per corner; empty if it is `line`.
+        left_out: rows of the file that could not be used, with the reasons.
+        origin: per row, the file from which it was read if rows come from several files; otherwise empty.
+        last_line: per row, its last line in the file, for images with a line per corner; empty if equal to `line`.
 
     Raises:
-        MeasurementError: the fields do not fit together, or a value is impossible; `column` is the field, `line` or the
-            message states the row.
+        MeasurementError: the fields do not fit together, or a value is impossible; `column` states the field, and
+            `line` or the message the row.
     """
 
     q: Float64[Tensor, "rows dof"]
@@ -230,7 +231,7 @@ class Measurements:
         """Return the rows that an index, in its order, or a mask selects, with all their fields.
 
         Args:
-            index: int64 numbers of rows, or one bool per row.
+            index: int64 indices of rows, or one boolean per row.
 
         Raises:
             MeasurementError: the index is out of range, the mask has a different length, or one row of a pair is
@@ -252,7 +253,7 @@ class Measurements:
         return MeasurementError(option="index", expected=expected, value=value, at=Place(self.source))
 
     def content_hash(self) -> str:
-        """Return the SHA-256 (hexadecimal) of all values; it does not depend on the source and the line numbers."""
+        """Return the SHA-256 (hexadecimal) of all values, which does not depend on the source or on line numbers."""
         digest = hashlib.sha256()
         data = self.as_fields()
         order = [item.name for item in fields(self)] + sorted(self.readings)
@@ -287,14 +288,15 @@ class Measurements:
     ) -> None:
         """Write a CSV file that `read_csv` reads back: degrees and millimetres with every digit, and quaternions.
 
-        The file is moved to its path in one step when it is complete. Values read back are equal to a relative 1e-12
-        (rotations if they are orthonormal to that).
+        The file is moved to its path in one step when it is complete. Values read back agree to a relative 1e-12
+        (rotations only if they are orthonormal to this accuracy).
 
         Args:
             path: the file; written completely or not at all.
-            robot: states which joints are revolute (degrees) and prismatic (millimetres); the controller's values of
-                coupled joints are written.
-            revolute: whether every joint is revolute, if no robot is given; without both, all joints are revolute.
+            robot: robot that states which joints are revolute (degrees) or prismatic (millimetres); for coupled joints,
+                the controller's values are written.
+            revolute: whether each joint is revolute, if no robot is given; if neither is given, all joints are
+                revolute.
 
         Raises:
             MeasurementError: the file could not be read back: there is no row, nothing was measured in a row, a CSV
@@ -331,7 +333,7 @@ def join(
 
     Args:
         data: one or more data sets with the same number of joints.
-        cleared: function that returns the rows to keep, called before the check that rows fit together.
+        cleared: function that returns the rows to keep; it is called before the check that rows fit together.
 
     Raises:
         MeasurementError: there is no data set, the numbers of joints differ, only some data sets have a split, or rows
@@ -360,8 +362,8 @@ def join(
 def with_new_frames(measurements: Measurements, lines: Sequence[int]) -> Measurements:
     """Start new frames at lines of the file, as after the instrument was moved.
 
-    From line 50, for example, rows of the frame "A" are in the frame "A from line 50", and rows of the frame "" in
-    "from line 50".
+    From line 50, for example, rows of the frame "A" get the frame "A from line 50", and rows of the frame "" get "from
+    line 50".
 
     Args:
         measurements: rows of one file.

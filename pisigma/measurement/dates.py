@@ -9,7 +9,7 @@ EXPECTED_DATE = "a day from 1970-01-01 to today, such as 2026-11-22"
 """Description of valid dates, for messages."""
 
 _FIRST = datetime.date(1970, 1, 1)
-"""Earliest date; joint values were not logged before it, so an earlier year is a typing error."""
+"""Earliest date; joint values were not logged before then, so an earlier year is a typing error."""
 _TIME_ZONES = datetime.timedelta(days=1)
 """Number of days that a date may be in the future: it may already be tomorrow in the instrument's time zone."""
 _IN_NAME = re.compile(r"(?<!\d)(\d{4})([-_.]?)(\d{2})[-_.]?(\d{2})(?!\d)")

@@ -32,12 +32,12 @@ class Fault:
     """A fault of a row; see `PisigmaError` for the fields.
 
     Attributes:
-        problem: a clause without a full stop that states what is wrong; if empty, the message is ``expected ..., got
+        problem: clause without a full stop that states what is wrong; if empty, the message is ``expected ..., got
             ...``.
         column: name of the first faulty column, or its number from 1; None for the whole row.
         expected: what was expected.
         value: what was given instead.
-        remedy: how to correct the fault, an imperative clause without a full stop.
+        remedy: imperative clause without a full stop that states how to correct the fault.
     """
 
     problem: str = ""

@@ -1,4 +1,4 @@
-"""Fields of a data set, and rows as fields."""
+"""Fields of a data set, and rows in the form of fields."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -46,7 +46,7 @@ class UnusableRow:
 
     Attributes:
         line: line number of the row in the file.
-        reason: what is wrong, in which column, and what to do.
+        reason: sentence that states what is wrong, in which column, and what to do.
         fault: the reason as a `Fault`, if one value of the row is faulty.
     """
 
@@ -66,19 +66,19 @@ class UnusableRow:
 
 @dataclass(frozen=True, eq=False)
 class MeasuredFields:
-    """Rows of measurements by field, in SI units; see `Measurements` for what the fields mean.
+    """Rows of measurements by field, in SI units; see `Measurements` for the meaning of the fields.
 
     Files are read and written, and rows are checked, selected and joined, in this form.
 
     Attributes:
-        numbers: numeric fields, one entry per row: "q", and those of `NUMBERS` and of registered sensors that were
-            measured.
-        texts: text fields, one entry per row: those of `TEXTS` and of registered sensors that are given.
-        line: per row, the line of the file that it was read from; 0 for rows that were not read from a file.
+        numbers: numeric fields, one entry per row: "q", and the measured ones among those of `NUMBERS` and of
+            registered sensors.
+        texts: text fields, one entry per row: those present among the fields of `TEXTS` and of registered sensors.
+        line: per row, the line of the file from which it was read; 0 for rows that were not read from a file.
         source: the file, or a name for the origin of the rows.
-        left_out: rows of the file that could not be used, and why.
-        origin: per row, the file that it was read from, if rows come from several files; otherwise empty.
-        last_line: per row, its last line in the file, as of an image with a line per corner; empty if it is `line`.
+        left_out: rows of the file that could not be used, with the reasons.
+        origin: per row, the file from which it was read if rows come from several files; otherwise empty.
+        last_line: per row, its last line in the file, for images with a line per corner; empty if equal to `line`.
     """
 
     numbers: Mapping[str, Tensor]

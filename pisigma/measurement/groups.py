@@ -1,4 +1,4 @@
-"""Groups of rows that belong together: equal joint values, the two rows of a pair, and one placement."""
+"""Groups of rows that belong together: rows of equal joint values, of a pair, or of a placement."""
 
 from collections.abc import Hashable, Sequence
 
@@ -10,7 +10,7 @@ from pisigma.files.errors import MeasurementError, Place
 from pisigma.measurement.dataset import Measurements
 
 _MIN_GROUPS = 3
-"""Smallest number of placements, sockets or anchors that are held out as a whole; with fewer, too few rows would
+"""Smallest number of placements, sockets or anchors that are held out as wholes; with fewer, too few rows would
 remain."""
 
 
@@ -41,8 +41,7 @@ def numbers_of_names(names: Sequence[Hashable]) -> Int64[Tensor, " rows"]:
 def groups_to_keep_whole(measurements: Measurements) -> Int64[Tensor, " rows"]:
     """Return the index of the group that a split must keep together, for every row.
 
-    Rows of equal joint values belong together, and so do the two rows of a pair with all rows that belong to either of
-    them.
+    Rows of equal joint values belong together, as do the two rows of a pair and all rows that belong to either of them.
 
     Args:
         measurements: the rows.
@@ -57,9 +56,9 @@ def groups_to_keep_whole(measurements: Measurements) -> Int64[Tensor, " rows"]:
 def held_out_groups(measurements: Measurements) -> Int64[Tensor, " rows"]:
     """Return the index of the group that is held out together for model selection, for every row.
 
-    Rows of one socket or anchor share its unknown position, so they predict each other better than other rows; the
-    same holds for the sockets of one placement. Groups are therefore whole placements if there are `_MIN_GROUPS` of
-    them, otherwise whole sockets and anchors, otherwise the groups of `groups_to_keep_whole`.
+    Rows of one socket or anchor share its unknown position, so they predict each other better than they predict other
+    rows; the same holds for the sockets of one placement. Groups are therefore whole placements if there are at least
+    `_MIN_GROUPS`, or else whole sockets and anchors, or else the groups of `groups_to_keep_whole`.
 
     Returns:
         For every row, the index of its group, from 0.
@@ -83,7 +82,7 @@ def held_out_groups(measurements: Measurements) -> Int64[Tensor, " rows"]:
 
 
 def placements(measurements: Measurements) -> tuple[str, ...]:
-    """Return the placement of every row: the position of the touched object or of the sensor.
+    """Return the name of every row's placement: the position of the touched object or of the sensor.
 
     Sockets "plate/0" and "plate/1" belong to the placement "plate"; a socket without "/" is a placement by itself.
     Without sockets, every frame is a placement.

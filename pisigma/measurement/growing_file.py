@@ -18,11 +18,11 @@ from pisigma.measurement.fields import MeasuredFields, UnusableRow
 from pisigma.robot import Robot
 
 _DIGITS = 9
-"""Number of decimals [SI] to which equal rows agree; programs that save a file again round values."""
+"""Number of decimals [SI] to which equal rows agree, because programs that save a file again round values."""
 
 
 Reader = Callable[[Table, bool], MeasuredFields]
-"""Function that converts rows of a table to measurements; the second argument is true once the file is complete."""
+"""Function that converts rows of a table to measurements; its second argument is whether the file is complete."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +31,7 @@ class FileGrowth:
 
     Attributes:
         rows: new rows in the order of the file; None if there are none.
-        left_out: new rows that cannot be used, and why.
+        left_out: new rows that cannot be used, with the reasons.
         notices: sentences about a file that was truncated or replaced.
         waiting: what is missing: the file, its header, or the end of its last line; "" if nothing is missing.
     """
@@ -50,8 +50,8 @@ class FileGrowth:
 class GrowingFile:
     """Reader of rows that are appended to a measurement file; see `Measurements.read_csv` for the columns.
 
-    Every row is read once, after the end of its line was written. If the file is truncated or replaced, rows that
-    were read remain valid, and equal rows of the new file are not read again.
+    Every row is read once, after the end of its line has been written. If the file is truncated or replaced, rows that
+    have been read remain valid, and equal rows of the new file are not read again.
     """
 
     def __init__(self, path: str | os.PathLike[str], robot: Robot, reader: Reader | None = None):
@@ -125,7 +125,7 @@ class GrowingFile:
 
     def _new_rows(self, data: MeasuredFields) -> list[int]:
         """Return the indices of the rows that were not read before, and record them as read."""
-        # of equal rows, those are new by which the file has more than were read
+        # if the file has more equal rows than were read, the excess rows are new
         in_file: Counter[str] = Counter()
         new = []
         for row in range(data.rows):

@@ -22,13 +22,13 @@ _SKIN = 1e-7
 
 
 class BlockSection(Section):
-    """Section of a jig file with a block whose edges are along the axes of the jig's frame.
+    """Section of a jig file that describes a block with edges along the axes of the jig's frame.
 
     Attributes:
         name: name of the block, unique in the jig.
         corner_mm: corner with the smallest coordinates [mm].
         size_mm: extent along x, y and z [mm].
-        faces: faces that may be touched, by their outward direction.
+        faces: faces that may be touched, as outward directions.
     """
 
     name: str = Field(min_length=1)
@@ -165,7 +165,7 @@ class Jig:
 
     @property
     def extent(self) -> tuple[Float64[Tensor, "faces 3"], Float64[Tensor, "faces 3"]]:
-        """Smallest and largest coordinates on every face [m]; along its normal both are `coordinate`."""
+        """Smallest and largest coordinates on every face [m]; along the normal, both are `coordinate`."""
         along = torch.nn.functional.one_hot(self.axis, 3).bool()
         coordinate = self.coordinate[:, None]
         return (

@@ -1,4 +1,4 @@
-"""Warn of joint values beyond the nominal joint limits, and widen the limits to include them."""
+"""Warn about joint values beyond the nominal joint limits, and widen the limits to include them."""
 
 from dataclasses import dataclass, replace
 
@@ -16,8 +16,8 @@ _MAX_NAMED = 5
 """Largest number of rows that a warning lists."""
 
 _MAX_TORQUE = 1e3
-"""[Nm/m^4] Largest torque over the fourth power of the reach, as masses grow with its cube: 75 for the UR5 (150 Nm), 60
-for the FANUC R-2000iC."""
+"""Largest ratio of a torque to the fourth power of the reach [Nm/m^4], because masses grow with its cube: 75 for the
+UR5 (150 Nm), 60 for the FANUC R-2000iC."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +64,7 @@ class JointRange:
 
 
 def joint_ranges(robot: Robot, rows: Measurements) -> tuple[JointRange, ...]:
-    """Return the ranges of the axes of a robot whose limits rows exceed."""
+    """Return the ranges of those axes of a robot whose limits are exceeded by rows."""
     values = robot.to_controller(rows.q.detach().cpu().double().numpy())
     found = []
     for axis, q in zip(robot.axes, np.moveaxis(values, -1, 0), strict=True):
@@ -74,17 +74,17 @@ def joint_ranges(robot: Robot, rows: Measurements) -> tuple[JointRange, ...]:
 
 
 def limit_warnings(robot: Robot, rows: Measurements) -> tuple[str, ...]:
-    """Return a warning for every joint whose limits rows exceed."""
+    """Return a warning for every joint whose limits are exceeded by rows."""
     return tuple(one.sentence(rows, robot) for one in joint_ranges(robot, rows))
 
 
 def row_warnings(robot: Robot, rows: Measurements) -> tuple[str, ...]:
-    """Return warnings about duplicate rows, joint values beyond the limits, and torques that no robot has."""
+    """Return warnings about duplicate rows, joint values beyond the limits, and impossible torques."""
     return (*copy_warnings(rows.left_out), *limit_warnings(robot, rows), *_torque_warnings(robot, rows))
 
 
 def _torque_warnings(robot: Robot, rows: Measurements) -> tuple[str, ...]:
-    """Warn of torques that are too large for an arm of this size, as those in Nmm or mNm are."""
+    """Warn about torques that are too large for an arm of this size, as are values in Nmm or mNm."""
     if rows.torque is None:
         return ()
     turning = np.flatnonzero(robot.revolute)

@@ -35,9 +35,9 @@ class ReadingColumn:
 
     Attributes:
         name: quantity of the column, such as "tilt_roll"; unique among all columns.
-        units: valid units, each of which gives a separate column, such as "tilt_roll_deg"; "" stands for a number
-            without unit, whose column has the name of the quantity.
-        is_text: whether the cells are names instead of numbers; `units` is then ("",).
+        units: valid units, each of which defines a separate column, such as "tilt_roll_deg"; "" stands for a
+            dimensionless number, whose column has the name of the quantity.
+        is_text: whether the cells contain names instead of numbers; `units` is then ("",).
         is_optional: whether a file may omit the column although it has the sensor's other columns.
     """
 
@@ -48,7 +48,7 @@ class ReadingColumn:
 
 
 def no_faults(readings: Readings) -> Iterator[RowFault]:
-    """Yield no faults, for sensors without special rules."""
+    """Yield no faults; for sensors without special rules."""
     yield from ()
 
 

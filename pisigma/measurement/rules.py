@@ -1,4 +1,4 @@
-"""Rules that rows of measurements must meet, individually and together, in files and in memory."""
+"""Rules that rows of measurements must satisfy, individually and together, in files and in memory."""
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -55,7 +55,7 @@ def check_fields(data: MeasuredFields) -> None:
 
     Raises:
         MeasurementError: a shape, type or value is wrong, or rows contradict each other; `line` or the message states
-            the row, `column` the field.
+            the row, and `column` the field.
     """
     _check_shapes(data)
     q = data.numbers["q"]
@@ -156,7 +156,7 @@ def row_faults(data: MeasuredFields, labels: FieldLabels) -> Iterator[RowAndFaul
     """Yield the faults of rows with impossible or contradictory values.
 
     A row contains one measured length: a position, the coordinate of a touch, a socket, or a distance. A second
-    sensor's reading at the same joint values is a second row. A row may appear several times.
+    sensor's reading at the same joint values is a second row. Duplicate rows are allowed.
     """
     yield from _value_faults(data, labels)
     yield from _reading_faults(data, labels)

@@ -1,4 +1,4 @@
-"""Split measurements into training and held-out rows; rows of equal joint values or of a pair are kept together."""
+"""Split measurements into training and held-out rows, keeping rows of equal joint values or of a pair together."""
 
 import heapq
 from collections.abc import Sequence
@@ -15,8 +15,8 @@ from pisigma.measurement.groups import groups_of_equal_joints as groups_of_equal
 from pisigma.measurement.groups import groups_to_keep_whole, placement_groups
 
 SplitBy = Literal["joints", "interleaved", "time", "space", "placement"]
-"""Assignment to folds. By joints: at random; interleaved: alternating, in the file's order; by time: contiguous
-blocks in the file's order; by space: blocks of the measured positions; by placement: all sockets of a placement, or
+"""Assignment to folds. "joints": at random; "interleaved": alternating, in the order of the file; "time": contiguous
+blocks in the order of the file; "space": blocks of the measured positions; "placement": all sockets of a placement, or
 all rows of a frame, together."""
 
 _RANDOM_SPLITS: tuple[SplitBy, ...] = ("joints", "placement")
@@ -90,12 +90,12 @@ def k_folds(
     Args:
         measurements: the rows to split.
         folds: number of folds, 2 or more; None for as many as there are groups to keep whole.
-        seed: random seed by joints and by placement; unused otherwise.
+        seed: random seed for "joints" and "placement"; otherwise unused.
         by: "joints": groups of equal joint values, shuffled and assigned such that folds are as equal as the groups
             allow; "interleaved": the same without shuffling, so that groups of equal size alternate between the
             folds, as in scikit-learn's GroupKFold; "time": contiguous blocks in the order of the groups' first rows;
             "space": blocks from cutting the measured positions recursively across their widest axis; "placement":
-            assigned like joints, but whole placements (see `placements`); rows without a placement are never held out.
+            as for "joints", but with whole placements (see `placements`); rows without a placement are never held out.
 
     Returns:
         The training rows and the held-out rows of every fold.
@@ -138,8 +138,8 @@ def repeated_k_folds(
         folds: number of folds, 2 or more; None for as many as there are groups.
         seed: random seed of the first repeat; the seeds of the other repeats follow from it.
         by: see `k_folds`.
-        times: number of repeats; None for the number that holds out `_HELD_OUT_GROUPS` groups, at most `_MAX_REPEATS`,
-            and for one repeat if groups are held out one by one or are not assigned at random by joints.
+        times: number of repeats; None for the number that holds out `_HELD_OUT_GROUPS` groups, limited to
+            `_MAX_REPEATS`, or for one repeat if groups are held out one by one or are not assigned at random by joints.
 
     Returns:
         The folds of every repeat, see `k_folds`; the first repeat is that of `k_folds` with the same seed.
@@ -174,7 +174,7 @@ def holdout(
     Args:
         measurements: the rows to split.
         share: share of the rows to hold out, between 0 and 1; met as closely as the groups allow.
-        seed: random seed by joints and by placement; unused otherwise.
+        seed: random seed for "joints" and "placement"; otherwise unused.
         by: "joints": groups of equal joint values at random; "interleaved": groups at regular intervals; "time": the
             last rows; "space": the far end of the widest axis of the measured positions; "placement": whole placements
             at random.
@@ -299,7 +299,7 @@ def _assign(
 
 
 def _interleaved(sizes: Int64[Tensor, " groups"], share: float) -> Bool[Tensor, " groups"]:
-    """Choose held-out groups such that their share of the rows up to any group is as close as possible to `share`."""
+    """Choose held-out groups so that their share of the rows up to any group is as close as possible to `share`."""
     # error diffusion: a group is held out if that brings the share of the rows so far nearer to `share`
     is_test, passed, held = [], 0, 0
     for size in sizes.tolist():
@@ -319,7 +319,7 @@ def _cut_into_folds(
     first: int,
     folds: int,
 ) -> None:
-    """Assign folds from `first` to `members` by recursive bisection."""
+    """Assign the folds from `first` on to `members` by recursive bisection."""
     if folds == 1:
         fold[members] = first
         return

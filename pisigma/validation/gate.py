@@ -24,7 +24,7 @@ from pisigma.validation.held_out.frames.fitted_frames import FrameKind
 from pisigma.validation.setup_faults.setup_fault import SetupFault
 
 _MIN_ROWS_TO_CALIBRATE = 12
-"""Smallest number of rows whose calibration shows whether the errors of the arm are too large for this robot."""
+"""Smallest number of rows with which a calibration shows whether the errors are too large for this robot."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +44,7 @@ class RowVerdict:
 
     @property
     def setup_faults(self) -> tuple[SetupFault, ...]:
-        """Setup faults that explain the errors of all rows, of any size, including allowed motions."""
+        """Setup faults of any size that explain the errors of all rows, including allowed motions."""
         return self.faults_of_lengths if self.judged is None else self.judged.setup_faults
 
     @property
@@ -68,14 +68,15 @@ def check_rows(
     """Check rows before they are used, against a model or a nominal robot.
 
     Against a nominal robot, or the mean robot of a fleet, the spread of the positions is compared with that of the
-    robot's poses; with at least 6 rows other robots of the catalogue are tried, with 8 signs and swaps of joint
-    columns, with 12 the rows are used for a calibration that is checked by `CHECKS`, and with 24 for setup faults.
+    robot's poses. With at least 6 rows, other robots of the catalogue are tried; with 8, reversed signs and swaps of
+    joint columns; with 12, the rows are calibrated and all checks of a calibration are run; with 24, setup faults are
+    searched for.
 
     Args:
         rows: the rows.
         against: a calibrated model, or the nominal robot.
         fitted: frames and tools that are known to have moved since the model was made.
-        may_move: what else may have moved since then, without being a fault of the rows.
+        may_move: what else may have moved since then without this being a fault of the rows.
         nominal: the nominal robot with base and tool fitted; only used to report its errors after a correction.
 
     Raises:
@@ -109,7 +110,7 @@ def check_rows_by_model(
 def check_rows_of_frames(
     rows: Measurements, against: Robot | CalibratedModel, found: FittedFrames
 ) -> tuple[Diagnostic, ...]:
-    """Check rows to which base, tool or both were fitted, without those that the others contradict.
+    """Check rows to which base, tool or both were fitted, leaving out those that the others contradict.
 
     The rows are checked against the model whose arm was used, with the frames fitted, or against the nominal robot and
     its model with the fitted frames; then the residuals are compared with the reach.
@@ -143,7 +144,7 @@ def check_rows_of_frames(
 
 
 def _until_implausible(checks: Iterable[Iterable[Diagnostic]]) -> tuple[Diagnostic, ...]:
-    """Return the findings up to the first check that finds the rows implausible; later findings are consequences."""
+    """Return the findings up to the first check that rejects the rows; later findings are consequences."""
     found: list[Diagnostic] = []
     for diagnostics in checks:
         found += diagnostics
@@ -153,7 +154,7 @@ def _until_implausible(checks: Iterable[Iterable[Diagnostic]]) -> tuple[Diagnost
 
 
 def _against_robot(rows: Measurements, robot: Robot) -> Iterator[Iterable[Diagnostic]]:
-    """Run the checks by the nominal robot, most reliable first."""
+    """Run the checks against the nominal robot, most reliable first."""
     yield _moved_setup(rows, robot)
     yield setup_diagnostics(robot, rows)
     yield check_position_size(robot, rows)
@@ -181,7 +182,7 @@ def _moved_setup(rows: Measurements, robot: Robot) -> tuple[Diagnostic, ...]:
 
 
 def _as_calibrated(rows: Measurements, robot: Robot) -> tuple[Diagnostic, ...]:
-    """Return the findings of the checks of a calibration of the rows.
+    """Calibrate with the rows, and return the findings of the checks of this calibration.
 
     The calibration has no joint correction, so residuals above the stated noise are not reported.
     """

@@ -13,7 +13,7 @@ _MAX_RESAMPLES = 1_000_000
 class Bootstrap:
     """Percentile bootstrap (Efron and Tibshirani 1993, chapter 13) over groups of rows with equal joint values.
 
-    Rows of one configuration share most of their error. Therefore groups are drawn with replacement, not rows.
+    Rows of one configuration share most of their error. Therefore groups, not rows, are drawn with replacement.
 
     Attributes:
         resamples: number of bootstrap resamples for confidence intervals.

@@ -22,23 +22,25 @@ from pisigma.robot.se3 import (
 )
 
 _CLOSURE = 1e-9
-"""Standard deviation [m or rad] to which frames and points that two arms share are the same, for rounding errors."""
+"""Standard deviation [m or rad] with which frames and points that two arms share are equated, for rounding errors."""
 _FALSE_ALARMS = 1e-4
-"""Probability that arms without faults are said to disagree."""
+"""Probability that arms without faults are reported to disagree."""
 MAX_ITERATIONS, _CONVERGENCE_TOLERANCE = 20, 1e-12
 _MIN_POINTS = 3
 _COLLINEAR = 1e-3
-"""Second singular value of points over the first one below which they are on a line, which determines no rotation."""
+"""Ratio of the second to the first singular value of points below which they lie on a line and determine no
+rotation."""
 
 
 @dataclass(frozen=True)
 class Disagreement:
-    """A shared object whose poses or positions by the arms differ.
+    """A shared object whose poses or positions differ between arms.
 
     Attributes:
         shared: the object.
-        distance: largest distance between its positions by two arms, with the bases found [m].
-        probability: probability that arms without faults differ as much at this object, given the others.
+        distance: largest distance between its positions according to two arms, with the fitted bases [m].
+        probability: probability that arms without faults differ at least as much at this object, given the other
+            objects.
     """
 
     shared: SharedObject
@@ -48,15 +50,15 @@ class Disagreement:
 
 @dataclass(frozen=True, eq=False)
 class ArmBases:
-    """Bases of arms in the base of the first arm.
+    """Bases of several arms, relative to the base of the first arm.
 
     Attributes:
-        arms: posteriors of the arms before.
+        arms: posteriors of the individually calibrated arms.
         shared: what the arms have in common.
         T_first_base: pose of every arm's base in the base of the first arm.
-        conditioned: the joint posterior; its x are the shifts along and the rotations about the axes of the first
-            arm's base of the bases of all other arms [m and rad], its z the directions of the roots of all arms.
-        equations: per equation, the number of the shared object.
+        conditioned: the joint posterior; its x are shifts of the bases of all other arms along, and rotations about,
+            the axes of the first arm's base [m and rad], its z the directions of the roots of all arms.
+        equations: per equation, the index of the shared object.
         distances: per shared object, the largest distance between its positions by two arms [m].
         system: derivatives of the equations with respect to z and x, and their misclosure at z = 0.
     """
@@ -71,38 +73,38 @@ class ArmBases:
 
     @property
     def root(self) -> Float64[Tensor, "arms 6 directions"]:
-        """Root of the covariance of the bases: shifts along and rotations about the axes of the first base."""
+        """Root of the covariance of the bases, as shifts along and rotations about the axes of the first base."""
         found = self.conditioned.x_root
         return torch.cat([found.new_zeros(6, found.shape[1]), found]).view(len(self.arms), 6, -1)
 
     def relative(self, first: int, second: int) -> tuple[Float64[Tensor, "4 4"], Float64[Tensor, "6 6"]]:
-        """Return the base of an arm in the base of another one, with its covariance.
+        """Return the base of an arm relative to that of another arm, with its covariance.
 
         Args:
-            first: number of the arm in whose base the pose is.
-            second: number of the other arm.
+            first: index of the arm in whose base the pose is expressed.
+            second: index of the other arm.
 
         Returns:
-            The pose, and the covariance of its shift along and its rotation about the axes of the first of both bases
-            [m and rad].
+            The pose, and the covariance of its shift along and rotation about the axes of the base of arm `first` [m
+            and rad].
         """
         T = invert(self.T_first_base[first]) @ self.T_first_base[second]
         away = self.T_first_base[second, :3, 3] - self.T_first_base[first, :3, 3]
         moved = self.root[second] - self.root[first]
-        # A rotation of the first base also shifts the second one seen from it.
+        # A rotation of the first base also shifts the second base relative to it.
         moved[:3] += torch.linalg.cross(away[:, None].expand(3, moved.shape[1]), self.root[first, 3:], dim=0)
         turned = (self.T_first_base[first, :3, :3].mT @ moved.view(2, 3, -1)).flatten(0, 1)
         return T, turned @ turned.mT
 
     @property
     def probability(self) -> float:
-        """Probability of a larger misfit of arms without faults; 1 if nothing is measured twice."""
+        """Probability of a larger misfit between arms without faults; 1 if no object is measured twice."""
         found = self.conditioned
         return float(chi2.sf(found.misfit, found.redundancy)) if found.redundancy else 1.0
 
     @cached_property
     def disagreements(self) -> tuple[Disagreement, ...]:
-        """Shared objects on whose place the arms disagree, the least probable first; empty if they agree."""
+        """Shared objects on whose location the arms disagree, least probable first; empty if they agree."""
         if self.probability >= _FALSE_ALARMS:
             return ()
         found = []
@@ -130,13 +132,15 @@ def closures(count: int | Tensor) -> Float64[Tensor, " equations"]:
 def fit_arm_bases(arms: Sequence[ArmPosterior]) -> ArmBases:
     """Find the base of every arm in that of the first one, by equating what the arms have in common.
 
-    The arms were calibrated independently of each other. Their joint posterior is the product of their own ones, given
-    that every shared frame is one frame and every shared point is one point; the bases have no prior. This is what one
-    least-squares fit of all rows gives, to first order in the errors of the arms and with the noise and prior sizes of
-    their own fits, because these summarise their rows as normal distributions; it is exact if positions are linear in
-    the parameters. The equations are linearised again until they close.
+    The arms were calibrated independently of each other. Their joint posterior is the product of their individual
+    posteriors, given that every shared frame is one frame and every shared point is one point; the bases have no prior.
+    The individual posteriors summarise the rows as normal distributions. The result therefore equals that of one
+    least-squares fit to all rows with the noise and prior sizes of the individual fits, to first order in the errors of
+    the arms, and exactly if positions are linear in the parameters. The equations are linearised repeatedly until they
+    close.
 
-    With one shared frame the equations only determine the bases. With more, each arm also learns from the others.
+    With one shared frame, the equations determine only the bases. With more, the arms also improve each other's
+    parameters.
 
     Args:
         arms: two or more arms.
@@ -185,7 +189,7 @@ def _used(arms: Sequence[ArmPosterior], shared: Sequence[SharedObject]) -> list[
 def _in_base(
     arm: ArmPosterior, key: tuple[str, str], values: Callable[[Sequence[int]], Tensor]
 ) -> tuple[Tensor, Tensor]:
-    """Return the pose of a shared object in the base of an arm, and what else its sensor has, such as a zero."""
+    """Return the pose of a shared object in the base of an arm, and the other unknowns of its sensor."""
     frame, rows = arm.shared_objects[key]
     T_base_frame = invert(transform_from_xyzrpy(values(arm.base_rows(frame))))
     if key[0] == "frame":
@@ -227,7 +231,7 @@ def _equations(
     parts: Sequence[Tensor],
     places: Sequence[dict[int, int]],
 ) -> Iterator[Tensor]:
-    """Yield the differences between the first arm of every shared object and each further one."""
+    """Yield the differences between the first arm of every shared object and each of its other arms."""
     for one in shared:
         seen = []
         for number in one.arms:
@@ -243,7 +247,7 @@ def _equations(
 
 
 def _pose(arm: ArmPosterior, key: tuple[str, str]) -> Float64[Tensor, "4 4"]:
-    """Return the pose of a shared object in the base of an arm by its own fit."""
+    """Return the pose of a shared object in the base of an arm, according to the fit of this arm."""
     return _in_base(arm, key, lambda rows: arm.values[list(rows)])[0]
 
 
@@ -254,7 +258,7 @@ def _distance(arms: Sequence[ArmPosterior], one: SharedObject, T: Float64[Tensor
 
 
 def _start(arms: Sequence[ArmPosterior], shared: Sequence[SharedObject]) -> list[Float64[Tensor, "4 4"]]:
-    """Return a base for every arm, from a frame that it shares with an arm before, or else from its points."""
+    """Return a base for every arm, from a frame shared with an earlier arm, or else from shared points."""
     placed = {0: torch.eye(4, dtype=torch.float64)}
     while len(placed) < len(arms):
         for number in range(len(arms)):
@@ -279,7 +283,7 @@ def _start(arms: Sequence[ArmPosterior], shared: Sequence[SharedObject]) -> list
 def _place(
     arms: Sequence[ArmPosterior], shared: Sequence[SharedObject], placed: dict[int, Tensor], number: int
 ) -> Float64[Tensor, "4 4"] | None:
-    """Return the base of an arm by what it shares with arms whose bases are known; None if it is not enough."""
+    """Return the base of an arm from what it shares with arms of known bases; None if this does not determine it."""
     wanted, own = [], []
     for one in shared:
         known = [other for other in one.arms if other in placed]

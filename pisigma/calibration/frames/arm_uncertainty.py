@@ -1,4 +1,4 @@
-"""Errors of measured values by the uncertainty of a model: of its arm, its joint correction and what is not fitted."""
+"""Errors of predicted values due to the uncertainty of a model's arm, joint correction and other fixed unknowns."""
 
 from collections.abc import Collection
 from dataclasses import dataclass
@@ -17,11 +17,11 @@ from pisigma.measurement.dataset import Measurements
 
 @dataclass(frozen=True, eq=False)
 class ArmUncertainty:
-    """Uncertainty of a model, for fits of frames with its arm as given.
+    """Uncertainty of a model, for fits of frames that hold its arm fixed.
 
     Attributes:
         known: the posterior of the model.
-        rows: rows of the fit with the joint values as commanded.
+        rows: rows of the fit, with commanded joint values.
     """
 
     known: PositionUncertainty
@@ -34,8 +34,8 @@ class ArmUncertainty:
 
         Args:
             solved: fit of some rows.
-            used: numbers of these rows.
-            fitted: indices of the parameters that were fitted, whose uncertainty in the model does not matter.
+            used: indices of these rows.
+            fitted: indices of the fitted parameters, whose uncertainty in the model does not matter.
         """
         root, fit_space = self.known.root, solved.problem.space
         positions = positions_by_key(self.known.space.parameters)
@@ -54,7 +54,7 @@ class ArmUncertainty:
 
 
 def positions_by_key(parameters: tuple[Parameter, ...]) -> dict[tuple[str, str, str], int]:
-    """Return the position of every parameter by group, owner and column, which do not depend on the other owners."""
+    """Return the position of every parameter by group, owner and column, a key that does not depend on other owners."""
     return {
         (one.group, one.owner, one.name.rsplit("_", 1)[-1]): number for number, one in enumerate(parameters)
     }

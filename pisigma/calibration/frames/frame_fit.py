@@ -1,4 +1,4 @@
-"""Fit base, tool or both to few rows with the arm as given: standard errors, what is not determined, wrong rows."""
+"""Fit base, tool or both to few rows with the arm held fixed, and find undetermined directions and wrong rows."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -33,21 +33,21 @@ from pisigma.robot.description import Robot
 FrameChoice = Literal["tool", "base", "hand-eye"]
 
 _MAX_WRONG_SHARE = 0.25
-"""Largest share of wrong rows: of four that disagree it is not known which one is wrong."""
+"""Largest share of wrong rows: if one of four rows disagrees, it is not known which one is wrong."""
 _HARDLY_DETERMINED = 1.0
-"""Standard deviation [mm or mrad] above which a direction is reported, and above which the undetermined directions
-leave a coordinate without a standard error."""
+"""Standard deviation [mm or mrad] above which a direction is reported, and above which undetermined directions leave a
+coordinate without a standard error."""
 _NO_FRAMES: Frames = MappingProxyType({})
 
 
 @dataclass(frozen=True, eq=False)
 class WeakDirection:
-    """A combination of coordinates that the rows hardly determine.
+    """A combination of coordinates that the rows determine poorly.
 
     Attributes:
-        words: the combination, in units of 1 mm and 1 mrad (0.057 deg).
+        words: the combination as text, in units of 1 mm and 1 mrad (0.057 deg).
         deviation: its standard deviation in these units; infinite if the rows contain no information on it.
-        held: whether it has its value before, because the rows do not determine it.
+        held: whether it keeps its previous value, because the rows do not determine it.
     """
 
     words: str
@@ -57,16 +57,16 @@ class WeakDirection:
 
 @dataclass(frozen=True, eq=False)
 class FrameFit:
-    """Base, tool or both, fitted with the arm as given.
+    """Base, tool or both, fitted with the arm held fixed.
 
     Attributes:
         only: what was fitted.
-        solved: the problem of the rows that were used, with its solution.
+        solved: the least-squares problem of the rows used, with its solution.
         rows: all rows.
-        used: numbers of the rows that were used.
-        wrong: numbers of the rows that were left out, in the order in which they were found.
-        bases: bases before by frame; the others are those of the robot.
-        tools: tools before by target; the others are those of the robot.
+        used: indices of the rows used.
+        wrong: indices of the rows left out, in the order in which they were found.
+        bases: previous bases by frame; other frames use the base of the robot.
+        tools: previous tools by target; other targets use the tool of the robot.
     """
 
     only: FrameChoice
@@ -79,18 +79,18 @@ class FrameFit:
 
     @property
     def frames(self) -> list[int]:
-        """Indices of the coordinates of bases and tools that were to be fitted."""
+        """Indices of the coordinates of bases and tools that the fit was asked for."""
         return _frames(self.solved)
 
     @cached_property
     def values(self) -> WhitenedValues:
-        """Measured values at the solution, linear in the directions that were fitted (see `basis`)."""
+        """Measured values at the solution, linear in the fitted directions (see `basis`)."""
         values = WhitenedValues.at_solution(self.solved, self.solved.problem.active.tolist())
         return replace(values, X=values.X @ self.basis)
 
     @cached_property
     def basis(self) -> Float64[Tensor, "active fitted"]:
-        """The directions that were fitted, in the coordinates of the problem: all except those that were held."""
+        """Fitted directions, in the coordinates of the problem: all except those that were held."""
         problem = self.solved.problem
         if problem.held is None:
             return torch.diag(problem.step_scale)
@@ -100,7 +100,7 @@ class FrameFit:
 
     @property
     def covariance(self) -> Float64[np.ndarray, "frames frames"]:
-        """Covariance of `frames` by the noise of the rows, the arm taken as exact [m² or rad²].
+        """Covariance of `frames` due to the noise of the rows, with the arm treated as exact [m² or rad²].
 
         The noise is that of the residuals. Directions that the rows do not determine have a standard deviation of at
         most 1 m or 1 rad.
@@ -135,7 +135,7 @@ class FrameFit:
 
     @cached_property
     def _directions(self) -> tuple[Float64[Tensor, "frames frames"], Float64[Tensor, " frames"]]:
-        """Return unit vectors in the user's coordinates and their standard deviations in mm and mrad, weakest first."""
+        """Return unit vectors in the user's coordinates, with standard deviations in mm and mrad, weakest first."""
         found, held = FrameDirections.at_solution(self.solved, self.frames), self.solved.problem.held
         if held is not None:  # with the deviation that was judged
             found = replace(found, deviation=torch.cat([held.deviation, found.deviation[self._held :]]))
@@ -144,18 +144,18 @@ class FrameFit:
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
-        """The coordinates of bases and tools that were to be fitted."""
+        """Coordinates of bases and tools that the fit was asked for."""
         return tuple(self.solved.problem.space.parameters[index] for index in self.frames)
 
     @property
     def estimates(self) -> Float64[np.ndarray, " frames"]:
-        """Their values in the user's coordinates [m or rad]."""
+        """Values of `parameters` in the user's coordinates [m or rad]."""
         values: np.ndarray = self.solved.geometry.values_of(self.solved.problem.space).numpy()[self.frames]
         return values
 
     @property
     def before(self) -> Float64[np.ndarray, " frames"]:
-        """Their values before [m or rad]."""
+        """Values of `parameters` before the fit [m or rad]."""
         values = values_before(self.solved.problem.space, self.bases, self.tools)
         before: np.ndarray = values.numpy()[self.frames]
         return before
@@ -168,18 +168,18 @@ def fit_frames(
     bases: Frames = _NO_FRAMES,
     tools: Frames = _NO_FRAMES,
 ) -> FrameFit:
-    """Fit base, tool or both by least squares, without the rows that all others contradict.
+    """Fit base, tool or both by least squares, leaving out rows that all others contradict.
 
-    The arm is not fitted. Directions that the rows do not determine keep their values before, see `hold_undetermined`.
-    A row is wrong if its error under the fit to the other rows is improbable (F-test of the deleted residual, see
-    `most_deviating_row`).
+    The arm is not fitted. Directions that the rows do not determine keep their previous values; see
+    `hold_undetermined`. A row is wrong if its error relative to the fit of the other rows is improbable (F-test of the
+    deleted residual; see `most_deviating_row`).
 
     Args:
-        robot: robot with the arm as given, and the base or tool that is not fitted.
+        robot: robot with the fixed arm, and with the base or tool that is not fitted.
         rows: touches, positions, poses or images; sockets are points at unknown positions.
         only: what to fit; the tool's orientation only if rows have orientations.
-        bases: bases of named frames, if they are not that of the robot.
-        tools: tools of named targets, if they are not that of the robot.
+        bases: bases of named frames that differ from the base of the robot.
+        tools: tools of named targets that differ from the tool of the robot.
 
     Raises:
         IdentificationError: there are too few rows, several frames or targets whose known base or tool is not stated,
@@ -230,7 +230,7 @@ def _frames(solved: SolvedCalibration) -> list[int]:
 
 
 def _refuse_several(column: str, names: set[str], known: Frames, rows: Measurements) -> None:
-    """Refuse rows of several frames or targets whose bases or tools are not fitted and not known.
+    """Refuse rows of several frames or targets whose bases or tools are neither fitted nor known.
 
     Raises:
         IdentificationError: there are several names, not all of which are known.
@@ -246,7 +246,7 @@ def _refuse_several(column: str, names: set[str], known: Frames, rows: Measureme
 
 
 def _wrong_row(fit: FrameFit) -> int | None:
-    """Return the number of the row that the others contradict; None if there is none, or too many are wrong."""
+    """Return the index of the row that the others contradict; None if there is none, or if too many rows are wrong."""
     if (
         len(fit.wrong) + 1 > _MAX_WRONG_SHARE * fit.rows.rows
         or fit.solved.solution.status == SolutionStatus.EXACT

@@ -1,4 +1,4 @@
-"""Why a hand-eye calibration does not fit: the camera, the board, the arm or the joint readings."""
+"""Reasons why a hand-eye calibration does not fit: the camera, the board, the arm or the joint readings."""
 
 import math
 
@@ -29,11 +29,11 @@ from pisigma.measurement.sensors.intrinsics import (
 from pisigma.measurement.sensors.sensor import distinct_names
 
 _UNIT = 1e-3
-"""[m or rad] Size of the errors of arm, joints and board (as a share) at size 1: 1 mm, 1 mrad, 0.1 %."""
+"""Errors of arm and joints [m or rad], and of the board as a share, at size 1: 1 mm, 1 mrad, 0.1 %."""
 _CAMERA_UNIT = 3.0
 """Errors of the intrinsics at size 1, in standard deviations of a typical calibration."""
 _MIN_ROWS = 6
-"""Rows below which causes are not compared: 36 values, of which base and tool absorb 12."""
+"""Number of rows below which causes are not compared: six rows have 36 values, of which base and tool absorb 12."""
 
 CAUSES = {
     "arm": "arm (lengths, angles and zeros of all joints)",
@@ -42,21 +42,23 @@ CAUSES = {
     "camera": "camera (intrinsics and distortion)",
     "board": "board (scale)",
 }
-"""What every cause is about."""
+"""Part of the setup that each cause concerns."""
 
 
 def misfit_causes(fit: FrameFit, uncertainty: ArmUncertainty | None = None) -> tuple[Cause, ...]:
     """Compare the possible causes of the residuals of a hand-eye calibration.
 
     The cause "joint noise" stands for errors of the joint readings that differ from row to row: noise, backlash, or a
-    delay between the image and the reading. Camera and board can be told from the arm with the corners of images only.
+    delay between the image and the reading. Camera and board can be distinguished from the arm only with the corners of
+    images.
 
     Args:
-        fit: base and tool that were fitted with the arm as given.
-        uncertainty: uncertainty of the arm, if a calibration states it; the arm is a cause if its errors are larger.
+        fit: base and tool that were fitted with the arm held fixed.
+        uncertainty: uncertainty of the arm, if a calibration states it; the arm is a cause only if its errors are
+            larger.
 
     Returns:
-        The causes, those that the evidence names first; none with fewer than `_MIN_ROWS` poses.
+        The causes, those supported by the evidence first; none if there are fewer than `_MIN_ROWS` poses.
     """
     rows = fit.rows.select(torch.tensor(fit.used))
     if fit.only != "hand-eye" or rows.rows < _MIN_ROWS or not fit.solved.problem.needs_rotation:
@@ -71,7 +73,7 @@ def misfit_causes(fit: FrameFit, uncertainty: ArmUncertainty | None = None) -> t
 def _residuals(
     solved: SolvedCalibration, fit: FrameFit, rows: Measurements, uncertainty: ArmUncertainty | None
 ) -> FitResiduals:
-    """Return the residuals with the stated intrinsics, linear in everything that may cause them."""
+    """Return the residuals with the stated intrinsics, linearised in everything that may cause them."""
     space, setup = solved.problem.space, solved.setup
     unknowns = setup.free_unknowns
     arm = list(range(space.arm_size))
@@ -109,7 +111,7 @@ def _usual_error(kind: str, name: str) -> float:
 
 
 def _noise_units(solved: SolvedCalibration, values: WhitenedValues) -> Float64[Tensor, " values"]:
-    """Return the factors that undo the estimated noise where the rows state theirs (corners of images)."""
+    """Return the factors that undo the estimated noise in rows that state their own noise (corners of images)."""
     deviation = sensor_view_of(solved.refined).variances.sqrt()
     noise = solved.setup.measurements.readings.get("corner_noise")
     factors = []

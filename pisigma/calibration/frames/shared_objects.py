@@ -1,4 +1,4 @@
-"""What the fits of several arms have in common: frames, sockets and anchors of one name."""
+"""What the fits of several arms have in common: frames, sockets and anchors with the same name."""
 
 import itertools
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ from pisigma.calibration.hybrid.uncertainty import PositionUncertainty
 from pisigma.estimation.covariance_root import CovarianceRoot
 
 _DETERMINED = 1e-6
-"""Smallest over largest standard deviation of the directions of a base below which one of them was not estimated."""
+"""Ratio of the smallest to the largest standard deviation of a base's directions below which one was not estimated."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,11 +53,11 @@ class ArmPosterior:
 
     @cached_property
     def shared_objects(self) -> dict[tuple[str, str], tuple[str, tuple[int, ...]]]:
-        """Frame and indices of the parameters of everything that another arm could have measured too.
+        """Frame and parameter indices of everything that another arm could also have measured.
 
         These are named frames in which the base was calibrated, and points at positions that were estimated: sockets
-        and anchors. For a frame, the parameters are those of the base. A base with a direction that the rows did not
-        determine, which kept its value before and has no covariance, is not shared.
+        and anchors. For a frame, the parameters are those of the base. A base is not shared if the rows did not
+        determine one of its directions, because such a direction keeps its previous value and has no covariance.
         """
         found = {
             ("frame", frame): (frame, tuple(self.base_rows(frame)))
@@ -76,7 +76,7 @@ class ArmPosterior:
 def is_determined(root: Float64[Tensor, "6 directions"]) -> bool:
     """Return whether all six directions of a base were estimated, by a root of its covariance [m and rad].
 
-    A direction that was held at its value before has no covariance.
+    A direction that was held at its previous value has no covariance.
     """
     return int(torch.linalg.matrix_rank(root, rtol=_DETERMINED)) == len(root)
 
@@ -87,8 +87,8 @@ class SharedObject:
 
     Attributes:
         kind: "frame" or the group of the sensor's unknowns, such as "socket".
-        name: its name in the rows of all of these arms.
-        arms: numbers of the arms.
+        name: its name in the rows of all these arms.
+        arms: indices of the arms.
     """
 
     kind: str

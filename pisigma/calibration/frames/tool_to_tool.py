@@ -1,4 +1,4 @@
-"""How well the tools of two arms are known relative to each other."""
+"""Uncertainty of the position of one arm's tool relative to that of another arm."""
 
 from dataclasses import dataclass
 
@@ -27,15 +27,15 @@ class Postures:
 
 
 def tool_to_tool_deviation(bases: ArmBases, first: int, second: int, postures: tuple[Postures, ...]) -> float:
-    """Return the RMS standard deviation of the vector from the tool of an arm to that of another one [m].
+    """Return the RMS standard deviation of the vector from the tool of one arm to that of another [m].
 
-    Unlike that of the bases, it does not depend on errors that a base absorbs, such as that of the zero of joint 1.
+    Unlike the uncertainty of the bases, it does not depend on errors that a base absorbs, such as the zero of joint 1.
 
     Args:
         bases: the arms.
         first: number of an arm.
         second: number of the other arm.
-        postures: postures of every arm; the n-th of both arms are a pair.
+        postures: postures of every arm; the n-th postures of both arms form a pair.
     """
     moved = [_tool_root(bases, number, postures[number]) for number in (first, second)]
     count = min(map(len, moved))

@@ -1,4 +1,4 @@
-"""Decide which directions of bases and tools the rows do not determine, and hold these at the values before."""
+"""Find the directions of bases and tools that the rows do not determine, and hold these at their previous values."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -20,30 +20,29 @@ from pisigma.robot.se3 import wrap_to_pi
 
 _LARGEST_SPREAD = 60.0
 """Standard deviation [mm or mrad], times the square root of the number of rows, above which a direction is not
-determined.
-
-Noise that shifts the tool also turns it, by the shift over a lever of about 400 mm. These turns look like information,
-even on directions that no row determines, with a standard deviation of 400 mm per row whatever the noise is. Below
-60 mm per row, errors are at most 1.25 times the stated ones for 4 to 12 touches."""
+determined. Noise that shifts the tool also rotates it, by the shift divided by a lever of about 400 mm. These rotations
+look like information, even on directions that no row determines, with a standard deviation of 400 mm per row regardless
+of the noise. Below 60 mm per row, errors are at most 1.25 times the stated ones for 4 to 12 touches."""
 _LEVER = 400.0
-"""That lever [mm]. Noise shifts an estimate by about this, times the share of the information that it imitates."""
+"""Length of this lever [mm]. Noise shifts an estimate by about this length times the share of information it
+imitates."""
 _IMPROBABLE = 5.0
-"""Number of standard deviations, in addition to this shift, beyond which the rows contradict a value before."""
+"""Number of standard deviations, in addition to this shift, beyond which the rows contradict a previous value."""
 _ROUNDING = 1e-9
-"""Information on a direction over that on the best determined one below which it is a rounding error."""
+"""Information on a direction, relative to that on the best determined one, below which it is a rounding error."""
 _CONTRADICTED = 3.0
-"""Ratio of the residuals with and without holding a direction above which the rows contradict its value before. Turns
-by the noise raise the residuals by a factor of at most 1 + distance / 400 mm."""
+"""Ratio of the residuals with and without holding a direction above which the rows contradict its previous value.
+Rotations due to noise raise the residuals by a factor of at most 1 + distance / 400 mm."""
 _MAX_SHIFTS, _SMALL = 10, 1e-6
-"""Largest number of shifts to the values before, and the remaining distance [mm or mrad] at which they end; one shift
-suffices for tools, while undetermined rotations of a base are nonlinear."""
+"""Largest number of shifts to the previous values, and the remaining distance [mm or mrad] at which they end; one shift
+is sufficient for tools, while undetermined rotations of a base are nonlinear."""
 
 Frames = Mapping[str, Float64[np.ndarray, " 6"]]
 
 
 @dataclass(frozen=True, eq=False)
 class FrameDirections:
-    """Independent directions of the coordinates of frames, the least determined first.
+    """Independent directions in the coordinates of frames, least determined first.
 
     Attributes:
         directions: the directions, orthonormal in units of 1 mm and 1 mrad, in the coordinates of the problem.
@@ -55,11 +54,11 @@ class FrameDirections:
 
     @staticmethod
     def at_solution(solved: SolvedCalibration, frames: Sequence[int]) -> "FrameDirections":
-        """Return the directions at a solution, by the noise of its residuals.
+        """Return the directions at a solution, with the noise estimated from its residuals.
 
         Args:
             solved: the solution.
-            frames: indices of the coordinates; the other free parameters are unknowns that are eliminated.
+            frames: indices of the coordinates; the other free parameters are eliminated.
         """
         active = solved.problem.active.tolist()
         X = WhitenedValues.at_solution(solved, active).X * solved.problem.step_scale
@@ -75,7 +74,7 @@ class FrameDirections:
     def in_user_coordinates(
         self, solved: SolvedCalibration
     ) -> tuple[Float64[Tensor, "parameters frames"], Float64[Tensor, " frames"]]:
-        """Return unit vectors of the directions in the user's coordinates, and the lengths that they had before.
+        """Return the directions in the user's coordinates as unit vectors, and their lengths before normalisation.
 
         Both are in units of 1 mm and 1 mrad.
         """
@@ -88,7 +87,7 @@ class FrameDirections:
     def distances(
         self, solved: SolvedCalibration, before: Float64[Tensor, " parameters"]
     ) -> Float64[Tensor, " frames"]:
-        """Return how far the values before are from a solution along every direction, in units of 1 mm and 1 mrad."""
+        """Return the distances of the previous values from a solution along all directions, per 1 mm and 1 mrad."""
         space, units = solved.problem.space, torch.from_numpy(solved.problem.space.usual_errors)
         vectors, length = self.in_user_coordinates(solved)
         off = before - solved.geometry.values_of(space)
@@ -99,27 +98,27 @@ class FrameDirections:
 def hold_undetermined(
     solved: SolvedCalibration, frames: Sequence[int], bases: Frames, tools: Frames
 ) -> SolvedCalibration:
-    """Fit again with all directions held at the values before that the rows do not determine.
+    """Fit again, with all directions that the rows do not determine held at their previous values.
 
-    A direction is not determined if its standard deviation is infinite, or larger than `_LARGEST_SPREAD` for the number
-    of rows unless the rows contradict its value before. The standard deviation of a held value includes its distance
-    from the estimate of the rows, because nothing else says how wrong it is.
+    A direction is not determined if its standard deviation is infinite, or if it is larger than `_LARGEST_SPREAD`
+    allows for the number of rows and the rows do not contradict the previous value. The standard deviation of a held
+    value includes its distance from the estimate of the rows, the only indication of its error.
 
     Args:
         solved: fit in which all coordinates were free.
         frames: indices of the coordinates of bases and tools.
-        bases: bases before by frame; the others are those of the robot.
-        tools: tools before by target; the others are those of the robot.
+        bases: previous bases by frame; other frames use the base of the robot.
+        tools: previous tools by target; other targets use the tool of the robot.
 
     Returns:
-        The fit; `problem.held` has the directions, if there are any.
+        The fit; `problem.held` contains the held directions, if any.
     """
     found, space = FrameDirections.at_solution(solved, frames), solved.problem.space
     unknown = int(torch.isinf(found.deviation).sum())
     before, rows = values_before(space, bases, tools), solved.problem.rows
     distance = found.distances(solved, before).abs()
     plausible = distance <= _IMPROBABLE * found.deviation + rows * found.deviation**2 / _LEVER
-    # The less determined directions come first; none is held after one that is not.
+    # The least determined directions come first, so once one is not held, none of the following are.
     weak = int(((found.deviation * rows**0.5 > _LARGEST_SPREAD) & plausible).cumprod(0).sum())
     deviation = found.deviation.hypot(distance)
     for count in range(weak, 0, -1):
@@ -130,7 +129,7 @@ def hold_undetermined(
 
 
 def values_before(space: ParameterSpace, bases: Frames, tools: Frames) -> Float64[Tensor, " parameters"]:
-    """Return the parameters before a fit, in the user's coordinates; see `hold_undetermined` for bases and tools."""
+    """Return the parameters before the fit, in the user's coordinates; see `hold_undetermined` for bases and tools."""
     return space.values(
         np.stack([bases.get(name, space.robot.base) for name in space.frames]),
         np.stack([tools.get(name, space.robot.tool) for name in space.targets]),
@@ -143,7 +142,7 @@ def _with_held(
     deviation: Float64[Tensor, " held"],
     before: Float64[Tensor, " parameters"],
 ) -> SolvedCalibration:
-    """Shift the least determined directions to the values before, and fit the others again, until nothing changes."""
+    """Shift the least determined directions to their previous values, and refit the others, until nothing changes."""
     for _ in range(_MAX_SHIFTS):
         found = FrameDirections.at_solution(solved, frames)
         held = HeldDirections(found.directions[:, : len(deviation)], deviation)
@@ -160,7 +159,7 @@ def _with_held(
 
 
 def _contradicts(held: SolvedCalibration, free: SolvedCalibration) -> bool:
-    """Return whether the residuals are much larger with held directions than with all directions free."""
+    """Return whether the residuals are much larger with directions held than with all directions free."""
     variances = sensor_view_of(free.refined).variances
     squares = [
         float((torch.stack([part.distance.square().sum() for part in view.contributions]) / variances).sum())

@@ -1,4 +1,4 @@
-"""Measured values of a calibration problem in standard deviations, linear in chosen parameters."""
+"""Measured values of a calibration problem in standard deviations, linearised in chosen parameters."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,9 +22,9 @@ class WhitenedValues:
         X: derivatives of the predicted values with respect to the chosen parameters [1/m or 1/rad].
         joints: derivatives with respect to the joint values of the row [1/rad or 1/m].
         y: measured minus predicted [1].
-        row: number of every value's row in the problem.
+        row: index of every value's row in the problem.
         exact: whether the standard deviation of a value is exactly as stated, such as that of a prior.
-        sensors: the values before they were whitened, with the factor from each to standard deviations.
+        sensors: the values before whitening, each with its factor to standard deviations.
     """
 
     X: Float64[Tensor, "values parameters"]
@@ -36,7 +36,7 @@ class WhitenedValues:
 
     @staticmethod
     def at_solution(solved: SolvedCalibration, parameters: Sequence[int]) -> "WhitenedValues":
-        """Linearise a calibration at its solution, with the noise that its residuals show.
+        """Linearise a calibration at its solution, with the noise estimated from its residuals.
 
         Args:
             solved: the calibration.

@@ -60,7 +60,7 @@ class GeometricCalibrator:
     Attributes:
         robot: the nominal robot.
         free: "identifiable" (all that the data determine), "joint_offsets" (theta of revolute and d of prismatic
-            joints), or names of parameters, such as "a_2". Base and tool are added to these, see below.
+            joints), or names of parameters, such as "a_2". Base and tool are added; see below.
         base: "free", or "fixed" to the base of the robot (only parameters of the base that are named in `free` are
             then estimated).
         tool: "free" or "fixed", as for the base; "position" frees x, y and z of the tool only.
@@ -178,7 +178,7 @@ class GeometricCalibrator:
         return build_setup(self.robot, measurements, options, self.prior, self.loss)
 
     def _finds(self, group: str) -> bool:
-        """Return whether bases or tools need start values, because they are free, or named (all six of a base)."""
+        """Return whether bases or tools need start values, because they are free or named (all six of a base)."""
         if getattr(self, group) != "fixed":
             return True
         if isinstance(self.free, str):

@@ -1,4 +1,4 @@
-"""Outliers of a calibration: rows with a small robust weight."""
+"""Outliers of a calibration: rows with small robust weights."""
 
 from dataclasses import dataclass
 from typing import Literal

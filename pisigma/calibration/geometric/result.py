@@ -1,4 +1,4 @@
-"""Result of a geometric calibration: robot, parameters with standard errors, and what is not identifiable."""
+"""Result of a geometric calibration: robot, parameters with standard errors, and dependencies between parameters."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -123,7 +123,7 @@ class SolvedCalibration:
 
     @property
     def _covariances(self) -> tuple[Float64[Tensor, "active active"], Float64[Tensor, "active held"]]:
-        """Return the covariance of what was estimated, and a root of that of what was held."""
+        """Return the covariance of the estimated directions, and a root of the covariance of the held directions."""
         estimated, held, scale = (
             covariance_of(self.refined.normal).cpu(),
             self.problem.held,
@@ -134,7 +134,7 @@ class SolvedCalibration:
 
 @dataclass(frozen=True, eq=False)
 class CalibrationResult:
-    """A geometric calibration; what predictions do not need is computed on demand.
+    """A geometric calibration; anything that predictions do not need is computed on demand.
 
     Attributes:
         robot: the calibrated robot, with the base of the first frame and the tool of the first target.
@@ -182,7 +182,7 @@ class CalibrationResult:
 
     @cached_property
     def noise(self) -> tuple[SensorNoise, ...]:
-        """Noise of every sensor whose values are measured, not given."""
+        """Noise of every sensor whose values are measured rather than given."""
         return _noise(self.solved)
 
     @property

@@ -1,4 +1,4 @@
-"""Calibrated arm with joint correction, and the measured ranges of its joint values."""
+"""Calibrated arm with a joint correction, and the measured ranges of its joint values."""
 
 import math
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.kinematics.tolerances import MEASURED_ROUNDING
 
 _LARGEST_GAP = math.radians(60)
-"""Largest distance of two measured joint values [rad] between which all values are treated as measured."""
+"""Largest distance between two measured joint values [rad] at which all values in between are treated as measured."""
 
 
 @dataclass(frozen=True, eq=False)

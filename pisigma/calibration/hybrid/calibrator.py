@@ -77,7 +77,7 @@ class HybridCalibrator:
     better than the geometric calibration does; if no feature remains, the result is the geometric calibration.
 
     Attributes:
-        robot: the nominal robot, or its geometric calibrator if this requires settings other than the defaults.
+        robot: the nominal robot, or its geometric calibrator if settings other than the defaults are needed.
         features: names of the features to try, see `joint_correction.registry.FEATURES`.
         harmonics: numbers of harmonics of the Fourier series, tried in this order.
         products: whether to try product units, which require two joints; without them the correction is additive.
@@ -119,7 +119,7 @@ class HybridCalibrator:
 
     @property
     def geometric(self) -> GeometricCalibrator:
-        """Geometric calibrator whose prior, loss and settings of sensors are used."""
+        """Geometric calibrator whose prior, loss and sensor settings are used."""
         return GeometricCalibrator(self.robot) if isinstance(self.robot, Robot) else self.robot
 
     def fit(
@@ -239,7 +239,7 @@ class HybridCalibrator:
     def _features(
         self, solved: SolvedCalibration, problem: CalibrationProblem, gravity: Direction
     ) -> tuple[list[AbstractFeature], list[AbstractFeature]]:
-        """Return the features to try: one feature in increasing sizes, and the other features in one size.
+        """Return the features to try: one feature in increasing sizes, and each of the others in one size.
 
         Raises:
             IdentificationError: two features have several sizes.

@@ -339,6 +339,6 @@ class AbstractDesignRegression(AbstractRegression):
             features: the additional features.
 
         Returns:
-            The gain, or infinity if a fit is as fast; and start values of the prior sizes of the features.
+            The gain, or infinity if a fit takes no longer; and initial prior sizes of the features.
         """
         return math.inf, None

@@ -53,9 +53,9 @@ def gravity_by_evidence(
     Geometry, a short series and the `GravityTorques` of each axis are fitted to the rows. Torques are linear in masses
     of either sign, so the evidence and all predictions are the same for both directions of an axis; the direction
     with a positive sum of masses is chosen. Directions other than down must have a log evidence above that of the
-    other axes by `CLEARLY` plus the log prior odds against them; an inclined direction, which is fitted to the rows,
-    also by minus the logarithm of the share of the half sphere that the rows leave for it (Laplace's approximation),
-    and must not be near an axis (`_LEAST_INCLINATION`).
+    other axes by `CLEARLY` plus the log prior odds against them; for an inclined direction, which is fitted to the
+    rows, minus the logarithm of the share of the half sphere that is compatible with the rows (Laplace's approximation)
+    is added to this threshold, and the direction must not be near an axis (`_LEAST_INCLINATION`).
 
     Args:
         robot: the nominal robot.
@@ -94,7 +94,7 @@ def gravity_by_evidence(
 class _EvidenceOfDirection:
     """Log evidence for gravity along `Σ c_k a_k`, for the `AXES` a_k, with the same masses for all axes.
 
-    With the precision `P = 1 + Σ c_k c_l N_kl` and the right side `d = Σ c_k d_k` of the normal equations of the
+    With the precision `P = 1 + Σ c_k c_l N_kl` and the right-hand side `d = Σ c_k d_k` of the normal equations of the
     masses, it is `(d P^-1 d - log det P) / 2`. c may have any length, which scales the prior size of the masses.
 
     Attributes:
@@ -166,7 +166,7 @@ def _most_probable(log_evidence: _EvidenceOfDirection) -> tuple[Direction, float
         c = tried[log_evidence(tried).argmax()]
         gradient, hessian = log_evidence.derivatives(c)
         curvature, along = torch.linalg.eigh(hessian)
-        # The absolute curvature makes the step point uphill where the Hessian is not negative; the factor 0 keeps c.
+        # With the absolute curvature, the step points uphill where the Hessian is not negative; the factor 0 keeps c.
         step = along @ (along.t() @ gradient / curvature.abs())
         tried = c + step * torch.tensor([[0.0], [0.125], [0.25], [0.5], [1.0]]).to(c)
     # Laplace: with the information H per squared radian along two tangents, the posterior covers an area of

@@ -163,7 +163,7 @@ class NormalEquations(PrimalRegression, AbstractDesignRegression):
 
 
 def _add_sums(design: Design, sensor: SensorValues, N: Tensor, b: Tensor) -> float:
-    """Add normal matrix and right side of a sensor's values in place; return the sum of the squared values."""
+    """Add the normal matrix and right-hand side of a sensor's values in place; return the sum of the squared values."""
     active, dof = design.active, sensor.joints.shape[-1]
     count = sum(chosen.count for chosen in design.features)
     size = active + dof * count

@@ -26,9 +26,10 @@ _LEVEL = 1.03
 CLEARLY = 5.0
 """Increase of the log evidence needed to keep features (a Bayes factor of 150: very strong, Kass and Raftery 1995).
 
-A threshold of 3 gains nothing for arms with joint errors: on 16 to 30 positions of the measured UR5 and UR10 the
-errors are 0.998 and 1.001 times the errors at 5, on average over 80 fits each, on 20 to 30 of simulated arms 0.997
-and 1.004 (120 fits each). On simulated arms with errors of the geometry alone it costs 1.7 %."""
+A threshold of 3 gains nothing for arms with joint errors: with 16 to 30 positions of the measured UR5 and UR10, the
+errors are on average 0.998 and 1.001 times those with a threshold of 5 (80 fits each), and with 20 to 30 positions of
+simulated arms 0.997 and 1.004 times (120 fits each). For simulated arms with errors of the geometry alone, it increases
+the errors by 1.7 %."""
 CLEAR_GAIN = 1.0
 """Decrease of the held-out squared errors [standard errors] that is regarded as an improvement."""
 _STRONGLY = 3.0
@@ -36,11 +37,11 @@ _STRONGLY = 3.0
 _MAX_EFFECTIVE_SHARE = 0.75
 """Largest effective number of unknowns per value; with more, they cannot be separated from the noise."""
 MAX_USUAL_SHARE = 0.97
-"""Largest effective number of unknowns per value if the prior sizes of the weights start with their usual sizes,
-which regularise what few values do not determine."""
+"""Largest effective number of unknowns per value if the prior sizes of the weights start at their usual sizes, which
+regularise what few values do not determine."""
 _MIN_USUAL_SCALE = 0.4
-"""Prior scale of the geometry that is also tried if the estimated scale is smaller: a geometric calibration of few
-rows attributes the effects of missing features to noise, and underestimates small errors of the geometry."""
+"""Prior scale of the geometry that is also tried if the estimated scale is smaller, because a geometric calibration of
+few rows attributes the effects of missing features to noise and underestimates small errors of the geometry."""
 _USUAL_UPDATES = 5
 """Number of updates of the usual sizes; few values hardly determine them, so more updates are not useful."""
 ROUGHLY = 1.0
@@ -277,8 +278,8 @@ class FeatureSearch:
     ) -> FeatureFit:
         """Return the better of a fit of all features, starting with usual sizes, and the best fit so far.
 
-        If features were kept before, strong evidence is sufficient, because few rows cannot give more. Without kept
-        features, very strong evidence is required.
+        If features have been kept already, strong evidence is sufficient, because few rows cannot give more. Otherwise,
+        very strong evidence is required.
         """
         self.progress(" + ".join(chosen.label for chosen in features))
         began = time.monotonic()

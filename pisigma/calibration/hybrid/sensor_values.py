@@ -138,7 +138,7 @@ class SensorValues:
             0, key, self.residual * weight[:, None]
         )
         # Both means are equal if the residuals of a configuration are independent. If they are all the same, the second
-        # is larger by the number of targets, which then count as one measurement.
+        # is larger by a factor of the number of targets, which then count as one measurement.
         square = float((self.residual.square() * weight[:, None]).sum()) / len(key)
         shared = float((summed.square().sum(1) / total).sum()) / groups
         repetition = max(shared / max(square, 1e-300), 1.0)

@@ -34,12 +34,12 @@ CHUNK = 128
 FEW_GROUPS = 600
 """Number of groups up to which noise and prior sizes are estimated again for every fold that is held out."""
 _VERY_FEW_GROUPS = 60
-"""Number of groups up to which `FOLDS_OF_FEW` folds are held out: a calibration without a quarter of so few rows is
-much worse than with all rows, so its errors are not representative."""
+"""Number of groups up to which `FOLDS_OF_FEW` folds are held out: with a quarter of so few rows left out, a calibration
+is much worse than with all rows, so its errors are not representative."""
 _FOLD_UPDATES, _FEWER_UPDATES, _SOME_GROUPS = 3, 1, 150
 """Number of updates of noise and prior sizes for every fold, for few and for more groups, and the number of groups
-up to which the first applies. With one update, 0.9 % fewer of 30 rows are in the predicted 95 % intervals, 0.4 % of
-100 rows and 0.3 % of 300 rows; fitting 300 rows then takes four fifths of the time."""
+up to which the first applies. With one update, the share of rows in the predicted 95 % intervals is 0.9 % lower for 30
+rows, 0.4 % for 100 rows and 0.3 % for 300 rows; fitting 300 rows then takes four fifths of the time."""
 
 MAX_EXACT_ENTRIES = 1 << 18
 """Entries of a covariance root up to which it is not rounded: 2 MB in a model folder."""
@@ -88,7 +88,7 @@ class PositionUncertainty:
     ) -> Float64[Tensor, "rows 3"]:
         """Compute the standard deviation of every row's position along the axes of its frame [m].
 
-        It includes the effect of row data that are not stated, such as directions of approach.
+        It includes the effect of conditions that the rows do not state, such as directions of approach.
 
         Args:
             measurements: joint values, frames and targets.
@@ -108,8 +108,8 @@ class PositionUncertainty:
     def with_rounded_root(self, rows: Measurements) -> "PositionUncertainty":
         """Round a large covariance root, so that a model folder stores some 1/40 of the bytes.
 
-        Predicted standard deviations change by at most `ROUNDING_TOLERANCE` at the rows, at joint values permuted
-        between rows, and of the motions between both; those of single unknowns do not change.
+        Predicted standard deviations at the rows, at joint values permuted between rows, and of the motions between
+        both change by at most `ROUNDING_TOLERANCE`; those of single unknowns do not change.
 
         Args:
             rows: rows of the calibration.

@@ -1,1 +1,1 @@
-"""Cameras and printed boards: from pixels of corners to camera poses for the calibration of a robot."""
+"""Cameras and printed boards: from the pixels of corners to poses for the calibration of a robot."""

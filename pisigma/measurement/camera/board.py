@@ -21,7 +21,7 @@ TagFamily = Literal["tag16h5", "tag25h9", "tag36h10", "tag36h11"]
 _TAG_CELLS = {"tag16h5": 6, "tag25h9": 7, "tag36h10": 8, "tag36h11": 8}
 """Number of cells along the side of a tag, including its border."""
 RULER = 100.0
-"""Length of the line by which the scale of a printed board is checked [mm]."""
+"""Length of the line with which the scale of a printed board is checked [mm]."""
 Length = Annotated[float, Field(ge=0.2)]
 """Length of a board [mm]; shorter lengths are probably in metres."""
 _LENGTHS: dict[BoardKind, tuple[str, ...]] = {
@@ -93,10 +93,11 @@ class BoardDocument(Section):
 class Board:
     """A flat board with numbered corners.
 
-    Seen from the printed side, x points right, y down and z into the board, and rows are counted downwards. Corners of
-    checkerboards and ChArUco boards are the inner ones, row by row from 0; corner 0 is the origin, and the square at
-    negative x and y is black. Corners of an AprilTag grid are those of its tags: corner 4 i is the upper left one of
-    tag i, counted row by row from 0, and the others follow clockwise; corner 0 is the origin.
+    Seen from the printed side, x points right, y down and z into the board, and rows are counted downwards. The corners
+    of checkerboards and ChArUco boards are the inner corners, numbered row by row from 0; corner 0 is the origin, and
+    the square at negative x and y is black. The corners of an AprilTag grid are those of its tags: corner 4 i is the
+    upper left corner of tag i, with tags counted row by row from 0, and the others follow clockwise; corner 0 is the
+    origin.
 
     Attributes:
         name: name of the board.
@@ -108,9 +109,9 @@ class Board:
         marker: side of the markers of a ChArUco board, or of AprilTags [m].
         dictionary: dictionary of the markers: a `Dictionary` or a `TagFamily`.
         scale_deviation: relative standard deviation of the scale, common to all lengths of the board; None if not
-            given.
+            stated.
         flatness: distance between two parallel planes that enclose the surface [m]; 0 for a perfectly flat board.
-        printed: ratio of the printed lengths, which the other attributes state, to those that were to be printed.
+        printed: ratio of the lengths as printed, which the other attributes state, to the intended lengths.
     """
 
     name: str
@@ -129,7 +130,8 @@ class Board:
         """Read a board from a YAML file with `kind`, `rows`, `columns` and its lengths, such as `square_mm`.
 
         Raises:
-            MeasurementError: the file cannot be read or is not a valid board; `file`, `line` and `column` state where.
+            MeasurementError: the file cannot be read or is not a valid board; `file`, `line` and `column` locate the
+                fault.
         """
         return read_yaml(path, BoardDocument, MeasurementError).board()
 

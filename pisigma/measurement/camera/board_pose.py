@@ -33,10 +33,10 @@ class BoardPose:
         distance: length of every corner's residual, divided by the relative standard deviation of the corner [px].
         weight: weight of every corner by the robust loss.
         by_intrinsics: derivative of the solved pose (shift of t [m], rotation vector of R in the camera's frame [rad])
-            by the intrinsics.
+            with respect to the intrinsics.
         root: square root of the corners' information on the intrinsics k, with the pose eliminated and a noise of 1
             px: `root (k - present) = residual`.
-        residual: right side of the equation of `root` [px].
+        residual: right-hand side of the equation of `root` [px].
     """
 
     R: Float64[np.ndarray, "3 3"]

@@ -116,7 +116,7 @@ class MatrixSection(BaseModel):
 class MatrixDocument(BaseModel):
     """Contents of a camera file of ROS (`camera_info`) or of OpenCV's calibration sample.
 
-    Fisheye lenses are refused because their coefficients have another meaning; binned images are refused because
+    Fisheye lenses are refused because their coefficients have a different meaning; binned images are refused because
     their pixels are larger.
     """
 
@@ -136,7 +136,7 @@ class MatrixDocument(BaseModel):
 class Camera:
     """A pinhole camera with radial and tangential distortion (Brown 1971, as in OpenCV and ROS's plumb_bob).
 
-    z points out of the camera, x to the right and y down in the image.
+    The z axis points out of the camera, x to the right and y down in the image.
 
     Attributes:
         name: name of the camera.
@@ -151,7 +151,7 @@ class Camera:
         p1: first tangential distortion coefficient.
         p2: second tangential distortion coefficient.
         k3: third radial distortion coefficient.
-        sigma: standard deviations of fx, fy, cx, cy [px], k1, k2, p1, p2, k3; None if not given.
+        sigma: standard deviations of fx, fy, cx, cy [px], k1, k2, p1, p2, k3; None if not stated.
         is_fixed: whether the camera is fixed and the board is on the flange; otherwise the camera is on the flange.
     """
 

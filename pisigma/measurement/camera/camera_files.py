@@ -1,4 +1,4 @@
-"""Cameras, boards and repeatability of the robot, which files of corners require."""
+"""Cameras, boards and robot repeatability, which files of corners require."""
 
 import math
 from dataclasses import dataclass, field
@@ -10,7 +10,7 @@ from pisigma.files.setting import KEY, Option, as_texts
 
 IntrinsicsChoice = Literal["fixed", "prior", "free"]
 _MAX_REPEATABILITY = 0.01, 0.105
-"""Largest repeatability [m] and [rad]; larger values must be in another unit."""
+"""Largest repeatability [m] and [rad]; larger values must be in a different unit."""
 
 
 @dataclass(frozen=True)

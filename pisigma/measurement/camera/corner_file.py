@@ -28,7 +28,8 @@ from pisigma.robot.description import Robot
 _SAME_JOINTS = 1e-9
 """Largest difference between the joint values in the rows of one image [rad or m]."""
 _RESOLUTION_IMAGES = 8
-"""Smallest number of images of which some must show corners outside the upper left quarter of the field of view."""
+"""Smallest number of images for the check that some show corners outside the upper left quarter of the field of
+view."""
 _CONDITIONS = ("split", "payload", "temperature", "approach", "torque", "date")
 """Fields that rows of corners may have in addition to joint values and pixels."""
 _IMAGE_COLUMNS = (*CORNERS, "sigma_px", "camera", "board")
@@ -41,13 +42,13 @@ CameraOrBoard = TypeVar("CameraOrBoard", Camera, Board)
 def read_corners(path: str | os.PathLike[str], robot: Robot, cameras: CameraFiles) -> Measurements:
     """Read a CSV file of corners: `image`, `corner`, `u_px`, `v_px` and the joints (`q1_deg` and so on).
 
-    Rows of one image have the same name and joint values. With several cameras or boards, the columns `camera` and
-    `board` name those of an image. Corners are weighted by 1 / `sigma_px`². Rows without a corner belong to other
-    sensors.
+    The rows of one image have the same image name and joint values. With several cameras or boards, the columns
+    `camera` and `board` name those of the image. Corners are weighted by 1 / `sigma_px`². Rows without a corner belong
+    to other sensors.
 
     Returns:
-        One row per image, in the frame of the board with the camera as target (of a fixed camera the other way
-        round), with the weights of `CornerSensor`; and the rows of other sensors.
+        One row per image, in the frame of the board with the camera as target (the other way round for a fixed camera)
+        and with the weights of `CornerSensor`; and the rows of other sensors.
 
     Raises:
         MeasurementError: a file cannot be used, or the corners of an image do not fit its board.
@@ -176,7 +177,7 @@ def _are_corners(table: Table) -> list[bool]:
     """Return the mask of the rows that contain a corner, which are the rows with an image.
 
     Raises:
-        MeasurementError: a column is missing, a row is not valid CSV, or its number of fields is not that of the
+        MeasurementError: a column is missing, a row is not valid CSV, or its number of fields differs from that of the
             header.
     """
     for row, fields in enumerate(table.records):
@@ -259,7 +260,7 @@ def _check_corners(
     camera: Camera,
     board: Board,
 ) -> None:
-    """Refuse corners that the board does not have, pixels outside the image, and standard deviations of 0 or less.
+    """Refuse corners that the board lacks, pixels outside the image, and standard deviations of 0 or less.
 
     Raises:
         MeasurementError: a corner, a pixel or a standard deviation is not valid.
@@ -292,10 +293,10 @@ _RESOLUTION_REMEDY = "give the camera's intrinsics at the resolution of the imag
 
 
 def _check_resolution(table: Table, pixels: Float64[np.ndarray, "rows 2"], camera: Camera) -> None:
-    """Refuse images if none shows a corner outside the upper left quarter of the field of view.
+    """Refuse images if none of them shows a corner outside the upper left quarter of the field of view.
 
     Raises:
-        MeasurementError: the images of a camera show corners in the upper left quarter only.
+        MeasurementError: the images of a camera show corners only in the upper left quarter.
     """
     if (pixels.max(0) < np.array([camera.width, camera.height]) / 2).all():
         raise MeasurementError(

@@ -37,7 +37,7 @@ from pisigma.measurement.sensors.intrinsics import (
 from pisigma.robot.se3 import skew
 
 _MAX_BEND_ITERATIONS = 4
-"""Largest number of iterations of the board's shape for given intrinsics; usually the second step is near rounding."""
+"""Largest number of iterations of the board's shape for given intrinsics; the second step is usually near rounding."""
 _BEND_TOLERANCE = 1e-6
 """Change of the board's shape [m] below which the iteration ends."""
 MAX_MEDIAN_RESIDUAL = 10.0
@@ -48,13 +48,13 @@ _SHAPES = 3
 
 @dataclass(frozen=True, eq=False)
 class Images:
-    """The corners in images that one camera took of one board.
+    """Corners in the images that one camera took of one board.
 
     Attributes:
         source: the file that contains the corners.
         names: names of the images, in the file's order.
         q: joint values of every image [rad or m].
-        lines: line of the first corner of every image.
+        lines: line number of the first corner of every image.
         corners: numbers of the corners in every image.
         pixels: pixels of the corners in every image [px].
         sigma: standard deviation of every corner, up to a common factor that is estimated; empty if all are equal.
@@ -96,8 +96,8 @@ def image_measurements(
         intrinsics: whether the camera's intrinsics are fixed, have their prior, or are free; see `prior_deviations`.
 
     Returns:
-        One row per image, in the frame of the board with the camera as target (of a fixed camera the other way
-        round), with the weights of `CornerSensor`.
+        One row per image, in the frame of the board with the camera as target (the other way round for a fixed camera),
+        with the weights of `CornerSensor`.
 
     Raises:
         MeasurementError: the corners of an image do not fit the board.
@@ -153,7 +153,7 @@ def _readings(
 def _board_poses(
     images: Images, camera: Camera, board: Board, bend: Float64[np.ndarray, " 3"], loss: AbstractLoss
 ) -> tuple[list[BoardPose], Float64[np.ndarray, " 3"]]:
-    """Solve the poses of a board at given intrinsics, together with its shape if it need not be flat.
+    """Solve the poses of a board for given intrinsics, together with its shape if it need not be flat.
 
     Returns:
         The poses, and the heights of the board's shapes [m].
@@ -179,7 +179,7 @@ def _board_poses(
 
 
 def _refuse_other_boards(images: Images, board: Board, poses: Sequence[BoardPose]) -> None:
-    """Refuse images whose corners do not fit the board, and images that show it mirrored.
+    """Refuse images whose corners do not fit the board, and images in which the board is mirrored.
 
     Raises:
         MeasurementError: an image does not fit the board or shows it mirrored.
@@ -208,7 +208,7 @@ def _refuse_other_boards(images: Images, board: Board, poses: Sequence[BoardPose
 
 
 def _target_pose(pose: BoardPose, is_fixed: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the pose of the target, and its derivative, in axes of the frame, with respect to the board's pose.
+    """Return the pose of the target, and its derivative with respect to the board's pose, in the axes of the frame.
 
     For a shift and a rotation vector of the board's pose, the position `-R^T t` of the inverse pose changes by
     `-R^T (shift + t × rotation)`, and its rotation by `-R^T rotation`.

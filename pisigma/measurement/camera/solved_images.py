@@ -23,7 +23,7 @@ from pisigma.measurement.sensors.intrinsics import ImageIntrinsics, intrinsics_i
 
 MAX_ITERATIONS = 20
 _CONVERGENCE_TOLERANCE = 0.1
-"""Change of the intrinsics, in standard deviations, below which they are not linearised again."""
+"""Change of the intrinsics, in standard deviations, below which they are not relinearised."""
 _FREE_FOCAL, _FREE_CENTRE = 0.05, 0.05
 """Prior standard deviations of free focal lengths and principal points, relative to focal length and image width;
 lenses vary less."""
@@ -42,9 +42,9 @@ def prior_deviations(camera: Camera, choice: IntrinsicsChoice) -> Float64[np.nda
     """Return prior standard deviations of a camera's intrinsics [px; distortion without unit], 0 if fixed.
 
     Args:
-        camera: the camera, with the standard deviations of its file or, without them, of a typical calibration.
+        camera: the camera, with the standard deviations of its file or else those of a typical calibration.
         choice: "fixed": all intrinsics are fixed; "prior": standard deviations of the camera; "free": standard
-            deviations so large that the images decide. Intrinsics that "prior" fixes are fixed with "free", too.
+            deviations so large that the images decide. Intrinsics that "prior" fixes are also fixed with "free".
     """
     stated = np.array(camera.sigma or USUAL_DEVIATIONS)
     wide = [
@@ -162,8 +162,8 @@ class IntrinsicCalibration:
         tilts: angle between the board's normal and the camera's axis in every image [rad].
         disagreement: ratio of the images' scatter about common intrinsics to their noise (Birge 1932): it is 1 if
             the model fits, and larger for a bowed board. Standard deviations are multiplied by it.
-        disagrees: whether the ratio is larger than by chance (three standard deviations).
-        covered: for every cell of the image, row by row, whether a corner was seen in it.
+        disagrees: whether the ratio is larger than chance explains (three standard deviations).
+        covered: whether a corner was seen in each cell of the image, row by row.
     """
 
     camera: Camera
@@ -226,7 +226,7 @@ def initial_camera(views: Sequence[BoardView], name: str, size: tuple[int, int])
     the focal length.
 
     Raises:
-        MeasurementError: all images are perpendicular to the board, so they do not determine the focal length.
+        MeasurementError: all images show the board frontally, so they do not determine the focal length.
     """
     middle, width = (np.array(size) - 1) / 2, float(size[0])
     slopes, constants = list[float](), list[float]()
@@ -261,7 +261,7 @@ def _solved(
 
 
 def _covered(views: Sequence[BoardView], size: tuple[int, int]) -> Bool[np.ndarray, "cells cells"]:
-    """Return for every cell of the image whether it contains a corner of any view."""
+    """Return whether each cell of the image contains a corner of any view."""
     covered = np.zeros((_CELLS, _CELLS), dtype=bool)
     for view in views:
         cell = np.clip(_CELLS * (view.pixels + 0.5) / size, 0, _CELLS - 1).astype(int)

@@ -1,4 +1,4 @@
-"""Columns of measurement files: names, quantities and units, and the fields that they form."""
+"""Columns of measurement files: names, quantities, units, and the fields that the columns form."""
 
 import re
 from collections.abc import Iterable
@@ -29,7 +29,7 @@ PLAN_COLUMNS = ("order", "candidate")
 
 _JOINT = re.compile(r"q([1-9][0-9]{0,2})_(deg|rad|mm|m)")
 PER_JOINT = {"approach": "approach", "torque": "tau_"}
-"""Fields with a value per joint, and what the names of their columns start with; the number of the joint follows."""
+"""Fields with a value per joint, and the prefixes of their columns' names, which the number of the joint follows."""
 _PER_JOINT = re.compile(rf"({'|'.join(PER_JOINT.values())})([1-9][0-9]{{0,2}})")
 
 
@@ -54,7 +54,7 @@ class Column:
 
     @property
     def joint(self) -> int:
-        """Number of the joint, from 1; 0 for other columns."""
+        """Number of the joint whose value the column contains, from 1; 0 for other columns."""
         match = _JOINT.fullmatch(self.name)
         return int(match[1]) if match else 0
 
@@ -75,7 +75,7 @@ class FileField:
         name: name of the field.
         quantities: quantities of the columns, one for every value of a row.
         units: valid units of the columns; files are written in the first unit.
-        column: name of the only column without its unit, if it differs from the quantity.
+        column: name, without the unit, of the field's only column, if it differs from the quantity.
     """
 
     name: str
@@ -110,7 +110,7 @@ def number_fields(dof: int = 0) -> tuple[FileField, ...]:
     """Return the numeric fields after the joint values, in the order of a file; rotations may also be read as `RPY`.
 
     Args:
-        dof: number of joints; with 0 the fields of `PER_JOINT` are not included.
+        dof: number of joints; if 0, the fields of `PER_JOINT` are not included.
     """
     numbers = range(1, dof + 1)
     per_joint = (

@@ -1,4 +1,4 @@
-"""Read the header of a measurement file: the meaning of its columns, and whether they fit together."""
+"""Read the header of a measurement file: find the meaning of its columns, and check that they fit together."""
 
 import math
 from dataclasses import dataclass, replace
@@ -27,7 +27,7 @@ class Layout:
     """Meaning and order of the columns of a file.
 
     Attributes:
-        columns: meaning of every column, in the file's order.
+        columns: meaning of every column, in the order of the file.
         index: index of the column of every quantity, such as {"q1": 0, "x": 6}.
         dof: number of joints.
         orientation: the quantities of the orientation: `RPY`, `QUATERNION` or none.
@@ -161,7 +161,7 @@ def _is_number(name: str) -> bool:
 
 
 def _check_joints(place: Place, columns: tuple[Column, ...]) -> int:
-    """Check that joints are numbered from q1 without a gap, with one unit per joint type; return their number."""
+    """Check that joints are numbered from q1 without gaps, with one unit per joint type; return their number."""
     joints = sorted((column for column in columns if column.joint), key=lambda column: column.joint)
     if not joints:
         remedy = "add q1_deg or q1_rad (q1_mm or q1_m for a prismatic joint) and so on for every joint"
@@ -207,7 +207,7 @@ def _check_robot(place: Place, joints: list[Column], robot: Robot) -> None:
 
 
 def _check_joint_fields(place: Place, columns: tuple[Column, ...], dof: int) -> None:
-    """Check that directions of approach and torques are those of joints in the file."""
+    """Check that directions of approach and torques belong to joints in the file."""
     for column in columns:
         if column.joint_field[1] > dof:
             raise MeasurementError(
@@ -219,7 +219,7 @@ def _check_joint_fields(place: Place, columns: tuple[Column, ...], dof: int) -> 
 
 
 def _check_position(place: Place, columns: tuple[Column, ...]) -> None:
-    """Check that x, y and z are given in one unit, unless the file has other lengths."""
+    """Check that x, y and z are present in one unit, unless the file has other lengths."""
     present = [column for column in columns if column.quantity in POSITION]
     if not present and {column.quantity for column in columns} & {"socket", *_NEEDED, *reading_numbers()}:
         return
@@ -267,7 +267,7 @@ def _check_lengths(place: Place, columns: tuple[Column, ...]) -> None:
 
 
 def _check_readings(place: Place, columns: tuple[Column, ...]) -> None:
-    """Check that a file has all columns of a registered sensor, or none."""
+    """Check that a file has either all columns of a registered sensor or none."""
     present = {column.quantity: column for column in columns}
     for readings in READINGS.values():
         there = [column for column in readings.columns if column.name in present]

@@ -34,13 +34,13 @@ _MAX_SHOWN, _MAX_LINE = 40, 10_000_000
 
 @dataclass(frozen=True, eq=False)
 class PoseChunk:
-    """Some or all rows of a file of poses.
+    """Some or all of the rows in a file of poses.
 
     Attributes:
         T: T_base_tool [m] of the valid rows.
         line: line numbers of the valid rows.
-        bad: invalid rows, and what is wrong with them.
-        share: fraction of the file that has been read, 0 to 1; NaN if the file has no length.
+        bad: invalid rows, with their faults.
+        share: fraction of the file that has been read, 0 to 1; NaN if the length of the file is unknown.
     """
 
     T: Float64[Tensor, "rows 4 4"]
@@ -158,7 +158,7 @@ class _Layout:
                 except ValueError:
                     pass
                 else:
-                    if np.abs(numbers).max(initial=0.0) <= MAX_MAGNITUDE:  # NaN is refused, too
+                    if np.abs(numbers).max(initial=0.0) <= MAX_MAGNITUDE:  # NaN is refused as well
                         return numbers, {}
         return self._checked_values(lines)
 

@@ -1,4 +1,4 @@
-"""Read measurement files, either completely with every row checked, or their joint values only."""
+"""Read measurement files, either completely, checking every row, or only their joint values."""
 
 import math
 import os
@@ -33,7 +33,7 @@ from pisigma.robot import Robot
 from pisigma.robot.se3 import rotation_from_quaternion, rotation_from_rpy
 
 _MAX_BYTES = 2**22
-"""Largest size [bytes] of a refused file that is tested for being an export, so that refusing does not take long."""
+"""Largest size [bytes] of a refused file that is tested for being an export, so that a refusal does not take long."""
 
 
 def read_fields(
@@ -44,19 +44,19 @@ def read_fields(
     Required are the joint values `q1_deg` or `q1_rad` and so on (prismatic: `q3_mm` or `q3_m`), and at least one kind
     of length (each also in `_m`), of which every row contains at most one: `x_mm,y_mm,z_mm`; `socket`, the name of the
     fixed point in which the ball sits; `touch_axis` (x, y or z) and `touch_mm` with `frame`, the jig; `distance_mm`
-    with `anchor`, the name of a fixed point whose position `anchor_x_mm,anchor_y_mm,anchor_z_mm` may be given, or
-    with `pair`, a name that the two rows share between which it was measured.
+    with `anchor`, the name of a fixed point whose position `anchor_x_mm,anchor_y_mm,anchor_z_mm` may be given, or with
+    `pair`, a name shared by the two rows between which the distance was measured.
 
     Optional are `roll_deg,pitch_deg,yaw_deg` (RotZ(roll) · RotY(pitch) · RotX(yaw)) or `qx,qy,qz,qw`, `target`,
     `frame`, `sigma_mm` (standard deviation of the row's length), `sigma_deg`, `set`, `payload_kg`, `temperature_c`,
-    `approach1` and so on (+1 where that joint's value increased before it stopped, -1 where it decreased), and `tau_1`
+    `approach1` and so on (+1 if that joint's value increased before it stopped, -1 if it decreased), and `tau_1`
     and so on (torque of that joint's drive in Nm, or its force in N). Registered sensors add further columns. Cells of
     quantities that were not measured are empty.
 
     Args:
         path: the file.
-        robot: robot against which number, units and limits of the joints are checked, and which converts the
-            controller's values of coupled joints to joint values; None for neither.
+        robot: robot against which number, units and limits of the joints are checked, and with which the controller's
+            values of coupled joints are converted; None for neither.
         on_bad_row: "error" to raise at the first row that cannot be used, "leave_out" to continue without such
             rows and to list them in `left_out`.
 
@@ -125,7 +125,7 @@ def _sound_rows(table: Table, layout: Layout, robot: Robot | None) -> MeasuredFi
 
 
 def _complete(data: MeasuredFields, on_bad_row: OnBadRow) -> MeasuredFields:
-    """Raise an error for the first fault, with the number of further faults, unless such rows may be left out."""
+    """Raise an error for the first fault, stating the number of other faults, unless such rows may be left out."""
     if not data.left_out or (on_bad_row == "leave_out" and data.rows):
         return data
     problem, more = data.left_out[0].error(data.source), len(data.left_out) - 1
@@ -133,7 +133,7 @@ def _complete(data: MeasuredFields, on_bad_row: OnBadRow) -> MeasuredFields:
 
 
 def _labels(layout: Layout) -> FieldLabels:
-    """Return name and unit of the column that messages state for every field."""
+    """Return the column name and the unit that messages use for every field."""
     names = {quantity: layout.column(quantity).name for quantity in layout.index}
     groups = {field.name: field.quantities for field in number_fields() if len(field.quantities) > 1}
     groups |= {sensor: readings.numbers for sensor, readings in READINGS.items()}
@@ -195,7 +195,7 @@ def read_joints(path: str | os.PathLike[str], robot: Robot) -> Float64[Tensor, "
 
 
 def contains_measurements(path: str | os.PathLike[str]) -> bool:
-    """Return whether a file contains measured values in addition to joint values, unlike those of `pisigma ik`.
+    """Return whether a file contains measured values besides joint values, unlike the output of `pisigma ik`.
 
     Raises:
         MeasurementError: the file cannot be used.

@@ -1,4 +1,4 @@
-"""Check every cell of a measurement file; faults state their column."""
+"""Check every cell of a measurement file; each fault states its column."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -124,7 +124,7 @@ def _number(cell: str) -> float:
 
 
 def _check_joints(values: _Values, layout: Layout, robot: Robot | None, faults: Faults) -> None:
-    """Check that every joint value is given and possible for its joint; see `far_beyond_limits`."""
+    """Check that every joint value is present and possible for its joint; see `far_beyond_limits`."""
     for number, quantity in enumerate(layout.joints):
         column, q = layout.column(quantity), values[:, layout.index[quantity]]
         empty = Fault("", column.name, "a joint value", "", "give the values of all joints in every row")
@@ -136,7 +136,7 @@ def _check_joints(values: _Values, layout: Layout, robot: Robot | None, faults: 
 def _check_limits(
     q: Float64[np.ndarray, " rows"], column: Column, joint: Row, robot: str, faults: Faults
 ) -> None:
-    """Check that a joint's values are not so far outside its limits that unit or joint must be wrong."""
+    """Check that a joint's values are not so far outside its limits that the unit or the joint must be wrong."""
     outside = far_beyond_limits(to_si(q, column.unit), joint)
     lower, upper = from_si(np.array([joint.lower, joint.upper]), column.unit).tolist()
     limits = f"{lower:.6g} to {upper:.6g} {column.unit}"

@@ -28,7 +28,7 @@ class Table:
         header_line: line number of the header.
         records: the fields of every row; empty for rows that are not valid CSV.
         lines: line numbers of the rows.
-        broken: what is wrong with the rows that are not valid CSV, by row.
+        broken: faults of the rows that are not valid CSV, by row.
     """
 
     source: str
@@ -126,7 +126,7 @@ def header_names(line: str, place: Place) -> tuple[str, ...]:
 
 
 def split_line(line: str) -> tuple[list[str], str]:
-    """Return the fields of a line, and what is wrong with its quotes ("" if nothing is)."""
+    """Return the fields of a line, and the fault of its quotes ("" if there is none)."""
     if '"' not in line:
         return line.split(","), ""
     try:
@@ -154,7 +154,7 @@ class Faults:
             self.by_row.setdefault(row, fault)
 
     def rows_without_faults(self, rows: int) -> Bool[np.ndarray, " rows"]:
-        """Return the mask of the rows, `rows` in number, that have no fault."""
+        """Return the mask, of length `rows`, of the rows that have no fault."""
         sound = np.ones(rows, dtype=bool)
         sound[list(self.by_row)] = False
         return sound

@@ -1,4 +1,4 @@
-"""Write a measurement file that reads back unchanged, completely or not at all."""
+"""Write a measurement file, completely or not at all, that is read back unchanged."""
 
 import csv
 import io
@@ -50,7 +50,7 @@ def write_fields(data: MeasuredFields, path: str | os.PathLike[str], revolute: S
 
 
 def _numbers(data: MeasuredFields, revolute: Sequence[bool]) -> dict[str, Float64[np.ndarray, " rows"]]:
-    """Return the numeric columns in the file's units, without those that would be empty.
+    """Return the numeric columns in the file's units, without columns that would be empty.
 
     The columns of the position are written, even empty, if there is no other length, because the file could not be read
     without them.

@@ -1,4 +1,4 @@
-"""Account for every row of the imported files: rows read = rows used + rows listed as left out."""
+"""Account for every row of the imported files: rows read = rows used + rows left out, which are listed."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ class LeftOutRow:
     Attributes:
         file: the file of the row.
         line: line number of the row.
-        reason: why it was left out, as a clause after "is left out: ...".
+        reason: reason why it was left out, as a clause that follows "is left out: ".
         point: name of the measured point; "" if the row has no name.
     """
 
@@ -35,7 +35,7 @@ class LeftOutRow:
 
 @dataclass(frozen=True)
 class FileAccount:
-    """Numbers of rows of a file that were read, used and left out; the first is the sum of the others.
+    """Numbers of rows of a file that were read, used and left out; the first is the sum of the other two.
 
     Attributes:
         file: the file.

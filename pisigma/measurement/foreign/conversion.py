@@ -45,7 +45,7 @@ class ConvertedRows:
         source: the file.
         lines: line numbers of the rows.
         cells: texts of every row by column, such as "q1_deg", and by the keys "point" and "time".
-        origins: the file of every row; () if all rows are from the source.
+        origins: the file of every row; () if all rows come from the source.
     """
 
     source: str
@@ -264,7 +264,7 @@ class MeasurementTable:
     Attributes:
         table: table of the rows in which a value was measured.
         places: file and line of these rows.
-        left_out: the rows that were left out, and why.
+        left_out: the rows that were left out, with the reasons.
     """
 
     table: Table
@@ -279,7 +279,7 @@ class MeasurementTable:
 
 
 def measurement_table(rows: ConvertedRows) -> MeasurementTable:
-    """Build the table of a measurement file, checking every row as its reader does.
+    """Build the table of a measurement file, checking every row as the reader of measurement files does.
 
     Raises:
         MeasurementError: the rows are not valid measurements; `line` is the line of the export.

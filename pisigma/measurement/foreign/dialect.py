@@ -19,12 +19,12 @@ _SAMPLED_LINES = 300
 """Number of lines from which the format is recognised."""
 _MAX_COLUMNS = 2000
 _BLANKS = 0.8
-"""Weight of spaces as separators; it is small, because names contain spaces, too."""
+"""Weight of spaces as separators; it is small, because names also contain spaces."""
 _SMALL, _FAR = 20.0, 200.0
 """Limits below which numbers such as 2.104 may be lengths in mm with a group of thousands: no robot reaches 20,000
 mm, and no measured position is 200,000 mm away."""
 COMMENT = re.compile(r"\s*(?://|#|%|!|\*\*|--|;|'|REM\b)\s*")
-"""Texts with which comments start; rows may start with them, too."""
+"""Texts with which comments start; rows may also start with them."""
 Decimal = Literal[".", ","]
 _MISSING = frozenset(
     ("", "-", "--", "---", "*", "n/a", "na", "nan", "null", "none", "nil", "n.a.", "missing")
@@ -139,7 +139,7 @@ class Dialect:
 def detect_dialect(lines: Sequence[tuple[int, str]], source: str, decimal: Decimal | None = None) -> Dialect:
     """Find the separator and the decimal sign for which most cells of most lines are numbers.
 
-    Of equally good formats the first is returned, in the order of `_SEPARATORS` and with points first.
+    Of equally good formats, the first is returned, in the order of `_SEPARATORS` and with decimal points first.
 
     Args:
         lines: line numbers and texts of the lines of the file that are not blank.
@@ -177,8 +177,8 @@ def _check_decimal(dialect: Dialect, rows: Sequence[tuple[int, list[str]]], sour
 
     A table is ambiguous if every number with the sign looks like 2.104, and either the sign also separates the
     cells, or a column also contains whole numbers, or all of these numbers are small and another column contains
-    whole numbers. It is also ambiguous if a column contains such numbers together with whole numbers of three digits
-    only.
+    whole numbers. It is also ambiguous if a column contains such numbers together with whole numbers that all have
+    three digits.
 
     Raises:
         MeasurementError: the numbers of the table are ambiguous.
@@ -230,7 +230,7 @@ def _counts(cells: Sequence[str]) -> bool:
 
 
 def _score(dialect: Dialect, lines: Sequence[str]) -> float:
-    """Return the share of lines that are rows of one width, times the share of certain numbers in their cells."""
+    """Return the share of lines that are rows of one width, times the share of unambiguous numbers in their cells."""
     rows = [dialect.split(line) for line in lines]
     numeric = [row for row in rows if dialect.is_row(row)]
     if not numeric:

@@ -1,4 +1,4 @@
-"""Read an export in any text encoding as a table of texts: comments, headings, units and rows."""
+"""Read an export in any text encoding as a table of texts, with comments, headings, units and rows."""
 
 import codecs
 import os
@@ -49,7 +49,7 @@ class ExportFile:
         records: cells of every row, in the order of the file.
         lines: line numbers of the rows.
         dialect: format of the file.
-        skipped: lines that are not used as rows: lines with numbers that are not rows, lines after the first row
+        skipped: lines that are not used as rows: lines that contain numbers but are not rows, lines after the first row
             that are neither rows nor blank, and rows that summarise others.
     """
 
@@ -93,8 +93,8 @@ def read_export(
         most: largest size of the file [bytes].
 
     Raises:
-        MeasurementError: the file cannot be read, is not text, does not contain a table of numbers, or a row has
-            another number of cells than the other rows.
+        MeasurementError: the file cannot be read, is not text, does not contain a table of numbers, or the number of
+            cells of a row differs from that of the other rows.
     """
     source = make_printable(str(path), cut=False)
     lines = _lines_of(decode_text(read_input(path, MeasurementError, most), source), source)
@@ -151,7 +151,7 @@ def _lines_of(text: str, source: str) -> _Lines:
 
 
 def _is_content(line: str, row: list[str], headings: list[str]) -> bool:
-    """Return whether cells without numbers are a row; the reader of measurement files then refuses it."""
+    """Return whether cells without numbers are a row, which the reader of measurement files then refuses."""
     return any(row) and row[: len(headings)] != headings and not _is_comment(line, row)
 
 
@@ -255,7 +255,7 @@ def _heading_row(lines: _Lines, cells: list[list[str]], is_units: list[bool], wi
 
 
 def _is_unit_row(cells: list[str]) -> bool:
-    """Return whether the cells of a line are units, possibly with other texts that are not names of columns."""
+    """Return whether the cells of a line are units, possibly with other texts that are not column names."""
     symbols = [unit_symbol(cell) or ambiguous_unit(cell) for cell in cells]
     others = [cell for cell, symbol in zip(cells, symbols, strict=True) if cell and not symbol]
     count = sum(map(bool, symbols))
@@ -291,7 +291,7 @@ def _recognised(cells: list[str]) -> float:
 
 
 def decode_text(content: bytes, source: str) -> str:
-    """Decode a text by its byte order mark, or else as UTF-16, UTF-8 or Windows-1252, whichever fits first.
+    """Decode a text by its byte order mark, or else with the first of UTF-16, UTF-8 and Windows-1252 that fits.
 
     Args:
         content: content of the file.

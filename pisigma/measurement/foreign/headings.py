@@ -1,4 +1,4 @@
-"""Registry of column headings of makers and instruments, and their meanings."""
+"""Registry of the column headings of manufacturers and instruments, and their meanings."""
 
 import re
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ _SIDES = {
     "measured": "actual act meas measured ist tracker reflector smr laser",
     "": "tcp tool pos position pose coord coordinate coordinates value values val jnt trans translation",
 }
-"""Words that may accompany a name: for commanded values, for measured values, and words without meaning."""
+"""Words that may accompany a name: those for commanded values, those for measured values, and words without meaning."""
 _SIDE_OF = {word: side for side, words in _SIDES.items() for word in words.split()}
 _OF_QUATERNION = re.compile(r"^(?:rot|rotation|ori|orient|orientation|quat|quaternion)(?=q[0-4xyzw]$)")
 _BRACKETS = re.compile(r"^(.*?)\s*(?:\[([^\]]*)\]|\(([^)]*)\)|<([^>]*)>)\s*$")
@@ -26,7 +26,8 @@ class Heading:
 
     Attributes:
         text: the heading as in the file.
-        name: name in the heading without unit, case, separators and words without meaning, such as "j1" of "J_1 [deg]".
+        name: name in the heading without unit, case, separators and words without meaning, such as "j1" for "J_1
+            [deg]".
         unit: symbol of the unit, or "".
         unknown_unit: text in brackets that is not a unit.
         side: "commanded" or "measured" if the heading states it, otherwise "".
@@ -75,13 +76,13 @@ def _unit_apart(text: str) -> tuple[str, str, str]:
 
 @dataclass(frozen=True)
 class MakerHeadings:
-    """Column names that a maker uses.
+    """Column names that a manufacturer uses.
 
     Attributes:
-        name: name of the maker.
+        name: name of the manufacturer.
         joints: names of the joints in order, or one name that is followed by numbers; "" if the names are not specific.
-        rotation: name of the maker's encoding of rotations.
-        position: name of the coordinate x, if it is needed to recognise the maker.
+        rotation: name of the manufacturer's encoding of rotations.
+        position: name of the coordinate x, if it is needed to recognise the manufacturer.
         length: unit of all lengths; "" if it is configurable.
         angle: unit of all angles; "" if it is configurable.
     """
@@ -105,11 +106,12 @@ MAKERS = (
     MakerHeadings("Epson", "", "epson", length="mm", angle="deg"),
     MakerHeadings("Kawasaki", "", "kawasaki", length="mm", angle="deg"),
 )
-"""Column names of makers, one maker per line. Makers without specific joint names are recognised by their rotations."""
+"""Column names of manufacturers, one per line. Manufacturers without specific joint names are recognised by their
+rotations."""
 
 _JOINTS = "j joint q axis ax achse th theta gelenk axe eje asse jt a rax position"
 JOINT_NAMES = tuple(_JOINTS.split())
-"""Names of joints that are followed by numbers, of any maker."""
+"""Names of joints, followed by numbers, that any manufacturer may use."""
 
 POSITIONS = tuple(
     tuple(names.split())
@@ -149,7 +151,7 @@ def joint_of(name: str, pattern: str) -> int | None:
 
     Args:
         name: name in a heading.
-        pattern: names of the joints that the maker uses, see `MakerHeadings.joints`.
+        pattern: names of the joints that the manufacturer uses, see `MakerHeadings.joints`.
     """
     if not pattern.endswith("#"):
         names = pattern.split()

@@ -1,4 +1,4 @@
-"""Join a log of joint values and images by name, by number of the stop in a video, or by time."""
+"""Join a log of joint values and images by name, by the number of the stop in a video, or by time."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -22,7 +22,7 @@ class JoinedJoints:
 
     Attributes:
         columns: columns of the log that are kept, such as "q1_deg" and "payload_kg".
-        cells: texts of these columns by image name; images without a partner are missing.
+        cells: texts of these columns by image name; images without a partner are omitted.
         remarks: sentences about rows without a partner, and warnings.
     """
 
@@ -50,11 +50,12 @@ def join_joint_values(
         path: CSV file with joint values (`q1_deg` and so on) and a column `image` (with or without extension) or
             `time`; further columns are kept if they are columns of measurement files.
         within: largest difference of time stamps [s].
-        stops: number of images that are numbered stops in a video, which have to be all rows of the file; 0 if there
-            is no video.
+        stops: number of images that are numbered stops in a video, which must equal the number of rows of the file; 0
+            if there is no video.
 
     Raises:
-        MeasurementError: the file cannot be used, no image has a partner, or the number of stops is another one.
+        MeasurementError: the file cannot be used, no image has a partner, or the number of stops differs from the
+            number of rows.
     """
     table = read_table(path)
     joints = [name for name in table.header if (column := find_column(name)) and column.joint]

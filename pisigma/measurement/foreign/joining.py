@@ -133,7 +133,7 @@ def _check_names(
 ) -> list[str]:
     """Refuse joined rows whose points have different names in both files.
 
-    If no name is in both files, the numbers at the ends of the names are compared, up to a constant offset.
+    If no name occurs in both files, the numbers at the ends of the names are compared, up to a constant offset.
 
     Returns:
         Warnings about names that cannot be compared.
@@ -277,7 +277,7 @@ def _joint_columns(rows: ConvertedRows) -> list[str]:
 def _partners(
     joints: ConvertedRows, partner: Int64[np.ndarray, " rows"], by: JoinBy
 ) -> Int64[np.ndarray, " _log"]:
-    """Return the rows of the log that need not be listed: joined rows, and rows between them in a continuous log."""
+    """Return the rows of the log that need not be listed: joined rows and, in a continuous log, rows between them."""
     if by != "time":
         if by == "point":
             names = {_plain_name(joints.cells["point"][row]) for row in partner if row >= 0}

@@ -22,7 +22,7 @@ STATE, _ACTION = "observation.state", "action"
 _POSITION = ".pos"
 """End of the names of positions; velocities and torques end in ".vel" and ".torque"."""
 _GRIPPER, _SHADOW = "gripper", "_shadow"
-"""Ends of the names of motors that LeRobot counts as joints, although they are none."""
+"""Ends of the names of motors that LeRobot counts as joints although they are not joints of the robot."""
 _SIDES = ("left_", "right_")
 """Prefixes of the two arms of LeRobot's pairs."""
 
@@ -34,10 +34,10 @@ def is_lerobot_dataset(path: str | os.PathLike[str]) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class LeRobotDataset:
-    """A data set on disk, whose frames are not read yet.
+    """A data set on disk whose frames have not been read yet.
 
     Attributes:
-        folder: its folder.
+        folder: folder of the data set.
         version: layout, one of `_VERSIONS`.
         fps: frames per second.
         names: names of the values of every feature of joint values (`STATE`, `_ACTION`), in their order.
@@ -55,7 +55,7 @@ class LeRobotDataset:
         """Read the description of a data set.
 
         Raises:
-            MeasurementError: it is missing, has another layout, or does not name its joint values.
+            MeasurementError: the description is missing, has an unknown layout, or does not name the joint values.
         """
         at = Place(Path(folder) / _INFO)
         try:
@@ -82,15 +82,15 @@ class LeRobotDataset:
         return LeRobotDataset(Path(folder), version, fps, names, files)
 
     def tables(self) -> "Iterator[tuple[Path, pyarrow.Table]]":
-        """Read file after file; see `read_table`."""
+        """Yield the tables of all files, one after the other; see `read_table`."""
         for file in self.files:
             yield file, read_table(file)
 
     def frames(self, table: "pyarrow.Table", key: str, file: Path) -> Float[np.ndarray, "frames values"]:
-        """Return the values of a feature in a table of `tables`, (frames, values).
+        """Return the values of a feature in one of the `tables`, (frames, values).
 
         Raises:
-            MeasurementError: the column is missing, or a frame has another number of values.
+            MeasurementError: the column is missing, or a frame has a different number of values.
         """
         at, count = Place(file, column=key), len(self.names[key])
         if key not in table.column_names:
@@ -107,7 +107,7 @@ def read_table(file: Path) -> "pyarrow.Table":
     """Read a Parquet file.
 
     Raises:
-        MeasurementError: it cannot be read.
+        MeasurementError: the file cannot be read.
         ImportError: pyarrow is not installed.
     """
     from pyarrow import ArrowException, parquet
@@ -133,13 +133,13 @@ def _value_names(feature: Any, key: str, at: Place) -> tuple[str, ...]:
 def joint_motors(names: Sequence[str], prefix: str = "") -> dict[str, int]:
     """Return the index of the position of every motor of an arm, by the name of the motor, in the order of the values.
 
-    The positions are the values whose names end in ".pos" ("left_elbow_flex.pos" of motor "elbow_flex"); if there are
-    none, as in data sets from before LeRobot 0.2, they are the values whose names have no dot. The gripper and the
-    second motor of a joint (ALOHA's "elbow_shadow") are left out, because they are no joints of the robot.
+    The positions are the values whose names end in ".pos" ("left_elbow_flex.pos" for motor "elbow_flex"); if there are
+    none, as in data sets from before LeRobot 0.2, they are the values whose names contain no dot. The gripper and the
+    second motor of a joint (ALOHA's "elbow_shadow") are left out, because they are not joints of the robot.
 
     Args:
         names: names of the values of a frame.
-        prefix: start of the names of this arm, such as "left_" of a pair.
+        prefix: start of the names of this arm, such as "left_" for one arm of a pair.
 
     Raises:
         MeasurementError: a motor appears twice, or the values are those of two arms and no prefix is given.

@@ -1,4 +1,4 @@
-"""Joint values of a LeRobot data set as a log, to which images or touched points belong."""
+"""Joint values of a LeRobot data set as a log for images or touched points."""
 
 import os
 from dataclasses import dataclass
@@ -23,9 +23,9 @@ class JointLog:
 
     Attributes:
         motors: motors of the columns q1, q2, ..., in their order.
-        left_out: names of the values that are not positions of these motors.
+        left_out: names of values that are not positions of these motors.
         header: names of the columns: `image`, `time` and the joint values.
-        rows: their texts.
+        rows: texts of the rows.
         source: the data set.
     """
 
@@ -39,13 +39,13 @@ class JointLog:
         """Write a CSV file that `pisigma detect --joints` takes.
 
         Raises:
-            OutputError: it cannot be written.
+            OutputError: the file cannot be written.
         """
         check_output(Path(path), (".csv",), "a file of joint values", [self.source])
         write_atomically(Path(path), "".join(",".join(row) + "\n" for row in (self.header, *self.rows)))
 
     def to_json(self) -> dict[str, object]:
-        """Return the number of rows, the columns and the values that are left out."""
+        """Return the number of rows, the columns, and the names of the values that are left out."""
         columns = {f"q{number}_deg": motor for number, motor in enumerate(self.motors, start=1)}
         return {"rows": len(self.rows), "columns": columns, "left_out": list(self.left_out)}
 
@@ -56,16 +56,16 @@ def read_joint_log(
     calibration: str | os.PathLike[str] | None = None,
     prefix: str = "",
 ) -> JointLog:
-    """Read the observed joint values of all frames, without the gripper and what are no positions of joints.
+    """Read the observed joint values of all frames, without the gripper and other values that are not joint positions.
 
     Columns are the motors in their order in the data set. `image` is `episode-000003-frame-000120`, the name of the
     image of that frame, and `time` [s] counts from the start of its episode.
 
     Args:
         dataset: folder of the data set.
-        units: units of its values; None if they are not stated.
+        units: units of the values; None if not stated.
         calibration: LeRobot's calibration file, needed for normalized values.
-        prefix: start of the names of this arm, such as "left_" of a pair.
+        prefix: start of the names of this arm, such as "left_" for one arm of a pair.
 
     Raises:
         MeasurementError: the data set cannot be read, has no joint values of this arm, the units of its values are not

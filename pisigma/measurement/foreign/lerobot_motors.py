@@ -15,13 +15,13 @@ from pisigma.files.errors import MeasurementError, Place, check_choice
 from pisigma.files.input_file import read_text
 
 LeRobotUnits = Literal["degrees", "normalized"]
-"""LeRobot's `use_degrees=true`, and its values of -100 to 100 over the range of a motor."""
+"""Units of LeRobot: degrees (`use_degrees=true`), or values of -100 to 100 over the range of a motor."""
 TICKS = 4096
 """Positions per turn of the 12-bit encoders of Feetech STS3215, Dynamixel XL330 and XL430 servos."""
 DAMIAO = re.compile(r"joint_\d+")
-"""Names of OpenArm's motors, which send degrees themselves; their zero is set in the motor, not by a range."""
+"""Names of OpenArm's motors, which themselves send degrees; their zero is set in the motor, not by a range."""
 _BEYOND_RANGE = 10.0
-"""Largest angle by which a motor leaves the range that was recorded for it by hand [deg]."""
+"""Largest angle by which a motor may leave the range that was recorded for it by hand [deg]."""
 _NORMALIZED = 200.0
 """Length of the interval from -100 to 100."""
 
@@ -31,11 +31,11 @@ class Motor:
     """A motor in LeRobot's calibration file; positions are those of its register, with the homing offset applied.
 
     Attributes:
-        id: number on the bus.
-        drive_mode: 1 if the motor counts in the opposite direction, else 0. LeRobot ignores it for degrees.
+        id: number of the motor on the bus.
+        drive_mode: 1 if the motor counts in the opposite direction, otherwise 0. LeRobot ignores this for degrees.
         homing_offset: offset in the motor's memory [ticks].
         range_min: lowest position [ticks].
-        range_max: highest position [ticks]; 0 deg is in the middle of both.
+        range_max: highest position [ticks]; 0 deg is midway between the lowest and the highest position.
     """
 
     id: int
@@ -49,7 +49,8 @@ def read_motors(path: str | os.PathLike[str]) -> dict[str, Motor]:
     """Read LeRobot's calibration file (JSON, LeRobot 0.2 and later): motors by name, in the order of the file.
 
     Raises:
-        MeasurementError: the file cannot be read or is not such a file; the exception has the file and the motor.
+        MeasurementError: the file cannot be read or is not a calibration file; the exception states the file and the
+            motor.
     """
     text = read_text(path, MeasurementError, "JSON")
     keys = [field.name for field in fields(Motor)]
@@ -69,7 +70,7 @@ def read_motors(path: str | os.PathLike[str]) -> dict[str, Motor]:
 
 
 def _motor(entry: Any, at: Place, keys: list[str]) -> Motor:
-    """Return a motor of the file after checks."""
+    """Check an entry of the file, and return its motor."""
     if not isinstance(entry, dict) or sorted(entry) != sorted(keys):
         raise MeasurementError(
             expected=f"a motor with {', '.join(keys)}",
@@ -104,17 +105,17 @@ def check_values(
 ) -> None:
     """Check that recorded values are possible in their units and with this calibration file.
 
-    LeRobot limits normalized values to -100 to 100, and a motor leaves its recorded range by little.
+    LeRobot limits normalized values to -100 to 100, and a motor leaves its recorded range only slightly.
 
     Args:
         values: values as recorded.
-        units: their units.
+        units: units of the values.
         names: names of the motors.
-        motors: the arm's calibration file; None if it is not known.
+        motors: motors in the arm's calibration file; None if it is not known.
         source: file of the values, for messages.
 
     Raises:
-        MeasurementError: a value is not possible.
+        MeasurementError: a value is impossible.
     """
     for name, column in zip(names, values.T, strict=True):
         limit, remedy = _NORMALIZED / 2, "state units=degrees if they are degrees"
@@ -136,14 +137,14 @@ def check_values(
 def radians_per_unit(units: LeRobotUnits, name: str, motors: Mapping[str, Motor] | None) -> float:
     """Return the rotation [rad] of a joint per unit of its recorded value.
 
-    LeRobot converts ticks to degrees with 360 / 4095, although a turn has 4096 ticks, so that its degrees are 0.02 %
-    too large, except those of OpenArm (`DAMIAO`); values of -100 to 100 span the range of the motor (`_normalize` in
-    its `motors_bus.py`, 0.3 to 0.6).
+    LeRobot converts ticks to degrees with 360 / 4095 although a turn has 4096 ticks, so its degrees are 0.02 % too
+    large, except those of OpenArm (`DAMIAO`); values of -100 to 100 span the range of the motor (`_normalize` in its
+    `motors_bus.py`, 0.3 to 0.6).
 
     Args:
         units: units of the values.
         name: name of the motor.
-        motors: the arm's calibration file; needed for normalized values.
+        motors: motors in the arm's calibration file; needed for normalized values.
 
     Raises:
         MeasurementError: the scale or the direction of normalized values is not known.

@@ -1,4 +1,4 @@
-"""Map the columns of an export to quantities and units, as stated or as proposed, and warn of doubtful columns."""
+"""Map the columns of an export to quantities and units, as stated or proposed, and warn about doubtful columns."""
 
 import re
 from collections.abc import Mapping
@@ -122,9 +122,9 @@ def map_columns(
 ) -> FileMapping:
     """Determine the quantities and units of the columns of a file.
 
-    Units are taken, in this order, from the mapping, the heading, the unit row, the comments, `units`, for a
-    coordinate from the stated unit of the other coordinates, and from the maker with these names if the values
-    cannot be in another unit.
+    Units are taken, in this order, from the mapping, the heading, the unit row, the comments, `units`, the stated unit
+    of the other coordinates (for a coordinate), and the manufacturer that uses these names, if the values cannot be in
+    another unit.
 
     Args:
         file: the export.
@@ -178,7 +178,7 @@ def _written_unit(proposal: Proposal, index: int) -> str:
 def _with_units(
     columns: tuple[MappedColumn, ...], proposal: Proposal, units: Mapping[UnitKind, str]
 ) -> tuple[MappedColumn, ...]:
-    """Return the columns with missing units added, as far as they can be determined."""
+    """Return the columns, adding missing units as far as they can be determined."""
     file = proposal.file
     written = stated_units(file.comments)
     for stated, symbol in units.items():
@@ -239,7 +239,7 @@ def ambiguous_spelling(file: ExportFile, index: int, kind: UnitKind | None) -> s
 def _units_of_maker(
     maker: MakerHeadings | None, file: ExportFile, columns: tuple[MappedColumn, ...]
 ) -> dict[UnitKind, str]:
-    """Return the units that a maker always uses, if the values cannot be in another unit."""
+    """Return the units that a manufacturer always uses, if the values cannot be in another unit."""
     if maker is None:
         return {}
     kinds: tuple[tuple[UnitKind, str, list[MappedColumn]], ...] = (

@@ -1,4 +1,4 @@
-"""Propose the quantities of the columns of an export from their headings, or without headings from their order."""
+"""Propose the quantities of an export's columns from their headings or, without headings, from their order."""
 
 import itertools
 from collections.abc import Mapping, Sequence
@@ -30,12 +30,12 @@ UNRECOGNISED = "not recognised"
 
 _JOINTS_WITHOUT_HEADINGS = (6, 7)
 _MIN_RISING = 5
-"""Number of rows in which the first column rises by chance in one of 120 files."""
+"""Number of rows at which the first column rises by chance in one of 120 files."""
 _MIN_ORDERED = 8
-"""Number of rows in which one of ten columns rises or falls by chance in one of 2,000 files."""
+"""Number of rows at which one of ten columns rises or falls by chance in one of 2,000 files."""
 _MANY, _MAX_REVERSED = 20, 0.1
-"""Smallest number of rows in which a share of the steps of a time may have the other sign, for example because a
-clock was set, and this share."""
+"""Smallest number of rows at which some steps of a time may have the opposite sign, for example because a clock was
+set, and the largest share of such steps."""
 _MIN_CHANGES = 0.4
 """Smallest share of the rows in which a time changes; joints that are at rest in many rows change less often."""
 _Side = Literal["commanded", "measured"]
@@ -48,7 +48,7 @@ class Proposal:
     Attributes:
         file: the export.
         columns: mapped columns by index.
-        maker: the maker that uses these column names; None if several makers use them.
+        maker: the manufacturer that uses these column names; None if several do.
         rotations: encodings of rotations that fit the headings, if there are several.
     """
 
@@ -73,10 +73,10 @@ class Proposal:
         self.columns[index] = MappedColumn(index, self.file.headings[index], target, reason)
 
     def names(self, *kinds: UnitKind) -> dict[str, list[int]]:
-        """Return the columns not yet mapped by name, without columns whose heading states a unit of another kind.
+        """Return the columns not yet mapped, by name, without columns whose heading states a unit of another kind.
 
         Args:
-            kinds: kinds of units; none for all columns.
+            kinds: kinds of units; empty for all columns.
         """
         names: dict[str, list[int]] = {}
         for index, heading in enumerate(self.headings):
@@ -88,7 +88,7 @@ class Proposal:
     def assign_columns(
         self, group: Mapping[str, str], names: Mapping[str, list[int]], side: _Side, reason: str
     ) -> None:
-        """Map columns by their names; of commanded and measured columns, keep one side."""
+        """Map columns by their names; of commanded and measured columns, keep only one kind."""
         for name, quantity in group.items():
             sides = {self.headings[index].side for index in names[name]}
             chosen = next(one for one in (side, "", *sides) if one in sides)
@@ -112,7 +112,7 @@ def propose_quantities(proposal: Proposal, rotation: str | None) -> None:
         rotation: encoding of rotations, `NO_ROTATION`, or None to determine it by the headings.
 
     Raises:
-        MeasurementError: there are no headings, and the number of columns does not determine them.
+        MeasurementError: there are no headings, and the number of columns does not determine their meanings.
     """
     if not proposal.file.has_header:
         _take_by_order(proposal, rotation)
@@ -150,7 +150,7 @@ def _take_by_order(proposal: Proposal, rotation: str | None) -> None:
     is_usual = joints in _JOINTS_WITHOUT_HEADINGS or (joints == 0 and measured == POSITION)
     is_otherwise = any(of_index.get(index, quantity) != quantity for index, quantity in stated.items())
     if is_otherwise or (not is_usual and len(set(stated) & set(order)) > 1):
-        return  # with another order, all columns have to be stated
+        return  # in any other order, all columns must be stated
     if joints > 0:
         _check_times(proposal, of_index)
     if not is_usual:
@@ -207,11 +207,11 @@ def _check_times(proposal: Proposal, of_index: Mapping[int, str]) -> None:
 
 
 def _is_ordered(numbers: Sequence[float], rising: int) -> bool:
-    """Return whether numbers rise or fall from row to row more often than by chance, apart from clock changes.
+    """Return whether numbers rise or fall from row to row more often than by chance, apart from changes of the clock.
 
     Args:
         numbers: numbers of a column.
-        rising: number of rows from which it is sufficient that all numbers rise; 0 if that is never sufficient.
+        rising: number of rows above which it is sufficient that all numbers rise; 0 if that is never sufficient.
     """
     steps = [after - before for before, after in itertools.pairwise(numbers)]
     up, down = (sum(sign * step > 0 for step in steps) for sign in (1, -1))
@@ -233,7 +233,7 @@ def _ends_with_matrices(file: ExportFile, leading: int) -> bool:
 
 
 def _take_joints(proposal: Proposal) -> None:
-    """Map the joints: the largest group of columns with names of joints, preferring a maker's names.
+    """Map the joints: the largest group of columns with names of joints, preferring a manufacturer's names.
 
     Stated joints have the number in their heading, otherwise the number of their target.
     """
@@ -277,7 +277,7 @@ def _take_position(proposal: Proposal) -> None:
 
 
 def _take_rotation(proposal: Proposal, rotation: str | None) -> None:
-    """Map the rotation by the names of its values, by the maker of the joints, or as stated."""
+    """Map the rotation by the names of its values, by the manufacturer of the joints, or as stated."""
     columns = {name for one in ROTATIONS.values() for name in (*one.columns, *one.quantities())}
     names = {
         name: indices
@@ -304,7 +304,7 @@ def _take_rotation(proposal: Proposal, rotation: str | None) -> None:
 
 
 def _take_names(proposal: Proposal) -> None:
-    """Map the names of points: without such a heading, the first column with a different name in every row."""
+    """Map the names of points; without a heading, this is the first column with a different name in every row."""
     file = proposal.file
     if "point" in proposal.quantities:
         return
@@ -324,7 +324,7 @@ def _take_names(proposal: Proposal) -> None:
 
 
 def _take_third_coordinate(proposal: Proposal) -> None:
-    """Map the third coordinate if two are stated: the only remaining length, otherwise the column in its place."""
+    """Map the third coordinate if two are stated: the only remaining length, or else the column in its place."""
     place = {
         one.target.quantity: index
         for index, one in proposal.columns.items()
@@ -357,7 +357,7 @@ def _take_third_coordinate(proposal: Proposal) -> None:
 
 
 def incomplete_rotation(proposal: Proposal) -> list[int]:
-    """Return columns with the names of all values of a rotation except one, and no other numbers between them.
+    """Return columns that have the names of all values of a rotation except one, with no other numbers in between.
 
     Args:
         proposal: the complete mapping; stated and used columns are ignored.

@@ -12,7 +12,7 @@ from pisigma.measurement.foreign.units import UNITS, UnitKind
 LEFT_OUT = "-"
 """Target of a column that a mapping omits; in front of a target it reverses the sign: "-q4_deg"."""
 _ALTHOUGH = "!"
-"""Mark after a target in a mapping: the column is in this unit although its heading states another one ("x_in!")."""
+"""Mark after a target in a mapping: the column is in this unit although its heading states another ("x_in!")."""
 KEYS = ("point", "time")
 """Quantities by which rows of two files are joined; they are not in measurement files."""
 
@@ -49,7 +49,7 @@ class Target:
         quantity: quantity such as "q1", "x", "kuka_a" or "point"; `LEFT_OUT` if the column is left out.
         unit: symbol of the unit of the cells; "" if there is no unit or it is unknown.
         is_reversed: whether the cells have the opposite sign.
-        overrides: whether the unit applies although the file states another one.
+        overrides: whether the unit applies although the file states another.
     """
 
     quantity: str
@@ -101,7 +101,7 @@ def fits_unit(quantity: str, unit: str) -> bool:
 
 
 def is_measured(name: str) -> bool:
-    """Return whether a column of measurement files contains measurements, not names, conditions or deviations."""
+    """Return whether a measurement-file column contains measurements, not names, conditions or deviations."""
     column = find_column(name)
     return column is not None and not (
         column.joint or column.joint_field[1] or column.quantity in _NOT_MEASURED

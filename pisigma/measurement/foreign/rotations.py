@@ -1,4 +1,4 @@
-"""Encodings of rotations, named after the makers that use them."""
+"""Encodings of rotations, named after the manufacturers that use them."""
 
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ ORTHONORMALITY_TOLERANCE = 1e-3
 
 @dataclass(frozen=True)
 class RotationEncoding:
-    """A maker's encoding of rotations R_frame_tool.
+    """A manufacturer's encoding of rotations R_frame_tool.
 
     Attributes:
         name: name for `--rotation` and for columns in mappings, such as "kuka_a_deg".
@@ -149,7 +149,7 @@ MATRIX_ROWS = (
 
 
 def encodings_of(names: Collection[str]) -> dict[str, dict[str, str]]:
-    """Return the encodings whose values are all among `names`, with the quantity of every name, by encoding."""
+    """Return the encodings whose values are all among `names`, each with the quantity of every name."""
     there = set(names)
     matches: dict[str, dict[str, str]] = {}
     for encoding in _ENCODINGS:

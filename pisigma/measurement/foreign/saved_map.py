@@ -11,7 +11,7 @@ from pisigma.measurement.foreign.mapping import FileMapping
 
 
 class SavedMap(Section):
-    """Contents of a file of mappings: targets by heading, for every file of an import."""
+    """Contents of a file of mappings: targets by heading for every file of an import."""
 
     files: tuple[dict[str, str], ...]
 
@@ -54,7 +54,7 @@ def parse_map(text: str) -> StatedMaps:
 
 
 def map_for(maps: StatedMaps, headings: Sequence[str]) -> Mapping[str, str]:
-    """Return the mapping that names most headings of a file, and that names no other headings if possible."""
+    """Return the mapping that names the most headings of a file and, if possible, no other headings."""
     there = {*headings, *map(str, range(1, len(headings) + 1))}
     fitting = maps if len(maps) == 1 else [one for one in maps if set(one) <= there]
     return max(fitting, key=lambda one: len(set(one) & there), default={})

@@ -37,8 +37,8 @@ def summary_rows(records: Sequence[Sequence[str]], numbers: NumberFormat) -> dic
     """Find rows that summarise other rows.
 
     A row is a summary if one of its cells names a statistic, or if it precedes or follows all other rows and contains
-    their mean or other statistics in every column. If many rows are named as means and none is the mean of the rows
-    before it, they are measurements that the instrument averaged.
+    their mean or other statistics in every column. If many rows are named as means and none of them is the mean of the
+    preceding rows, they are measurements that the instrument averaged.
 
     Args:
         records: cells of the rows.
@@ -68,7 +68,7 @@ def summary_rows(records: Sequence[Sequence[str]], numbers: NumberFormat) -> dic
 
 
 def named_statistics(records: Sequence[Sequence[str]]) -> dict[int, str]:
-    """Return the statistics that cells name, by row index; the last such cell of a row is used."""
+    """Return the statistics that cells name, by row index, using the last such cell of a row."""
     return {
         row: name
         for row, record in enumerate(records)
@@ -84,7 +84,7 @@ def statistic_name(cell: str) -> str:
 
 
 def _holds_means(records: Sequence[Sequence[str]], numbers: NumberFormat, named: Mapping[int, str]) -> bool:
-    """Return whether a row that is named as a mean is the mean of the rows since the previous such row."""
+    """Return whether any row that is named as a mean is the mean of the rows since the previous such row."""
     group: list[list[str | None]] = []
     for row, record in enumerate(records):
         texts = [numbers.text(cell) for cell in record]
@@ -122,7 +122,7 @@ def _are_statistics(
 ) -> bool:
     """Return whether all of the last rows are statistics of the rows, and one of them is their mean.
 
-    A calculated mean is rounded or has more digits than the rows; a central commanded value is not.
+    A calculated mean is rounded or has more digits than the rows; a central commanded value is neither.
     """
     finest = rounding[: len(rows)].min(0)
     clear = np.ptp(rows, axis=0) > _MIN_RANGE * rounding[len(rows) :].max(0)

@@ -88,7 +88,7 @@ def ambiguous_date(at: Place, text: str) -> MeasurementError:
 def check_restarts(
     times: Float64[np.ndarray, " rows"], within: float, source: str, lines: Sequence[int]
 ) -> None:
-    """Check that rows close in time are of one recording, because the wrong recording could be joined otherwise.
+    """Check that rows close in time belong to one recording, because the wrong recording might otherwise be joined.
 
     Args:
         times: time stamps in the order of the file [s].
@@ -97,7 +97,7 @@ def check_restarts(
         lines: lines of its rows.
 
     Raises:
-        MeasurementError: time stamps restart, and the same times occur before and after.
+        MeasurementError: time stamps restart, and the same times occur before and after the restart.
     """
     restarts = np.diff(times, prepend=times[:1]) < -within
     order = np.argsort(times, kind="stable")
@@ -120,7 +120,7 @@ def _is_open(match: re.Match[str]) -> bool:
 
 
 def _day(match: re.Match[str], first: bool | None) -> datetime | None:
-    """Return the time of midnight on a date; None if the date is invalid or ambiguous."""
+    """Return the time of midnight on a date [s]; None if the date is invalid or ambiguous."""
     one, two, last = int(match[1]), int(match[3]), int(match[4])
     if len(match[1]) == 4:
         year, month, day = one, two, last

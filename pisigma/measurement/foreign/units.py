@@ -1,4 +1,4 @@
-"""Units of exports: their spellings, and conversion to the units of measurement files."""
+"""Units of exports, their spellings, and their conversion to the units of measurement files."""
 
 import decimal
 import math
@@ -66,7 +66,7 @@ _STATEMENT = re.compile(
     r"values)\b(.*)"
 )
 _BETWEEN = frozenset(("", "in", "and", "und", "are", "is"))
-"""Words that may be between a word of `_STATEMENT` and its unit; comments have to spell out inches."""
+"""Words that may occur between a word of `_STATEMENT` and its unit; comments must spell out inches."""
 
 
 def unit_symbol(text: str) -> str:
@@ -143,8 +143,8 @@ def to_file_unit(number: str, symbol: str) -> str:
 def reason_to_doubt(symbol: str, largest: float, rows: int) -> str:
     """Return the reason why values are unlikely to be in the stated unit; "" if they are plausible.
 
-    Joints rotate by at most two or three turns, instruments measure at most 200 m away, and a measured robot moves
-    by more than three degrees and 20 mm.
+    Joints rotate by at most two or three turns, instruments measure at distances of up to 200 m, and a measured robot
+    moves by more than three degrees and 20 mm.
 
     Args:
         symbol: symbol of the unit.

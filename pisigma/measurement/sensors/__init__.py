@@ -1,4 +1,4 @@
-"""Sensors, one file per sensor: columns of measurement files, residuals, derivatives and held-out errors."""
+"""Sensors, one file each, with their columns of measurement files, residuals, derivatives and held-out errors."""
 
 from pisigma.measurement.readings import ReadingColumn, Readings, RowFault, SensorReadings
 from pisigma.measurement.sensors.registry import SENSORS, register_sensor

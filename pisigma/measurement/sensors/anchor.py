@@ -100,7 +100,7 @@ class AnchorSensor(AbstractSensor):
 
     @classmethod
     def initial_guess(cls, measurements: Measurements, T: Poses, reach: float) -> InitialUnknowns | None:
-        """Guess zero offsets, and by multilateration the positions that are not given.
+        """Guess zero offsets and, by multilateration, the positions that are not stated.
 
         Raises:
             IdentificationError: a distance contradicts most other distances, or an anchor has too few distances.
@@ -128,10 +128,10 @@ class AnchorSensor(AbstractSensor):
     def uncalibrated_unknowns(
         cls, measurements: Measurements, owner: str, T: Poses, calibrated: Collection[str]
     ) -> Float64[Tensor, " columns"]:
-        """Return the anchor's given position with a zero offset of 0.
+        """Return the anchor's stated position with a zero offset of 0.
 
         Raises:
-            IdentificationError: the position of the anchor is not given.
+            IdentificationError: the position of the anchor is not stated.
         """
         row = (measurements.anchor or ()).index(owner)
         position = stated_position(measurements, row)
@@ -146,7 +146,7 @@ class AnchorSensor(AbstractSensor):
 
 
 def stated_position(measurements: Measurements, row: int) -> Float64[Tensor, " 3"] | None:
-    """Return the given position of a row's anchor in its frame [m], or None."""
+    """Return the stated position of a row's anchor in the row's frame [m], or None."""
     place = measurements.anchor_place
     return place[row] if place is not None and bool(torch.isfinite(place[row]).all()) else None
 
@@ -160,7 +160,7 @@ def anchor_from_distances(
     `|p - a| + zero = d`.
 
     Args:
-        points: positions of the tool by the nominal robot [m].
+        points: positions of the tool according to the nominal robot [m].
         distance: measured distances [m].
 
     Returns:
@@ -218,7 +218,7 @@ def _check_wire(
 ) -> None:
     """Refuse distances from an anchor that no position of the anchor explains.
 
-    By the triangle inequality, two distances differ at most by the distance of their points, for any zero offset.
+    By the triangle inequality, two distances differ by at most the distance between their points, for any zero offset.
 
     Raises:
         IdentificationError: a distance contradicts most other distances, or there are too few distances.

@@ -80,14 +80,14 @@ def _row_faults(readings: Readings) -> Iterator[RowFault]:
 
 @dataclass(frozen=True, eq=False)
 class CornerSensor(AbstractSensor):
-    """A camera that sees a board: `W · (position; rotation vector)` of measured against predicted poses.
+    """A camera that sees a board: `W · (position; rotation vector)` of measured relative to predicted poses.
 
     An image determines some directions of its pose much better than others, and position and rotation are correlated.
     The row of an image therefore states, in addition to the pose, a lower triangular W with `W^T W` the inverse
     covariance of (position [m], rotation vector [rad]) in the axes of the row's frame. The covariance is the sum of
     the covariances of the corners and of the robot's repeatability; the pose error that all corners of an image
-    share is thereby eliminated in closed form. Values are the noise of one corner, as a length at the board, times W
-    times the errors.
+    share is thereby eliminated in closed form. Values are the errors multiplied by W and by the noise of one corner,
+    expressed as a length at the board.
 
     Attributes:
         position: measured positions [m].
@@ -243,7 +243,7 @@ def as_poses(
 
 
 def with_fixed_intrinsics(measurements: Measurements, length: float, angle: float) -> Measurements:
-    """Return rows of images with fixed intrinsics and board scale, and with additional noise of their poses.
+    """Return rows of images with fixed intrinsics and board scale, and with additional noise in their poses.
 
     Args:
         measurements: the rows.
@@ -263,7 +263,7 @@ def with_fixed_intrinsics(measurements: Measurements, length: float, angle: floa
 
 
 def with_pose_noise(measurements: Measurements, covariance: Float64[np.ndarray, "rows 6 6"]) -> Measurements:
-    """Return rows of images with additional noise of their poses; rows of other sensors are not changed.
+    """Return rows of images with additional noise in their poses; rows of other sensors are not changed.
 
     Args:
         measurements: the rows.

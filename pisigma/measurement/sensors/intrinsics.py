@@ -1,4 +1,4 @@
-"""Information of images on their camera's intrinsics and on the scale of their board, with poses eliminated."""
+"""Information in images on their camera's intrinsics and on the scale of their board, with poses eliminated."""
 
 import math
 from collections.abc import Collection, Mapping
@@ -40,9 +40,9 @@ CAMERA_UNITS: dict[str, OtherUnit] = {
 }
 NUMBERS = len(CAMERA_UNITS)
 _UNINFORMATIVE = 1e3
-"""Factor on given standard deviations that makes the prior negligible relative to the images."""
+"""Factor on stated standard deviations that makes the prior negligible relative to the images."""
 _USUAL_SCALE = 1e-3
-"""Relative standard deviation of a board's scale if the board file does not state it: the error of printers and
+"""Relative standard deviation of a board's scale if the board file does not state one: the error of printers and
 paper."""
 
 
@@ -54,7 +54,7 @@ class ImageIntrinsics:
         pose_jacobian: derivative of the measured position and rotation vector, in the axes of the row's frame, with
             respect to k.
         root: matrix of the equations of k with the poses eliminated, `root (k - at) = residual` with unit variances.
-        residual: right side of the equations of `root`.
+        residual: right-hand side of the equations of `root`.
         at: intrinsics at which the images were linearised.
         stated: intrinsics of the camera file, the prior mean.
         sigma: prior standard deviations; 0 for fixed intrinsics.
@@ -95,7 +95,7 @@ def intrinsics_information(
     """Sum the information of the images and the prior of one camera on its intrinsics, with poses eliminated.
 
     Returns:
-        U [1/px; 1 for distortion] with `U^T U` the information (0 for fixed intrinsics), and the mean [px; 1 for
+        U [1/px; 1 for distortion], where `U^T U` is the information (0 for fixed intrinsics), and the mean [px; 1 for
         distortion].
     """
     sigma, at = images.sigma[0], images.at[0]
@@ -151,7 +151,7 @@ def texts_of(measurements: Measurements, name: str) -> tuple[str, ...]:
 
 
 def cameras(measurements: Measurements) -> tuple[str, ...] | None:
-    """Return per row the name of the camera whose intrinsics are estimated, or ""; None if no row has one."""
+    """Return the name of each row's camera with estimated intrinsics, or ""; None if no row has one."""
     stated = zip(
         texts_of(measurements, CAMERA_COLUMN), texts_of(measurements, INTRINSICS_COLUMN), strict=True
     )
@@ -160,7 +160,7 @@ def cameras(measurements: Measurements) -> tuple[str, ...] | None:
 
 
 def boards(measurements: Measurements) -> tuple[str, ...] | None:
-    """Return per row the name of the board in the image: the frame or the target, whichever is not the camera.
+    """Return the name of the board in each row's image: the frame or the target, whichever is not the camera.
 
     Boards without a name are named "board".
     """
@@ -174,7 +174,7 @@ def boards(measurements: Measurements) -> tuple[str, ...] | None:
 def scale_deviations(measurements: Measurements) -> Float64[Tensor, " boards"]:
     """Return the relative prior standard deviation of the scale of every board, 0 for fixed scales.
 
-    A scale is fixed if no deviation is given and no other row has a length that could determine it.
+    A scale is fixed if no deviation is stated and no other row has a length that could determine the scale.
     """
     names, stated = boards(measurements), texts_of(measurements, SCALE_COLUMN)
     other_lengths = bool((~measurements.is_measured("corner") & ~measurements.is_measured("rotation")).any())
@@ -188,8 +188,8 @@ class IntrinsicsSensor(AbstractSensor):
     """Information of all images of a camera and of the prior on the intrinsics, as the value of one row.
 
     The poses of the boards are eliminated from the images (variable projection, Golub and Pereyra 1973); the remaining
-    information is summed over the images and the prior. Values are the noise of one corner, as a length at the board,
-    times `U (mean - k)` with `U^T U` the information.
+    information is summed over the images and the prior. Values are `U (mean - k)`, where `U^T U` is the information,
+    times the noise of one corner, expressed as a length at the board.
 
     Attributes:
         owner: index of the camera of every row, -1 in rows without a value.
@@ -272,7 +272,7 @@ class IntrinsicsSensor(AbstractSensor):
 class BoardScaleSensor(AbstractSensor):
     """The prior of the scale of a board, as the value of one row.
 
-    With the unknown s, every length of the board is `1 + s` times its given length.
+    With the unknown s, every length of the board is `1 + s` times its stated length.
 
     Attributes:
         owner: index of the board of every row, -1 in rows without a value.
@@ -330,7 +330,7 @@ class BoardScaleSensor(AbstractSensor):
 
     @classmethod
     def initial_guess(cls, measurements: Measurements, T: Poses, reach: float) -> InitialUnknowns | None:
-        """Return 0 for every board: the given scale."""
+        """Return 0, the stated scale, for every board."""
         if boards(measurements) is None:
             return None
         free = scale_deviations(measurements)[:, None] > 0

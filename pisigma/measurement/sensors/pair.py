@@ -74,7 +74,7 @@ class PairSensor(AbstractSensor):
         """Check the distances; there are no unknowns to guess.
 
         Raises:
-            IdentificationError: a distance differs too much from the distance by the nominal robot.
+            IdentificationError: a distance differs too much from that of the nominal robot.
         """
         if measurements.pair is None or measurements.distance is None:
             return None
@@ -101,6 +101,6 @@ def _following(values: Tensor) -> Tensor:
 
 
 def _apart(values: Tensor) -> Tensor:
-    """Return the value of every row minus that of the next; only used for the first rows of pairs."""
+    """Return the value of every row minus that of the next row; used only for the first rows of pairs."""
     apart: Tensor = values - _following(values)
     return apart

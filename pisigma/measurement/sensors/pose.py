@@ -53,7 +53,7 @@ class PositionSensor(AbstractSensor):
 
 @dataclass(frozen=True, eq=False)
 class RotationSensor(AbstractSensor):
-    """The orientation of a 6D tracker, as a rotation vector from the predicted to the measured one.
+    """The orientation from a 6D tracker, as a rotation vector from the predicted to the measured orientation.
 
     Attributes:
         measured: measured rotations, the row index last.
@@ -71,7 +71,7 @@ class RotationSensor(AbstractSensor):
 
     @classmethod
     def build(cls, rows: SensorRows) -> "RotationSensor | None":
-        """Build the sensor from the orientations, relative to the anchors of bases and tools; None without any."""
+        """Build the sensor from orientations, relative to the anchors of bases and tools; None if there are none."""
         data = rows.measurements
         present = (data.is_measured("rotation") | data.is_measured("pose")) & ~rows.has_corner_poses
         if data.rotation is None or not bool(present.any()):
@@ -99,8 +99,8 @@ def rotation_difference(
 ) -> Float[Tensor, "3 rows"]:
     """Return the rotation vectors of measured · predicted^T [rad], equal to those of `rotation_vector`.
 
-    Only the trace of the product R and `R - R^T` are computed, which determine all rotations except rotations near
-    180 deg: with m and p the columns of the rotations, the vector part of `R - R^T` is `Σ p × m`.
+    Only the trace of the product R and `R - R^T` are computed, which determine all rotations except those near 180 deg:
+    for the columns m and p of the two rotations, the vector part of `R - R^T` is `Σ p × m`.
     """
     twice_sine_axis = torch.linalg.cross(predicted, measured, dim=0).sum(1)
     cosine = ((measured * predicted).sum((0, 1)) - 1) / 2

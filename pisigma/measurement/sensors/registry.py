@@ -103,7 +103,7 @@ def unknown_groups(measurements: Measurements) -> tuple[UnknownGroup, ...]:
 
 
 def sort_pairs_first(measurements: Measurements, rows: Int64[Tensor, " rows"]) -> Int64[Tensor, " rows"]:
-    """Sort rows such that pairs come first, with their rows next to each other; other rows keep their order."""
+    """Sort rows so that pairs come first, with their rows next to each other; other rows keep their order."""
     if measurements.pair is None:
         return rows
     order = distinct_names(measurements.pair)
@@ -118,11 +118,11 @@ def measured_errors(
     """Return measured minus predicted values for the tool poses that a model predicts.
 
     Args:
-        T: poses of the target by the model, in the frame of every row.
+        T: poses of the target according to the model, in the frame of every row.
         measurements: the measurements.
         unknowns: estimated unknowns of the sensors; for other owners see `AbstractSensor.uncalibrated_unknowns`. None
-            for unknowns that are fitted to the rows; errors of n values with p fitted unknowns of an owner are then
-            multiplied by `sqrt(n / (n - p))`, and NaN without degrees of freedom.
+            to fit the unknowns to the rows; the errors of n values with p fitted unknowns of an owner are then
+            multiplied by `sqrt(n / (n - p))`, and are NaN without degrees of freedom.
 
     Returns:
         Errors by sensor [m or rad], NaN in rows without a value; the error of a pair is in both of its rows, and the

@@ -100,10 +100,10 @@ class SensorRows:
     def sigma(
         self, present: Bool[Tensor, " rows"], unit: Literal["m", "rad"] = "m"
     ) -> Float64[Tensor, " rows"] | None:
-        """Return the standard deviations that a sensor's rows state [m or rad]; None if no row does.
+        """Return the standard deviations that a sensor's rows state [m or rad]; None if no row states one.
 
         Raises:
-            IdentificationError: some of the sensor's rows state a standard deviation, others do not.
+            IdentificationError: some of the sensor's rows state a standard deviation and others do not.
         """
         data = self.measurements
         sigma = data.sigma_position if unit == "m" else data.sigma_rotation
@@ -161,8 +161,8 @@ class AbstractSensor(ABC):
         unit: unit of the values.
         components: number of values per row.
         turning: whether the predicted values depend on the tool's rotation.
-        certain: whether the values are given rather than measured: their standard deviation is not estimated, and
-            they are never outliers.
+        certain: whether the values are stated rather than measured, so that their standard deviation is not estimated
+            and they are never outliers.
         paired: whether a value belongs to a row and the next one.
         holds_frame: whether the values determine the position of the frame in which the sensor measures.
         readings: columns that the sensor adds to measurement files; None for a sensor whose values are fields of
@@ -193,7 +193,7 @@ class AbstractSensor(ABC):
 
     @abstractmethod
     def residual(self, motion: ToolMotion, unknowns: Unknowns, rows: slice) -> Values:
-        """Return measured minus predicted values; rows without a value may contain anything."""
+        """Return measured minus predicted values; the result is arbitrary in rows without a value."""
 
     @abstractmethod
     def derivative(self, motion: ToolMotion, unknowns: Unknowns, rows: slice) -> Derivative:
@@ -218,7 +218,7 @@ class AbstractSensor(ABC):
 
     @classmethod
     def initial_guess(cls, measurements: Measurements, T: Poses, reach: float) -> InitialUnknowns | None:
-        """Estimate initial unknowns by the nominal robot, and refuse values that are impossible for a similar robot.
+        """Estimate initial unknowns with the nominal robot, and refuse values that are impossible for a similar robot.
 
         Args:
             measurements: the rows; pairs come first, with their rows next to each other.
@@ -239,7 +239,7 @@ class AbstractSensor(ABC):
         Args:
             measurements: rows that were not used for the calibration.
             owner: name of the owner, such as an anchor.
-            T: poses of the tool by a model, in the frame of every row.
+            T: poses of the tool according to a model, in the frame of every row.
             calibrated: names of the owners that were calibrated.
 
         Raises:
@@ -291,7 +291,7 @@ def owners_of(
 def component_along(
     axis: Float[Tensor, "3 poses"], derivative: Float[Tensor, "parameters six poses"]
 ) -> Float[Tensor, "parameters 1 poses"]:
-    """Return the component along an axis of the shift of the tool by every parameter."""
+    """Return the component along an axis of the tool's shift due to every parameter."""
     total = derivative[:, 0] * axis[0]
     for k in (1, 2):
         total = torch.addcmul(total, derivative[:, k], axis[k])

@@ -1,4 +1,4 @@
-"""Sockets: fixed points in which the ball at the tool sits, and given distances between sockets."""
+"""Sockets, which are fixed points that hold the ball of the tool, and stated distances between sockets."""
 
 import re
 from collections.abc import Collection, Iterable, Mapping
@@ -31,7 +31,7 @@ PairOfSockets = tuple[str, str]
 SOCKET_COLUMNS = ("x", "y", "z")
 
 _MAX_SCATTER = 0.05
-"""Largest plausible scatter of the rows of one socket by the nominal robot, as a share of the reach."""
+"""Largest plausible scatter of the rows of one socket under the nominal robot, as a share of the reach."""
 
 _OUTLIER_FACTOR = 4.0
 """Distance of a row from the median position, relative to the median distance, above which it is an outlier: about 6
@@ -92,7 +92,7 @@ class SocketSensor(AbstractSensor):
         """Guess the position of every socket as the mean of its rows.
 
         Raises:
-            IdentificationError: by the nominal robot, the rows of one socket are far from each other.
+            IdentificationError: according to the nominal robot, the rows of one socket are far apart.
         """
         names = distinct_names(measurements.socket)
         if not names:
@@ -124,7 +124,7 @@ class SocketSensor(AbstractSensor):
 
 @dataclass(frozen=True, eq=False)
 class SocketDistanceSensor(AbstractSensor):
-    """Given distances between two sockets, each assigned to a row of one of them.
+    """Stated distances between two sockets, each assigned to a row of one of them.
 
     Attributes:
         first: index of one socket, -1 in rows without a distance.
@@ -147,7 +147,7 @@ class SocketDistanceSensor(AbstractSensor):
 
     @classmethod
     def build(cls, rows: SensorRows) -> "SocketDistanceSensor | None":
-        """Return None: the distances are given by the user, see `assign_distances`."""
+        """Return None, because the user states the distances; see `assign_distances`."""
         return None
 
     @classmethod
@@ -191,7 +191,7 @@ class SocketDistanceSensor(AbstractSensor):
         return cls(*(tensor.to(device) for tensor in tensors))
 
     def residual(self, motion: ToolMotion, unknowns: Unknowns, rows: slice) -> Values:
-        """Return given minus predicted distances [m]."""
+        """Return stated minus predicted distances [m]."""
         residual: Tensor = self.measured[rows] - self._apart(unknowns, rows).norm(dim=0)
         return residual[None]
 

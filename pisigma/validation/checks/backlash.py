@@ -1,4 +1,4 @@
-"""Check whether the residuals depend on the direction from which every joint came: unstated backlash."""
+"""Check for unstated backlash: whether the residuals depend on the direction from which every joint arrived."""
 
 import math
 from collections.abc import Callable
@@ -20,11 +20,11 @@ from pisigma.validation.setup_faults.ordered_rows import OrderedRows
 
 @dataclass(frozen=True)
 class LostMotion:
-    """Backlash of joints, whose last motions are known from the order of the rows.
+    """Backlash of joints whose last motions are known from the order of the rows.
 
     Attributes:
         play: backlash of the joints by their index [rad or m].
-        error_ratio: errors of the rows over those without the backlash [1].
+        error_ratio: ratio of the errors of the rows without and with the backlash in the model [1].
         log_bayes_factor: logarithm of the odds of backlash in these joints against none.
     """
 
@@ -36,16 +36,16 @@ class LostMotion:
 def find_backlash(rows: OrderedRows, measurements: Measurements) -> LostMotion | None:
     """Fit half the backlash of every joint to the residuals of a calibration: `r = X x + Σ_j J_j s_j b_j + e`.
 
-    `s_j` is the sign of the joint's last motion. With friction the joint stays behind (b_j < 0); without it, inertia
-    carries it through the play when the drive stops. Joints are added one by one while the odds grow, at the cost of
-    one more parameter (`OrderedRows.evidence_of`) and of the choice.
+    `s_j` is the sign of the joint's last motion. With friction the joint lags behind (b_j < 0); without it, inertia
+    carries the joint through the play when the drive stops. Joints are added one by one as long as the odds increase,
+    with a penalty for each additional parameter (`OrderedRows.evidence_of`) and for the choice of the joint.
 
     Args:
         rows: residuals of a calibration.
         measurements: the rows of the calibration, with the directions of the last motions.
 
     Returns:
-        None if there are too few rows, or no joint can be tested.
+        None if there are too few rows or no joint can be tested.
     """
     if len(rows.residual) < MIN_ROWS:
         return None
@@ -82,11 +82,11 @@ def with_sides_of_order(
 
     Args:
         calibrator: a geometric calibrator of the robot.
-        rows: all rows of the files, because the last motion follows from the row before.
-        calibrated: returns those of the rows that decide whether the directions matter.
+        rows: all rows of the files, because the last motion follows from the preceding row.
+        calibrated: function that selects the rows that decide whether the directions matter.
 
     Returns:
-        The rows, and the finding of `unstated_backlash`; the unchanged rows and nothing without a finding.
+        The rows, and the finding of `unstated_backlash`; without a finding, the unchanged rows and None.
     """
     if rows.approach is not None:
         return rows, ()
@@ -98,8 +98,8 @@ def with_sides_of_order(
 def unstated_backlash(calibrator: GeometricCalibrator, rows: Measurements) -> Diagnostic | None:
     """Test whether the directions of the last motions matter in rows that state no directions of approach.
 
-    A lag between joint values and measurements also depends on the last motion; the one with the larger evidence is
-    assumed.
+    A lag between joint values and measurements also depends on the last motion; the explanation with the larger
+    evidence is assumed.
 
     Args:
         calibrator: a geometric calibrator of the robot.
@@ -113,7 +113,7 @@ def unstated_backlash(calibrator: GeometricCalibrator, rows: Measurements) -> Di
     try:
         ordered = OrderedRows.from_result(calibrator.fit(replace(rows, approach=None)))
     except IdentificationError:
-        return None  # the calibration itself refuses these rows
+        return None  # the calibration itself rejects these rows
     found = None if ordered is None else find_backlash(ordered, rows)
     if ordered is None or found is None or found.log_bayes_factor < LIKELY or found.error_ratio < NOTICED:
         return None

@@ -1,4 +1,4 @@
-"""Check known weaknesses of calibrations by a camera: views, intrinsics, tool, and limits of the accuracy."""
+"""Check for known weaknesses of camera calibrations: views, intrinsics, tool, and limits of the accuracy."""
 
 from collections.abc import Iterator
 
@@ -28,7 +28,7 @@ _FRONTAL = np.deg2rad(12.0)
 """Angle of views [rad]; if 90 % of the views are less oblique, the error over the workspace is 1.5 to 3 times that
 of typical views."""
 _ONE_BRANCH = 0.95
-"""Share of the images in one branch of the arm above which the other branches are treated as not measured."""
+"""Share of the images in one branch of the arm above which the other branches are treated as unmeasured."""
 _EXPLAINED = 1.3
 """Ratio of the images' scatter to the scatter explained by their corners, below which no model of the arm can
 improve the fit."""
@@ -93,7 +93,7 @@ def _largest_share(branch: Tensor) -> float:
 
 
 def _intrinsics(images: Measurements, result: CalibrationResult) -> Iterator[Diagnostic]:
-    """Warn of intrinsics that are fixed, free, or far from their calibration."""
+    """Warn about intrinsics that are fixed, free, or far from their calibration."""
     identified = ImageIntrinsics.from_texts(texts_of(images, INTRINSICS_COLUMN))
     cells = zip(texts_of(images, CAMERA_COLUMN), identified.stated, identified.sigma, strict=True)
     first = {camera: (stated, sigma) for camera, stated, sigma in reversed(list(cells)) if camera}
@@ -141,7 +141,7 @@ def _tool(images: Measurements, rows: Measurements, result: CalibrationResult) -
 
 
 def _limit(images: Measurements, result: CalibrationResult) -> Iterator[Diagnostic]:
-    """Warn that the images limit the accuracy, with the shares of the predicted error by intrinsics and boards."""
+    """Warn that the images limit the accuracy, with the shares of the predicted error due to intrinsics and boards."""
     problem, view = result.solved.problem, sensor_view_of(result.solved.refined)
     number = next(k for k, sensor in enumerate(problem.sensors) if sensor.name == "corner")
     ratio = view.noise[number] / float(torch.as_tensor(images.readings[NOISE_COLUMN]).median())

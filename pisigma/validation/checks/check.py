@@ -55,7 +55,7 @@ class CheckedCalibration:
 
     @property
     def robot_class(self) -> RobotClass:
-        """The stated class of the robot, or else that of its maker."""
+        """The stated class of the robot, or else its manufacturer's class."""
         stated = self.calibrator.robot_class
         return RobotClass.from_robot(self.robot) if stated is None else CLASSES[stated]
 
@@ -79,13 +79,13 @@ class CheckedCalibration:
     def errors(self) -> Mapping[str, Mapping[str, Float64[Tensor, "rows components"]]]:
         """Errors (measured minus predicted) by result and sensor [m or rad].
 
-        The order is that of `rows`; NaN in rows without a value of the sensor.
+        They are in the order of `rows`, with NaN in rows without a value of the sensor.
         """
         return MappingProxyType({name: result.errors_of(self.rows) for name, result in self.results.items()})
 
     @property
     def final_errors(self) -> Mapping[str, Float64[Tensor, "rows components"]]:
-        """Errors [m or rad] by sensor of the last result, which is the calibration that is kept."""
+        """Errors [m or rad], by sensor, of the last result, which is the calibration that is kept."""
         return list(self.errors.values())[-1]
 
     @cached_property
@@ -101,7 +101,7 @@ Move = Literal["frame", "tool", "joint_zero"]
 """What may have moved since a model was made; see the kinds of `Cause`."""
 MOVES: Final[frozenset[Move]] = frozenset({"frame", "tool", "joint_zero"})
 LARGE_SHARE = 2e-3
-"""Errors, as a share of the reach, above which their cause is a mistake or a motion, not wear."""
+"""Size of errors, as a share of the reach, above which their cause is a mistake or a motion, not wear."""
 _STEP = 1e-6
 """Step of finite differences with respect to joint values [rad or m]."""
 FITTED = 9
@@ -118,8 +118,8 @@ class RowsUnderModel:
         model: the model.
         rows: the rows.
         fitted: frames and tools that are known to have moved and are therefore fitted to the rows.
-        may_move: what else may have moved without being a fault, such as "joint_zero".
-        nominal: the nominal robot with base and tool fitted; only used to report its errors after a correction.
+        may_move: what else may have moved without this being a fault, such as "joint_zero".
+        nominal: the nominal robot with base and tool fitted; used only to report its errors after a correction.
     """
 
     model: CalibratedModel
@@ -153,7 +153,7 @@ class RowsUnderModel:
 
     @cached_property
     def renamed_rows(self) -> Measurements:
-        """The rows, in which fitted frames and targets have names of the model."""
+        """The rows, with the names of fitted frames and targets replaced by names of the model."""
         return with_known_names(self.model, self.rows, self.fitted)
 
     @cached_property
@@ -164,7 +164,7 @@ class RowsUnderModel:
     def zero_columns(
         self, zeros: Float64[Tensor, " dof"] | None = None
     ) -> tuple[Float64[Tensor, "rows 4 4"], Float64[Tensor, "dof rows 4 4"]]:
-        """Return poses predicted with moved joint zeros [rad or m], and their derivatives by finite differences."""
+        """Return poses predicted with moved joint zeros [rad or m], and their derivatives from finite differences."""
         zeros = torch.zeros(self.renamed_rows.dof, dtype=torch.float64) if zeros is None else zeros
         moved = [zeros, *(zeros + _STEP * torch.eye(self.renamed_rows.dof).double())]
         here, *there = (
@@ -224,7 +224,7 @@ class RowsUnderModel:
 
     @cached_property
     def setup_faults(self) -> tuple[SetupFault, ...]:
-        """Setup faults that explain the errors of all rows, of any size."""
+        """Setup faults of any size that explain the errors of all rows."""
         return find_setup_faults(self.model, self.nominal, self.rows, self.fitted)
 
     @cached_property
@@ -242,13 +242,13 @@ Check = Callable[[CheckedCalibration], Iterator[Diagnostic]]
 
 It yields nothing if it finds no fault, and raises `IdentificationError` if the rows cannot belong to this robot."""
 RowCheck = Callable[[RowsUnderModel], Iterator[Diagnostic]]
-"""Check of rows for one kind of fault, by the predictions of a model."""
+"""Check of rows for one kind of fault, using the predictions of a model."""
 
 
 def kinds_to_fit(
     model: CalibratedModel, rows: Measurements, fitted: Collection[FrameKind]
 ) -> tuple[FrameKind, ...]:
-    """Return what is fitted, including frames or tools if rows have some that the model does not have."""
+    """Return what is fitted, including frames or tools if the rows have some that the model lacks."""
     new: tuple[FrameKind, ...] = (
         *(("base",) if _unknown(rows.frame, model.bases) else ()),
         *(("tool",) if _unknown(rows.target, model.tools) else ()),
@@ -257,7 +257,7 @@ def kinds_to_fit(
 
 
 def _unknown(names: tuple[str, ...], known: Collection[str]) -> bool:
-    """Return whether a frame or target is unknown to a model, see `pisigma.model.calibrated_model.known_names`."""
+    """Return whether a frame or target is unknown to a model; see `pisigma.model.calibrated_model.known_names`."""
     if not set(known) - {""}:
         return len(set(names)) > 1
     return not set(names) <= set(known) and not (len(known) == 1 and not any(names))

@@ -26,8 +26,8 @@ class Lag:
     """Lag between the logged joint values and the measured pose, as a share of the motion between two rows.
 
     Attributes:
-        before: whether joint values were logged before the arrival, on the way from the previous row; otherwise
-            after leaving.
+        before: whether joint values were logged before the arrival, on the way from the previous row; otherwise they
+            were logged after departure.
         share: lag as a share of the motion between two rows [1].
         factor: ratio of the errors with and without the lag [1].
         log_bayes_factor: logarithm of the odds of a lag against no lag.
@@ -63,7 +63,7 @@ def check_lag(checked: CheckedCalibration) -> Iterator[Diagnostic]:
 
 
 def find_lag(rows: OrderedRows, measurements: Measurements) -> Lag | None:
-    """Fit a lag to the residuals of a calibration, likely or not; None if there are too few rows.
+    """Fit a lag to the residuals of a calibration, whether it is likely or not; None if there are too few rows.
 
     Args:
         rows: residuals of a calibration.

@@ -1,4 +1,4 @@
-"""Check whether only some rows agree with a model, and the others belong to another setup."""
+"""Check whether only some of the rows agree with a model while the others belong to another setup."""
 
 import itertools
 import math
@@ -40,8 +40,8 @@ _FAR_APART = 6.0
 _BETWEEN = 0.15
 """Largest share of the rows that may be neither near nor far."""
 DRAWS, _SAMPLE = 100, 4
-"""Number and size of the random samples of rows to which a base or a tool is fitted, in addition to halves and every
-second row."""
+"""Number and size of the random samples of rows to which a base or a tool is fitted, in addition to halves of the file
+and every second row."""
 _SPARE_ROWS = 3
 """Number of rows that must agree with a fit in addition to the rows of its sample."""
 _ADVICE = " No result is computed from all of them; measure again, or give each group its own file or frame."
@@ -50,12 +50,12 @@ _EXPLAINED = 2.5
 
 
 def check_mixed_rows(judged: RowsUnderModel) -> Iterator[Diagnostic]:
-    """Look for the largest set of rows that agrees with the model, with given or fitted base or tool.
+    """Find the largest set of rows that agree with the model, with its own or a fitted base or tool.
 
     Bases and tools are fitted to random samples of rows (RANSAC: Fischler and Bolles 1981, Communications of the ACM
-    24(6)). If more than a quarter of the rows are far off while the others agree to the noise, rows of two setups
-    are mixed, or it is unknown which rows are wrong. Moved joint zeros cause errors of all sizes, so they are fitted
-    to all rows first.
+    24(6)). If more than a quarter of the rows are far off while the others agree within the noise, rows of two setups
+    are mixed, or it is unknown which rows are wrong. Moved joint zeros cause errors of all sizes, so they are fitted to
+    all rows first.
     """
     if not bool(torch.isfinite(judged.predicted_deviation).all()):
         return
@@ -86,7 +86,7 @@ def too_many_wrong_rows(rows: Measurements, wrong: Bool[Tensor, " rows"]) -> Dia
 
 
 def _cause(judged: RowsUnderModel, wrong: Bool[Tensor, " rows"]) -> str:
-    """Return a sentence about what explains the wrong rows; empty if nothing does."""
+    """Return a sentence about the cause that explains the wrong rows; empty if no cause does."""
     faults = find_setup_faults(judged.model, None, judged.rows.select(wrong), judged.fitted)
     if not faults:
         return ""
@@ -136,7 +136,7 @@ def _fitted(judged: RowsUnderModel, kind: str, chosen: Tensor) -> Float64[Tensor
 
 
 def _apart(judged: RowsUnderModel, T: Float64[Tensor, "rows 4 4"]) -> Bool[Tensor, " rows"] | None:
-    """Return the mask of rows that are far from the agreeing rows; None if they are few or not clearly separated."""
+    """Return the mask of rows that are far from the agreeing rows; None if they are few or not clearly apart."""
     ratio = judged.error_lengths(T) / (AGREES * judged.predicted_deviation)
     near, far = ratio <= 1, ratio > _APART
     count = judged.rows.rows
@@ -157,26 +157,26 @@ def _joints_explain(judged: RowsUnderModel) -> bool:
 
 
 _CERTAIN = 30.0
-"""Log Bayes factor above which rows certainly differ. For one arm, unmodelled gear errors and sag give factors of up
-to 90 with frames, and up to 30 otherwise, but small differences."""
+"""Log Bayes factor above which rows certainly differ. For one arm, unmodelled gear errors and sag give factors of up to
+90 with frames and up to 30 otherwise, but the differences are small."""
 _LARGE = {"tool": 1.6, "frame": 2.2, "arm": 2.2}
 """Ratio of the errors with and without the difference above which there are two populations. For one arm (simulated
-with gear errors and sag, and measured: UR5, UR10, FANUC R-2000iC) the ratio is 1.3, 1.9 and 1.9 at most."""
+with gear errors and sag, and measured: UR5, UR10, FANUC R-2000iC) the ratio is at most 1.3, 1.9 and 1.9."""
 _HARDLY_USED = 0.38
-"""Share of the values absorbed by parameters above which the ratios of one arm grow, because the best of many ways
-to split the rows overfits: 24 sets of 60 positions (share 0.35) have 1.7 at most, of 40 positions (0.5) 2.9, and
-arms of 7 joints (0.63) 3.1."""
+"""Share of the values absorbed by parameters above which the ratios of one arm grow, because the best of many ways to
+split the rows overfits: the ratio is at most 1.7 in 24 sets of 60 positions (share 0.35), 2.9 with 40 positions (0.5),
+and 3.1 with arms of 7 joints (0.63)."""
 _IMPLAUSIBLE = 5.0
-"""Ratio of the errors with and without a different tool or frame above which the calibration is wrong; with two arms
+"""Ratio of the errors with and without a different tool or frame above which the calibration is wrong; with two arms,
 it always is."""
 
 
 def check_two_populations(checked: CheckedCalibration) -> Iterator[Diagnostic]:
-    """Look for rows of another arm, tool or frame; if there are none, look for two sizes of errors.
+    """Look for rows of another arm, tool or frame; if there are none, look for errors of two sizes.
 
-    Up to a tenth of wrong rows are outliers, to which the robust loss gives no weight; more wrong rows need not be
-    outliers. A hybrid has smaller residuals, so smaller differences are visible, but it absorbs a part of large
-    differences, so both calibrations are tested.
+    If at most a tenth of the rows are wrong, they are outliers, to which the robust loss gives no weight; more wrong
+    rows need not be outliers. A hybrid has smaller residuals, so smaller differences are visible, but it absorbs part
+    of large differences, so both calibrations are tested.
     """
     learned = checked.hybrid if checked.hybrid is not None and checked.hybrid.learned is not None else None
     for result in (checked.geometric, learned):
@@ -218,7 +218,7 @@ def _differ(found: Populations) -> bool:
 
 
 def _two_populations(rows: Measurements, found: Populations) -> Diagnostic:
-    """Report the rows of the smaller population, and how they differ from the others."""
+    """Report the rows of the smaller population and how they differ from the others."""
     second = torch.from_numpy(found.second)
     distinction = distinguishing_property(rows, second)
     size, moved = int(second.sum()), f"{length_text(math.hypot(*found.difference[:3]))}"
@@ -259,7 +259,7 @@ class Distinction(NamedTuple):
 
     Attributes:
         by: "name", "range" (of the file), "period" (every n-th row), "value", or "nothing" if the rows are scattered.
-        clause: such as "all rows after rows.csv, line 8".
+        clause: the property in words, such as "all rows after rows.csv, line 8".
     """
 
     by: Literal["name", "range", "period", "value", "nothing"]

@@ -17,10 +17,10 @@ from pisigma.validation.held_out.trained_calibrations import base_and_tool
 
 _SUSPICIOUS = 0.01
 """Errors of the nominal robot, as a share of its reach, above which other robots are tried, and up to which another
-robot explains the rows; arms are built to a third of it or better."""
+robot explains the rows; arms are built to within a third of this."""
 _NEARER = 1 / 3
-"""Ratio of the errors of another robot to those of this robot below which the other is reported. A nominal arm
-explains measurements of such an arm to a thousandth of its reach; different robots differ by more."""
+"""Ratio of the errors of another robot to those of this robot below which the other is reported. The nominal model
+explains measurements of its own type of arm to a thousandth of the reach; different robots differ by more."""
 _MIN_ROWS = 6
 """Minimum number of rows; with fewer, base and tool alone fit another robot to the rows."""
 _MAX_ROWS = 200
@@ -35,7 +35,7 @@ def check_other_robot(checked: CheckedCalibration) -> Iterator[Diagnostic]:
     if stated is None or stated <= _SUSPICIOUS * robot.reach * 1e3:
         return
     robots = {name: Robot.load(name) for name in catalogue()}
-    # small arms have small errors for any rows: another robot has to explain the rows as its own
+    # small arms have small errors for any rows, so another robot must explain the rows as well as its own
     others = {
         name: size
         for name, other in robots.items()
@@ -61,7 +61,7 @@ def check_other_robot_of_rows(judged: RowsUnderModel) -> Iterator[Diagnostic]:
 
 
 def other_robot_diagnostics(robot: Robot, rows: Measurements) -> tuple[Diagnostic, ...]:
-    """Check rows without a calibration for another robot; empty if there are too few rows."""
+    """Check uncalibrated rows for another robot; empty if there are too few rows."""
     calibrator = GeometricCalibrator(robot)
     if rows.rows < _MIN_ROWS:
         return ()
@@ -74,7 +74,7 @@ def other_robot_diagnostics(robot: Robot, rows: Measurements) -> tuple[Diagnosti
 
 
 def _rms_mm(checked: CheckedCalibration, other: Robot) -> float | None:
-    """Return the RMS error of another nominal robot [mm]; None if it has other joints or cannot be fitted."""
+    """Return the RMS error of another nominal robot [mm]; None if its joints differ or it cannot be fitted."""
     if other.name == checked.robot.name or other.revolute != checked.robot.revolute:
         return None
     count = checked.rows.rows

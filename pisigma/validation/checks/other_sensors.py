@@ -27,8 +27,8 @@ from pisigma.validation.setup_faults.setup_fault import SetupFault, fault_of_cau
 from pisigma.validation.setup_faults.setup_faults import unexplained
 
 FAR, _STRETCHED = 3.0, 0.01
-"""Limits of a stated distance: it is wrong if it is off by more than this multiple of the RMS error of the rows plus
-this share of the distance."""
+"""Limits for a stated distance, which is wrong if it is off by more than the first times the RMS error of the rows plus
+the second times the distance."""
 
 MAX_ITERATIONS, _MIN_GAIN, _STEP, MAX_STEP = 8, 0.9, 1e-6, 0.3
 """Settings of the fit of motions: number of iterations, ratio of successive errors at which it ends,
@@ -36,7 +36,7 @@ finite-difference step and largest step [rad or m]."""
 
 
 def distance_diagnostics(comparison: ModelComparison, figures: ModelFigures) -> Iterator[Diagnostic]:
-    """Report stated distances between sockets that a model contradicts by more than its rows scatter.
+    """Report stated distances between sockets that a model contradicts by more than the scatter of its rows.
 
     Args:
         comparison: comparison of models on the rows of the sockets.
@@ -66,15 +66,15 @@ def diagnose_lengths(
 ) -> tuple[tuple[Diagnostic, ...], tuple[SetupFault, ...]]:
     """Report the causes of errors that are too large for wear, in rows without positions.
 
-    The hypotheses are a reversed sign of every joint, a swap of two neighbouring joints, a moved zero of every
-    joint and another tool, one at a time.
+    The hypotheses, tried one at a time, are a reversed sign of each joint, a swap of two neighbouring joints, a moved
+    zero of each joint, and another tool.
 
     Args:
         model: the model.
         rows: rows without positions. Rows of an anchor with too few rows are not checked; touches and wires to
             stated points are not checked if the base may have moved, because they depend on the base.
         fitted: frames and tools that are known to have moved.
-        may_move: what else may have moved without being a fault.
+        may_move: what else may have moved without this being a fault.
 
     Returns:
         The findings that make the rows implausible, and the setup fault that explains them, which may be a motion.
@@ -121,7 +121,7 @@ def _fault(model: CalibratedModel, rows: Measurements, free: Collection[str]) ->
 
 
 def _moved_most(model: CalibratedModel, rows: Measurements, free: Collection[str]) -> tuple[float, Cause]:
-    """Return the smallest errors [m] after moving one joint zero or the tool, and the cause.
+    """Return the smallest errors [m] that remain after moving one joint zero or the tool, and the cause.
 
     The joint is chosen with errors linearised at the model; then joint and tool are fitted by iteration.
     """
@@ -179,7 +179,7 @@ def _least_squares(
 ) -> Float64[Tensor, " free"]:
     """Solve `J x = b` in least squares; directions that the orientations of the rows hardly determine stay at 0.
 
-    Noise of the rows looks like information on such directions, and would move a tool along them by hundreds of mm.
+    The noise of the rows looks like information on such directions, and would move a tool along them by hundreds of mm.
     """
     rows = int((J.view(-1, 3, J.shape[1]) != 0).any(-1).any(-1).sum())
     solution: Tensor = torch.linalg.pinv(J, atol=MIN_TURN * rows**0.5, rtol=0.0) @ b

@@ -1,4 +1,4 @@
-"""Check whether the geometric errors have a size that is possible for the nominal robot and its class."""
+"""Check whether the sizes of the geometric errors are possible for the nominal robot and its class."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -14,9 +14,8 @@ UNUSUAL = 4.0
 """Ratio of the lower bound of the errors to their prior standard deviation above which a warning is given. Healthy
 robots have up to 4.6 times the default prior of 1 mrad."""
 _IMPLAUSIBLE = 10.0
-"""Ratio of the lower bound of the errors to their prior standard deviation above which the rows do not belong to
-this robot (the user can state a wider prior): the odds against a normal error of 10 standard deviations are 1e23 to
-1."""
+"""Ratio of the lower bound of the errors to their prior standard deviation above which the rows do not belong to this
+robot: the odds against a normal error of 10 standard deviations are 1e23 to 1. The user can state a wider prior."""
 PREDICTED_SHARE = 0.25
 """Share of the nominal robot's error below which the error of held-out rows is small, if it also meets
 `PREDICTED_REACH`."""
@@ -33,9 +32,9 @@ NAMES = {
 def check_prior_ratio(checked: CheckedCalibration) -> Iterator[Diagnostic]:
     """Compare the estimated sizes of the geometric errors with the prior and with the limits of the robot's class.
 
-    If the class is not stated, it is the narrowest class, starting from the manufacturer's, in which joint zeros of
-    these sizes are possible. Joint zeros beyond the manufacturer's class are accepted if held-out rows are predicted
-    well.
+    If no class is stated, the limits are those of the narrowest class, starting with the manufacturer's, in which joint
+    zeros of these sizes are possible. Joint zeros beyond the manufacturer's class are accepted if held-out rows are
+    predicted well.
     """
     unusual = [ratio for ratio in checked.geometric.prior_ratios if ratio.at_least > UNUSUAL]
     large = [ratio for ratio in unusual if ratio.at_least > _IMPLAUSIBLE]
@@ -60,7 +59,7 @@ def narrowest_robot_class(
 ) -> RobotClass | None:
     """Return the class of a robot with errors of these sizes: the stated class, or the narrowest that allows them.
 
-    The search for the narrowest class starts with the maker's class.
+    The search for the narrowest class starts with the manufacturer's class.
 
     A wider class than the manufacturer's is accepted for joint zeros only: lengths and angles of another class belong
     to another robot, unless the user states the class.
@@ -140,10 +139,10 @@ _CERTAIN = 3.0
 
 
 def check_joint_zero(checked: CheckedCalibration) -> Iterator[Diagnostic]:
-    """Warn of joint zeros that are far off; a calibration cannot distinguish a wrong zero from a wrong log.
+    """Warn about joint zeros that are far off; a calibration cannot distinguish a wrong zero from a wrong log.
 
-    Large deviations are found as a setup fault with the nominal robot. If the poses cover little of the workspace,
-    base and tool absorb most of their effect, and only the estimated parameters show them.
+    With the nominal robot, large deviations are found as a setup fault. If the poses cover little of the workspace,
+    base and tool absorb most of the effect, and only the estimated parameters show the deviations.
     """
     if setup_diagnostics(checked.robot, checked.rows):
         return

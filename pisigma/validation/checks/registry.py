@@ -64,7 +64,7 @@ def diagnostics_of(checked: CheckedCalibration) -> tuple[Diagnostic, ...]:
 
 
 def diagnostics_of_rows(calibrator: GeometricCalibrator, rows: Measurements) -> tuple[Diagnostic, ...]:
-    """Calibrate with some rows and run all checks; empty if there are too few rows for a calibration.
+    """Calibrate with the rows and run all checks; empty if there are too few rows for a calibration.
 
     Raises:
         ImplausibleError: no calibration error explains the rows.

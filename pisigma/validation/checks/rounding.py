@@ -1,4 +1,4 @@
-"""Check whether joint values or positions were rounded so coarsely that rounding explains a part of the errors."""
+"""Check whether joint values or positions were rounded so coarsely that rounding explains part of the errors."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -23,8 +23,8 @@ _MIN_ROWS = 12
 _MIN_SHARE = 0.25
 """Share of the squared errors above which rounding is reported."""
 _MAX_SHARE = 1.7
-"""Largest ratio of the predicted to the observed squared error of rounded rows; the series of joint errors absorbs a
-part of it."""
+"""Largest ratio of the predicted to the observed squared error of rounded rows; the series of joint errors absorbs part
+of it."""
 _LIKELY = math.log(100.0)
 """Log likelihood ratio above which rounding causes the errors."""
 _SIZES = np.geomspace(1e-3, 1e3, 61)
@@ -38,7 +38,7 @@ class Rounding:
     Attributes:
         steps: rounding step of every joint [rad or m]; 0 for joints that are not rounded.
         error: RMS position error caused by the rounding [m].
-        share: share of the squared errors of the rows that rounding causes [1].
+        share: share of the rows' squared errors that is caused by rounding [1].
     """
 
     steps: tuple[float, ...]
@@ -49,8 +49,8 @@ class Rounding:
 def check_rounding(checked: CheckedCalibration) -> Iterator[Diagnostic]:
     """Compare the errors that rounding causes with the errors of the rows.
 
-    Joints that were commanded to whole degrees have round values without an error. Therefore the directions of the
-    errors must also agree with rounded joint values: errors must be large where a joint moves the tool far.
+    Joints that were commanded to whole degrees have round values without a rounding error. Therefore the pattern of the
+    errors must also agree with rounding: errors must be large where a joint moves the tool far.
     """
     rounding = joint_rounding(checked.geometric, checked.rows)
     if rounding is not None:
@@ -85,7 +85,7 @@ def check_rounding(checked: CheckedCalibration) -> Iterator[Diagnostic]:
 
 
 def joint_rounding(result: CalibrationResult, measurements: Measurements) -> Rounding | None:
-    """Return the rounding of joint values that causes a part of the errors; None if there is none.
+    """Return the rounding of joint values that causes part of the errors; None if there is none.
 
     With the derivative `J` of a row's values, rounding to steps `s` adds the covariance `J diag(s²/12) J^T` of a
     uniform distribution to the covariance of the other errors, `σ² I`. The maximum likelihoods over σ with and
@@ -106,7 +106,7 @@ def joint_rounding(result: CalibrationResult, measurements: Measurements) -> Rou
     if rows is None or len(rows.residual) < _MIN_ROWS:
         return None
     made = rows.joint_derivative * steps / math.sqrt(12)
-    # Residuals of a fit are too small, because the parameters absorbed a part of the errors.
+    # Residuals of a fit are too small, because the parameters absorbed part of the errors.
     left = rows.residual_after_fit * math.sqrt(
         rows.values / max(rows.values - rows.effective_parameters, 1.0)
     )
@@ -146,7 +146,7 @@ def _common_step(values: Float64[np.ndarray, "rows columns"]) -> float:
 
 
 def _steps_text(robot: Robot, steps: Sequence[float]) -> str:
-    """Return a text with rounding steps and the joints that have them."""
+    """Return a text that lists the rounding steps and their joints."""
     texts = []
     for step in dict.fromkeys(step for step in steps if step):
         joints = tuple(joint for joint, one in enumerate(steps) if one == step)

@@ -29,20 +29,20 @@ _LARGE = 1.5
 _MIN_ROWS = 12
 """Smallest number of rows of a setup: 36 values for the 9 parameters of base and tool of positions."""
 _FITS_SHARE = 5e-3
-"""Errors of the nominal robot, as a share of its reach; geometric errors cause smaller ones."""
+"""Errors of the nominal robot, as a share of its reach, that are larger than geometric errors can cause."""
 FAR = 5.0
 """Ratio of an error to the errors of the rows of a setup above which a row belongs to another setup."""
 _MAX_WRONG_SHARE = 0.1
-"""Share of the rows of a setup that may be far off without contradicting it."""
+"""Share of the rows of a setup that may be far off without contradicting the setup."""
 
 
 def check_row_order(checked: CheckedCalibration) -> Iterator[Diagnostic]:
     """Test the residuals for a motion of a frame or the tool at any row, or for a slow motion over all rows.
 
-    A motion is reported if it is `_LIKELY`. It makes the calibration implausible if it is `_CERTAIN` and its factor on
-    the residuals is `_LARGE`. A hybrid has smaller residuals, so smaller motions are visible, but it absorbs a part
-    of large motions, so both calibrations are tested. A tool that seems to have moved exactly where the rows of
-    another frame start is an effect of errors that the frames do not explain, unless the factor is `_LARGE`.
+    A motion is reported if it is `_LIKELY`. It makes the calibration implausible if it is `_CERTAIN` and changes the
+    residuals by a `_LARGE` factor. A hybrid has smaller residuals, so smaller motions are visible, but it absorbs part
+    of large motions, so both calibrations are tested. A tool that seems to have moved exactly where the rows of another
+    frame start is an effect of errors that the frames do not explain, unless the factor is `_LARGE`.
     """
     motions = [find_motion(checked.geometric)]
     if checked.hybrid is not None and checked.hybrid.learned is not None:
@@ -84,7 +84,7 @@ def _values(motion: Motion, rows: Measurements) -> dict[str, float | int | str]:
 
 
 def _texts(motion: Motion, rows: Measurements) -> tuple[str, str]:
-    """Return a text about what moved, at which row and how far, and a text about what to do."""
+    """Return a text that states what moved, at which row and how far, and a text that states what to do."""
     what = {"frame": "measuring frame", "target": "target on the tool", "tool": "tool"}[motion.moved]
     what += f" '{motion.name}'" if motion.name and motion.moved != "tool" else ""
     x, y, z = motion.shift * 1e3
@@ -108,7 +108,7 @@ def _texts(motion: Motion, rows: Measurements) -> tuple[str, str]:
 
 
 def explain_refusal(refusal: IdentificationError, robot: Robot, rows: Measurements) -> IdentificationError:
-    """Return a refusal that names the setup fault if one explains the errors; otherwise the refusal unchanged."""
+    """Return a refusal that names the setup fault that explains the errors; otherwise the unchanged refusal."""
     if moved := new_setup_refusal(robot, rows):
         return moved
     causes = setup_diagnostics(robot, rows)
@@ -120,12 +120,12 @@ def explain_refusal(refusal: IdentificationError, robot: Robot, rows: Measuremen
 def new_setup_refusal(robot: Robot, measurements: Measurements) -> IdentificationError | None:
     """Find the row before which the instrument was moved so far that no calibration of all rows is possible.
 
-    Base and tool are fitted to the first and to the last third of the rows. The row is found up to (or after) which
-    the other rows agree with that fit. The rows on both sides must fit the nominal robot separately.
+    Base and tool are fitted to the first and to the last third of the rows. The row found is the one up to which (or
+    after which) the other rows agree with that fit. The rows on each side must separately fit the nominal robot.
 
     Args:
         robot: the nominal robot.
-        measurements: rows of one frame and one target with positions; others are not tested.
+        measurements: rows with positions of one frame and one target; other rows are not tested.
 
     Returns:
         The error to raise, with file and line of the row; None if there is no such row.
@@ -166,7 +166,7 @@ def new_setup_refusal(robot: Robot, measurements: Measurements) -> Identificatio
 
 
 def _errors(robot: Robot, measurements: Measurements, rows: np.ndarray) -> Float64[np.ndarray, " rows"]:
-    """Compute all position errors [m] with base and tool fitted to given rows; infinite if undetermined."""
+    """Compute all position errors [m] with base and tool fitted to the given rows; infinite if undetermined."""
     try:
         fitted = fit_base_and_tool(robot, measurements.select(torch.from_numpy(rows.copy()))).robot
     except IdentificationError:

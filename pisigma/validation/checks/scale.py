@@ -21,21 +21,21 @@ from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.setup_faults.cause import length_text
 
 _SCALE_SIGMAS = (0.003, 0.1)
-"""Prior standard deviations of a common factor on the lengths, with equal probability: for instruments and heat, and
+"""Equally probable prior standard deviations of a common factor on the lengths: one for instruments and heat, and one
 for wrong units."""
 _LENGTH_ERRORS = np.geomspace(3e-5, 1.0, 40)
-"""Standard deviations of the errors of individual lengths [m], with equal probability."""
+"""Equally probable standard deviations of the errors of individual lengths [m]."""
 _STRONG = math.log(10.0)
 """Logarithm of the Bayes factor above which a common factor is reported (Jeffreys 1961, Theory of Probability, appendix
 B: "strong").
 
-Only nominal lengths determine the scale, and errors of 0.3 mm of links of 0.5 m have the effect of a factor with an
-error of 0.0004. Of 600 simulated arms, 5 are reported without a factor, and 61 with a factor of 1.001. The most
-powerful test (Neyman and Pearson 1933) with as few false alarms, which knows the distribution of link errors, finds a
-factor of 1.001 in half of the KR 10."""
+Only nominal lengths determine the scale, and errors of 0.3 mm in links of 0.5 m give the factor an error of 0.0004. Of
+600 simulated arms, 5 are reported without a factor, and 61 with a factor of 1.001. The most powerful test (Neyman and
+Pearson 1933) with as few false alarms, which knows the distribution of link errors, finds a factor of 1.001 in half of
+the simulated KR 10 arms."""
 _IMPLAUSIBLE = 0.03
 """Difference of the factor from 1 above which the unit or the robot is wrong. Heat stretches arms and instruments by
-less than 0.2 %, and wrong use of a scale bar by 1 %."""
+less than 0.2 %; wrong use of a scale bar causes 1 %."""
 
 
 MAX_ODDS = 1e6
@@ -58,7 +58,7 @@ class CommonScale:
 
     @property
     def odds(self) -> float:
-        """Odds of a common factor against independent errors of the links, at most `MAX_ODDS`."""
+        """Odds of a common factor against independent errors of the links, limited to `MAX_ODDS`."""
         return math.exp(min(self.log_bayes_factor, math.log(MAX_ODDS)))
 
 
@@ -86,11 +86,11 @@ def check_scale(checked: CheckedCalibration) -> Iterator[Diagnostic]:
 def scale_figures(checked: CheckedCalibration) -> ScaleFigures | None:
     """Estimate a factor on all measured positions, and the error of true positions that it causes.
 
-    An arm with revolute joints only fits scaled positions equally well with base, links and tool scaled by the same
-    factor, so the residuals do not show it; only the nominal lengths do.
+    An arm that has only revolute joints fits scaled positions equally well with base, links and tool scaled by the same
+    factor. The residuals therefore do not show the factor; only the nominal lengths do.
 
     Returns:
-        The figures; None if no position was measured, a joint is prismatic, or no length that is nominally not 0 was
+        The figures; None if no position was measured, a joint is prismatic, or no nominally nonzero length was
         estimated.
     """
     position = checked.rows.position
@@ -116,14 +116,14 @@ def common_scale(result: CalibrationResult) -> CommonScale | None:
     """Estimate a factor on all lengths of the arm by Bayesian model comparison.
 
     The model of the true lengths is `(1 + s) L + e` with the nominal lengths L, and e for lengths that are nominally 0.
-    The errors e are normal with one standard deviation, over which the evidence is averaged, with s and without. The
-    data enter by their normal equations at the solution, from which the prior is subtracted. With the normal matrix N
-    of the data, their right-hand side b, and the prior precision P of all parameters, the likelihood of s is normal,
-    with the information `L^T P L - L^T P (N + P)^-1 P L` and the estimate `L^T P (N + P)^-1 b` divided by this
+    The errors e are normal with one standard deviation, over which the evidence with and without s is averaged. The
+    data enter through their normal equations at the solution, from which the prior is subtracted. With the normal
+    matrix N of the data, their right-hand side b, and the prior precision P of all parameters, the likelihood of s is
+    normal, with the information `L^T P L - L^T P (N + P)^-1 P L` and the estimate `L^T P (N + P)^-1 b` divided by this
     information.
 
     Returns:
-        The factor; None if no length that is nominally not 0 was estimated.
+        The factor; None if no nominally nonzero length was estimated.
     """
     problem, here = result.solved.problem, result.solved.refined
     precision = (
@@ -154,7 +154,7 @@ def common_scale(result: CalibrationResult) -> CommonScale | None:
         plain[k] = np.log(precision[erring]).sum() / 2 - np.log(root.diagonal() / column).sum() + u @ u / 2
         information[k] = lengths @ pull - v @ v
         estimate[k] = u @ v / information[k]
-    # A normal prior and a normal likelihood of s: their product integrates in closed form.
+    # The product of the normal prior and the normal likelihood of s integrates in closed form.
     ratio = np.square(_SCALE_SIGMAS)[:, None] * information
     gain = (np.square(estimate) * information * ratio / (1 + ratio) - np.log1p(ratio)) / 2
     scaled = plain + gain
@@ -167,14 +167,14 @@ def common_scale(result: CalibrationResult) -> CommonScale | None:
 
 
 _MIN_CHANGE = 5e-4
-"""Smallest difference of the factor from 1; smaller ones are caused by heat: 20 K stretch an aluminium arm by 0.05
-%."""
+"""Smallest difference of the factor from 1 that is reported; heat causes smaller ones: 20 K stretch an aluminium arm by
+0.05 %."""
 _UNUSUAL = 2.0
 """Ratio of errors to expected errors below which no explanation is needed."""
 _EXPLAINED_BY_SCALE = 0.6
 """Largest share of the errors that may remain after correction of the factor."""
 _AS_GOOD_AS_SCALE = 1.3
-"""Factor by which errors under any other explanation must be larger."""
+"""Factor by which the errors under every other explanation must be larger."""
 _MIN_DEVIATIONS = 5.0
 """Difference of the factor from 1, in standard deviations, above which it is reported."""
 

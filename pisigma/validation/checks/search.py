@@ -8,7 +8,7 @@ from pisigma.validation.held_out.diagnostic import Diagnostic
 
 
 def check_search(checked: CheckedCalibration) -> Iterator[Diagnostic]:
-    """Reject a search that stopped at the iteration limit, and warn of a search that stalled near the minimum."""
+    """Reject a search that stopped at the iteration limit, and warn about a search that stalled near the minimum."""
     status = checked.geometric.status
     if not status.is_minimum:
         stopped = status is SolutionStatus.ITERATION_LIMIT

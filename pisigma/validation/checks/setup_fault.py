@@ -30,11 +30,11 @@ _UNRELATED = (
     "different rows belong together; check whether one of them was sorted or comes from another program."
 )
 _MIN_ROWS_OF_SIZE = 4
-"""Minimum number of rows for the check of size; with fewer, positions may be near each other by chance."""
+"""Minimum number of rows for the check of size; with fewer, positions may be close together by chance."""
 _SCALE = 30.0
 """Ratio of the spreads of measured and nominal positions above which (or below whose inverse) the unit is wrong."""
 _ARM_SHARE = 0.3
-"""Spread of positions caused by a tool that the nominal robot lacks, and smallest spread of typical poses, as a
+"""Spread of the positions that a tool missing from the nominal robot causes, and smallest spread of typical poses, as a
 share of the reach."""
 _MIN_ROWS_FOR_JOINTS = 8
 """Smallest number of rows that distinguish columns of joints: 24 values, 9 of which determine base and tool."""
@@ -43,9 +43,9 @@ _MIN_ROWS_FOR_JOINTS = 8
 def check_setup_fault(checked: CheckedCalibration) -> Iterator[Diagnostic]:
     """Look for setup faults that explain the errors of the nominal robot; see `find_nominal_robot_faults`.
 
-    A fault makes the calibration implausible, because parameters may absorb it and are then wrong at other poses. A
-    joint zero is a parameter, which a calibration estimates correctly, so it is only a warning up to the size that
-    is possible in the class of the robot.
+    A fault makes the calibration implausible, because parameters may absorb the fault and are then wrong at other
+    poses. A joint zero is a parameter that a calibration estimates correctly, so it only causes a warning, up to the
+    size that is possible in the class of the robot.
     """
     yield from setup_diagnostics(checked.robot, checked.rows)
 
@@ -67,7 +67,7 @@ def setup_diagnostics(robot: Robot, rows: Measurements) -> tuple[Diagnostic, ...
 def check_setup_of_rows(rows: RowsUnderModel) -> Iterator[Diagnostic]:
     """Look for setup faults that explain the errors of a model; see `find_setup_faults`.
 
-    A moved base, tool or zero of one joint is not a fault if it may have moved. If base and tool may not have moved,
+    A moved base, tool or single joint zero is not a fault if it is allowed to have moved. If base and tool are not,
     their motion is reported even if it is small.
     """
     if rows.has_large_errors:

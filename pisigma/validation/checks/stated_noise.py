@@ -1,4 +1,4 @@
-"""Check whether standard deviations stated in the rows agree with the residuals."""
+"""Check whether the standard deviations stated in the rows agree with the residuals."""
 
 import math
 from collections.abc import Iterator

@@ -13,7 +13,7 @@ by less than 15 K; 20 deg C is 68 deg F."""
 
 
 def check_temperature(checked: CheckedCalibration) -> Iterator[Diagnostic]:
-    """Warn of temperatures that look like degrees Fahrenheit."""
+    """Warn about temperatures that look like degrees Fahrenheit."""
     rows = checked.rows
     if rows.temperature is None:
         return

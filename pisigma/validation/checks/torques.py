@@ -13,7 +13,7 @@ _SIGNIFICANT = 3.0
 
 
 def check_torques(checked: CheckedCalibration) -> Iterator[Diagnostic]:
-    """Warn of negative compliances: torques of the load instead of the drive, or in the opposite direction."""
+    """Warn about negative compliances, which show torques of the load instead of the drive, or of opposite sign."""
     hybrid = checked.hybrid
     if hybrid is None or hybrid.learned is None:
         return

@@ -19,16 +19,16 @@ from pisigma.validation.setup_faults.explanations import PLAUSIBLE_SHARE
 from pisigma.validation.setup_faults.setup_faults import unexplained
 
 _LARGE = 1e-3
-"""Errors, as a share of the reach, above which calibration must have reduced them; measured arms (UR5, UR10, FANUC,
-Panda, FR3) have 2e-4 to 6e-4."""
+"""Size of errors, as a share of the reach, above which calibration must have reduced them; measured arms (UR5, UR10,
+FANUC, Panda, FR3) have 2e-4 to 6e-4."""
 _HARDLY = 1.3
-"""Ratio of the errors of the nominal and the calibrated robot below which calibration hardly helped."""
+"""Ratio of the errors of the nominal and the calibrated robot below which the calibration hardly helped."""
 _NOISE = 0.5
 """Share of the errors above which the stated noise of the sensor explains them."""
 
 
 def check_unexplained(checked: CheckedCalibration) -> Iterator[Diagnostic]:
-    """Compare the errors of held-out positions, otherwise of the calibration, with errors of calibrated robots.
+    """Compare the errors of held-out positions, or else of the calibration, with those of calibrated robots.
 
     Errors that other checks explain are not reported again; for example, rounded joint values are errors of the
     rows, not of the robot.
@@ -60,7 +60,7 @@ def check_unexplained(checked: CheckedCalibration) -> Iterator[Diagnostic]:
 
 
 def _explained(checked: CheckedCalibration, left: float) -> bool:
-    """Return whether rounding or the stated noise of the sensor makes errors of this size [mm]."""
+    """Return whether rounding or the stated noise of the sensor causes errors of this size [mm]."""
     sigma = checked.rows.sigma_position
     noise = 0.0 if sigma is None else 3**0.5 * float(sigma.nanmedian()) * 1e3
     return noise > _NOISE * left or joint_rounding(checked.geometric, checked.rows) is not None
@@ -107,10 +107,10 @@ the variance. For a healthy robot the ratio is below 0.01."""
 
 
 def check_residual(checked: CheckedCalibration) -> Iterator[Diagnostic]:
-    """Compare the residuals of every sensor with the robot's reach, and residuals of positions with their spread.
+    """Compare the residuals of every sensor with the robot's reach, and those of positions with the positions' spread.
 
-    Half of the measured lengths must be within 1 % of the reach per axis, and half of the measured angles within
-    0.01 rad, which moves a point at the distance of the reach equally far. No calibration error exceeds these limits.
+    Half of the measured lengths must be within 1 % of the reach per axis, and half of the measured angles within 0.01
+    rad, which moves a point at the distance of the reach by the same amount. No calibration error exceeds these limits.
     """
     robot, by_images = checked.robot, "corner" in checked.rows.kinds
     rows = "images and joint values" if by_images else "rows and positions"

@@ -1,4 +1,4 @@
-"""Leave out single rows that no error of the robot explains, while all others agree with a model."""
+"""Leave out single rows that no robot error explains, while all others agree with a model."""
 
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass, replace
@@ -22,7 +22,7 @@ calibrated robot."""
 _MAX_WRONG_SHARE = 0.1
 """Largest share of wrong rows; if more rows are far off, it is unknown which are wrong, and no row is left out."""
 _MIN_ROWS, _MIN_ROWS_TO_FIT = 6, 10
-"""Smallest numbers of rows with which a row can be called wrong: in known frames, and with frames or tools fitted to
+"""Smallest numbers of rows with which a row can be called wrong, in known frames, and with frames or tools fitted to
 the rows."""
 _SUSPICIOUS, _REFITS = 3.0, 12
 """Ratio of an error to the median error above which a row is not used in the fit of frames and tools, and number of
@@ -37,7 +37,7 @@ class FilteredRows:
 
     Attributes:
         rows: the remaining rows; all rows if none is wrong.
-        warnings: warnings about wrong rows and how far they are off; empty if no row is wrong.
+        warnings: warnings about wrong rows and the sizes of their errors; empty if no row is wrong.
         numbers: indices of the wrong rows, from 0.
     """
 
@@ -49,7 +49,7 @@ class FilteredRows:
 def without_wrong_rows(
     models: Iterable[CalibratedModel], rows: Measurements, fitted: Collection[FrameKind] = ()
 ) -> FilteredRows:
-    """Leave out single rows that deviate too much from every model to be measured correctly.
+    """Leave out single rows that deviate too much from every model to have been measured correctly.
 
     Args:
         models: models with which the rows are compared.
@@ -80,7 +80,7 @@ def without_wrong_rows(
 def _far_rows(
     model: CalibratedModel, rows: Measurements, fitted: Collection[FrameKind]
 ) -> dict[int, str] | None:
-    """Return the rows that are far off, with texts of how far; None if the model cannot predict the rows."""
+    """Return the rows that are far off, with texts of their errors; None if the model cannot predict the rows."""
     if rows.position is None:
         return _far_lengths(model, rows)
     there = torch.isfinite(rows.position).all(-1)
@@ -133,7 +133,7 @@ def _angles(judged: RowsUnderModel, T: Float64[Tensor, "rows 4 4"]) -> Float64[T
 
 
 def _far(judged: RowsUnderModel, T: Float64[Tensor, "rows 4 4"]) -> tuple[Bool[Tensor, " rows"], list[str]]:
-    """Return the mask of the rows that are far off, and a text of the error of every row."""
+    """Return the mask of the rows that are far off, and a text with the error of every row."""
     lengths = judged.error_lengths(T)
     far = lengths > max(FAR * float(lengths.median()), PLAUSIBLE_SHARE * judged.model.robot.reach)
     texts = [length_text(length) for length in lengths.tolist()]

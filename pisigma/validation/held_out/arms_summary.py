@@ -1,4 +1,4 @@
-"""Figures of several arms: bases relative to each other, what the arms share, and whether they agree on it."""
+"""Figures of several arms: bases relative to each other, shared objects, and whether the arms agree on these."""
 
 import math
 from typing import Any
@@ -16,7 +16,7 @@ Six = tuple[float, float, float, float, float, float]
 
 
 class ArmBaseFigures(Section):
-    """Base of an arm in the base of another one.
+    """Base of an arm relative to the base of another arm.
 
     Attributes:
         arm: name of the arm.
@@ -28,8 +28,8 @@ class ArmBaseFigures(Section):
         pitch_deg: rotation about the new y axis [deg].
         yaw_deg: rotation about the new x axis [deg].
         standard_errors: standard errors of a shift of the base along x, y, z [mm] and of a rotation about x, y, z
-            [deg], the axes of the other arm's base.
-        covariance: covariance of the same six [mm and deg].
+            [deg]; the axes are those of the other arm's base.
+        covariance: covariance of the same six values [mm and deg].
         tool_to_tool_mm: RMS standard deviation of the vector from the tool of the other arm to that of this one [mm],
             over pairs of measured postures.
     """
@@ -48,13 +48,14 @@ class ArmBaseFigures(Section):
 
 
 class SharedFigures(Section):
-    """Something that several arms measured under one name.
+    """A frame or point that several arms measured under one name.
 
     Attributes:
         kind: "frame", "socket" or "anchor".
         name: its name.
         arms: names of the arms.
-        distance_mm: largest distance between its positions by two arms [mm]; 0 if it only served to find the bases.
+        distance_mm: largest distance between its positions according to two arms [mm]; 0 if it only served to determine
+            the bases.
     """
 
     kind: str
@@ -82,13 +83,13 @@ class ArmsSummary(Section):
 
     Attributes:
         arms: the arms with their models.
-        bases: base of every arm in that of every arm before it.
-        shared: what the arms share.
+        bases: base of every arm relative to that of every arm listed before it.
+        shared: objects that the arms share.
         misfit: sum of the squared differences between the arms in units of their standard deviations.
-        redundancy: number of independent differences, those that the bases do not absorb.
+        redundancy: number of independent differences that the bases do not absorb.
         probability: probability of a larger misfit of arms without faults.
-        diagnostics: what the arms disagree on.
-        sums: what of the bases is known only in a sum with parameters of a tool, one sentence each.
+        diagnostics: findings about objects on which the arms disagree.
+        sums: directions of the bases that are known only in a sum with parameters of a tool, one sentence each.
     """
 
     arms: tuple[ModelFile, ...]
@@ -106,7 +107,7 @@ class ArmsSummary(Section):
 
 
 def base_figures(found: ArmBases, first: int, second: int, postures: tuple[Postures, ...]) -> ArmBaseFigures:
-    """Return the base of the second arm in that of the first one; `postures` are those of every arm."""
+    """Return the base of the second arm relative to that of the first; `postures` are those of every arm."""
     T, covariance = found.relative(first, second)
     shown = np.array([1e3] * 3 + [math.degrees(1)] * 3)
     in_mm_and_deg = covariance.numpy() * shown * shown[:, None]
@@ -123,7 +124,7 @@ def base_figures(found: ArmBases, first: int, second: int, postures: tuple[Postu
 
 
 def disagreement_diagnostic(found: ArmBases, one: Disagreement) -> Diagnostic:
-    """Return the finding that arms disagree on the place of something that they share."""
+    """Return the finding that arms disagree on the location of a shared object."""
     names = " and ".join(f"'{found.arms[number].name}'" for number in one.shared.arms)
     remedy = (
         "check that it was not moved between the measurements of the arms, that its name is right in all rows, and "
@@ -143,7 +144,7 @@ def disagreement_diagnostic(found: ArmBases, one: Disagreement) -> Diagnostic:
 
 
 def sums_with_tool(arm: str, result: CalibrationResult) -> tuple[str, ...]:
-    """Return what of the bases of an arm is known only in a sum with parameters of its tool, one sentence each."""
+    """Return a sentence for every direction of an arm's bases that is known only in a sum with tool parameters."""
     in_a_sum = {one.name for one in result.parameters if one.label.startswith("in a sum")}
     return tuple(
         f"{one.names[0]} of arm '{arm}' is known only in a sum with {', '.join(one.names[1:])}; errors of these shift "
@@ -158,7 +159,7 @@ def sums_with_tool(arm: str, result: CalibrationResult) -> tuple[str, ...]:
 def arms_summary(
     found: ArmBases, robots: tuple[str, ...], postures: tuple[Postures, ...], sums: tuple[str, ...]
 ) -> ArmsSummary:
-    """Gather the figures of arms.
+    """Collect the figures of several arms.
 
     Args:
         found: the arms with their bases.

@@ -1,8 +1,8 @@
 """Figures of a calibration as one typed value.
 
-Cards, tables on the screen, report pages and JSON are made from it, and a model folder stores it as metrics. Figures
-are in millimetres and degrees. Figures that do not exist are not set and are omitted from JSON; figures without a
-finite value are None.
+Cards, terminal tables, report pages and JSON are made from it, and a model folder stores it as metrics. Figures
+are in millimetres and degrees. Figures that do not exist are unset and omitted from JSON; figures without a finite
+value are None.
 """
 
 import math
@@ -72,9 +72,9 @@ class RedundancyFigures(Section):
 
     Attributes:
         kept: an identifiable set of parameters.
-        removed: parameters whose effect is a linear combination of those of the kept ones.
+        removed: parameters whose effect is a linear combination of the effects of kept parameters.
         no_effect: parameters that change no measured value.
-        dependencies: combinations that are identifiable although single parameters are not, one sentence each.
+        dependencies: combinations that are identifiable although the individual parameters are not, one sentence each.
         pairwise_sets: sets of parameters that are redundant by the Pearson correlation of pairs.
         pairwise_kept: parameters that remain by this criterion.
     """
@@ -91,12 +91,12 @@ class OutlierFigures(Section):
     """A row with less than half of the full weight.
 
     Attributes:
-        row: number in the measurements, from 0.
+        row: index in the measurements, from 0.
         place: file and line.
         sensor: kind of sensor of the value.
         deviations: length of the residual, in standard deviations of one value.
         residual_mm: length of the residual [mm].
-        residual_deg: the same for an orientation [deg].
+        residual_deg: angle of the residual, for an orientation [deg].
     """
 
     row: int
@@ -114,9 +114,9 @@ class TrialFigures(Section):
         name: name of the trial, such as "gravity + series 56 + products (2, 2)".
         unknowns: number of parameters and weights.
         log_evidence: log evidence up to a constant of the data; None if it was not computed.
-        left_out: held-out RMS error of training rows over that of the geometric calibration [1].
-        seconds: time it took [s].
-        kept: whether it was better than the best trial before it.
+        left_out: ratio of the held-out RMS error of training rows to that of the geometric calibration [1].
+        seconds: duration [s].
+        kept: whether it was better than all previous trials.
     """
 
     name: str
@@ -128,7 +128,7 @@ class TrialFigures(Section):
 
 
 class LearnedFigures(Section):
-    """A joint correction that was kept.
+    """The joint correction that was kept.
 
     Attributes:
         features: name and settings of every feature.
@@ -153,7 +153,7 @@ class HybridFigures(Section):
     """Joint correction of a hybrid calibration.
 
     Attributes:
-        verdict: what was kept and why, as a sentence.
+        verdict: sentence that states what was kept and why.
         learned: the correction; None if none was kept.
         trials: the trials, in order.
     """
@@ -164,13 +164,13 @@ class HybridFigures(Section):
 
 
 class ScaleFigures(Section):
-    """A common factor on all measured lengths.
+    """Common factor on all measured lengths.
 
     Attributes:
-        factor: estimated over nominal lengths of the arm [1].
+        factor: ratio of estimated to nominal lengths of the arm [1].
         sigma: its standard deviation [1].
         odds: odds of a common factor against independent errors of the links, at most 1e6.
-        rms_mm: RMS error of true positions, about their mean, if the factor is an error of the sensor [mm].
+        rms_mm: RMS error of true positions about their mean if the factor is an error of the sensor [mm].
     """
 
     factor: float
@@ -192,7 +192,7 @@ class CalibrationSummary(AbstractSummary):
     Attributes:
         rows: number of rows of the calibration.
         fit_seconds: duration of the calibration without its validation [s].
-        status: why the search ended.
+        status: reason why the search ended.
         iterations: number of steps tried.
         rank: rank of the Jacobian: number of identifiable combinations of parameters.
         condition_number: condition number of the Jacobian of the free parameters.
@@ -202,7 +202,7 @@ class CalibrationSummary(AbstractSummary):
         redundancy: which parameters are identifiable.
         weak_directions: weakly identifiable directions, one sentence each.
         scale: common factor of the lengths, if positions were measured.
-        outliers: rows with less than half of the full weight, the worst first.
+        outliers: rows with less than half of the full weight, worst first.
         warnings: what to check or to measure next, one sentence each.
         rmse_mm: RMS residual of the first sensor at every iteration, starting with the initial guess.
         hybrid: joint correction of a hybrid calibration.
@@ -210,14 +210,14 @@ class CalibrationSummary(AbstractSummary):
         calibrated: errors of the rows of the calibration.
         test: errors of the rows that the file marks as test.
         held_out: errors of other simulated rows.
-        predicted_rms_mm: predicted RMS error at other poses if no row was held out, see `predicted_at_other_poses`
-            [mm].
+        predicted_rms_mm: predicted RMS error at other poses if no row was held out [mm]; see
+            `predicted_at_other_poses`.
         held_out_rows: hashes of the file of held-out rows.
         learning_curve: errors of held-out rows by the number of training rows.
-        redundant_sets: for recipes: sets of parameters that are redundant by pairs.
-        no_effect: for recipes: parameters without effect, by pairs.
-        pairwise_parameters: for recipes: number of parameters that remain by pairs.
-        paper: for recipes: published figures, by name.
+        redundant_sets: for recipes, sets of parameters that are redundant in pairs.
+        no_effect: for recipes, parameters without effect, found with `redundant_sets`.
+        pairwise_parameters: for recipes, number of parameters that remain after removing those redundant in pairs.
+        paper: for recipes, published figures by name.
     """
 
     kinds = ("geometric_calibration", "hybrid_calibration")
@@ -252,12 +252,12 @@ class CalibrationSummary(AbstractSummary):
 
     @property
     def validation_errors(self) -> ValidationFigures | None:
-        """Errors of held-out rows: of the cross-validation, else of simulated rows, else of the test set."""
+        """Errors of held-out rows: of the cross-validation, or else of simulated rows, or else of the test set."""
         return self.cross_validation or self.held_out or self.test
 
 
 def summarise(result: Result) -> CalibrationSummary:
-    """Gather the figures of a calibration, without those of its validation.
+    """Collect the figures of a calibration, without those of its validation.
 
     Args:
         result: geometric or hybrid calibration.

@@ -39,24 +39,25 @@ from pisigma.validation.held_out.trained_calibrations import (
 from pisigma.validation.held_out.validation_figures import LearningPoint, ValidationFigures
 
 _FEW_ROWS = 500
-"""Rows up to which folds are calibrated in parallel threads; larger folds need the memory for themselves."""
+"""Number of rows up to which folds are calibrated in parallel threads; larger folds need all of the memory."""
 
 
 @dataclass(frozen=True, eq=False)
 class CalibrationValidation:
-    """Errors of held-out rows, each under calibrations without it; NaN for rows that were never held out.
+    """Errors of held-out rows, each under calibrations without that row; NaN for rows that were never held out.
 
     Attributes:
         folds: number of folds; 1 if rows were held out once, 0 for a separate test set.
         models: errors by name: "nominal" (the nominal arm with base and tool fitted to the training rows), "geometric",
-            and "hybrid" if requested, which selects its features on the training rows alone.
+            and "hybrid" if requested, which selects its features using only the training rows.
         spread: position errors with their predicted standard deviations under the hybrid; None without a hybrid.
-        distances: errors of stated distances between sockets that were held out.
+        distances: errors of held-out stated distances between sockets.
         frames_fitted: number of frames that were held out completely; their bases were fitted to the held-out rows.
         sockets_held_out: number of sockets that were held out completely; their errors are relative to the mean
             predicted position of the ball.
-        not_judged: number of held-out rows whose target or anchor no training row has.
-        again: validations with other folds (repeats), whose errors count in the figures too.
+        not_judged: number of held-out rows that could not be evaluated, because no training row has their target or
+            anchor.
+        again: validations with other folds (repeats), whose errors are included in the figures.
     """
 
     folds: int
@@ -91,7 +92,8 @@ class CalibrationValidation:
         """Compute the statistics of all repeats in mm and deg.
 
         Args:
-            simulations: training and test rows of each of several simulations, whose RMS errors are listed one by one.
+            simulations: training and test rows of each of several simulations, whose RMS errors are listed
+                individually.
         """
         last = list(self.models.values())[-1]
         figures: dict[str, object] = {"folds": self.folds} if self.folds else {}
@@ -125,13 +127,13 @@ class JudgedFold:
     """Result of one fold: errors of its held-out rows under all models.
 
     Attributes:
-        test: numbers of the held-out rows.
+        test: indices of the held-out rows.
         errors: their errors by model.
         distances: errors of stated distances between sockets that its calibration did not use.
         spread: position errors and their predicted standard deviations under the hybrid.
         frames: number of frames that were held out completely.
         sockets: number of sockets that were held out completely.
-        not_judged: number of held-out rows that could not be judged.
+        not_judged: number of held-out rows that could not be evaluated.
     """
 
     test: Int64[Tensor, " rows"]
@@ -172,16 +174,16 @@ def validate(
     """Calibrate on the training rows of every split, and compute the errors of its test rows.
 
     Args:
-        calibrator: the calibrator; "nominal" is the geometric one without free parameters of the arm and with full
-            weight of all rows. Features and outliers are selected on the training rows only.
+        calibrator: the calibrator; "nominal" is its geometric calibrator without free parameters of the arm and with
+            full weight of all rows. Features and outliers are selected using only the training rows.
         measurements: the rows.
         splits: splits of `k_folds` or `holdout`.
         progress: called with the current fold and trial; not called from other processes.
         jobs: number of processes for the splits, with one thread each; None for threads of this process.
 
     Raises:
-        IdentificationError: the training rows of a split do not determine the parameters, or no test row has a target
-            or anchor that its training rows have.
+        IdentificationError: the training rows of a split do not determine the parameters, or they share no target or
+            anchor with its test rows.
     """
     judged = judged_folds(calibrator, measurements, [splits], progress, jobs)
     return joined_repeats(measurements, [splits], judged)
@@ -194,7 +196,7 @@ def judged_folds(
     progress: Progress = lambda what: None,
     jobs: int | None = None,
 ) -> Iterator[JudgedFold]:
-    """Judge every fold of every repeat, in threads or processes; see `fold_tasks` and `validate`."""
+    """Evaluate every fold of every repeat, in threads or processes; see `fold_tasks` and `validate`."""
     tasks = fold_tasks(calibrator, measurements, repeats, progress if jobs is None else no_progress)
     return (
         run_in_threads(tasks, measurements.rows > _FEW_ROWS)
@@ -209,7 +211,7 @@ def fold_tasks(
     repeats: Sequence[Sequence[TrainTest]],
     progress: Progress,
 ) -> list[Callable[[], JudgedFold]]:
-    """Make the functions that judge every fold of every repeat.
+    """Make the functions that evaluate every fold of every repeat.
 
     Args:
         calibrator: see `validate`.
@@ -232,7 +234,7 @@ def fold_tasks(
 def joined_repeats(
     measurements: Measurements, repeats: Sequence[Sequence[TrainTest]], judged: Iterator[JudgedFold]
 ) -> CalibrationValidation:
-    """Combine the judged folds of all repeats, in the order of `fold_tasks`."""
+    """Combine the evaluated folds of all repeats, in the order of `fold_tasks`."""
     first, *again = [_joined(measurements, [next(judged) for _ in splits], len(splits)) for splits in repeats]
     return replace(first, again=tuple(again))
 
@@ -245,7 +247,7 @@ def _judged_fold(
     distances: Mapping[PairOfSockets, float],
     progress: Progress,
 ) -> JudgedFold:
-    """Calibrate on the training rows of one split without some distances, and judge these and its test rows."""
+    """Calibrate on the training rows of a split without some distances, and evaluate these and the test rows."""
     progress(fold)
     train, test = split
     training = measurements.select(train)
@@ -288,9 +290,9 @@ def learning_curve(
         measurements: the rows.
         splits: training and test rows.
         sizes: numbers of training rows.
-        seed: random seed of the training rows; smaller draws are subsets of larger ones.
+        seed: random seed of the selection of training rows; smaller selections are subsets of larger ones.
         progress: called with the current step.
-        whole: validation with all training rows, as the last point of the curve; None for none.
+        whole: validation with all training rows, as the last point of the curve; None to omit it.
         jobs: see `validate`.
 
     Returns:
@@ -317,12 +319,12 @@ def learning_curve(
 def judge(
     calibrator: Calibrator, result: Result, training: Measurements, test: Measurements
 ) -> CalibrationValidation:
-    """Judge a calibration on a separate test set.
+    """Evaluate a calibration on a separate test set.
 
     Args:
         calibrator: the calibrator, for the "nominal" errors; see `validate`.
-        result: its result.
-        training: the rows that it was fitted to.
+        result: result of the calibrator.
+        training: the rows to which the calibration was fitted.
         test: the rows of the test set.
 
     Raises:
@@ -339,9 +341,9 @@ def _judge(
     distances: Mapping[PairOfSockets, float],
     rows: Measurements,
 ) -> JudgedFold:
-    """Judge all models on held-out rows, with missing frames fitted by a calibrator, if there is one.
+    """Evaluate all models on held-out rows; a calibrator, if given, fits missing frames.
 
-    Held-out distances between sockets are judged on all rows.
+    Held-out distances between sockets are evaluated on all rows.
     """
     if calibrator is not None:
         results = {name: with_frames(calibrator, fitted, held_out) for name, fitted in results.items()}
@@ -365,8 +367,9 @@ def pose_errors_of(result: ErrorPredictor, measurements: Measurements) -> PoseEr
     """Compute the errors of rows of any sensor under a calibration.
 
     Returns:
-        As `position` the length of the error of a row's measured length: the distance for a position or a ball in a
-        socket, the difference for a touch, a wire or a pair [m]. As `rotation` the same for its measured angle [rad].
+        `position` contains the length of the error of a row's measured length [m]: the distance for a position or a
+        ball in a socket, the difference for a touch, a wire or a pair. `rotation` contains the angle of its orientation
+        error [rad].
 
     Raises:
         IdentificationError: a row has a frame, target or anchor that was not calibrated.

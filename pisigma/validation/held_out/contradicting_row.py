@@ -14,7 +14,7 @@ class ContradictingRowFigures(Section):
     Attributes:
         row: index in the measurements, from 0.
         place: file and line.
-        residual_mm: length of its error under the model from the other rows [mm].
+        residual_mm: length of its error under the model fitted to the other rows [mm].
         residual_deg: angle of its orientation error [deg].
     """
 
@@ -25,7 +25,7 @@ class ContradictingRowFigures(Section):
 
     @property
     def sentence(self) -> str:
-        """Sentence on which row was left out, why, and what to do."""
+        """Sentence that states which row was left out, why, and what to do."""
         sizes = ((self.residual_mm, "mm"), (self.residual_deg, "deg"))
         missed = " and ".join(f"{size:.3g} {unit}" for size, unit in sizes if size is not None)
         return (
@@ -42,7 +42,7 @@ def contradicting_rows(
     Args:
         result: calibration with the other rows.
         rows: all rows.
-        wrong: numbers of the rows that were left out.
+        wrong: indices of the rows that were left out.
 
     Raises:
         IdentificationError: such a row has a frame, target or anchor that was not calibrated.

@@ -1,4 +1,4 @@
-"""Findings of the checks: why a calibration or rows must not be trusted, and warnings."""
+"""Findings of the checks: warnings, and reasons not to trust a calibration or rows."""
 
 from typing import Literal
 
@@ -7,7 +7,7 @@ from pydantic import Field
 from pisigma.files.yaml_file import Section
 
 Severity = Literal["implausible", "warning"]
-"""Whether the result must not be trusted ("implausible"), or should be checked ("warning")."""
+"""Whether the result must not be trusted ("implausible") or should be checked ("warning")."""
 
 
 class Diagnostic(Section):
@@ -17,11 +17,12 @@ class Diagnostic(Section):
         kind: kind of the finding, such as "search" or "prior_ratio"; one check may report several kinds.
         severity: "implausible": the result must not be trusted, and commands end with status 3; or "warning".
         sentence: what is wrong, where, and what to do.
-        rows: places (file and line) of the rows at fault; empty if all rows are concerned.
-        cause: what was found, among the findings of this kind, such as "frame" or "tool" of "row_order"; may be empty.
-        values: numbers and names of the sentence by name; the unit ends the name ("shift_mm"). Joints count from 1.
-            "log_odds" is the logarithm of the odds of the finding, "sigma" the standard deviation of its amount.
-        remedy: what to do, as at the end of the sentence; empty if the sentence says only what to check.
+        rows: file and line of each row at fault; empty if all rows are concerned.
+        cause: what was found, within the kind, such as "frame" or "tool" for "row_order"; may be empty.
+        values: numbers and names in the sentence, by name; names end with the unit ("shift_mm"). Joints are counted
+            from 1. "log_odds" is the logarithm of the odds of the finding, and "sigma" the standard deviation of its
+            amount.
+        remedy: what to do, as at the end of the sentence; empty if the sentence only says what to check.
     """
 
     kind: str

@@ -1,7 +1,7 @@
 """Figures of a distilled model as one typed value: its deviations from the full solutions that it approximates.
 
-Cards, tables on the screen and JSON are made from it, and a model folder stores it as metrics. Figures are in
-millimetres and degrees.
+Cards, terminal tables and JSON are made from it, and a model folder stores it as metrics. Figures are in millimetres
+and degrees.
 """
 
 from pisigma.files.yaml_file import Section
@@ -10,7 +10,7 @@ from pisigma.validation.held_out.validation_figures import ErrorFigures
 
 
 class ParentFigures(Section):
-    """The model that was distilled; `sha256` is that of its `model.yaml` if it was read from a folder."""
+    """The model that was distilled; `sha256` is the hash of its `model.yaml` if it was read from a folder."""
 
     name: str
     kind: str
@@ -43,12 +43,12 @@ class RegionFigures(Section):
 
 
 class PoseFigures(Section):
-    """Numbers of poses.
+    """Numbers of poses that were drawn, fitted and held out.
 
     Attributes:
         fitted: number of poses that the network was fitted to.
         held_out: number of held-out poses, used neither for fitting nor for selection.
-        beyond_measured_share: share of the held-out poses outside the joint range measured for the parent model.
+        beyond_measured_share: share of the held-out poses outside the joint ranges measured for the parent model.
         inside_domain_share: share of the held-out poses inside the domain.
         drawn: number of poses that were drawn in total.
         refused: number of drawn poses that were rejected, by reason.
@@ -63,7 +63,7 @@ class PoseFigures(Section):
 
 
 class SizeFigures(Section):
-    """A size of network that was tried.
+    """A network size that was tried.
 
     Attributes:
         orders: orders of the product units.
@@ -95,7 +95,7 @@ class DistilledErrors(Section):
 
     @property
     def models(self) -> dict[str, ErrorFigures]:
-        """All three, by name."""
+        """Errors of all three models, by name."""
         return {"nominal": self.nominal, "distilled": self.distilled, "full": self.full}
 
 
@@ -126,7 +126,7 @@ class DistillationSummary(AbstractSummary):
         sizes: sizes that were tried, in order.
         held_out: errors of the tool on held-out poses.
         joints: corrections and their errors on held-out poses.
-        warnings: reasons for which the model may be unsuitable, one sentence each.
+        warnings: reasons why the model may be unsuitable, one sentence each.
         limitations: features of the full solution that the distilled model lacks, one sentence each.
     """
 

@@ -1,4 +1,4 @@
-"""Calibrations of few rows: the arm stays nominal unless a fitted one predicts held-out rows better.
+"""Calibrations of few rows: the arm stays nominal unless a fitted arm predicts held-out rows better.
 
 A calibration and those of its cross-validation can run in parallel.
 """
@@ -31,22 +31,23 @@ from pisigma.validation.held_out.trained_calibrations import (
 
 _MIN_RATIO = 2.0
 """Measured values per parameter below which rows are few: the noise, and with it the prior scale, is then estimated
-from less than half of them."""
+from fewer than half of the values."""
 _MIN_RATIO_HELD_OUT = 1.25
-"""Values per parameter below which held-out rows cannot decide, because a fit without a pose has hardly more values
+"""Values per parameter below which held-out rows cannot decide, because a fit that omits a pose has hardly more values
 than parameters; an F test of the residuals of all rows decides instead."""
 _CHANCE = 1e-4
-"""Significance level of this test. In 10 and 11 random positions of the measured UR10 and UR5, the fitted arms that
-pass predict other rows with 0.6 and 0.25 times the error of the nominal arm (medians of 27 and 14 draws; the worst
-single one has 1.4 times)."""
+"""Significance level of this test. With 10 random positions of the measured UR10 and 11 of the UR5, the fitted arms
+that pass predict other rows with 0.6 and 0.25 times the error of the nominal arm (medians of 27 and 14 draws; the worst
+draw has 1.4 times the error)."""
 _MIN_POSES = 10
-"""Fewer poses cannot decide, even with orientations: 6 poses of the UR10 would give 0.6 to 2.4 times the error."""
+"""Smallest number of poses that can decide, even with orientations: 6 poses of the UR10 would give 0.6 to 2.4 times the
+error."""
 _USED_UP = 0.9
 """Share of the values of a sensor used up by the parameters above which its noise is not determined."""
 
 
 def fit_if_better(calibrator: Calibrator, rows: Measurements, progress: Progress) -> Result:
-    """Calibrate; with few rows, the fitted arm is kept only if it is shown to be better than the nominal one.
+    """Calibrate; with few rows, the fitted arm is kept only if it proves better than the nominal one.
 
     Args:
         calibrator: a calibrator of either kind.
@@ -54,7 +55,7 @@ def fit_if_better(calibrator: Calibrator, rows: Measurements, progress: Progress
         progress: called with the current step.
 
     Returns:
-        The calibration, or the nominal arm with base and tool fitted.
+        The calibration, or else the nominal arm with base and tool fitted.
 
     Raises:
         IdentificationError: see the calibrators' `fit`.
@@ -74,7 +75,7 @@ def fit_if_better(calibrator: Calibrator, rows: Measurements, progress: Progress
 def _helps(
     calibrator: GeometricCalibrator, result: CalibrationResult, rows: Measurements, progress: Progress
 ) -> bool:
-    """Return whether there are enough values per parameter, or else whether a fit predicts held-out poses better."""
+    """Return whether there are enough values per parameter, or if not, whether a fit predicts held-out poses better."""
     ratio = distinct_values(result.solved.problem) / max(result.solved.findings.estimated, 1)
     if ratio >= _MIN_RATIO:
         return True
@@ -84,7 +85,7 @@ def _helps(
         return distinct_rows(result.solved.problem) >= _MIN_POSES and _evident(calibrator, result, rows)
     try:
         errors = validate(calibrator, rows, k_folds(rows, None, seed=0), progress).models
-    except (IdentificationError, MeasurementError):  # without one pose, nothing can be fitted
+    except (IdentificationError, MeasurementError):  # with one pose left out, nothing can be fitted
         return False
     nominal, fitted = (errors[name].position.square().nanmean() for name in ("nominal", "geometric"))
     return not bool(fitted >= nominal)
@@ -118,16 +119,16 @@ def fit_with_folds(
         rows: the rows to calibrate with.
         training: rows of the cross-validation.
         repeats: training and test rows of every fold, per repeat; empty for no cross-validation.
-        progress: called with the current step of this process.
+        progress: callback that is called with the current step of this process.
         jobs: number of processes for the calibration and the folds, with one thread each; None for threads of this
             process.
 
     Returns:
-        The calibration, see `fit_if_better`, and the folds for `joined_repeats`.
+        The calibration (see `fit_if_better`), and the folds for `joined_repeats`.
 
     Raises:
-        IdentificationError: the rows do not determine the parameters; for a fold it is raised by the iterator.
-        MemoryError: a process was killed twice with the calibration or a fold.
+        IdentificationError: the rows do not determine the parameters; for a fold, the iterator raises it.
+        MemoryError: a process with the calibration or a fold was killed twice.
     """
     validating = with_stage(progress, "cross-validation")
     if jobs is None or not repeats:

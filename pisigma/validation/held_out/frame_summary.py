@@ -1,4 +1,4 @@
-"""Figures of a base, a tool or a hand-eye transform that was calibrated with the arm as given."""
+"""Figures of a base, a tool or a hand-eye transform that was calibrated with the arm held fixed."""
 
 import math
 from typing import Literal
@@ -20,10 +20,10 @@ class CoordinateFigures(Section):
     Attributes:
         name: name, such as "tool_x" or, with several targets, "tool_ball_x".
         unit: unit of the figures: "mm" or "deg".
-        nominal: value before.
+        nominal: value before the calibration.
         estimated: estimated value.
         standard_error: standard error of the estimate; None if the rows do not determine it.
-        by_noise: its share by the noise of the rows, without that of the arm's own uncertainty.
+        by_noise: part of the standard error due to the noise of the rows, without the uncertainty of the arm.
     """
 
     name: str
@@ -40,9 +40,9 @@ class CauseFigures(Section):
     Attributes:
         cause: "arm", "joint zeros", "joint noise", "camera" or "board".
         log_bayes_factor: log evidence with this cause alone, minus that with noise alone [nats].
-        share: share of the squared residuals, in units of their noise, that it explains alone.
+        share: share of the squared residuals, in units of their noise, that this cause alone explains.
         size: most probable size of its errors, with units.
-        named: whether the evidence names it.
+        named: whether the evidence supports it.
     """
 
     cause: str
@@ -57,15 +57,15 @@ class FrameSummary(AbstractSummary):
 
     Attributes:
         only: what was calibrated.
-        parent: model whose arm was used; None for a robot as drawn.
+        parent: model whose arm was used; None for a nominal robot.
         rows: number of rows, including those that were left out.
-        coordinates: what was calibrated, with standard errors.
-        weak_directions: what the rows hardly determine, one sentence each.
+        coordinates: calibrated coordinates, with standard errors.
+        weak_directions: directions that the rows hardly determine, one sentence each.
         noise: noise of each sensor, from the residuals.
         rms_mm: RMS residual of the positions [mm].
         rms_deg: RMS residual of the orientations [deg].
-        outliers: rows that were left out, as the others contradict them.
-        causes: possible causes of the residuals, those that the evidence names first; not set if not compared.
+        outliers: rows that were left out because the others contradict them.
+        causes: possible causes of the residuals, those supported by the evidence first; unset if not compared.
         warnings: warnings, one sentence each.
     """
 
@@ -89,7 +89,7 @@ def coordinate_figures(fit: FrameFit, arm_variance: tuple[float, ...]) -> tuple[
 
     Args:
         fit: the fit.
-        arm_variance: variance of every coordinate by the uncertainty of the arm [m² or rad²].
+        arm_variance: variance of every coordinate due to the uncertainty of the arm [m² or rad²].
     """
     lost, variances = fit.undetermined, fit.covariance.diagonal()
     figures = []
@@ -114,7 +114,7 @@ def coordinate_figures(fit: FrameFit, arm_variance: tuple[float, ...]) -> tuple[
 
 
 def weak_direction_sentences(fit: FrameFit) -> tuple[str, ...]:
-    """Return what the rows hardly determine, one sentence each."""
+    """Return a sentence for every direction that the rows hardly determine."""
     return tuple(
         f"the rows do not determine {one.words} (in mm and mrad; {_deviation_text(one.deviation)}); it keeps its "
         "previous value; measure other orientations"
@@ -155,7 +155,7 @@ def frame_summary(
     parent: ParentFigures | None,
     warnings: tuple[str, ...],
 ) -> FrameSummary:
-    """Gather the figures of a fit.
+    """Collect the figures of a fit.
 
     Args:
         fit: the fit.

@@ -1,4 +1,4 @@
-"""File of the errors of all held-out rows in a model folder, from which a report shows where they are."""
+"""File in a model folder with the errors of all held-out rows, from which a report shows where errors occur."""
 
 import csv
 import hashlib
@@ -35,7 +35,7 @@ class HeldOutRows:
         target: target of every row.
         models: lengths [m] and angles [rad] of the errors by model; NaN in rows that were never held out.
         residual: measured minus predicted position under the last model [m], in the row's frame; NaN in rows that were
-            never held out, and if it was not stored.
+            never held out, and if it is not stored.
         data_sha256: hash of the measurements.
     """
 
@@ -52,7 +52,7 @@ class HeldOutRows:
 
         Args:
             validation: the cross-validation.
-            measurements: its rows.
+            measurements: the rows that were validated.
         """
         spread = validation.spread
         residual = torch.full((measurements.rows, 3), torch.nan) if spread is None else spread.error
@@ -66,7 +66,7 @@ class HeldOutRows:
         )
 
     def to_csv(self, robot: Robot) -> str:
-        """Write CSV text: joint values, frame and target, and per model the errors in mm and deg.
+        """Write CSV text with joint values, frame, target, and the errors under every model in mm and deg.
 
         Args:
             robot: the robot, for the units of revolute (deg) and prismatic (mm) joints.
@@ -90,7 +90,7 @@ class HeldOutRows:
         return text.getvalue()
 
     def hashes(self, text: str) -> HeldOutFile:
-        """Compute the hashes that the metrics of the model store for this text and its measurements."""
+        """Compute the hashes of this text and its measurements, which the metrics of the model store."""
         return HeldOutFile(sha256=hashlib.sha256(text.encode()).hexdigest(), data_sha256=self.data_sha256)
 
 
@@ -98,7 +98,7 @@ def read_held_out(folder: Path, model: CalibratedModel) -> HeldOutRows | None:
     """Read the file of a model folder; None if the model was made without one.
 
     Raises:
-        ModelError: the file is missing, or is not the one that was written with the model.
+        ModelError: the file is missing, or is not the one written with the model.
     """
     summary = CalibrationSummary.read(model)
     if summary is None or summary.held_out_rows is None:

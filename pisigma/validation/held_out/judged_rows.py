@@ -24,9 +24,9 @@ from pisigma.validation.held_out.pose_statistics import PoseErrors
 from pisigma.validation.held_out.reference_models import nominal_model
 
 _MIN_REPEATS = 10
-"""Degrees of freedom that repeated rows need to show the scatter."""
+"""Degrees of freedom that repeated rows must have for an estimate of the scatter."""
 MAX_PREDICTED = 4_000
-"""Rows at which the accuracy is predicted, evenly over all: each takes a millisecond."""
+"""Number of evenly spaced rows at which the accuracy is predicted; each takes a millisecond."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,8 +44,8 @@ class JudgedRows:
         predicted: standard deviation of the predicted position [m]; NaN if there is none.
         inside: whether every joint value is in the range measured for the model.
         left_out: number of rows of the file that are marked as training rows and are not included.
-        again: warnings of duplicate rows and of training rows of the model.
-        nominal: base and tool of "nominal": "fitted" to the model's poses, as "given" to a model that was not
+        again: warnings about duplicate rows and training rows of the model.
+        nominal: origin of base and tool of "nominal": "fitted" to the model's poses, "given" for a model that was not
             calibrated, or those of the "model" if it stores too few poses; None for held-out rows.
         unknown: number of rows without a position error.
         repeats: number of repeats of the cross-validation; the errors are those of the first one.
@@ -77,7 +77,7 @@ class JudgedRows:
 
     @property
     def scatter(self) -> float | None:
-        """Pooled scatter of positions at equal joint values, as RMS length [mm]; None with too few repeats."""
+        """Pooled scatter of positions at equal joint values, as RMS length [mm]; None if there are too few repeats."""
         finite = torch.isfinite(self.residual).all(-1)
         if int(finite.sum()) <= _MIN_REPEATS:
             return None
@@ -95,7 +95,7 @@ class JudgedRows:
 def rows_of_file(
     model: CalibratedModel, measurements: Measurements, held_out: HeldOutRows | None
 ) -> JudgedRows:
-    """Judge the rows of a file without training rows of the model; only those marked as test if there are any.
+    """Evaluate the rows of a file without training rows of the model; only rows marked as test if there are any.
 
     Args:
         model: the model.
@@ -103,7 +103,7 @@ def rows_of_file(
         held_out: held-out rows that the model folder stores, or None.
 
     Raises:
-        MeasurementError: no row can be judged.
+        MeasurementError: no row can be evaluated.
     """
     rows = _test_rows(measurements)
     left_out = measurements.rows - rows.rows
@@ -143,7 +143,7 @@ def rows_of_file(
 
 
 def rows_of_folder(model: CalibratedModel, held_out: HeldOutRows) -> JudgedRows:
-    """Return the held-out rows that a model folder stores, as judged rows."""
+    """Return the held-out rows that a model folder stores, as `JudgedRows`."""
     rows = Measurements(
         q=held_out.q, frame=held_out.frame, target=held_out.target, source=model.provenance.data_source
     )
@@ -209,7 +209,7 @@ def _repeats(model: CalibratedModel) -> int:
 
 
 def _nominal_poses(model: CalibratedModel, rows: Measurements) -> tuple[Float64[Tensor, "rows 4 4"], bool]:
-    """Predict poses of the nominal robot with base and tool fitted, and say whether they could be fitted."""
+    """Predict poses of the nominal robot with base and tool fitted, and return whether they could be fitted."""
     try:
         nominal = nominal_model(model, rows.rotation is not None)
     except ModelError:
@@ -220,7 +220,7 @@ def _nominal_poses(model: CalibratedModel, rows: Measurements) -> tuple[Float64[
 def _errors(
     T: Float64[Tensor, "rows 4 4"], rows: Measurements
 ) -> tuple[PoseErrors, Float64[Tensor, "rows 3"]]:
-    """Compute errors of rows, and the signed ones of positions; for balls in sockets relative to their mean."""
+    """Compute the errors of rows, and signed errors of positions; balls in sockets are relative to their mean."""
     position = torch.full_like(T[:, :3, 3], torch.nan) if rows.position is None else rows.position
     residual = position - T[:, :3, 3]
     if rows.socket is not None:

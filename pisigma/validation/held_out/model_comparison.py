@@ -1,4 +1,4 @@
-"""Comparison of models on the same rows: their errors, the differences, and confidence intervals of both."""
+"""Comparison of models on the same rows: errors, differences of errors, and confidence intervals of both."""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -25,15 +25,15 @@ from pisigma.validation.held_out.validation_figures import SocketDistances
 from pisigma.validation.resampling import Bootstrap
 
 Interval = tuple[float, float]
-"""Lower and upper end."""
+"""Lower and upper end of a confidence interval."""
 _UNITS = {"position": ("mm", 1e3), "orientation": ("deg", float(np.rad2deg(1.0)))}
 """Unit of every quantity in tables and files, and its factor from SI units."""
 STATISTICS = ("mean", "rms", "p95")
-"""Statistics with a confidence interval; the maximum has none, because no resample exceeds the measured one."""
+"""Statistics with a confidence interval; the maximum has none, because no resample exceeds the measured maximum."""
 _QUANTILE = 0.95
 """Quantile of the statistic "p95"."""
 _BATCH = 2**16
-"""Indices that are drawn at a time."""
+"""Number of indices that are drawn at a time."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Intervals:
 
     Attributes:
         value: lower and upper end of each statistic of each model; NaN if there is only one configuration.
-        difference: the same for its difference to that of the first model.
+        difference: the same for the difference from the first model.
     """
 
     value: Float64[np.ndarray, "statistics models 2"]
@@ -88,7 +88,7 @@ def confidence_intervals(
 def statistics(
     errors: Float64[np.ndarray, " rows"], times: Int64[np.ndarray, "*resamples rows"]
 ) -> Float64[np.ndarray, "statistics *resamples"]:
-    """Compute mean, RMS and 95 % quantile of errors of which each occurs some times, in the order of `STATISTICS`."""
+    """Compute mean, RMS and 95 % quantile of errors with given multiplicities, in the order of `STATISTICS`."""
     order = np.argsort(errors)
     errors, times = errors[order], times[..., order]
     last = times.cumsum(-1)
@@ -134,7 +134,7 @@ class QuantityErrors:
             rows have lengths instead of positions.
         inside: `statistics` of the rows inside the model's domain; empty if there are none or the model has no domain.
         outside: the same for the rows outside it.
-        difference: difference to the first model; None for the first one.
+        difference: difference from the first model; None for the first model.
     """
 
     unit: str
@@ -156,7 +156,7 @@ class ModelFigures:
         position: errors of positions, and of the lengths of other sensors in rows without a position.
         orientation: errors of orientations; None if none was measured.
         rows_inside: number of compared rows inside the model's domain; None if it has no domain.
-        rows_outside: the same outside it.
+        rows_outside: number of compared rows outside it; None if it has no domain.
     """
 
     name: str
@@ -206,7 +206,7 @@ class ModelComparison:
     Attributes:
         models: figures of the models, in the given order.
         rows: number of compared rows.
-        rows_without_position: number of rows without a position or another length that can be judged.
+        rows_without_position: number of rows without a position or another length that can be evaluated.
         configurations: number of different configurations of the compared rows.
         bootstrap: settings of the confidence intervals.
         socket_distance: errors of stated distances between sockets; None if none is stated.
@@ -246,7 +246,7 @@ def compare_models(
 
     Args:
         models: one or more models by name.
-        measurements: the rows, in the frames that the models were fitted in.
+        measurements: the rows, in the frames in which the models were fitted.
         bootstrap: settings of the confidence intervals; None for `Bootstrap()`.
         fitted: frames or targets that are fitted to the rows for every model; see `errors_in_fitted_frames`.
         socket_distances: stated distances between sockets of the rows [m].
@@ -307,16 +307,16 @@ def compare_models(
 def _distances(
     models: Mapping[str, CalibratedModel], rows: Measurements, stated: Mapping[PairOfSockets, float]
 ) -> SocketDistances | None:
-    """Compute the figures of stated distances between sockets, each at the mean predicted position of its ball."""
+    """Compute the figures of stated distances between sockets at the mean predicted positions of their balls."""
     poses = {name: poses_of_rows(model, rows) for name, model in models.items() if stated}
     return distance_figures([DistanceErrors.from_poses(poses, stated, rows)])
 
 
 def inside_domain(model: CalibratedModel, measurements: Measurements) -> Bool[Tensor, " rows"] | None:
-    """Return which rows are inside a model's domain, in which its correction was learned.
+    """Return the mask of rows inside a model's domain, in which its correction was learned.
 
     Returns:
-        None if the model has no domain, as geometric calibrations.
+        The mask; None if the model has no domain, as for geometric calibrations.
     """
     if model.hybrid is not None:
         return model.hybrid.coverage.contains(measurements.q)
@@ -338,7 +338,7 @@ def _quantity(
     group: Int64[Tensor, " rows"],
     bootstrap: Bootstrap,
 ) -> list[QuantityErrors]:
-    """Compute the figures of one quantity for all models, on the common rows that have it under all models."""
+    """Compute the figures of a quantity for all models, on the common rows that have it under all models."""
     unit, factor = _UNITS[quantity]
     stacked = torch.stack(list(vectors)) * factor
     there = common & torch.isfinite(stacked).all(-1).all(0)

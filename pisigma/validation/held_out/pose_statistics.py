@@ -1,4 +1,4 @@
-"""Errors of measured poses under a model, their statistics, and the errors that a calibration predicts."""
+"""Errors of measured poses under a model, statistics of these errors, and errors that a calibration predicts."""
 
 import math
 from collections.abc import Sequence
@@ -21,7 +21,7 @@ from pisigma.robot.se3 import rotation_vector
 from pisigma.validation.held_out.validation_figures import ErrorFigures
 
 WITHIN = 1.96
-"""[standard deviations] Half the width of a 95 % interval of a normal distribution."""
+"""Half the width of a 95 % interval of a normal distribution [standard deviations]."""
 _OTHER_POSES = 5
 """Poses per row at which a calibration predicts its errors; their joint values are those of the rows, permuted."""
 
@@ -91,14 +91,14 @@ class PoseErrors:
         return PoseErrors(nothing, nothing.clone() if turned else None)
 
     def set_rows(self, rows: Int64[Tensor, " some"], errors: "PoseErrors") -> None:
-        """Set the errors of some rows in place; rotations only if both have some."""
+        """Set the errors of some rows in place; rotations are set only if both objects have them."""
         self.position[rows] = errors.position
         if self.rotation is not None and errors.rotation is not None:
             self.rotation[rows] = errors.rotation
 
     @staticmethod
     def concatenate(several: Sequence["PoseErrors"]) -> "PoseErrors":
-        """Concatenate errors, which all have orientations or none has."""
+        """Concatenate errors, all of which, or none of which, have orientations."""
         rotations = [errors.rotation for errors in several if errors.rotation is not None]
         return PoseErrors(
             torch.cat([errors.position for errors in several]), torch.cat(rotations) if rotations else None
@@ -169,7 +169,7 @@ class Comparison:
     Attributes:
         nominal: errors without the correction (base and tool as fitted).
         corrected: errors with it; NaN in the same rows.
-        not_predicted: number of rows that are left out of both, because the model has no prediction there.
+        not_predicted: number of rows that are left out of both because the model has no prediction for them.
     """
 
     nominal: PoseErrors
@@ -178,7 +178,7 @@ class Comparison:
 
     @staticmethod
     def from_errors(nominal: PoseErrors, corrected: PoseErrors) -> "Comparison":
-        """Compare on the rows for which both have errors."""
+        """Compare the errors on the rows for which both are available."""
         both = ~(torch.isfinite(nominal.position) & torch.isnan(corrected.position))
         return Comparison(nominal.mask_other_rows(both), corrected, int((~both).sum()))
 
@@ -202,7 +202,7 @@ class PredictedSpread:
 
     Attributes:
         error: measured minus predicted position along the axes of the row's frame [m]; NaN if a row has no position or
-            was not judged.
+            was not evaluated.
         sigma: predicted standard deviation of the error, including measurement noise [m]; NaN in the same rows.
     """
 
@@ -234,7 +234,7 @@ class PredictedSpread:
         return float(inside[self._judged].double().mean())
 
     def in_file_units(self) -> dict[str, float]:
-        """Return the coverage and the RMS predicted position error [mm]; empty without rows."""
+        """Return the coverage and the RMS predicted position error [mm]; empty if there are no rows."""
         if not self.values:
             return {}
         rows = self._judged.all(-1)
@@ -277,8 +277,8 @@ def predicted_at_other_poses(
 ) -> float | None:
     """Compute the RMS position error, including noise, that a calibration predicts at other poses [m].
 
-    Other poses have the joint values of the rows, permuted independently for every joint. At the rows themselves the
-    predicted errors are smaller than at other poses between them, several times so for few rows.
+    Other poses have the joint values of the rows, permuted independently for every joint. The predicted errors are
+    smaller at the rows themselves than at poses between them, by a factor of several for few rows.
 
     Args:
         result: the calibration.

@@ -54,7 +54,7 @@ class SignedRank:
         statistic: the smaller of the rank sums of positive and of negative differences.
         z: standardised statistic, at most 0; 0 if there is no difference.
         p: two-sided p-value for a symmetric distribution about 0.
-        pairs: number of differences that are not 0; the others are left out.
+        pairs: number of nonzero differences; the others are left out.
     """
 
     statistic: float

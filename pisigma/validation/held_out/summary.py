@@ -13,7 +13,7 @@ Summary = TypeVar("Summary", bound="AbstractSummary")
 
 
 class AbstractSummary(Section):
-    """All figures of a model. Figures that do not exist are not set and are omitted from JSON.
+    """All figures of a model. Figures that do not exist are unset and omitted from JSON.
 
     Attributes:
         kinds: kinds of models that have these metrics.
@@ -38,7 +38,7 @@ class AbstractSummary(Section):
         """Return the figures that a model stores.
 
         Returns:
-            The figures; None for a model of another kind or without figures.
+            The figures; None for a model of another kind, or one without figures.
 
         Raises:
             ModelError: the figures do not have the form of this version.

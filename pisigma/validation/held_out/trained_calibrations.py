@@ -1,4 +1,4 @@
-"""Calibrations of the same training rows that are compared by their predictions of other rows."""
+"""Calibrations fitted to the same training rows, to be compared by their predictions of other rows."""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -96,9 +96,9 @@ def drop_missing_frames(
     Args:
         calibrator: calibrator for all rows.
         rows: the rows to which the calibrator will be fitted.
-        all_rows: rows of all folds; frames and distances that all rows lack are kept, so that the calibrator refuses
-            them.
-        held_out: socket distances to remove in addition.
+        all_rows: rows of all folds; frames and distances that all of these rows lack are kept, so that the calibrator
+            refuses them.
+        held_out: further socket distances to remove.
     """
     if isinstance(calibrator, HybridCalibrator):
         geometric = drop_missing_frames(calibrator.geometric, rows, all_rows, held_out)
@@ -175,7 +175,7 @@ def _bases(
 
 
 def judgeable_rows(measurements: Measurements, test: Tensor, training: Measurements) -> Tensor:
-    """Return the mask of test rows whose target and anchor (unless stated) are also in training rows.
+    """Return the mask of test rows whose target and anchor (unless stated) also occur in training rows.
 
     Args:
         measurements: all rows.
@@ -183,10 +183,10 @@ def judgeable_rows(measurements: Measurements, test: Tensor, training: Measureme
         training: the training rows.
 
     Returns:
-        One bool per test row.
+        One boolean per test row.
 
     Raises:
-        IdentificationError: no test row can be judged.
+        IdentificationError: no test row can be evaluated.
     """
     targets, anchors = set(training.target), {*(training.anchor or ()), ""}
     names = measurements.anchor or ("",) * measurements.rows
@@ -228,9 +228,10 @@ class DistanceErrors:
         """Return the errors under several calibrations, with sockets at the mean predicted position of their balls.
 
         Args:
-            poses: predicted poses of the target in every row by name of a calibration without these distances.
+            poses: predicted poses of the target in every row, by name of a calibration that does not use these
+                distances.
             stated: the distances [m].
-            rows: rows of the sockets, and others.
+            rows: the rows, including those of the sockets.
         """
         errors, sockets = {}, tuple({one for pair in stated for one in pair})
         for model, T in poses.items():
@@ -245,7 +246,7 @@ class DistanceErrors:
 
     @staticmethod
     def concatenate(parts: "Sequence[DistanceErrors]") -> "DistanceErrors":
-        """Return the errors of several folds as one."""
+        """Concatenate the errors of several folds."""
         there = [part for part in parts if part.stated]
         stated = {pair: distance for part in there for pair, distance in part.stated.items()}
         names = there[0].errors if there else ()
@@ -259,9 +260,10 @@ def held_out_distances(
 ) -> tuple[dict[PairOfSockets, float], ...]:
     """Assign every stated distance to one fold, whose calibration does not use it.
 
-    This is the fold without rows of one of the sockets; otherwise distances are assigned to the folds cyclically, as
-    long as one distance remains in the fold, because a calibration without distances does not determine the scale.
-    Distances of a socket that no row has are assigned to no fold, so that the calibrations refuse them.
+    If a fold has no rows of one of the sockets, the distance is assigned to that fold. Otherwise distances are assigned
+    to the folds cyclically, as long as one distance remains in the fold, because a calibration without distances does
+    not determine the scale. Distances of a socket that occurs in no row are assigned to no fold, so that the
+    calibrations refuse them.
     """
     names = measurements.socket or ()
     known = [{names[row] for row in train.tolist()} if names else set() for train, _ in splits]
@@ -278,7 +280,7 @@ def held_out_distances(
 
 
 def distance_figures(repeats: Sequence[DistanceErrors]) -> SocketDistances | None:
-    """Return the figures of several repeats [mm]; None if no distance was judged."""
+    """Return the figures of several repeats [mm]; None if no distance was evaluated."""
     repeats = [one for one in repeats if one.stated]
     if not repeats:
         return None

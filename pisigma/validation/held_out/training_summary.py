@@ -1,4 +1,4 @@
-"""Results of training networks on joint errors: joint errors before and after the correction, and all figures."""
+"""Results of training networks on joint errors: joint errors before and after the correction, and other figures."""
 
 import math
 from collections.abc import Mapping
@@ -142,7 +142,7 @@ class JointFigures(Section):
 
 
 class RowFigures(Section):
-    """Numbers of rows that were used for training, left out by a rule, and held out as the set "test"."""
+    """Numbers of rows used for training, left out by a rule, and held out as the set "test"."""
 
     used: int
     left_out: int
@@ -156,7 +156,7 @@ class ComparisonFigures(Section):
     Attributes:
         folds: number of folds of a cross-validation.
         rows: number of rows of a test set.
-        rows_not_predicted: number of rows that are not compared, because the model has no prediction for them.
+        rows_not_predicted: number of rows that are not compared because the model has no prediction for them.
         nominal: errors without the correction, with base and tool as fitted.
         corrected: errors with the correction.
     """
@@ -194,7 +194,7 @@ class ComparisonFigures(Section):
 
     @property
     def increased_maxima(self) -> tuple[str, ...]:
-        """Quantities whose largest error the correction increases by more than rounding."""
+        """Quantities whose largest error is increased by the correction by more than rounding."""
         nominal, corrected = self.nominal.figures_by_name, self.corrected.figures_by_name
         return tuple(
             name
@@ -205,7 +205,7 @@ class ComparisonFigures(Section):
 
     @property
     def recommendation(self) -> Recommendation:
-        """Recommendation about the use of the correction."""
+        """Recommendation on the use of the correction."""
         effects = self.effects.values()
         if "lowers" not in effects:
             return "do not use it"
@@ -213,7 +213,7 @@ class ComparisonFigures(Section):
 
     @property
     def verdict(self) -> str:
-        """Effect of the correction on held-out rows, and whether to use it, as a sentence."""
+        """Sentence on the effect of the correction on held-out rows and on whether to use it."""
         nominal, corrected = self.nominal.figures_by_name, self.corrected.figures_by_name
         findings = []
         for name, effect in self.effects.items():
@@ -227,7 +227,7 @@ class ComparisonFigures(Section):
 
 
 class TrainingSummary(AbstractSummary):
-    """All figures of a training of networks.
+    """All figures of a training run.
 
     Attributes:
         rows: numbers of rows.
@@ -295,7 +295,7 @@ def _effect(before: float, after: float) -> Effect:
 
 
 def _rise(before: float, after: float, unit: str) -> str:
-    """Return a clause that the largest error increases, or "" if it does not within the digits shown."""
+    """Return a clause stating that the largest error increases; "" if it does not within the digits shown."""
     texts = f"{before:.3f}", f"{after:.3f}"
     rises = after > before and texts[0] != texts[1]
     return f"the largest rises from {texts[0]} to {texts[1]} {unit}" if rises else ""

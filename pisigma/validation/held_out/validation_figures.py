@@ -66,7 +66,7 @@ class AbstractValidationFigures(Section):
 
     Attributes:
         folds: number of folds of the cross-validation; 1 if rows were held out once; not set for a test set.
-        repeats: number of repeats of the cross-validation, if there are several.
+        repeats: number of repeats of the cross-validation, if more than one.
         rms_mm_of_repeats: RMS position error of each repeat by calibration [mm].
         nominal: errors of the nominal robot, with base and tool fitted to the training rows.
         geometric: errors of the geometric calibration.
@@ -76,7 +76,8 @@ class AbstractValidationFigures(Section):
         socket_distance: errors of stated distances between sockets that were held out.
         frames_fitted: number of frames that were held out completely; their bases were fitted to the held-out rows.
         sockets_held_out: number of sockets that were held out completely.
-        rows_not_judged: number of held-out rows whose target or anchor no training row has.
+        rows_not_judged: number of held-out rows that could not be evaluated, because no training row has their target
+            or anchor.
     """
 
     folds: int | None = None
@@ -94,7 +95,7 @@ class AbstractValidationFigures(Section):
 
     @property
     def models(self) -> dict[str, ErrorFigures]:
-        """Figures of the calibrations that were judged, by name."""
+        """Figures of the evaluated calibrations, by name."""
         return {name: figures for name in MODELS if (figures := getattr(self, name)) is not None}
 
 
@@ -113,7 +114,7 @@ class ValidationFigures(AbstractValidationFigures):
 
 
 class LearningPoint(AbstractValidationFigures):
-    """Errors of held-out rows under calibrations with `rows` training rows; `held_out` rows were judged."""
+    """Errors of `held_out` held-out rows under calibrations fitted to `rows` training rows."""
 
     rows: int
     held_out: int

@@ -81,8 +81,8 @@ def largest_cube(
     nearest to the middle of the region is returned.
 
     Args:
-        reaches: function that returns whether positions in the base frame [m] are reachable with the tested
-            orientation.
+        reaches: function that returns whether positions in the base frame [m] are reachable with the orientation under
+            test.
         low: lowest corner of the region to search [m].
         high: highest corner of the region to search [m].
         spacing: spacing of the grid [m]; the edge of the cube is a multiple of the spacing.

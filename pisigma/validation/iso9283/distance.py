@@ -1,4 +1,4 @@
-"""Distance accuracy AD and distance repeatability RD: commanded and attained distances between two poses."""
+"""Distance accuracy AD and distance repeatability RD, from commanded and attained distances between two poses."""
 
 from dataclasses import dataclass
 

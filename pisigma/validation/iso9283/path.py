@@ -1,4 +1,4 @@
-"""Path accuracy AT and path repeatability RT, and measured paths at the points of the commanded path."""
+"""Path accuracy AT and path repeatability RT, and resampling of measured paths at the points of the command."""
 
 from dataclasses import dataclass
 
@@ -33,7 +33,7 @@ class PathPoints:
 
 
 def path_tangents(command: Float[Tensor, "points 3"]) -> Float[Tensor, "points 3"]:
-    """Compute unit vectors along a commanded path [1], at inner points from the neighbours on either side.
+    """Compute unit vectors along a commanded path [1]; those at inner points follow from both neighbours.
 
     Raises:
         MeasurementError: there is only one point, or neighbours coincide.
@@ -135,7 +135,7 @@ def _crossings(
     tangents: Float[Tensor, "some 3"],
     first: int,
 ) -> tuple[Tensor, Tensor]:
-    """Return for every path and command point the segment that crosses the plane, and the position on it (0 to 1)."""
+    """Return the segment that crosses the plane, for every path and command point, and the position on it (0 to 1)."""
     off = measured[:, None] - command[:, None]
     ahead = (off * tangents[:, None]).sum(-1)
     before, behind = ahead[..., :-1], ahead[..., 1:]

@@ -1,4 +1,4 @@
-"""Pose accuracy AP, pose repeatability RP, their drift, and the variation with the direction of approach."""
+"""Pose accuracy AP, pose repeatability RP, drift of both, and variation with the direction of approach."""
 
 from dataclasses import dataclass
 
@@ -15,7 +15,7 @@ class Accuracy:
     """Difference between the mean attained value and the command.
 
     Attributes:
-        length: for positions the distance, for distances the error of the length [m].
+        length: distance of positions, or error of a distance [m].
         axes: signed components along x, y, z [m].
     """
 
@@ -89,7 +89,7 @@ def directional_position_variation(
     `vAP_P = max_{h,k} √((x̄_h - x̄_k)² + (ȳ_h - ȳ_k)² + (z̄_h - z̄_k)²)`.
 
     Args:
-        attained: positions [m]; the standard requires three directions, perpendicular to each other.
+        attained: positions [m]; the standard requires three mutually perpendicular directions.
     """
     middle = barycentre(attained)
     apart = middle[..., :, None, :] - middle[..., None, :, :]
@@ -113,7 +113,7 @@ def accuracy_drift(accuracy: Float[Tensor, "times *kinds"]) -> Float[Tensor, "ti
     """Compute the drift of pose accuracy dAP (ISO 9283:1998, 7.6): `dAP = |AP_{t=1} - AP_{t=T}|`.
 
     Args:
-        accuracy: AP at every time, of positions [m] or of angles [rad], such as `position_accuracy(...).length` of
+        accuracy: AP at every time, of positions [m] or of angles [rad], for example `position_accuracy(...).length` of
             `(times, n, 3)`.
 
     Returns:
@@ -152,7 +152,7 @@ def barycentre(attained: Float[Tensor, "*batch n 3"]) -> Float[Tensor, "*batch 3
 
 
 def check_repeats(attained: Float[Tensor, "*batch n 3"], of: str) -> None:
-    """Refuse fewer than two repeats, which have no spread.
+    """Refuse a single repeat, which has no spread.
 
     Args:
         attained: values of the n repeats.

@@ -16,7 +16,7 @@ from pisigma.validation.iso9283.pose import barycentre, position_accuracy, posit
 CYCLES = 30
 """Number of repeats of a pose that ISO 9283:1998 requires."""
 MIN_CYCLES = 10
-"""Number of repeats below which RP is not computed, because the spread of few distances is far too small."""
+"""Number of repeats below which RP is not computed, because few distances underestimate the spread."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class RepeatedPose:
 
 
 def pooled_deviation(poses: Sequence[RepeatedPose]) -> tuple[float, int] | None:
-    """Return the pooled scatter of a coordinate over poses that were measured more than once.
+    """Return the pooled scatter of one coordinate over poses that were measured more than once.
 
     `s² = Σ_poses Σ_j |x_j - x̄|² / (3 Σ_poses (n - 1))`, with `3 Σ (n - 1)` degrees of freedom; s contains the noise
     of the instrument.

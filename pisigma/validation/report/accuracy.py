@@ -1,4 +1,4 @@
-"""Accuracy before and after calibration, on every set of rows with known errors, and what limits it."""
+"""Accuracy before and after calibration on every set of rows with known errors, and the limits of the accuracy."""
 
 import math
 from collections.abc import Mapping
@@ -21,12 +21,10 @@ DOMINANT_SHARE = 0.8
 _JOINT_ROWS = (("held_out", True), ("training", False))
 
 RowOrigin = Literal["file", "training", "test", "cross_validation", "simulation", "poses"]
-"""Origin of the rows to which errors belong.
-
-"file": rows of a file with which the model was not calibrated. "training": rows with which it was calibrated. "test":
-rows that its file marks as test. "cross_validation": rows held out in k-fold cross-validation, or once.
-"simulation": other rows of a simulation. "poses": poses of a region, on which a distilled model was compared with its
-parent.
+"""Origin of the rows to which errors belong. "file": rows of a file that was not used to calibrate the model.
+"training": rows with which the model was calibrated. "test": rows that its file marks as test. "cross_validation": rows
+held out in k-fold cross-validation, or once. "simulation": other rows of a simulation. "poses": poses of a region, on
+which a distilled model was compared with its parent.
 """
 
 
@@ -37,8 +35,8 @@ class Accuracy:
     Attributes:
         origin: origin of the rows.
         rows: number of rows.
-        models: error figures by the name of the model, "nominal" first; the last is the model of the report.
-        source: file of the rows; for "poses" the name of the parent model, to whose poses the errors refer.
+        models: error figures by name of the model, "nominal" first and the model of the report last.
+        source: file of the rows; for "poses", the name of the parent model, to whose poses the errors are relative.
         validation: figures of the cross-validation, with its folds and repeats; None for other rows.
     """
 
@@ -96,7 +94,7 @@ def accuracies(
 
 
 def figures_of(errors: PoseErrors) -> ErrorFigures:
-    """Compute the statistics of position errors [mm] and orientation errors [deg], as far as there are any."""
+    """Compute the statistics of position errors [mm] and orientation errors [deg], if there are any."""
     figures: dict[str, float] = {}
     for values, unit, factor in ((errors.position, "mm", 1e3), (errors.rotation, "deg", 180 / torch.pi)):
         if values is not None and bool(torch.isfinite(values).any()):

@@ -18,7 +18,7 @@ from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.kinematics.tolerances import MEASURED_ROUNDING
 
 _POINTS_PER_CURVE = 1_500
-"""Number of points of a curve: 13 points per period of the 110th harmonic over a revolution."""
+"""Number of points of a curve, which gives 13 points per period of the 110th harmonic over a revolution."""
 _ROWS_PER_CHUNK = 4_096
 """Number of rows for which the correction is computed at a time, to limit the memory."""
 _STRONG_CORRELATION = 0.9
@@ -122,7 +122,7 @@ class CorrectionCurve:
 
     @property
     def measured_range(self) -> tuple[float, float] | None:
-        """Lowest and highest measured value [`unit`]; None if the whole curve or nothing was measured."""
+        """Lowest and highest measured value [`unit`]; None if the whole curve, or none of it, was measured."""
         inside = self.values[self.measured]
         low, high = inside.min(initial=math.inf), inside.max(initial=-math.inf)
         return (float(low), float(high)) if not self.measured.all() and high > low else None
@@ -131,7 +131,7 @@ class CorrectionCurve:
 def correction_curves(model: CalibratedModel) -> tuple[CorrectionCurve, ...]:
     """Compute the curves of all corrected joints; empty for a model without a learned correction.
 
-    The other joints have the values of the stored row that is nearest to the median of all rows.
+    The other joints have their values in the stored row that is nearest to the median of all rows.
     """
     robot, hybrid, q = model.robot, model.hybrid, model.starts
     if (hybrid is None and model.network is None) or not len(q):

@@ -17,7 +17,7 @@ from pisigma.validation.held_out.rank_tests import SIGNIFICANT, groups_differ, r
 NOTABLE_RATIO = 1.25
 """Ratio of the largest to the smallest RMS error of bins below which a dependence is small."""
 _ORDERED = 0.3
-"""Rank correlation of a joint with the order of the rows above which time and position are hard to separate."""
+"""Rank correlation of a joint with the order of the rows above which time and position are hard to distinguish."""
 _MAX_BINS = 12
 """Largest number of bins of a joint's measured values."""
 MIN_ROWS = 8
@@ -68,8 +68,8 @@ class OrderTest:
         p: two-sided probability of such a correlation by chance.
         change: mean error of the last tenth of the rows minus that of the first, in the unit of the errors; 0 if the
             correlation is not significant.
-        ordered_joint: number of the joint, from 1, whose values follow the order of the rows, so that order and
-            position cannot be separated; None if there is no such joint.
+        ordered_joint: number, from 1, of a joint whose values follow the order of the rows, so that order and position
+            cannot be distinguished; None if there is no such joint.
         joint_correlation: absolute rank correlation of that joint with the order.
         of_training: whether signed errors are residuals of rows with which the model was calibrated.
     """
@@ -193,7 +193,7 @@ class BinnedErrors:
 
 
 def error_lengths(rows: JudgedRows) -> tuple[Float64[np.ndarray, " rows"], Float64[np.ndarray, " rows"], str]:
-    """Return errors before and after, and their unit: positions in mm, otherwise orientations in deg."""
+    """Return errors before and after, and their unit: positions in mm, or else orientations in deg."""
     if bool(np.isfinite(rows.after.position.numpy()).any()) or rows.after.rotation is None:
         return rows.before.position.numpy() * 1e3, rows.after.position.numpy() * 1e3, "mm"
     before = rows.before.rotation
@@ -271,7 +271,7 @@ def _over_joint(values: np.ndarray, errors: np.ndarray, groups: np.ndarray) -> B
 
 
 def _over_order(rows: JudgedRows, errors: dict[str, np.ndarray], judged: np.ndarray, unit: str) -> Dependence:
-    """Test the dependence of signed errors, otherwise of their lengths, on the order of the rows."""
+    """Test the dependence of signed errors, or else of error lengths, on the order of the rows."""
     number = np.arange(1.0, len(judged) + 1)[judged]
     residual = rows.residual.numpy()[judged] * 1e3
     signed = unit == "mm" and bool(np.isfinite(residual).all()) and len(residual) > 0
@@ -311,7 +311,7 @@ def root_mean_square(values: Float64[np.ndarray, " values"]) -> float:
 def bin_errors(
     values: Float64[np.ndarray, " rows"], errors: Float64[np.ndarray, " rows"], bins: int = _MAX_BINS
 ) -> BinnedErrors:
-    """Compute RMS errors in bins of equal width, fewer bins for few rows."""
+    """Compute RMS errors in bins of equal width; fewer rows give fewer bins."""
     bins = int(np.clip(len(values) // MIN_ROWS, 1, bins))
     low, high = float(values.min()), float(values.max())
     edges = np.linspace(low, high if high > low else low + 1.0, bins + 1)

@@ -17,20 +17,19 @@ from pisigma.validation.held_out.rank_tests import SIGNIFICANT, groups_differ
 from pisigma.validation.report.dependence import MIN_ROWS, error_lengths, root_mean_square
 
 MAX_POINTS = 20_000
-"""Largest number of points of a map; of more rows, the largest errors and an even selection of the others are shown."""
+"""Largest number of points of a map; if there are more rows, the largest errors and an even selection of the others are
+shown."""
 _WORST_SHARE = 0.05
 """Share of `MAX_POINTS` that is reserved for the largest errors."""
 _SAMPLES = 3_000
-"""Number of samples of the workspace, if no rows were measured."""
+"""Number of samples of the workspace if no rows were measured."""
 
 Quantity = Literal[
     "before", "after", "predicted", "before_deg", "after_deg", "correction", "distance", "turn"
 ]
-"""Quantity that a map shows.
-
-"before" and "after": position error of the nominal robot and of the model; with "_deg" the orientation error.
-"predicted": standard deviation of the predicted position. "correction": distance by which the calibration moves the
-tool. "distance" and "turn": distance and angle between the poses of two models.
+"""Quantity that a map shows. "before" and "after": position error of the nominal robot and of the model; with "_deg":
+their orientation errors. "predicted": standard deviation of the predicted position. "correction": distance by which the
+calibration moves the tool. "distance" and "turn": distance and angle between the poses of two models.
 """
 
 
@@ -56,12 +55,12 @@ class ErrorMap:
     Attributes:
         place: position of the tool in the robot's base frame [mm].
         layers: quantities that can be shown, at least one.
-        row: line of every point's row in the file, otherwise its number from 1; 0 for samples.
+        row: line of every point's row in the file, or else the number of the row from 1; 0 for samples.
         q: joint values [deg or mm].
         frame: frame of every point.
         target: target of every point.
         inside: whether every joint value was measured for the calibration.
-        rows: number of judged rows; 0 for samples of the workspace.
+        rows: number of evaluated rows; 0 for samples of the workspace.
         source: file of the rows, or name of the model.
         origin: `JudgedRows.origin` of the rows; "" for samples of the workspace.
         random: number of points that were drawn at random.
@@ -81,7 +80,7 @@ class ErrorMap:
 
 
 def map_of_rows(model: CalibratedModel, rows: JudgedRows) -> ErrorMap:
-    """Return the map of judged rows; of very many, the largest errors and an even selection of the others."""
+    """Return the map of evaluated rows; for very many rows, the largest errors and an even selection of the others."""
     before, after = rows.before, rows.after
     layers = _finite(
         _layer("before", before.position),
@@ -99,7 +98,7 @@ def map_of_rows(model: CalibratedModel, rows: JudgedRows) -> ErrorMap:
 
 
 def map_of_workspace(model: CalibratedModel) -> ErrorMap:
-    """Return a map of the workspace without measurements: stored joint values, and random ones in their ranges."""
+    """Return a map of the workspace without measurements, at stored joint values and random ones in their ranges."""
     q, more = samples_of_workspace(model)
     frame, target = (next(iter(names), "") for names in (model.bases, model.tools))
     samples = Measurements(q=q, frame=(frame,) * len(q), target=(target,) * len(q), source=model.name)
@@ -191,7 +190,7 @@ class Region:
 
 @dataclass(frozen=True)
 class LargestErrors:
-    """The worst row and the worst region of judged rows.
+    """The worst row and the worst region of evaluated rows.
 
     Attributes:
         row: index of the row with the largest error.
@@ -241,7 +240,7 @@ def worst_region(place: Float64[np.ndarray, "rows 3"], errors: Float64[np.ndarra
     cells = [(k, inside) for k, inside in cells if len(inside) >= least]
     if len(cells) < 2:
         return None
-    # compare one standard error lower, so that a cell of few rows is not the worst by chance
+    # compare values lowered by one standard error, so that a cell of few rows is not the worst by chance
     worst, _ = max(cells, key=lambda one: root_mean_square(one[1]) * (1 - 1 / math.sqrt(len(one[1]))))
     inside = number == worst
     _, chance = groups_differ(inside.astype(int), errors)

@@ -68,7 +68,7 @@ def joint_gaps(model: CalibratedModel, rows: JudgedRows | None) -> tuple[JointGa
 
     Args:
         model: the model.
-        rows: judged rows, whose joint values are used unless they belong to another file; None for the joint values
+        rows: evaluated rows, whose joint values are used unless they belong to another file; None for the joint values
             that the model stores.
     """
     q = model.starts if rows is None or rows.origin == "other" else rows.measurements.q
@@ -113,8 +113,8 @@ def measured_intervals(
     The range of a joint without limits is one revolution, to which its measured stretches are wrapped.
 
     Args:
-        model: a hybrid stores the stretches with which it was calibrated.
-        q: measured joint values [rad or m], for models that store none.
+        model: the model; a hybrid stores the stretches with which it was calibrated.
+        q: measured joint values [rad or m], for models that store no ranges.
     """
     coverage = model.hybrid.coverage if model.hybrid else JointCoverage.from_joints(model.robot, q)
     result = []

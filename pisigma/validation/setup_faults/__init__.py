@@ -1,1 +1,1 @@
-"""Faults of the setup or the file that explain large errors: hypotheses, their trial and their report."""
+"""Faults of the setup or the file that explain large errors: generation, test and report of hypotheses."""

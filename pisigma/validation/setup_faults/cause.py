@@ -14,12 +14,12 @@ class Cause:
             "joint_sign", "joint_coupling", "joint_zero", "joint_values" or "correction".
         clause: what is wrong, such as "the sign of joint 3 is reversed".
         advice: what the fault means or what to check.
-        size: complexity of the assumption, at least 1; of equally good explanations, the simplest is chosen.
+        size: complexity of the assumption, at least 1; among equally good explanations, the simplest is chosen.
         joints: indices of the joints concerned, from 0.
         moved: largest displacement of a joint zero [rad or m]; infinite for faults of other kinds.
         amount: displacement of a frame or tool [m]; for a wrong unit, the ratio of correct to stated values; the number
-            of corrections applied in addition to those logged (1 or -1); or the number of targets under one name. NaN
-            for faults of other kinds.
+            of corrections applied in addition to those logged (1 or -1); or the number of targets with the same name.
+            NaN for faults of other kinds.
         columns: for every joint, the number (from 1) of the logged column with its values, negative for a reversed
             sign; empty for faults other than "joint_order" and "joint_sign".
     """
@@ -35,7 +35,7 @@ class Cause:
 
 
 def joints_text(joints: tuple[int, ...]) -> str:
-    """Return a text of joint numbers (from 1) for joint indices (from 0)."""
+    """Return a text with the joint numbers (from 1) of joint indices (from 0)."""
     if len(joints) == 1:
         return f"joint {joints[0] + 1}"
     if len(joints) > 2 and joints[-1] - joints[0] == len(joints) - 1:
@@ -44,7 +44,7 @@ def joints_text(joints: tuple[int, ...]) -> str:
 
 
 def join_words(words: Iterable[str]) -> str:
-    """Return words joined to a list in a sentence."""
+    """Join words to a list for a sentence."""
     *first, last = words
     return f"{', '.join(first)} and {last}" if first else last
 

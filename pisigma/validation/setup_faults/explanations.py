@@ -1,4 +1,4 @@
-"""Hypotheses that are tried to explain large errors, and the choice among them."""
+"""Hypotheses that are tried as explanations of large errors, and the choice among them."""
 
 import itertools
 import math
@@ -40,12 +40,12 @@ if TYPE_CHECKING:
 _SMALL_SHARE = 2e-4
 """Errors, as a share of the reach, below which a fault of a joint column is not their cause."""
 PLAUSIBLE_SHARE = 0.01
-"""Largest errors of a calibrated robot, and after correction of a fault, as a share of the reach."""
+"""Largest errors of a calibrated robot, and of a robot after correction of a fault, as a share of the reach."""
 PLAUSIBLE_TURN = PLAUSIBLE_SHARE / LEVER_SHARE
 """Largest orientation errors of a calibrated robot [rad], which are treated as position errors at a distance of
 `LEVER_SHARE` of the reach."""
 AS_GOOD = 1.5
-"""Ratio of the errors of a simpler explanation to the smallest errors up to which the simpler explanation is chosen."""
+"""Ratio of the errors of a simpler explanation to the smallest errors, up to which the simpler one is chosen."""
 _MAX_CONVENTIONS = 8
 """Number of promising conventions of orientations that are tried with the whole model."""
 _MIN_TURN = 0.01
@@ -75,7 +75,7 @@ def explanation_limit(here: Hypothesis, reach: float) -> float:
 
 
 def choose_simplest(fault_hypotheses: Sequence[Hypothesis], most: float) -> list[Hypothesis]:
-    """Return the simplest of the hypotheses that explain the errors about equally well, up to `most` [m].
+    """Return the simplest hypothesis among those that explain the errors, up to `most` [m], about equally well.
 
     The remaining errors must also be small relative to the spread of the poses, which a wrong unit can shrink.
     """
@@ -94,7 +94,7 @@ def choose_simplest(fault_hypotheses: Sequence[Hypothesis], most: float) -> list
 def fault_hypotheses(
     arm: PredictingArm, some: Measurements, here: Hypothesis, most: float
 ) -> Iterator[Hypothesis]:
-    """Yield all hypotheses that may explain the errors up to `most` [m]; the first is that nothing is wrong."""
+    """Yield all hypotheses that may explain the errors up to `most` [m]; the first one is that nothing is wrong."""
     return frame_hypotheses(arm, some, list(_faults_in_frames(arm, some, here)), most)
 
 
@@ -157,7 +157,7 @@ def _other_corrections(
 def frame_hypotheses(
     arm: PredictingArm, some: Measurements, tried: Sequence[Hypothesis], most: float = math.inf
 ) -> Iterator[Hypothesis]:
-    """Yield hypotheses unchanged, and with another frame, tool, and both; without a model, both are fitted.
+    """Yield hypotheses unchanged, with another frame, tool, and both; without a model, both are always fitted.
 
     Both are fitted only if an affine fit, which is a lower bound of the errors, leaves at most `most` [m].
 
@@ -220,7 +220,7 @@ def _per_group(
 def _moved(
     kind: str, X: Float64[Tensor, "#rows 4 4"], frames: Float64[Tensor, "#rows 4 4"] | None = None
 ) -> Cause:
-    """Return the cause that a frame or tool has moved, with the largest motion of its origin.
+    """Return the cause "a frame or tool has moved", with the largest motion of its origin.
 
     Args:
         kind: "frame" or "tool".
@@ -239,7 +239,7 @@ def _moved(
 def measured_pose_faults(
     measured: MeasuredPoses, predicted: Float64[Tensor, "rows 3"], by_images: bool
 ) -> Iterator[tuple[MeasuredPoses, Cause]]:
-    """Yield positions in other units, mirrored positions and orientations, and inverse poses.
+    """Yield positions in other units, mirrored positions and orientations, and inverted poses.
 
     Args:
         measured: the measured poses.
@@ -320,10 +320,10 @@ def other_conventions(
 
 
 def _as_rotation_vector(angles: Float64[np.ndarray, "rows 3"]) -> Float64[np.ndarray, "rows 3"]:
-    """Return roll, pitch and yaw in the one of two equivalent forms that is the shorter vector.
+    """Return roll, pitch and yaw in whichever of the two equivalent forms is the shorter vector.
 
-    A rotation vector that was read as angles may have a second component beyond 90 deg, for which angles read back
-    from the matrix are the other solution.
+    A rotation vector that was read as angles may have a second component beyond 90 deg; the angles computed from the
+    matrix are then the other form.
     """
     roll, pitch, yaw = angles.T
     half = np.pi * np.stack([-np.sign(roll), np.sign(pitch), -np.sign(yaw)], 1)

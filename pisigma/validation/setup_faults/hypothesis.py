@@ -38,11 +38,12 @@ _SHIFTS = (1, -1, 2, -2)
 """Numbers of rows by which joint values may be shifted relative to the measurements."""
 MARGIN = max(_SHIFTS)
 _ENDS = 3
-"""Base and tool are fitted to the first and to the last third of the rows if a row may have been lost in between."""
+"""Shares of the rows at both ends to which base and tool are fitted if a row may have been lost in between."""
 _ADVICE = "look for a joint vector or a measurement that was lost or written twice, and match them again"
 MAX_ITERATIONS = 30
 _TRIED, _HOPELESS = 8, 0.25
-"""Number of iterations after which the search is abandoned if more than a share of the cost remains, and this share."""
+"""Number of iterations after which the search is abandoned if more than a certain share of the cost remains, and this
+share."""
 _CONVERGENCE_TOLERANCE = 1e-3
 """Relative decrease of the cost per step at convergence."""
 _STILL = 1e-3
@@ -53,7 +54,7 @@ _EQUAL = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class PredictingArm:
-    """Arm that predicts the poses of rows under hypotheses.
+    """Arm that predicts the poses of rows under a hypothesis.
 
     Attributes:
         robot: the nominal robot.
@@ -72,7 +73,7 @@ class PredictingArm:
 
     @property
     def fits_of_frames(self) -> tuple[FittedFrames, ...]:
-        """Frames that are fitted to compare hypotheses; without a model, base and tool always are."""
+        """Frames that are fitted to compare hypotheses; without a model, these are always base and tool."""
         return ("base and tool",) if self.model is None else ("none", "base", "base and tool")
 
     def screened_errors(
@@ -107,9 +108,9 @@ class PredictingArm:
 def error_with_fitted(
     mode: FittedFrames, T: Float64[Tensor, "*#batch rows 4 4"], measured: MeasuredPoses
 ) -> Float64[Tensor, "*#batch"]:
-    """Compute the mean squared error [m²] of predicted poses, unchanged or with frames fitted.
+    """Compute the mean squared error [m²] of predicted poses, either unchanged or with frames fitted.
 
-    With base and tool fitted, the result is the lower bound of `affine_error`.
+    With base and tool fitted, the result is the lower bound that `affine_error` computes.
     """
     if mode == "base and tool":
         return affine_error(T, measured)
@@ -121,7 +122,7 @@ def error_with_fitted(
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """Joint values, predicted and measured poses under the assumption of a fault.
+    """Joint values, predicted poses and measured poses under the assumption of a fault.
 
     Attributes:
         q: joint values under the hypothesis [rad or m].
@@ -139,7 +140,7 @@ class Hypothesis:
 
     @property
     def complexity(self) -> float:
-        """Complexity of the causes; frame and tool together count less than separately, as a new setup changes both."""
+        """Complexity of the causes; frame and tool together count less, because a new setup changes both."""
         kinds = {cause.kind for cause in self.causes}
         return sum(cause.size for cause in self.causes) - (1 if {"frame", "tool"} <= kinds else 0)
 
@@ -164,7 +165,7 @@ class Hypothesis:
         return position, float(rotation_vector(R).square().sum(-1).mean().sqrt())
 
     def without_causes(self, kinds: Set[str]) -> "Hypothesis":
-        """Return the hypothesis without causes of some kinds, which are not reported."""
+        """Return the hypothesis without the causes of given kinds, which are not reported."""
         return replace(self, causes=tuple(cause for cause in self.causes if cause.kind not in kinds))
 
     def with_cause(self, cause: Cause, T: Float64[Tensor, "rows 4 4"], fitted: int) -> "Hypothesis":
@@ -175,12 +176,12 @@ class Hypothesis:
 def shifted_rows(
     robot: Robot, rows: Measurements, chosen: Int64[Tensor, " chosen"], measured: MeasuredPoses
 ) -> Iterator[tuple[Float64[Tensor, "chosen dof"], MeasuredPoses, Cause]]:
-    """Yield hypotheses of joint values or orientations shifted by rows, in all rows or on one side of a row.
+    """Yield hypotheses with joint values or orientations shifted by rows, in all rows or on one side of a row.
 
     Args:
         robot: the nominal robot.
         rows: rows in the order of the file.
-        chosen: indices of the rows to judge, at least `MARGIN` from both ends.
+        chosen: indices of the rows to evaluate, at least `MARGIN` rows from both ends.
         measured: measured poses of these rows.
     """
     q = rows.q[chosen]
@@ -206,7 +207,7 @@ def shifted_rows(
 def _shifted_from_a_row(
     robot: Robot, rows: Measurements, chosen: Int64[Tensor, " chosen"]
 ) -> Iterator[tuple[Float64[Tensor, "chosen dof"], MeasuredPoses, Cause]]:
-    """Find the row after (or before) which a shift explains most, with base and tool fitted to the other side.
+    """Find the row after (or before) which a shift explains the most, with base and tool fitted to the other side.
 
     The neighbouring rows are left out, because the lost values are unknown.
     """
@@ -226,7 +227,7 @@ def _shifted_from_a_row(
             place = rows.place(int(inner[change]))
             where = f"after about {place}" if at_start else f"before about {place}"
             clause = f"{where} the joint values are shifted by {_count(shift)} relative to the measurements"
-            # The change is between two rows, hence the half.
+            # The change lies between two rows, hence the half.
             kept = chosen[(chosen - inner[change] + 0.5).abs() > abs(shift)]
             behind = kept >= inner[change]
             q = torch.where((behind == at_start)[:, None], rows.q[kept + shift], rows.q[kept])
@@ -242,7 +243,7 @@ def _count(shift: int) -> str:
 def estimate_joint_values(
     robot: Robot, rows: Measurements, measured: MeasuredPoses
 ) -> list[tuple[Float64[Tensor, "rows dof"], Cause]]:
-    """Yield hypotheses with the values of one revolute joint estimated and the other joints as logged.
+    """Yield hypotheses in which the values of one revolute joint are estimated and those of other joints are as logged.
 
     Every row's value is the one that brings the tool nearest to the measured pose, in closed form, because a target's
     position and axes move on circles about the joint axis. This alternates with fits of base and tool. Two values per
@@ -312,12 +313,13 @@ def _turned(
     T = forward_kinematics(robot, q)
     J = joint_jacobian(robot, q)[1]
     axis = J[:, 3:, joint]
-    # axis × (axis × lever) is minus the lever normal to the axis: foot is the point of the axis nearest to the flange.
+    # axis × (axis × lever) is minus the component of the lever normal to the axis; foot is the point on the axis
+    # nearest to the flange.
     foot = T[:, :3, 3] + torch.linalg.cross(axis, J[:, :3, joint])
     tip, R = T @ tool, base[:3, :3]
     position = (measured.position - base[:3, 3]) @ R
     pairs = [(tip[:, :3, 3] - foot, position - foot, torch.ones(len(q)).double())]
-    # `squared_errors` has |dR|² / 2, about the angle squared, so every column weighs lever² / 2.
+    # `squared_errors` uses |dR|² / 2, about the angle squared, so every column has the weight lever² / 2.
     weight = measured.has_rotation * measured.lever**2 / 2
     pairs += [(tip[:, :3, k], measured.rotation[:, :, k] @ R, weight) for k in range(3)]
     sine, cosine = torch.zeros(2, len(q)).double()
@@ -326,13 +328,13 @@ def _turned(
         cosine = cosine + w * ((a * b).sum(-1) - (axis * a).sum(-1) * (axis * b).sum(-1))
     turned = q.clone()
     turned[:, joint] += torch.atan2(sine, cosine)
-    # For positions the tip's lever is parallel to the measured one after the turn, and only the direction is used.
+    # For positions, the tip's lever is parallel to the measured one after the rotation, and only its direction is used.
     shift = torch.linalg.cross(axis, position - foot)
     return turned, torch.cat([shift @ R.mT, axis @ R.mT], 1)
 
 
 def _copied(q: Float64[Tensor, "rows dof"], joint: int) -> int | None:
-    """Return another joint whose column is equal; None if there is none."""
+    """Return another joint with an equal column; None if there is none."""
     same = (q - q[:, joint : joint + 1]).abs().amax(0) < _EQUAL
     same[joint] = False
     return int(same.nonzero()[0, 0]) if bool(same.any()) else None

@@ -22,9 +22,9 @@ _QUARTER = math.pi / 2
 _GRADIANS = 0.9
 """Number of degrees in a gradian."""
 _ZERO_TOLERANCE = math.radians(0.5)
-"""Distance from a multiple of 90 deg below which a zero is set to that multiple [rad]."""
+"""Distance from a multiple of 90 deg below which a zero is set to this multiple [rad]."""
 _MAX_ORDERS = 5040
-"""Number of orders of seven joints; with more joints, only pairs are swapped."""
+"""Number of permutations of seven joints; with more joints, only pairs are swapped."""
 _MAX_ZEROS = 4**7
 _SCREEN_ROWS = 32
 """Number of rows on which every map is tried."""
@@ -88,13 +88,13 @@ def signs_and_swaps(dof: int) -> JointMaps:
 
 
 def reversed_signs(dof: int) -> JointMaps:
-    """Return maps of all combinations of reversed signs."""
+    """Return maps with all combinations of reversed signs."""
     choices = list(itertools.product((1.0, -1.0), repeat=dof))[1:]
     return JointMaps.scaled(torch.tensor(choices, dtype=torch.float64))
 
 
 def other_orders(dof: int) -> JointMaps:
-    """Return maps of all orders of the joints; for more than seven joints, of all swaps of two."""
+    """Return maps for all orders of the joints; for more than seven joints, for all swaps of two."""
     orders = torch.arange(dof).repeat(math.comb(dof, 2), 1)
     pairs = torch.combinations(torch.arange(dof))
     orders = orders.scatter(1, pairs, pairs.flip(1))
@@ -106,7 +106,7 @@ def other_orders(dof: int) -> JointMaps:
 
 
 def coupled_joints(dof: int) -> JointMaps:
-    """Return maps for all pairs of joints of which one is logged relative to the other, for example with a belt."""
+    """Return maps for all pairs of joints in which one is logged relative to the other, for example with a belt."""
     pairs = torch.tensor(list(itertools.permutations(range(dof), 2)), dtype=torch.int64).reshape(-1, 2)
     pairs, sign = pairs.repeat(2, 1), torch.tensor([1.0, -1.0]).double().repeat_interleave(len(pairs))
     maps = JointMaps.unchanged(len(pairs), dof)
@@ -114,7 +114,7 @@ def coupled_joints(dof: int) -> JointMaps:
 
 
 def other_units(robot: Robot) -> JointMaps:
-    """Return maps of swapped units: degrees and radians (or gradians), and mm and m for prismatic joints."""
+    """Return maps that swap units: degrees and radians (or gradians), and mm and m for prismatic joints."""
     turning = [1.0 if turns else 0.0 for turns in robot.revolute]
     rows = [[_GRADIANS ** (sign * turns) for turns in turning] for sign in (1, -1) if any(turning)]
     for revolute, per_unit in ((True, math.degrees(1)), (False, 1e3)):
@@ -129,7 +129,7 @@ def other_units(robot: Robot) -> JointMaps:
 
 
 def quarter_turned_zeros(robot: Robot, inner: bool = False) -> JointMaps:
-    """Return maps with zeros moved by multiples of 90 deg, of one joint at a time if there are too many.
+    """Return maps with zeros moved by multiples of 90 deg, one joint at a time if there are too many combinations.
 
     Args:
         robot: the robot.
@@ -153,7 +153,7 @@ def moved_zeros(joints: Int64[Tensor, " maps"], by: Float64[Tensor, " maps"], do
 
 
 def joint_causes(maps: JointMaps, number: int, robot: Robot) -> tuple[Cause, ...]:
-    """Return the causes: what is wrong with the joint columns under a map."""
+    """Return the causes that a map assumes: what is wrong with the joint columns."""
     matrix, offset = maps.matrix[number], maps.offset[number].tolist()
     order = matrix.abs().argmax(1).tolist()
     factor = [row[column] for row, column in zip(matrix.tolist(), order, strict=True)]
@@ -287,7 +287,7 @@ def _screened_rows(measurements: Measurements) -> Int64[Tensor, " chosen"]:
 
 
 def _best_zeros(robot: Robot, errors_of: Callable[[JointMaps], Float64[Tensor, " maps"]]) -> JointMaps:
-    """Return the best zero of every joint on a refined grid, rounded to a multiple of 90 deg if near."""
+    """Return the best zero of every joint on a refined grid, rounded to a nearby multiple of 90 deg if there is one."""
     dof = robot.dof
     width = torch.tensor(
         [torch.pi if turns else robot.reach for turns in robot.revolute], dtype=torch.float64
@@ -299,7 +299,7 @@ def _best_zeros(robot: Robot, errors_of: Callable[[JointMaps], Float64[Tensor, "
         tried = by[:, None] + width[:, None] * grid
         errors = errors_of(moved_zeros(joints, tried.flatten(), dof)).reshape(tried.shape)
         by = tried.gather(1, errors.argmin(1, keepdim=True))[:, 0]
-        # The minimum is near the best point: two steps of the grid on either side.
+        # The minimum is within two steps of the grid from the best point.
         width = width * 2 / STEPS
     near = (by / _QUARTER).round() * _QUARTER
     # -180 deg and 180 deg are the same zero.

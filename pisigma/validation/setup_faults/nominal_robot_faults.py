@@ -37,7 +37,7 @@ from pisigma.validation.setup_faults.hypothesis import (
 from pisigma.validation.setup_faults.setup_fault import SetupFault, fault_from_hypothesis
 
 MAX_ROWS = 1_000
-"""Largest number of rows on which hypotheses are tried, evenly over all rows."""
+"""Largest number of rows on which hypotheses are tried, spread evenly over all rows."""
 _MAX_ROWS_NOMINAL = 150
 """Largest number of rows on which hypotheses are tried with the nominal robot, for which base and tool are fitted
 each time."""
@@ -46,7 +46,7 @@ MIN_ROWS_NOMINAL = 24
 _LARGEST_ZERO = 0.1
 """Largest standard deviation of the zeros of revolute joints of industrial arms and cobots after a repair [rad]."""
 _MAX_ZEROS = 3.0
-"""Largest plausible error of a single zero over `largest_zero`."""
+"""Ratio of the largest plausible error of a single zero to `largest_zero`."""
 _MAX_SLIDE = 3 * HOBBY.largest.length
 """Largest plausible error of the zero of a prismatic joint [m]."""
 _USUAL = 1e-3
@@ -54,7 +54,7 @@ _USUAL = 1e-3
 _SURE = 1e-3
 """Probability of the F test below which joint values explain positions."""
 _MAX_TARGETS = 4
-"""Largest number of targets that are searched for under one name."""
+"""Largest number of targets with the same name that are searched for."""
 _MAX_EXAMPLES = 3
 """Largest number of rows that a sentence lists."""
 _MAX_TARGET_ITERATIONS = 20
@@ -62,11 +62,11 @@ _MAX_TARGET_ITERATIONS = 20
 _TARGET_TOLERANCE = 1e-2
 """Relative decrease of the mean square per iteration at convergence."""
 _MAX_CLUSTERINGS = 8
-"""Largest number of iterations of assigning rows to the nearest target and fitting base and targets again."""
+"""Largest number of iterations, each of which assigns rows to the nearest target and refits base and targets."""
 
 
 def largest_zero(robot: Robot) -> float:
-    """Return the largest standard deviation [rad] of the zeros of revolute joints of this maker's class of robots."""
+    """Return the largest standard deviation [rad] of revolute joint zeros in this manufacturer's class of robots."""
     return max(_LARGEST_ZERO, RobotClass.from_robot(robot).largest.joint_offset)
 
 
@@ -75,12 +75,12 @@ def find_nominal_robot_faults(robot: Robot, measurements: Measurements) -> tuple
 
     Base and tool are fitted to the unchanged rows and under every hypothesis: the hypotheses of `find_setup_faults`,
     rows shifted before or after a row, several targets under one name, and a joint whose logged values are wrong.
-    Hypotheses are tried if the errors are larger than geometric errors of the usual prior (1 mm, 1 mrad) make them.
-    A correct explanation then leaves these usual errors, which are a tenth or less of those caused by faults.
+    Hypotheses are tried if the errors are larger than those caused by geometric errors of the usual prior (1 mm, 1
+    mrad). A correct explanation then leaves these usual errors, which are a tenth or less of those caused by faults.
 
     Args:
         robot: the nominal robot.
-        measurements: rows; only rows with positions of the most frequent frame and target are judged.
+        measurements: rows; only rows with positions of the most frequent frame and target are evaluated.
 
     Returns:
         The faults; empty if the errors are of usual size, or if nothing explains them.
@@ -118,7 +118,7 @@ def find_nominal_robot_faults(robot: Robot, measurements: Measurements) -> tuple
 def _better_than_zeros(faults: Sequence[Hypothesis], error: float, usual: float) -> list[Hypothesis]:
     """Return the faults that explain the rows better than moved zeros of all joints, which a calibration estimates.
 
-    Moved zeros of single joints are also kept if errors of usual size remain.
+    Moved zeros of single joints are also kept if the remaining errors are of usual size.
 
     Args:
         faults: the faults found.
@@ -148,7 +148,7 @@ def _error_with_zeros(robot: Robot, rows: Measurements, measured: MeasuredPoses)
 
 
 def _named_otherwise(robot: Robot, measurements: Measurements, usual: float) -> tuple[SetupFault, ...]:
-    """Return faults in the names of targets of the most frequent frame, if errors are larger than usual [m]."""
+    """Return faults in the names of targets in the most frequent frame, if errors are larger than usual [m]."""
     rows = largest_group(measurements, by_target=False)
     rows = rows.select(evenly_spaced_rows(torch.arange(rows.rows), MAX_ROWS))
     number, lever = numbers_of_names(rows.target), LEVER_SHARE * robot.reach
@@ -169,7 +169,7 @@ def _named_otherwise(robot: Robot, measurements: Measurements, usual: float) -> 
 def _labelled(
     rows: Measurements, T: Float64[Tensor, "rows 4 4"], measured: MeasuredPoses
 ) -> list[Hypothesis]:
-    """Return hypotheses with other names of the targets; see `target_labellings`."""
+    """Return hypotheses with other target names; see `target_labellings`."""
     return [
         Hypothesis(rows.q, one.T, measured, (one.cause,), 3 * one.targets)
         for one in target_labellings(rows, T, measured)
@@ -183,7 +183,7 @@ def _with_joints(
     most: float,
     values: int = 0,
 ) -> list[Hypothesis]:
-    """Return hypotheses from other joint values or poses, with the nominal robot.
+    """Return hypotheses with other joint values or poses, for the nominal robot.
 
     Args:
         arm: the predicting arm.
@@ -200,7 +200,7 @@ def _with_joints(
 
 
 def are_unrelated(robot: Robot, measurements: Measurements) -> bool:
-    """Return whether positions are unrelated to the joint values of their rows, for example because one was sorted."""
+    """Return whether positions are unrelated to the joint values of their rows, for example after sorting a column."""
     rows = largest_group(measurements)
     if rows.rows < MIN_ROWS_NOMINAL:
         return False
@@ -281,7 +281,7 @@ class Labelling:
 def target_labellings(
     rows: Measurements, T: Float64[Tensor, "rows 4 4"], measured: MeasuredPoses
 ) -> Iterator[Labelling]:
-    """Find targets from the measurements alone, as clusters of the measured points of the tool.
+    """Find targets from the measurements alone, as clusters of measured points on the tool.
 
     The method is k-means, with base and targets fitted to all rows in every iteration. The number of targets is the
     number of names, and every target gets the most frequent name of its rows; with one name, 2 to `_MAX_TARGETS`
@@ -362,18 +362,18 @@ def _other_names(rows: Measurements, number: Int64[Tensor, " rows"], names: tupl
 
 
 def _where(rows: Measurements, row: int) -> str:
-    """Return a text with the place of a row without its file."""
+    """Return a text that locates a row without naming its file."""
     return f"line {rows.line[row]}" if rows.line[row] else f"row {row}"
 
 
 def _clustered(
     T: Float64[Tensor, "rows 4 4"], measured: MeasuredPoses, count: int
 ) -> tuple[Int64[Tensor, " rows"], Float64[Tensor, "rows 4 4"]]:
-    """Cluster the measured points of the tool; return their cluster indices and the predicted poses."""
+    """Cluster the measured points on the tool; return their cluster indices and the predicted poses."""
     number = torch.zeros(len(T), dtype=torch.int64)
     base, tool = best_base_and_tool(T, measured)
     points, fitted = _in_tool_frame(base @ T, measured), base @ T @ tool
-    # Farthest-point start: each new centre is the median of the points that are farthest from the centres so far.
+    # Farthest-point initialisation: each new centre is the median of the points farthest from the previous centres.
     centres = points.median(0).values[None]
     for _ in range(count):
         far = torch.cdist(points, centres).amin(1).topk(max(1, len(T) // (4 * count))).indices

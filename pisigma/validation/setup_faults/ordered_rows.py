@@ -34,10 +34,10 @@ _HARMONICS, _JOINT_ERROR = 3, 3e-4
 together with the parameters, because in rows ordered by a joint's values, slow errors of its gear look like a slow
 motion."""
 _SAG = 1e-3
-"""Prior standard deviation of the weights of gravity torques [rad], which are fitted too: the sag of elastic joints can
-look like a second arm. It is 8.6e-4 for the measured UR10."""
+"""Prior standard deviation of the weights of gravity torques [rad], which are also fitted, because the sag of elastic
+joints can look like a second arm. The weights are 8.6e-4 for the measured UR10."""
 _VALUES_PER_POSE = 6
-"""Number of independent values of a configuration (the pose of the tool), for any number of targets and repeats."""
+"""Number of independent values of a configuration (the pose of the tool), regardless of targets and repeats."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +67,7 @@ class OrderedRows:
     def content_hash(self) -> bytes:
         """SHA-256 of everything that a search depends on, which identifies its last result.
 
-        The same rows are calibrated with when they are added to a cell, and again for its model.
+        The same rows are used in a calibration when they are added to a cell, and again for its model.
         """
         setup = (self.problem.frame.cpu().numpy(), self.problem.target.cpu().numpy(), self.configuration)
         names = (self.problem.space.frames, self.problem.space.targets)  # the result already contains them
@@ -133,7 +133,7 @@ class OrderedRows:
 
     @cached_property
     def clipped(self) -> Float64[np.ndarray, "rows values"]:
-        """Residuals; large ones are shortened so that they do not determine where a fault is searched for."""
+        """Residuals; large ones are shortened so that they do not dominate the search for a fault."""
         lengths = np.linalg.norm(self.residual, axis=1)
         longest = _CAP * np.quantile(lengths, 0.75)
         shortened: np.ndarray = (
@@ -177,7 +177,7 @@ class OrderedRows:
 
     @cached_property
     def _joint_errors(self) -> tuple[tuple[AbstractFeature, Bool[np.ndarray, "dof columns"], float], ...]:
-        """Derivatives by the weights of unmodelled joint errors, and prior standard deviations of the weights [rad].
+        """Derivatives with respect to weights of unmodelled joint errors, and prior standard deviations of these [rad].
 
         Gravity acts on masses at the origins of the frames. Backlash needs stated directions of approach.
         """
@@ -220,7 +220,7 @@ class OrderedRows:
         return self.without_parameters(self.residual.ravel()).reshape(self.residual.shape)
 
     def without_parameters(self, values: Float64[np.ndarray, "*values"]) -> Float64[np.ndarray, "*values"]:
-        """Return what remains of values, or of columns of them, after fitting the parameters and weights to them."""
+        """Return the remainder of values, or of columns of values, after fitting the parameters and weights to them."""
         X = self.jacobian.reshape(-1, self.jacobian.shape[2])
         left: np.ndarray = values - X @ (self.covariance @ (X.T @ values))
         return left
@@ -287,7 +287,7 @@ def inverse_of(normal: Float64[np.ndarray, "unknowns unknowns"]) -> Float64[np.n
         root = np.linalg.cholesky(scaled)
         inverse: np.ndarray = np.linalg.inv(root)
         inverse = inverse.T @ inverse
-        # The sums of rows bound the largest eigenvalues of both, so that every direction is determined.
+        # Row sums bound the largest eigenvalues of both matrices, so that every direction is determined.
         if np.abs(scaled).sum(0).max() * np.abs(inverse).sum(0).max() * UNDETERMINED < 1:
             inverse *= scales
             return inverse

@@ -14,9 +14,9 @@ from pisigma.validation.setup_faults.ordered_rows import OrderedRows, inverse_of
 MIN_ROWS = 20
 """Minimum number of rows; with fewer, two arms cannot be distinguished."""
 _MAX_ROWS = 300
-"""Largest number of rows to which the populations are fitted, evenly over all rows."""
+"""Largest number of rows to which the populations are fitted, spread evenly over all rows."""
 MIN_SHARE = 0.1
-"""Smallest share of a population; smaller ones are outliers, to which the robust loss gives no weight."""
+"""Smallest share of a population; smaller groups are outliers, to which the robust loss gives no weight."""
 _TAILS = 5.0
 """Degrees of freedom of the t distribution of the residuals, so that outliers do not become a population."""
 _MAX_USED = 0.9
@@ -26,12 +26,12 @@ _STARTS, _FIRST_ITERATIONS, MAX_ITERATIONS = 8, 6, 40
 _CONVERGENCE_TOLERANCE = 1e-2
 """Largest change of the probabilities, and relative change of the variance, at convergence."""
 _ALTERNATING = 0.95
-"""Share of the rows that must alternate: 1 in 20 may be predicted equally well by both populations."""
+"""Share of the rows that must alternate; both populations may predict 1 in 20 equally well."""
 _DIFFERENCE = 2.0
-"""Ratio of the variance of the difference of two arms to that of an arm and the nominal arm."""
+"""Ratio of the variance of the difference between two arms to that between an arm and the nominal arm."""
 _APART = 4.0
-"""Ratio of the distance of a population to the scatter of the other above which they are separate. Residuals of
-healthy robots are a mixture with ratios of up to 2.5, because the unexplained errors depend on the pose."""
+"""Ratio of the distance of one population to the scatter of the other above which they are separate. Residuals of
+healthy robots form a mixture with ratios of up to 2.5, because the unexplained errors depend on the pose."""
 _NORMAL_ITERATIONS = 200
 _FLOOR = 1e-6
 """Smallest standard deviation, as a share of the largest residual."""
@@ -43,9 +43,9 @@ class Populations:
     """Two populations of rows.
 
     Attributes:
-        differing: what differs between the populations.
+        differing: what differs between the populations: base, tool or arm.
         second: mask of the measured rows that belong to the smaller population.
-        tried: number of rows that were judged.
+        tried: number of rows that were evaluated.
         difference: difference of the base, tool or arm parameters of the populations [m or rad].
         factor: ratio of the errors of the rows without and with the difference [1].
         used: share of the values that all fitted parameters absorb [1].
@@ -65,7 +65,7 @@ class Populations:
 # cached, because the same rows are checked when they are added to a cell and in its calibration
 @lru_cache(maxsize=2)
 def find_populations(rows: OrderedRows, count: int) -> Populations | None:
-    """Find the two populations that explain the residuals of a calibration best, likely or not.
+    """Find the two populations that best explain the residuals of a calibration, whether they are likely or not.
 
     `r_i = X_i x + w_i Z_i m + e_i`: a row of the second population (w_i = 1) has the difference m in addition to the
     unknowns x of all rows. The probabilities of w_i, x, m and the variance of e_i are estimated by expectation
@@ -121,7 +121,7 @@ def _most_used(components: int) -> float:
 
 
 def _alternating(second: Bool[np.ndarray, " rows"]) -> Bool[np.ndarray, " rows"]:
-    """Return exactly alternating rows for nearly alternating ones, because rows that fit both may be in either."""
+    """Make nearly alternating rows alternate exactly, because rows that fit both populations may be in either."""
     odd: np.ndarray = np.arange(len(second)) % 2 == 1
     for turn in (odd, ~odd):
         if np.mean(second == turn) > _ALTERNATING:
@@ -185,9 +185,10 @@ class _Mixture:
         """Fit the mixture to some rows from several starts, and assign all rows to a population."""
         r, X, Z = self.rows.residual[some], self.rows.jacobian[some], self.Z[some]
         rng = np.random.default_rng(0)
-        # Expectation maximisation finds local maxima: start with alternating rows (two arms in turns) and at random.
+        # Expectation maximisation finds local maxima, so it is started with alternating rows (two arms in turn) and at
+        # random.
         starts = [np.arange(len(some)) % 2 * 0.8 + 0.1, *rng.uniform(0, 1, (_STARTS - 1, len(some)))]
-        # The same errors and prior without a difference: what the mixture has to beat.
+        # The same errors and prior without a difference, which the mixture has to outperform.
         alone = _Em(r, X, Z[:, :, :0], np.r_[self.rows.precision])
         one = alone.run(alone.start(np.zeros(len(some))), MAX_ITERATIONS)
         em = _Em(r, X, Z, np.r_[self.rows.precision, self.precision])
@@ -331,7 +332,7 @@ def two_populations(residuals: Float64[np.ndarray, "rows components"]) -> Mixtur
     centred = residuals - residuals.mean(0)
     # Without a floor the likelihood is unbounded: a population could shrink to one row or to a plane.
     floor = (_FLOOR * np.abs(centred).max() + 1e-15) ** 2 * np.eye(components)
-    # Start with the two halves along the first principal axis: two clusters separate along it.
+    # Start with the two halves along the first principal axis, along which two clusters separate.
     key = centred @ np.linalg.svd(centred, full_matrices=False)[2][0]
     weight = (key > np.median(key)).astype(float)
     for _ in range(_NORMAL_ITERATIONS):
@@ -347,7 +348,7 @@ def two_populations(residuals: Float64[np.ndarray, "rows components"]) -> Mixtur
     # Log likelihoods of both models without their common constant; the BIC counts mean, covariance and share below.
     alone = np.linalg.slogdet(centred.T @ centred / rows + floor)[1]
     gain = np.logaddexp(*logs).sum() + rows / 2 * (alone + components)
-    # Scatters within a factor of 2 (geometric mean) are treated as equal: then the smaller population is the odd one.
+    # Scatters within a factor of 2 (geometric mean) are treated as equal; the smaller population is then the odd one.
     alike = abs(determinants[1] - determinants[0]) < 2 * components * math.log(2.0)
     far = int(np.argmin(counts) if alike else np.argmax(determinants))
     return Mixture(

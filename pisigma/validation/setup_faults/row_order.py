@@ -19,12 +19,11 @@ from pisigma.validation.setup_faults.ordered_rows import OrderedRows, inverse_of
 _MIN_ROWS = 3
 """Smallest number of rows before and after a motion."""
 _MAX_USED = 0.8
-"""Largest share of the values that parameters and motions may absorb; with more, the fit follows the noise, which it
-also estimates."""
+"""Largest share of the values that parameters and motions may absorb; above it, the fit follows the noise."""
 DEGREES = (1, 3, 6)
 """Degrees of the polynomials of slow motions, as functions of the share of the rows measured so far."""
 _AS_LIKELY = 0.5
-"""Share of the largest log Bayes factor above which a motion at the start of a frame also explains the residuals."""
+"""Share of the largest log Bayes factor above which a motion at the start of a frame explains the residuals as well."""
 MAX_ITERATIONS = 6
 """Largest number of iterations of the reweighting."""
 _CONVERGENCE_TOLERANCE = 1e-2
@@ -62,7 +61,7 @@ class Motion:
 
 
 def find_motion(result: CalibrationResult | HybridResult) -> Motion | None:
-    """Find the motion of frame or tool that explains the residuals of a calibration best, likely or not.
+    """Find the motion of frame or tool that best explains the residuals of a calibration, even if it is unlikely.
 
     A frame or a tool that moves before row k shifts the values of the rows from k by `Z_i m` with six unknowns m. The
     model of the residuals r is linear in m and in x, the parameters of the calibration and the weights of a short
@@ -85,7 +84,7 @@ def find_motion(result: CalibrationResult | HybridResult) -> Motion | None:
     return None if rows is None else _motion_of(rows)
 
 
-# the same rows are checked when they are added to a cell and when they are calibrated with
+# the same rows are checked when they are added to a cell and when they are used in a calibration
 @lru_cache(maxsize=2)
 def _motion_of(rows: OrderedRows) -> Motion | None:
     search = _Search(rows)
@@ -202,7 +201,7 @@ class _Search:
             yield from (candidate.from_row(int(first)) for first in changes)
 
     def _rigid(self) -> Iterator[_Candidate]:
-        """Yield what may have moved rigidly: frames, single targets (if there are several), and the tool."""
+        """Yield whatever may have moved rigidly: frames, single targets (if there are several), and the tool."""
         space = self.rows.problem.space
         tool: _Moved = "target" if len(space.targets) > 1 else "tool"
         kinds: tuple[tuple[_Moved, Literal["frame", "target"]], ...] = (("frame", "frame"), (tool, "target"))
@@ -299,7 +298,7 @@ class _Search:
         """
         if fit.effective > _MAX_USED * self.rows.values:
             return -math.inf
-        # Neither correlated values nor repeats of a configuration bring more information than one pose each.
+        # Correlated values and repeats contain no more information than one pose per configuration.
         values = max(
             min(
                 (self.rows.values - self.rows.effective_parameters) / values_per_independent,
@@ -307,7 +306,7 @@ class _Search:
             ),
             1.0,
         )
-        # Without a motion, at the candidate's scale: residuals of the calibration or of a refit, whichever cost less.
+        # Without a motion, at the candidate's scale: residuals of the calibration or of a refit, if this costs less.
         before = min(
             float(fit.robust_costs(residual).sum())
             for residual in (self.rows.residual, self.fit_without_motion.after)
@@ -354,7 +353,7 @@ class _Search:
             names = self.rows.problem.space.frames
             anchor = self.rows.result.solved.setup.anchors.bases[candidate.number].cpu().numpy()
             center = self._center(self.rows.number[candidate.index[candidate.first or 0 :]])
-            # The base turns about its anchor, so the shift of the measured points is that of their centre.
+            # The base rotates about its anchor, so the shift of the measured points is that of their centre.
             lever = anchor[:3, :3].T @ (center - anchor[:3, 3])
             shift = anchor[:3, :3] @ (shift + np.cross(turn, lever))
         return Motion(

@@ -1,4 +1,4 @@
-"""Setup faults that explain large errors, in the form in which they are reported."""
+"""Setup faults that explain large errors, in the form that is reported."""
 
 import math
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ from pisigma.validation.setup_faults.hypothesis import COLLAPSED, Hypothesis
 
 @dataclass(frozen=True)
 class SetupFault:
-    """A setup fault that explains errors: after its correction they fall to a quarter or less.
+    """A setup fault that explains errors, which fall to a quarter or less when it is corrected.
 
     Attributes:
         kinds: kinds of the causes, see `Cause.kind`.
@@ -81,7 +81,7 @@ class SetupFault:
 
     @property
     def values(self) -> dict[str, float | int | str | tuple[int, ...]]:
-        """Numbers of the sentence by name; joints are counted from 1; see `Diagnostic.values`."""
+        """Numbers in the sentence, by name, with joints counted from 1; see `Diagnostic.values`."""
         figures = {"before_mm": self.before * 1e3, "after_mm": self.after * 1e3}
         finite = {name: value for name, value in figures.items() if np.isfinite(value)}
         if len(self.amounts) == 1 and self.kinds[0].endswith("_unit") and np.isfinite(self.amounts[0]):
@@ -103,7 +103,7 @@ class SetupFault:
 
 
 def combine_alternatives(faults: Sequence[SetupFault]) -> SetupFault:
-    """Return one fault with alternatives for faults that explain the errors about equally well, best first."""
+    """Combine faults that explain the errors about equally well, best first, to one fault with alternatives."""
     if len(faults) == 1:
         return faults[0]
     clauses = dict.fromkeys(fault.clause for fault in faults)
@@ -124,7 +124,7 @@ def fault_of_cause(cause: Cause, before: float, after: float) -> SetupFault:
 
 
 def fault_from_hypothesis(here: Hypothesis, other: Hypothesis, after_nominal: float) -> SetupFault:
-    """Return the fault of a hypothesis, with errors before (`here`), after, and of the nominal robot [m]."""
+    """Return the fault of a hypothesis, with errors before (`here`) and after, and of the nominal robot [m]."""
     (before, before_rotation), (after, after_rotation) = here.rms(), other.rms()
     return SetupFault(
         kinds=tuple(cause.kind for cause in other.causes),

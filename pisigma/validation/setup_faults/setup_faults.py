@@ -48,18 +48,18 @@ def find_setup_faults(
     The hypotheses are: another frame and another tool (best-fitting rigid transforms), positions in other units or
     mirrored, orientations in another convention, shifted rows, degrees for radians or millimetres for metres (and vice
     versa) in joint columns, all orders and signs of the joints, pairs of coupled joints, zeros moved by multiples of 90
-    deg or one zero moved by any amount, and a correction that was applied once more or once less than logged; each also
-    together with another frame and tool, as after a new setup of the sensor. Several faults are returned if they
-    explain the errors equally well. If nothing explains the errors, the nominal robot is tried; see
+    deg or one zero moved by any amount, and a correction that was applied once more or once less than logged; each is
+    also tried together with another frame and tool, as after a new setup of the sensor. Several faults are returned if
+    they explain the errors equally well. If nothing explains the errors, the nominal robot is tried; see
     `find_nominal_robot_faults`.
 
     Args:
         model: the model.
-        nominal: the nominal robot with base and tool fitted, to report its errors after the correction; None not to
-            report them.
+        nominal: the nominal robot with base and tool fitted, to report its errors after the correction; None to omit
+            them.
         measurements: rows with positions in frames and of targets of the model; joint limits are not considered.
-        fitted: frames or targets that are fitted to the rows: any name is allowed, and a motion is not a fault.
-        frames_only: try only motions of frames and tools.
+        fitted: frames or targets that are fitted to the rows; any name is allowed, and a motion is not a fault.
+        frames_only: whether to try only motions of frames and tools.
 
     Returns:
         The faults; empty if the errors are below 0.02 mm, or if nothing explains them.
@@ -130,7 +130,7 @@ def is_implausible(figures: ModelFigures, model: CalibratedModel) -> bool:
 
 
 def unexplained(model: CalibratedModel) -> Diagnostic:
-    """Return the finding that no setup fault explains implausible errors of a model, with what to check."""
+    """Return the finding that no setup fault explains implausible errors of a model, with advice on what to check."""
     limit, turn = PLAUSIBLE_SHARE * model.robot.reach * 1e3, np.rad2deg(PLAUSIBLE_TURN)
     return Diagnostic(
         kind="implausible_errors",

@@ -1,1 +1,1 @@
-"""Uncertainty of a corrected robot after the GUM (JCGM 100:2008): components, their budget, and its instrument."""
+"""Uncertainty of a corrected robot according to the GUM (JCGM 100:2008): components, budget and instrument."""

@@ -1,4 +1,4 @@
-"""Uncertainty budget after the GUM: standard uncertainties of components, and the expanded uncertainty of their sum."""
+"""Uncertainty budget according to the GUM: standard uncertainties of components, and their expanded sum."""
 
 import math
 from dataclasses import dataclass
@@ -16,8 +16,8 @@ class Component:
         name: the uncertain quantity.
         evaluation: "A": from repeated observations (JCGM 100:2008, 4.2); "B": from other knowledge (4.3).
         standard_uncertainty: standard uncertainty of one coordinate of the tool's position [m].
-        degrees_of_freedom: degrees of freedom; infinite if the uncertainty is assumed to be exact; None if they are
-            unknown and therefore treated as infinite.
+        degrees_of_freedom: degrees of freedom; infinite if the uncertainty is assumed to be exact; None if unknown,
+            which is treated as infinite.
         source: source of the figure.
     """
 
@@ -47,7 +47,7 @@ class UncertaintyBudget:
 
     Attributes:
         components: components whose figures come from data or from a stated setting.
-        missing: components that are not stated, one sentence each; they do not contribute.
+        missing: components that are not stated and do not contribute, one sentence each.
     """
 
     components: tuple[Component, ...]

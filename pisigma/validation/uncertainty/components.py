@@ -1,6 +1,6 @@
-"""Components of the uncertainty of a corrected robot, from a model, its rows, and statements about the cell.
+"""Components of the uncertainty of a corrected robot, from a model, its rows, and values stated for the cell.
 
-Functions return a `Component`, or a sentence that names what is not stated.
+Functions return a `Component`, or a sentence that names the missing statement.
 """
 
 import math
@@ -19,7 +19,7 @@ from pisigma.validation.uncertainty.instrument import Instrument
 SCATTER = "scatter that the model leaves"
 """Name of the component that makes a budget comparable with measured errors."""
 _POSITION = "position"
-"""Sensor whose residuals are coordinates."""
+"""Sensor whose residuals are coordinates of positions."""
 
 
 def uncertainty_budget(
@@ -34,9 +34,9 @@ def uncertainty_budget(
 ) -> UncertaintyBudget:
     """Return the budget of one coordinate of the tool's position, with the correction active.
 
-    The scatter of the calibration contains the repeatability of the robot, the random errors of the instrument and
-    what the model cannot express; the certificate of the instrument also covers its random errors. The budget therefore
-    tends to be too large rather than too small.
+    The scatter of the calibration contains the repeatability of the robot, the random errors of the instrument, and
+    errors that the model cannot express; the certificate of the instrument also covers its random errors. The budget
+    therefore tends to be too large rather than too small.
 
     Args:
         model: the model.
@@ -46,8 +46,8 @@ def uncertainty_budget(
         temperatures: mean temperature of every session [deg C], by name; None if the rows do not state it.
         made_of: names of the sessions to which the model was fitted.
         expansion_per_k: coefficient of linear expansion of the arm [1/K]; None if it is not stated.
-        repeatability_mm: pose repeatability RP of the maker [mm], which is used if the scatter is not known; None if
-            it is not stated.
+        repeatability_mm: pose repeatability RP stated by the manufacturer [mm], which is used if the scatter is
+            unknown; None if it is not stated.
     """
     scatter = scatter_component(model)
     found = (
@@ -65,7 +65,7 @@ def parameter_component(model: CalibratedModel, poses: Measurements | None, wher
     """Evaluate the uncertainty of the parameters: RMS over poses and axes of the posterior's standard deviation.
 
     `u² = mean(diag(J C Jᵀ))` with the covariance C of all parameters, including base and tool, and the derivatives J of
-    the positions by them.
+    the positions with respect to them.
 
     Args:
         model: the model.
@@ -85,7 +85,7 @@ def parameter_component(model: CalibratedModel, poses: Measurements | None, wher
 
 
 def scatter_component(model: CalibratedModel) -> Component | str:
-    """Evaluate the scatter that the model leaves: the standard deviation of a coordinate after the calibration.
+    """Evaluate the remaining scatter: the standard deviation of a coordinate after the calibration.
 
     `s² = Σ r² / (n - p)` of the n residuals r with the effective number p of parameters, with `ν = n - p` degrees of
     freedom.
@@ -100,7 +100,7 @@ def scatter_component(model: CalibratedModel) -> Component | str:
 
 
 def repeatability_component(repeatability_mm: float | None) -> Component | str:
-    """Evaluate the repeatability that the maker states, where no residuals of coordinates contain it.
+    """Evaluate the repeatability stated by the manufacturer, for models without residuals that contain it.
 
     Distances l from the barycentre of independent normal errors with the standard deviation σ along every axis have the
     mean `σ √(8/π)` and the variance `σ² (3 - 8/π)`, so that `RP = l̄ + 3 S_l` of ISO 9283:1998, 7.2.2 is `3.62 σ`.
@@ -117,7 +117,7 @@ def repeatability_component(repeatability_mm: float | None) -> Component | str:
 
 
 def instrument_component(instrument: Instrument) -> Component | str:
-    """Evaluate the instrument: `u = U / k` of its certificate (JCGM 100:2008, 4.3.3)."""
+    """Evaluate the uncertainty of the instrument: `u = U / k` of its certificate (JCGM 100:2008, 4.3.3)."""
     U, k = instrument.expanded_uncertainty_mm, instrument.coverage_factor
     if U is None or k is None:
         missing = "expanded_uncertainty_mm" if U is None else "coverage_factor"

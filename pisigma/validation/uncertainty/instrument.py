@@ -13,10 +13,10 @@ class Instrument(Section):
     """The measuring instrument and its calibration.
 
     Attributes:
-        name: maker and type.
+        name: manufacturer and type.
         serial: serial number.
         certificate: number of the calibration certificate.
-        calibrated: day of the calibration (ISO 8601).
+        calibrated: date of the calibration (ISO 8601).
         expanded_uncertainty_mm: expanded uncertainty U of a measured coordinate at the distance of the robot [mm].
         coverage_factor: coverage factor k of U, as the certificate states it.
     """

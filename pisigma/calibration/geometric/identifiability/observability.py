@@ -13,7 +13,7 @@ from pisigma.calibration.geometric.problem.problem import CalibrationProblem
 _ROUNDING = 1e-12
 """Ratio of an eigenvalue of the information to the largest one below which it is zero up to rounding."""
 _SHOWN = 0.25
-"""Component of a direction above which the sentence names its parameter."""
+"""Size of a component of a direction above which the sentence names its parameter."""
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ _OFF_SHARE = 0.2
 
 
 def refuse_implausible(problem: CalibrationProblem, here: Linearisation[Tensor], source: str) -> None:
-    """Refuse a fit of the arm with large residuals of most positions or distances, or with impossible links.
+    """Refuse a fit of the arm if most positions or distances have large residuals, or if links are impossible.
 
     If no parameter of the arm is free (only base and tool), nothing is refused. Touches and corners are not tested.
 
@@ -67,7 +67,7 @@ def refuse_implausible(problem: CalibrationProblem, here: Linearisation[Tensor],
 
 
 def _refuse_ruined_links(problem: CalibrationProblem, point: Tensor, source: str) -> None:
-    """Refuse an arm with long links that changed by half, for example because metres are in a column of millimetres.
+    """Refuse an arm whose long links changed by half, for example because a column of millimetres contains metres.
 
     Raises:
         ImplausibleError: a long link changed by more than half of its length.
@@ -92,7 +92,7 @@ def _refuse_ruined_links(problem: CalibrationProblem, point: Tensor, source: str
 def misfitting_frames(
     problem: CalibrationProblem, here: Linearisation[Tensor]
 ) -> tuple[CalibrationWarning, ...]:
-    """Return warnings about frames with far larger residuals than the other frames.
+    """Return warnings about frames whose residuals are far larger than those of the other frames.
 
     Args:
         problem: the problem with its free parameters.

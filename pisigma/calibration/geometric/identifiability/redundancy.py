@@ -24,7 +24,7 @@ _EXPLAINED = 0.5
 _SIGNIFICANT = 20.0
 """F statistic that further parameters must reach in order to be added."""
 _VISIBLE = 1e-7
-"""Share of a column's length orthogonal to the kept columns below which it is treated as dependent."""
+"""Share of a column's length that is orthogonal to the kept columns, below which the column is treated as dependent."""
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from pisigma.robot.kinematics.forward import forward_kinematics
 
 @dataclass(frozen=True)
 class CalibrationWarning:
-    """A warning about what measurements do not determine, or what does not fit, with the action to take.
+    """A warning about something that measurements do not determine or that does not fit, with the action to take.
 
     Attributes:
         kind: kind of the warning.
@@ -78,7 +78,7 @@ def free_parameters(redundancy: Redundancy, explicit: bool, unknowns: int) -> in
 def refuse_too_few(
     problem: CalibrationProblem, redundancy: Redundancy, explicit: bool, unknowns: int, source: str
 ) -> None:
-    """Refuse data that cannot determine the free parameters.
+    """Refuse data that are too few to determine the free parameters.
 
     Args:
         problem: rows and sensors.
@@ -193,8 +193,8 @@ def _undetermined(setup: CalibrationSetup) -> tuple[CalibrationWarning, ...]:
 def determines_scale(setup: CalibrationSetup) -> bool:
     """Return whether the measurements determine the scale.
 
-    Sockets fit a robot of any size; touches determine lengths by faces at different coordinates. Orientations alone do
-    not determine the scale, but lengths then have no effect either, so no length has to be fixed.
+    Sockets fit a robot of any size; touches determine lengths if faces have different coordinates. Orientations alone
+    do not determine the scale, but lengths then have no effect either, so no length has to be fixed.
     """
     data = setup.measurements
     lengths = _lengths(setup)
@@ -257,7 +257,7 @@ def without_sensor_unknowns(setup: CalibrationSetup, information: Information) -
 
 
 def _scale_of_boards(setup: CalibrationSetup) -> str:
-    """Yield a warning if only boards determine the scale, which states how accurately."""
+    """Yield a warning if only boards determine the scale, stating how accurately they do so."""
     stated = [float(text) for text in texts_of(setup.measurements, SCALE_COLUMN) if text]
     how_sure = (
         f"the stated standard deviation of its squares is {max(stated):.2g} of their length, or "

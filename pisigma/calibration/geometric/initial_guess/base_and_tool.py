@@ -87,12 +87,11 @@ def fit_base_and_tool(
     """Fit base and tool of a robot to measured poses or positions; no initial guess is needed.
 
     A closed-form start (see `base_and_tool_starts`) is refined by least squares on base (6) and tool: 6 parameters if
-    rotations were measured; otherwise the position of every target, with the orientation of the tool fixed. The
-    weights are 1 / sigma if the measurements state it; otherwise the inverse of the scatter of positions and of
-    rotations.
+    rotations were measured; otherwise the position of every target, with the orientation of the tool fixed. The weights
+    are 1 / sigma if the measurements state sigma, otherwise the inverse of the scatter of positions and of rotations.
 
     Args:
-        robot: the robot; its base and tool are not used as a guess, but only for what the data do not determine.
+        robot: the robot; its base and tool are used only for what the data do not determine, not as a guess.
         measurements: rows with `position`, and `rotation` if measured, all in one frame.
         free_base: whether to fit the base; otherwise the base of the robot is used.
         free_tool: whether to fit the tool; otherwise the tool of the robot is used.
@@ -169,10 +168,10 @@ def _solved(robot: Robot, problem: BaseToolProblem, maximum_iterations: int) -> 
 
 
 def _off(robot: Robot, problem: BaseToolProblem, solution: Solution[BaseToolState]) -> tuple[float, bool]:
-    """Return the size of the residuals of a solution [m], and whether residuals of positions are small.
+    """Return the size of the residuals of a solution [m], and whether the residuals of positions are small.
 
-    Angles are converted to lengths at the reach of the arm. The cost cannot be compared, because every search divides
-    it by its own noise.
+    Angles are converted to lengths at the reach of the arm. Costs cannot be compared, because every search divides by
+    its own estimate of the noise.
     """
     shift = _rms_position(problem, solution.linearisation.point)
     turn = (

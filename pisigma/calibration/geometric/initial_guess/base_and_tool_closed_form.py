@@ -17,13 +17,13 @@ _LINEAR_ROWS = 13
 _DEPENDENT = 1e-9
 """Ratio of a singular value of the linear system to the largest one below which it is treated as zero."""
 _UNDETERMINED = 1e-9
-"""Relative weight of the given rotation, which is used for what points do not determine."""
+"""Relative weight of the given rotation, which determines what the points leave undetermined."""
 _SINGLE = 0.9
 """Ratio of the second to the first singular value above which the rotations may not be unique."""
 
 
 def base_and_tool_starts(robot: Robot, problem: BaseToolProblem) -> Iterator[BaseToolState]:
-    """Yield starts to refine and compare; one is sufficient except for positions of few or special poses.
+    """Yield starts to refine and compare; one is sufficient unless positions were measured in few or special poses.
 
     Args:
         robot: the robot, whose base and tool are used if they are not free or not determined.

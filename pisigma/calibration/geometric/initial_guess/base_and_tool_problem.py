@@ -36,7 +36,7 @@ class BaseToolState:
 
 @dataclass(frozen=True, eq=False)
 class _View:
-    """Normal matrix, right side and cost of positions and of rotations, and their standard deviations."""
+    """Normal matrix, right-hand side and cost of positions and of rotations, and their standard deviations."""
 
     blocks: tuple[tuple[Tensor, Tensor, float], ...]
     noise: tuple[float, float]

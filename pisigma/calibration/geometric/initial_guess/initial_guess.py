@@ -35,7 +35,7 @@ from pisigma.robot.se3 import (
 _GUESS_ROWS = 1_024
 """Largest number of rows used to guess base and tool."""
 _MIN_POSITIONS = 9
-"""Number of positions below which a frame's base is guessed with the tools of other frames."""
+"""Number of positions below which a frame's base is guessed with tools that were found in other frames."""
 _MIN_POSITIONS_TOUCHED = 5
 """Number of positions in a touched frame that are sufficient for base and tool in closed form."""
 MIN_TURN = 0.02
@@ -51,7 +51,7 @@ class InitialGuess:
         bases: base in every frame: x, y, z [m], roll, pitch, yaw [rad].
         tools: tool of every target, in the same form.
         unknowns: unknowns of every owner in its frame, by group of the sensors' unknowns [m or rad].
-        free_unknowns: mask of the unknowns to identify; measurements state the other values.
+        free_unknowns: mask of the unknowns to identify; the measurements state the others.
     """
 
     bases: Float64[np.ndarray, "frames 6"]
@@ -251,7 +251,7 @@ def tool_from_sockets(
     socket: Int64[Tensor, " rows"],
     guess: Float64[Tensor, " 3"],
 ) -> Float64[Tensor, " 3"]:
-    """Compute the position of a ball on the flange such that the rows of every socket agree best.
+    """Compute the position of a ball on the flange at which the rows of every socket agree best.
 
     `R · ball + p - socket = 0` is linear in ball and socket; subtracting the means over the rows of every socket
     eliminates the sockets. Directions that the orientations hardly determine keep their guess.

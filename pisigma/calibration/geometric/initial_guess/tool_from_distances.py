@@ -51,7 +51,7 @@ _MAX_WRONG_SHARE = 0.25
 
 @dataclass(frozen=True, eq=False)
 class _Distances:
-    """Distances of one target's rows from anchors, and from the other rows of pairs (anchor -1).
+    """Distances of one target's rows from anchors, or from the other rows of their pairs (anchor -1).
 
     The length of `R · tool + p - anchor` is measured; for pairs, R and p are the differences between the two rows.
     """

@@ -1,4 +1,4 @@
-"""Directions of the free parameters that keep their values in a search, because the rows do not determine them."""
+"""Directions of the free parameters that a search does not change, because the rows do not determine them."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 LARGEST_DEVIATION = 1e3
-"""Standard deviation [mm or mrad] that the covariance states where the rows contain no information at all."""
+"""Standard deviation [mm or mrad] in the covariance of directions on which the rows contain no information."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,12 +31,12 @@ class HeldDirections:
     ) -> tuple[Float64[Tensor, "active active"], Float64[Tensor, " active"]]:
         """Return normal equations whose step has no component along the directions.
 
-        With V the directions and `P = I - V V^T`, they are `P normal P + c V V^T` and `P descent` in units of `scale`.
+        With the directions V and `P = I - V V^T`, they are `P normal P + c V V^T` and `P descent` in units of `scale`.
         The constant c, the information on the best determined parameter, only keeps the matrix regular.
 
         Args:
             normal: matrix of the normal equations [1/m² or 1/rad²].
-            descent: their right side [1/m or 1/rad].
+            descent: their right-hand side [1/m or 1/rad].
             scale: size of 1 mm or 1 mrad for every parameter.
         """
         V, units = self.directions.to(normal), scale * scale[:, None]

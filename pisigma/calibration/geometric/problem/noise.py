@@ -33,7 +33,7 @@ class SensorContribution:
 
     Attributes:
         normal: `Σ w J J^T / sigma_row²` over the rows of the sensor.
-        descent: `Σ w J r / sigma_row²`, the right side of the normal equations.
+        descent: `Σ w J r / sigma_row²`, the right-hand side of the normal equations.
         residual: measured minus predicted values [m or rad]; 0 in rows without a value.
         distance: length of the residual divided by sigma_row; 0 in rows without a value.
         measured: number of measured rows.
@@ -223,18 +223,19 @@ def angle_disagreement(
     """Estimate the factor on the variance of measured angles, per sensor.
 
     Orientation errors that the geometry does not explain, such as the wobble of a wrist, depend on the pose. If rows
-    are treated as independent, they seem to determine the geometry far better than they do, and pull the predicted
-    positions away from the measured ones. Let x be the parameters estimated from lengths and prior alone, with the
-    information A, and y the parameters estimated also from angles. Including the angles changes predicted lengths by
-    `(x - y)^T Q (x - y)`, with the information Q of the lengths alone, while `tr(Q (cov x - cov y))` is expected.
-    The factor, which is at least 1, makes both equal. It is the moment estimator of random-effects meta-analysis
-    (DerSimonian and Laird 1986, Controlled Clinical Trials 7(3), 177-188), weighted by the cost of predicted lengths.
+    are treated as independent, the angles seem to determine the geometry far better than they do, and pull the
+    predicted positions away from the measured ones. Let x be the parameters estimated from lengths and prior alone,
+    with the information A, and y the parameters estimated also from angles. Including the angles changes predicted
+    lengths by `(x - y)^T Q (x - y)`, with the information Q of the lengths alone, while `tr(Q (cov x - cov y))` is
+    expected. The factor, which is at least 1, makes both equal. It is the moment estimator of random-effects
+    meta-analysis (DerSimonian and Laird 1986, Controlled Clinical Trials 7(3), 177-188), weighted by the cost of
+    predicted lengths.
 
     Args:
         sensors: the sensors.
         view: normal equations and noise.
         held: prior precision of every free parameter.
-        pull: contribution of the prior to the right side of the normal equations.
+        pull: contribution of the prior to the right-hand side of the normal equations.
     """
     angular = [sensor.unit == "rad" and not sensor.certain for sensor in sensors]
     lengths = [sensor.unit != "rad" and not sensor.certain for sensor in sensors]

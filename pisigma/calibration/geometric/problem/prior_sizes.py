@@ -19,19 +19,19 @@ SMALLEST_PRIOR = 0.03
 class PriorGroup(IntEnum):
     """Groups of parameters whose errors have a common prior scale, because they have the same cause.
 
-    There are few groups, because a scale needs several parameters; one scale per parameter (relevance vectors,
-    Tipping 2001) fits the noise. Lengths that are nominally 0 have their own group, because calibrations of weak
-    data were worse when they were joined with the others; it made no difference whether d and a, or alpha and beta,
-    are separated.
+    There are few groups, because a scale can only be estimated from several parameters; one scale per parameter
+    (relevance vectors, Tipping 2001) fits the noise. Lengths that are nominally 0 have their own group, because
+    calibrations of weak data were worse when they were joined with the others; it made no difference whether d and a,
+    or alpha and beta, are separated.
     """
 
     JOINT_OFFSET = 0
     """Group of theta, the zeros of the joints."""
     LENGTH = 1
-    """Group of d and a that are nominally not 0, the lengths of links."""
+    """Group of d and a that are nominally nonzero, the lengths of links."""
     NO_LENGTH = 2
-    """Group of d and a that are nominally 0 or below their tolerance, the distances of axes that should meet or be
-    in line."""
+    """Group of d and a that are nominally 0 or below their tolerance, the distances between axes that should intersect
+    or align."""
     BETWEEN_AXES = 3
     """Group of alpha and beta, the angles between axes."""
 

@@ -18,13 +18,13 @@ _ALONG = np.linspace(0.2, 0.8, 9)
 _ACROSS = np.linspace(-1.0, 1.0, 41)
 """Positions of the samples across an edge, relative to half the sampled width."""
 _FOLLOWED = 0.7
-"""Half the sampled width relative to the clearance of an edge; it is < 1 because neighbouring edges are blurred,
-too."""
+"""Half the sampled width relative to the clearance of an edge; it is < 1 because neighbouring edges are also
+blurred."""
 _ENDS = 0.7
 """Relative position across an edge beyond which the samples are fully black or white."""
 _SMOOTHING = 1.5
-"""Standard deviation [px] of the smoothing before gradients are computed, less in small windows; the best value on
-rendered images."""
+"""Standard deviation [px] of the smoothing before gradients are computed, which is less in small windows; it is the
+best value on rendered images."""
 _WINDOW = 0.8
 """Half the side of the window around a corner, relative to the clearance."""
 _MIN_SQUARE = 16.0
@@ -37,7 +37,7 @@ _ITERATIONS = 4
 _DAMPING = 1e-9
 """Damping of the normal matrices, whose diagonals are scaled to 1, for windows without contrast."""
 _LOG_BLURS = np.log((0.2, 6.0))
-"""Logarithms of the smallest and largest blur [px] of a fit."""
+"""Logarithms of the smallest and largest blur [px] that a fit may have."""
 _MAX_SHIFT = 0.5
 """Shift of a corner [px] above which a fit is discarded, because it has fitted another structure."""
 _INITIAL_BLUR = 1.0
@@ -85,8 +85,8 @@ def refine_corners(image: Image, detected: DetectedBoard, board: Board) -> Detec
     """Return corners of squares refined to sub-pixel accuracy.
 
     Corners are first moved to the point to which the gradients around them are perpendicular (Förstner & Gülch 1987).
-    The window around each is as large as possible without other edges in it; corners whose window leaves the image are
-    left out. The gray values are then fitted, see `fit_saddles`.
+    The window around each is as large as possible without other edges in it; corners whose window extends beyond the
+    image are left out. The gray values are then fitted, see `fit_saddles`.
 
     Args:
         image: the image.
@@ -193,8 +193,8 @@ def fit_saddles(
     With `s_i` the distances of a pixel at x from the two lines of directions `θ_i` through the corner at c, its gray
     value is `(m + k erf(s_1 / √2 σ) erf(s_2 / √2 σ)) (1 + g · (x - c))`: edges blurred by σ, under light of gradient g.
     The nine unknowns of every corner (c, θ_1, θ_2, log σ, m, k, g) are found by Gauss-Newton steps. For independent
-    noise of the pixels this is the maximum-likelihood estimate; corners from gradients of the same pixels have twice
-    the noise and are biased by gradients of the light.
+    noise of the pixels, this is the maximum-likelihood estimate; corners computed from gradients of the same pixels
+    have twice the noise and are biased by gradients of the light.
 
     Args:
         gray: gray values of the image.
@@ -256,8 +256,8 @@ def _saddle(
         steps.append(erf(distance / np.sqrt(2)))
         slopes.append(np.sqrt(2 / np.pi) * np.exp(-(distance**2) / 2))
         alongs.append((cos * off[..., 0] + sin * off[..., 1]) / blur)
-        # Derivatives of d: with respect to the corner (sin, -cos) / blur, by the angle -along, by the logarithm of the
-        # blur -d.
+        # Derivatives of d: (sin, -cos) / blur with respect to the corner, -along to the angle, -d to the logarithm of
+        # the blur.
         normals.append((sin / blur, -cos / blur, distance))
     by = np.empty((*x.shape[:2], 5))
     first, second = slopes[0] * steps[1], steps[0] * slopes[1]

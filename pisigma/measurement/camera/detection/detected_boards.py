@@ -116,7 +116,7 @@ def rms_of(residual: Float64[np.ndarray, "*corners 2"]) -> float:
 
 
 def predict_boards(images: Sequence[BoardImage], camera: Camera, board: Board) -> DetectedBoards:
-    """Predict corners from the pose of the board in every image, and remove those of images for which no pose fits.
+    """Predict corners from the pose of the board in every image, and drop images for which no pose fits.
 
     Raises:
         MeasurementError: the size of an image differs from that of the camera's images.

@@ -31,17 +31,17 @@ from pisigma.measurement.camera.detection.video import (
 )
 
 _MIN_PIECE = 3
-"""Smallest number of rows and columns of corners of a piece of a board that is recognised."""
+"""Smallest number of rows and columns of corners in a recognised piece of a board."""
 
 
 def detect_checkerboard(image: Image, board: Board) -> DetectedBoard | NoBoard:
     """Find all corners of a checkerboard, which must be completely visible.
 
-    Corners are found by sectors (Duda & Frese 2018) and refined by their gradients; on rendered images this is as
+    Corners are found with sectors (Duda & Frese 2018) and refined with their gradients; on rendered images this is as
     accurate as the search at twice the resolution, and four times as fast.
 
     Returns:
-        The corners; on a symmetric board the numbering starts at the corner nearest to the upper left of the image.
+        The corners; on a symmetric board, the numbering starts at the corner nearest to the upper left of the image.
     """
     there, corners = cv2.findChessboardCornersSB(image, (board.columns, board.rows))
     if not there:
@@ -69,7 +69,7 @@ def _numbered(
 
 
 def _missing(image: Image, board: Board) -> NoBoard:
-    """Return why no complete board was found: only a piece of it is visible, or nothing."""
+    """Return why no complete board was found: only part of it is visible, or none of it."""
     size = (_MIN_PIECE, _MIN_PIECE)
     there, _, piece = cv2.findChessboardCornersSBWithMeta(image, size, cv2.CALIB_CB_LARGER)
     expected = f"{board.rows} x {board.columns} corners"
@@ -98,8 +98,8 @@ def image_files(
 
     Args:
         paths: image files, videos, and folders of image files.
-        video_start: time of the first frame of a video in another clock [s], if frames are named by their time in
-            this clock; None: they are named by the numbers of the stops, from 1.
+        video_start: time of the first frame of a video on another clock [s], if frames are to be named by their time on
+            that clock; None to name them by the numbers of the stops, from 1.
 
     Raises:
         MeasurementError: there are no images, two images have the same name, or a video has no frame at rest.

@@ -19,7 +19,7 @@ _ITERATIONS = 2
 
 
 def detect_charuco(image: Image, board: Board) -> DetectedBoard | NoBoard:
-    """Find the corners of a ChArUco board that are next to a decoded marker, possibly only some of them."""
+    """Find those corners of a ChArUco board that are next to a decoded marker, possibly only some of them."""
     size = (board.columns + 1, board.rows + 1)
     printed = cv2.aruco.CharucoBoard(size, board.square, board.marker, dictionary_of(board))
     corners, numbers, _, _ = cv2.aruco.CharucoDetector(printed).detectBoard(image)
@@ -83,6 +83,6 @@ def dictionary_of(board: Board) -> cv2.aruco.Dictionary:
 
 
 def marker_cells(board: Board, number: int) -> Bool[np.ndarray, "cells cells"]:
-    """Return which cells of a marker are black, row by row, including its black border."""
+    """Return the mask of a marker's black cells, row by row, including its black border."""
     dictionary = dictionary_of(board)
     return np.asarray(cv2.aruco.generateImageMarker(dictionary, number, dictionary.markerSize + 2) == 0)

@@ -1,4 +1,4 @@
-"""Sharp frames of videos of an arm that stops at every pose."""
+"""Sharp frames from videos of an arm that stops at every pose."""
 
 import os
 import threading
@@ -22,16 +22,16 @@ _ENDINGS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 FRAME = ".frame"
 """Beginning of the extension of a frame's path, such as VIDEO.mp4/0003.frame182."""
 _BLOCKS = (16, 12)
-"""Number of blocks of an image along u and v; any block that changes shows that the arm moves."""
+"""Number of blocks of an image along u and v; a change in any block shows that the arm is moving."""
 _BLOCK_PIXELS = 24
 """Width and height of a block after the reduction of the image [px]."""
 LAG = 0.1
 """Time between frames that are compared [s]; slow motions change neighbouring frames too little."""
 _MIN_STILL = 0.4
-"""Shortest time at rest of a stop [s]."""
+"""Shortest duration of a stop [s]."""
 _NOISE_SHARE, _NOISE_FACTOR, _NOISE_GRAY = 0.2, 1.5, 2.0
-"""The change of frames at rest is this quantile of all changes; larger changes are motions if they exceed it by this
-factor and this gray level."""
+"""Criteria of a motion: the change of frames at rest is the first quantile of all changes, and larger changes are
+motions if they exceed it by the second factor and by the third number of gray levels."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class StillFrame:
 def still_frames(path: str | os.PathLike[str]) -> tuple[StillFrame, ...]:
     """Return the sharpest frame of every stop in a video, by the variance of the Laplacian (Pech-Pacheco et al. 2000).
 
-    A stop is a time of 0.4 s or more in which no block of the image changes by more than the noise.
+    A stop is an interval of 0.4 s or more in which no block of the image changes by more than the noise.
 
     Raises:
         MeasurementError: the file is not a video that OpenCV reads, or contains no stop.
@@ -107,7 +107,8 @@ def read_frame(path: Path) -> Image:
 class _FrameReader:
     """Reads frames by decoding all frames before them.
 
-    OpenCV seeks by the mean frame rate and would return other frames of videos with a variable rate, as phones record.
+    OpenCV seeks with the mean frame rate and would return wrong frames of videos with a variable rate, as recorded by
+    phones.
     """
 
     def __init__(self, path: Path) -> None:
@@ -120,7 +121,7 @@ class _FrameReader:
         self._video = _open(path)
 
     def read(self, number: int) -> Image | None:
-        """Return the gray values of a frame, or None if it cannot be decoded; ascending numbers need one pass."""
+        """Return the gray values of a frame, or None if it cannot be decoded; ascending numbers need a single pass."""
         if number < self._next:
             self._video, self._next = _open(self._path), 0
         while self._next <= number:
@@ -132,12 +133,12 @@ class _FrameReader:
 
 
 _LOCK = threading.Lock()
-"""Held while a frame is read, because all threads share one reader."""
+"""Lock that is held while a frame is read, because all threads share one reader."""
 
 
 @lru_cache(maxsize=1)
 def _frame_reader(path: Path, mtime_ns: int) -> _FrameReader:
-    """Return the reader of a video, which is the same until another video is read or the file changes."""
+    """Return the reader of a video, which is reused until another video is read or the file changes."""
     return _FrameReader(path)
 
 
@@ -183,7 +184,7 @@ def _opened(path: str | os.PathLike[str]) -> Iterator[cv2.VideoCapture]:
 
 
 def _open(path: str | os.PathLike[str]) -> cv2.VideoCapture:
-    """Open a video, see `_opened`; whoever has it last closes it."""
+    """Open a video (see `_opened`); it is closed when the last reference to it is dropped."""
     if not os.path.isfile(path):
         read_input(path, MeasurementError)
     video = cv2.VideoCapture(os.fspath(path))

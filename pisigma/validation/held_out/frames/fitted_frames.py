@@ -32,7 +32,7 @@ FrameKind = Literal["base", "tool"]
 """Frames that can be fitted: the base in every frame of the rows, the tool of every target."""
 
 MIN_CONFIGURATIONS = 6
-"""Different joint vectors that a frame or a target needs: 18 values for the 9 parameters of base and tool."""
+"""Number of different joint vectors that a frame or a target needs: 18 values for the 9 parameters of base and tool."""
 
 
 def fitted_kinds(fit_frame: bool, fit_tool: bool) -> tuple[FrameKind, ...]:
@@ -44,7 +44,7 @@ def fitted_kinds(fit_frame: bool, fit_tool: bool) -> tuple[FrameKind, ...]:
 def with_known_names(
     model: CalibratedModel, rows: Measurements, fitted: Collection[FrameKind]
 ) -> Measurements:
-    """Replace the names of fitted frames and targets by some name of the model, because their poses do not matter."""
+    """Replace the names of fitted frames and targets with any name of the model, because their poses do not matter."""
     if "base" in fitted:
         rows = replace(rows, frame=(next(iter(model.bases), ""),) * rows.rows)
     if "tool" in fitted:
@@ -73,7 +73,7 @@ def fitted_remark(rows: Measurements, fitted: Collection[FrameKind]) -> tuple[st
 def errors_in_fitted_frames(
     model: CalibratedModel, measurements: Measurements, fitted: Collection[FrameKind]
 ) -> ErrorVectors:
-    """Compute errors under a model, with frames or targets fitted as after a sensor or a reflector was moved.
+    """Compute errors under a model, with frames or targets fitted, as after a sensor or a reflector was moved.
 
     Parameters that are fitted to n values make their errors too small. Therefore the errors are multiplied by
     `sqrt(n / (n - p))`, where p is the trace of the hat matrix over these values, which is the number of parameters if
@@ -86,8 +86,8 @@ def errors_in_fitted_frames(
         fitted: what is fitted; empty for the errors in the frames of the model.
 
     Returns:
-        Measured minus predicted, see `errors_of_rows`; NaN where nothing was measured or predicted, and in rows
-        without a position if something is fitted.
+        Measured minus predicted values, see `errors_of_rows`; NaN where nothing was measured or predicted, and in rows
+        without a position if frames or targets are fitted.
 
     Raises:
         MeasurementError: a frame or a target has fewer than `MIN_CONFIGURATIONS` different joint vectors, there are no
@@ -124,7 +124,7 @@ def errors_in_fitted_frames(
 
 
 def _enlargement(rows: Measurements, fitted: float) -> float:
-    """Compute the factor on errors for a number of fitted parameters."""
+    """Compute the factor on errors that corrects for the number of fitted parameters."""
     values = 3 * len(set(groups_to_keep_whole(rows).tolist()))
     return float((values / (values - fitted)) ** 0.5) if fitted else 1.0
 
@@ -132,7 +132,7 @@ def _enlargement(rows: Measurements, fitted: float) -> float:
 def _check_configurations(
     model: CalibratedModel, measurements: Measurements, rows: Measurements, fitted: Collection[FrameKind]
 ) -> None:
-    """Refuse frames and targets that have too few rows to be fitted."""
+    """Refuse frames and targets with too few rows for a fit."""
     names = {
         "base": ("frame", measurements.frame, rows.frame),
         "tool": ("target", measurements.target, rows.target),

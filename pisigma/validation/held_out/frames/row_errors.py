@@ -22,9 +22,9 @@ def errors_of_rows(T: Float64[Tensor, "rows 4 4"], measurements: Measurements) -
         measurements: the rows.
 
     Returns:
-        As `position` the errors of positions, and in rows without one those of the measured length: for a ball in a
-        socket along the axes of the frame, for a wire, a touch or a pair the difference as the first component. NaN
-        where nothing was measured or predicted.
+        `position` contains the errors of positions, and in rows without a position the errors of the measured length:
+        along the axes of the frame for a ball in a socket; the difference, as the first component, for a wire, a touch
+        or a pair. NaN where nothing was measured or predicted.
 
     Raises:
         IdentificationError: an anchor has too few rows to determine its position.
@@ -52,7 +52,7 @@ def errors_of_rows(T: Float64[Tensor, "rows 4 4"], measurements: Measurements) -
 
 
 def other_lengths(measurements: Measurements) -> Bool[Tensor, " rows"]:
-    """Return which rows have a length of another sensor but no position."""
+    """Return the mask of rows that have a length from another sensor but no position."""
     kinds = [kind for kind in measurements.kinds if kind in SENSORS and SENSORS[kind].unit == "m"]
     there = torch.zeros(measurements.rows, dtype=torch.bool)
     for kind in kinds:
@@ -61,7 +61,7 @@ def other_lengths(measurements: Measurements) -> Bool[Tensor, " rows"]:
 
 
 def has_position(measurements: Measurements) -> Bool[Tensor, " rows"]:
-    """Return which rows have a position."""
+    """Return the mask of rows that have a position."""
     if measurements.position is None:
         return torch.zeros(measurements.rows, dtype=torch.bool)
     return torch.isfinite(measurements.position).all(-1)
