@@ -215,7 +215,8 @@ def _moving(joint: Any, origin: Frame, at: Place, commanded: Collection[str]) ->
             expected="a revolute or prismatic joint",
             value=joint.type,
             at=at,
-            remedy="choose base and tip so that it is not between them, or replace it with revolute and prismatic joints",
+            remedy="choose base and tip so that it is not between them, or replace it with revolute and prismatic "
+            "ones",
         )
     # URDF's default axis is x; pytorch-kinematics' own chains use z.
     axis = np.array((1.0, 0.0, 0.0) if joint.axis is None else joint.axis, dtype=np.float64)

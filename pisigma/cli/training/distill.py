@@ -64,7 +64,7 @@ def distill(
 ) -> None:
     """Distil a calibrated model into a small network for controllers that can only add an offset.
 
-    Prints its error against the full solution at held-out poses.
+    Prints its error relative to the full solution at held-out poses.
     """
     from pisigma.files.output_folder import check_folder
     from pisigma.lifetime.cell.layout import EXPORTS, model_folder
@@ -140,7 +140,9 @@ def _print(distillation: "Distillation", out: Path, as_json: bool, verbose: bool
         f"export it: `pisigma export {out} --format onnx --out MODEL.onnx`.",
     )
     head, rows = pose_rows(errors.models)
-    blocks = [table_block(f"errors of the tool against the full model, {count} held-out poses", head, rows)]
+    blocks = [
+        table_block(f"errors of the tool relative to the full model, {count} held-out poses", head, rows)
+    ]
     details = [
         table_block(
             "absolute joint corrections, and errors of the distilled ones", *correction_table(summary)
