@@ -1,1 +1,1 @@
-"""Changes since a calibration: recalibration, monitoring, comparison, fleets."""
+"""Changes since a calibration: recalibration, monitoring, comparison and fleets."""

@@ -1,4 +1,4 @@
-"""A camera that sees a board: the covariance of a pose from an image, before the image is taken."""
+"""A camera that sees a board, and the covariance of a pose from an image before the image is taken."""
 
 from dataclasses import dataclass
 
@@ -14,7 +14,7 @@ from pisigma.robot.se3 import invert, skew
 
 @dataclass(frozen=True, eq=False)
 class BoardSight:
-    """A camera and the board that it sees: one of them is on the flange (the target), the other is the measuring frame.
+    """A camera and the board that it sees: one is on the flange (the target), the other is the measuring frame.
 
     Attributes:
         camera: camera with known intrinsics.
@@ -31,11 +31,11 @@ class BoardSight:
     repeatability: Repeatability
 
     def board_in_camera(self, T_frame_target: Float64[Tensor, "poses 4 4"]) -> Float64[Tensor, "poses 4 4"]:
-        """Return T_camera_board of T_frame_target [m]."""
+        """Return T_camera_board for T_frame_target [m]."""
         return T_frame_target if self.is_fixed else invert(T_frame_target)
 
     def weight(self, T_frame_target: Float64[Tensor, "poses 4 4"]) -> Float64[Tensor, "poses 6 6"]:
-        """Compute lower triangular W such that `W^T W` is the inverse covariance of poses measured by images.
+        """Compute the lower triangular W for which `W^T W` is the inverse covariance of poses measured with images.
 
         The covariance is that of (translation [m], rotation vector [rad]) of the target in the axes of the measuring
         frame: `(Σ J^T J)^-1 noise²` over all corners plus the repeatability, as in `CornerSensor` for measured corners.
@@ -48,7 +48,7 @@ class BoardSight:
         in_camera = corners @ T[:, :3, :3].mT + T[:, None, :3, 3]
         by_point = torch.from_numpy(self.camera.project(in_camera.numpy())[1])
         origin = T_frame_target[:, None, :3, 3]
-        # A camera on the flange moves against the board, so the sign and the axes change.
+        # A camera on the flange moves relative to the board, so the sign and the axes change.
         if self.is_fixed:
             by_shift, lever = by_point, in_camera - origin
         else:

@@ -26,8 +26,8 @@ MAX_ITERATIONS = 30
 _MAX_DEPTH_RATIO = 8.0
 """Largest depth of random boards, as a multiple of the depth at which they fill the image."""
 _SIGHT_LINE_SHARES = (0.1, 0.8)
-"""Start and end of the checked part of a line of sight, as shares of the way from the camera to the board: camera and
-board may be mounted on a box."""
+"""Start and end of the checked part of a line of sight, as shares of the distance from the camera to the board, because
+camera and board may be mounted on a box."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,11 +63,11 @@ class BoardViews:
     def draw(
         self, arm: ArmInSurroundings, count: int, generator: torch.Generator
     ) -> Float64[Tensor, "count dof"]:
-        """Draw joint values [rad or m] of random views, each in a random branch; NaN where a view is not reached.
+        """Draw joint values [rad or m] of random views, each in a random branch; NaN if a view is not reached.
 
         Depth, obliqueness, its direction, the rotation about the line of sight and the position in the image are
-        uniform. An arm without a closed form, or with fewer than six joints, gets the poses nearest to a view that
-        numeric inverse kinematics finds from random joint values.
+        uniformly distributed. For an arm without a closed form, or with fewer than six joints, the poses are those
+        nearest to a view that numeric inverse kinematics finds from random joint values.
         """
         T_board = self._sampled_boards(count, generator)
         T_frame_target = T_board if self.sight.is_fixed else invert(T_board)
@@ -96,13 +96,13 @@ class BoardViews:
     def obliqueness(
         self, arm: ArmInSurroundings, q: Float64[Tensor, "poses dof"]
     ) -> Float64[Tensor, " poses"]:
-        """Compute the angle between board normal and line of sight to its centre [rad]; from behind > π / 2."""
+        """Compute the angle of the board's normal to the line of sight to its centre [rad]; > π / 2 from behind."""
         return self._obliqueness(self._boards(arm, q)[0])
 
     def margin_in_image(
         self, arm: ArmInSurroundings, q: Float64[Tensor, "poses dof"]
     ) -> Float64[Tensor, " poses"]:
-        """Compute the distance that the board may be from its stated position before it leaves the image [m]."""
+        """Compute how far the board may be from its stated position before it leaves the image [m]."""
         points, pixels, _ = self._shown(self._boards(arm, q)[0])
         edge = pixels.new_tensor([self.sight.camera.width, self.sight.camera.height])
         room = torch.minimum(pixels, edge - pixels).amin(-1) * points[..., 2] / self.sight.camera.fx
@@ -118,12 +118,12 @@ class BoardViews:
         left, top, right, bottom = board_sheet(self.sight.board)
         fills = camera.fx * min(right - left, bottom - top) / min(camera.width, camera.height)
         least, most = max(self.nearest, fills), min(self.farthest, _MAX_DEPTH_RATIO * fills)
-        # From where the board fills the image to where it is too small in it, within the stated distances.
+        # Depths from where the board fills the image to where it is too small, within the stated distances.
         depth = least + (most - least) * draws[:, 2:3]
         middle = depth * torch.cat([rays, torch.ones_like(depth)], 1)
         direction, turn = 2 * math.pi * draws[:, 3:5].t()
         nothing = torch.zeros_like(turn)
-        # Roll is the direction of the tilt and pitch its size; then the board is turned in its own plane.
+        # Roll is the direction of the tilt and pitch its size; the board is then rotated in its own plane.
         R = rotation_from_rpy(torch.stack([direction, self.oblique * draws[:, 5], nothing], 1))
         R = R @ rotation_from_rpy(torch.stack([turn, nothing, nothing], 1))
         return transform(R, middle - R @ self._middle)
@@ -164,7 +164,8 @@ class BoardViews:
     ]:
         """Return points of the sheet in the camera's frame [m], their pixels, and whether the projection is regular.
 
-        Far outside the image the polynomials of a distortion model fold back, so a pixel has several points.
+        Far outside the image, the polynomials of a distortion model fold back, so a pixel corresponds to several
+        points.
         """
         points = self._sheet @ T_camera_board[:, :3, :3].mT + T_camera_board[:, None, :3, 3]
         in_front = points.clone()

@@ -24,7 +24,7 @@ _KERNEL_WIDTH, _RARE_SHARE = 0.25, 0.5
 """Width of the kernel for the density of joint angles [rad], and the share of the mean density below which an angle
 is rare."""
 _MIN_VIEWS = 100
-"""Views of a board that are drawn together, because a robot reaches few of them."""
+"""Number of views of a board that are drawn together, because a robot reaches few of them."""
 _SAME_JOINTS = 1e-6
 """Difference of joint values below which rows of a file are the same pose [rad or m]."""
 _OUTSIDE_WORKSPACE = "the reflector is outside the box of the workspace"
@@ -41,12 +41,12 @@ class Candidates:
 
     Attributes:
         q: joint values [rad or m].
-        number: number of every candidate in the file, or among the poses that were drawn, from 1.
+        number: number of every candidate in the file, or among the drawn poses, from 1.
         looked_at: number of poses that were drawn or read.
         refused: number of refused poses by reason.
-        workspace: joint values at which the robot must be accurate, and which may be waypoints [rad or m]: the
-            candidates themselves; with a camera, which sees its board from a small part of the workspace only, poses
-            that the surroundings allow.
+        workspace: joint values at which the robot must be accurate, and which may be waypoints [rad or m]. These are
+            the candidates or, with a camera, which sees its board only from a small part of the workspace, poses that
+            the surroundings allow.
     """
 
     q: Float64[Tensor, "candidates dof"]
@@ -67,7 +67,7 @@ class Candidates:
         """Refuse a number of poses that exceeds the number of candidates.
 
         Raises:
-            PlanningError: there are fewer candidates; the message says why poses were refused.
+            PlanningError: there are fewer candidates; the message states why poses were refused.
         """
         if len(self.q) < count:
             raise PlanningError(
@@ -88,14 +88,14 @@ def draw_candidates(
     """Draw candidates until enough are allowed or too many were refused.
 
     Candidates are uniform in the joint values. Joints with a range of more than one revolution are drawn within half a
-    revolution of the centre of their range, or of 0 without limits, and then unwrapped (`with_workspace`). Where a
-    camera has to see a board, views are drawn instead.
+    revolution of the centre of their range, or of 0 without limits, and then unwrapped (`with_workspace`). If a camera
+    must see a board, views are drawn instead.
 
     Args:
         arm: the robot in its surroundings.
         count: number of candidates.
         seed: random seed.
-        workspace: box in which the reflector has to be; None for anywhere.
+        workspace: box in which the reflector must be; None for anywhere.
         views: conditions under which the camera sees its board; None without a camera.
 
     Raises:
@@ -114,16 +114,16 @@ def draw_candidates(
         blocks.append((q, _faults(arm, q, workspace, views)))
     q = torch.cat([sampled for sampled, _ in blocks])
     faults = Faults(blocks[0][1].reasons, torch.cat([one.failed for _, one in blocks]))
-    enough = int((faults.allowed.cumsum(0) < count).sum()) + 1  # poses up to the last that is needed
+    enough = int((faults.allowed.cumsum(0) < count).sum()) + 1  # poses up to the last one that is needed
     candidates = _allowed(q[:enough], replace(faults, failed=faults.failed[:enough]))
     return candidates if views is not None else with_workspace(arm, candidates, candidates)
 
 
 def with_workspace(arm: ArmInSurroundings, candidates: Candidates, others: Candidates) -> Candidates:
-    """Add the whole workspace to candidates that cover a part of it, and unwrap the joint values of both.
+    """Add the whole workspace to candidates that cover part of it, and unwrap the joint values of both.
 
     A joint that is rarely free at some angles, such as a shoulder above a floor, is unwrapped about the centre of the
-    other angles: between values on both sides of ±180 deg there would be no free motion.
+    other angles, because there would be no free motion between values on both sides of ±180 deg.
 
     Args:
         arm: the robot in its surroundings.
@@ -151,12 +151,12 @@ def read_candidates(
     workspace: Workspace | None = None,
     views: BoardViews | None = None,
 ) -> Candidates:
-    """Return candidates from the joint values of a file; repeated joint values count once.
+    """Return candidates from the joint values in a file; repeated joint values count once.
 
     Args:
         arm: the robot in its surroundings.
-        path: CSV file with joint values, of measurements or without.
-        workspace: box in which the reflector has to be; None for anywhere.
+        path: CSV file with joint values, with or without measurements.
+        workspace: box in which the reflector must be; None for anywhere.
         views: conditions under which the camera sees its board; None without a camera.
 
     Raises:
@@ -178,7 +178,7 @@ def _repeats(q: Float64[Tensor, "poses dof"]) -> Bool[Tensor, " poses"]:
 def select_spread_poses(
     arm: ArmInSurroundings, q: Float64[Tensor, "poses dof"], count: int, others: Float64[Tensor, "others dof"]
 ) -> Int64[Tensor, " chosen"]:
-    """Select poses spread over the workspace, always the pose farthest from all selected and given poses.
+    """Select poses spread over the workspace, each time the pose farthest from all selected and given poses.
 
     Distances combine the reflector's positions and the joint values, each divided by its standard deviation (Kennard
     and Stone 1969, Technometrics 11(1)).

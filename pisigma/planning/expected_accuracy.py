@@ -1,4 +1,4 @@
-"""Expected accuracy after measuring poses, the sources of the remaining error, and what limits planned images."""
+"""Expected accuracy after measuring poses, sources of the remaining error, and limits of planned images."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -20,11 +20,11 @@ _RANDOM_SELECTIONS = 5
 DRAWS = 100
 """Number of robots that are drawn from the posterior to compute quantiles."""
 DRAWS_AT_POSE = 1_000
-"""Robots that are drawn for the quantile at a single pose, which scatters by 2 % then."""
+"""Number of robots that are drawn for the quantile at a single pose, which then scatters by 2 %."""
 _MORE_IMAGES = 10
 """Number of additional images whose benefit is predicted."""
 _EXACT_CORNERS, _EXACT_ROBOT = 1e-4, Repeatability(1e-9, 1e-9)
-"""Noise of corners [px] and repeatability of a robot so small that they do not contribute to the error."""
+"""Noise of corners [px] and repeatability of a robot that are too small to contribute to the error."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class RemainingError:
     """Contribution of a group of unknowns to the remaining error.
 
     Attributes:
-        name: group, such as "correction of joint 2" or "tool".
+        name: name of the group, such as "correction of joint 2" or "tool".
         rms: contribution to the RMS error over the task, `sqrt(rms² - rms'²)` with the error rms' if the group were
             known exactly [m].
         share: share of the variance.
@@ -155,14 +155,14 @@ def _groups(posterior: RobotPosterior) -> dict[str, list[int]]:
 
 @dataclass(frozen=True)
 class CameraProspects:
-    """Expected error of planned images, and the error expected if one condition were better.
+    """Expected error with the planned images, and the errors expected if one condition were better.
 
     Attributes:
         rms: RMS position error over the task [m].
         rms_with_more_images: RMS error with `_MORE_IMAGES` more images [m].
         rms_with_exact_corners: RMS error with corners without noise [m].
         rms_with_exact_robot: RMS error with a robot that repeats exactly [m].
-        room: distance that the board may be from its place in the surroundings before it leaves an image [m].
+        room: largest distance of the board from its stated place at which it does not leave an image [m].
         unidentifiable: parameters of the arm that images cannot identify, one sentence each.
     """
 
@@ -227,7 +227,7 @@ class CameraProspects:
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """Sentences about what limits the accuracy, what is not identifiable, and how exactly to place the board."""
+        """Sentences about the limits of the accuracy, unidentifiable parameters, and how exactly to place the board."""
         better = {
             f"{_MORE_IMAGES} more images": self.rms_with_more_images,
             "corners without noise": self.rms_with_exact_corners,

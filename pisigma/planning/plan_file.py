@@ -51,7 +51,7 @@ class PlanDocument(Section):
         model: folder of the planned model, relative to this file; None for a nominal robot.
         settings: settings of the plan, with paths relative to this file.
         cell: surroundings of the robot.
-        way_points: waypoints between poses where the straight joint motion is not free.
+        way_points: waypoints between poses whose straight joint motion is not free.
     """
 
     poses_file: str = Field(alias="poses")
@@ -73,8 +73,8 @@ class StoredPlan:
         q: joint values [rad or m].
         check: whether each pose tests the calibration (set "test") or is used for it ("train").
         candidate: row of each pose in the file of candidates, or its number among the random poses; from 1.
-        waypoints: joint values through which the robot moves to each pose [rad or m]; mostly none.
-        number: number of each pose, which parts of the plan keep; () if numbers start at 1.
+        waypoints: joint values through which the robot moves to each pose [rad or m]; usually none.
+        number: number of each pose, which is kept in parts of the plan; () if numbers start at 1.
     """
 
     arm: ArmInSurroundings
@@ -92,7 +92,7 @@ class StoredPlan:
         return self.number or tuple(range(1, len(self.q) + 1))
 
     def select_poses(self, poses: Int64[Tensor, " some"]) -> "StoredPlan":
-        """Return a part of the poses, which keep their numbers."""
+        """Return some of the poses, which keep their numbers."""
         return replace(
             self,
             q=self.q[poses],
@@ -127,7 +127,7 @@ class StoredPlan:
         ]
 
     def _document(self, path: Path) -> dict[str, Any]:
-        """Return the content of the YAML, without values that are not stated."""
+        """Return the content of the YAML file, without values that are not stated."""
         folder = path.resolve().parent
         seen = self.settings.with_files(lambda path: os.path.relpath(path, folder))
         settings = {name: value for name, value in asdict(seen).items() if value is not None}
@@ -155,8 +155,8 @@ def read_plan(path: str | os.PathLike[str]) -> StoredPlan:
     """Return the plan in a CSV file or a YAML file.
 
     Raises:
-        PlanningError: the YAML is missing or cannot be used.
-        MeasurementError: the CSV cannot be used.
+        PlanningError: the YAML file is missing or cannot be used.
+        MeasurementError: the CSV file cannot be used.
     """
     file = Path(path)
     if file.suffix.lower() == ".csv":

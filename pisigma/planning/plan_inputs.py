@@ -61,7 +61,7 @@ def instrument_of(settings: PlanSettings, anchor: Float64[Tensor, " 3"] | None =
 
 
 def find_candidates(settings: PlanSettings, arm: ArmInSurroundings) -> Candidates:
-    """Draw or read the poses to select from.
+    """Draw or read the poses from which a plan is selected.
 
     Raises:
         MeasurementError: the file of candidates cannot be used.
@@ -78,7 +78,7 @@ def find_candidates(settings: PlanSettings, arm: ArmInSurroundings) -> Candidate
 
 
 def allow_measured_poses(settings: PlanSettings, arm: ArmInSurroundings) -> ArmInSurroundings:
-    """Return the arm, modified so that candidates that were measured are free of self-collision.
+    """Return the arm, modified so that measured candidates are free of self-collision.
 
     Raises:
         MeasurementError: the file of candidates cannot be used.
@@ -89,7 +89,7 @@ def allow_measured_poses(settings: PlanSettings, arm: ArmInSurroundings) -> ArmI
 
 
 def workspace_of(settings: PlanSettings) -> Workspace | None:
-    """Return the box in which the reflector or the target of a camera is measured; None for anywhere."""
+    """Return the box in which the reflector, or the target of a camera, is measured; None for anywhere."""
     if settings.box_mm is None:
         return None
     return torch.tensor(settings.box_mm, dtype=torch.float64).reshape(2, 3) / 1e3
@@ -143,7 +143,7 @@ def check_measured(model: CalibratedModel | None, settings: PlanSettings, robot:
         Warnings, such as that the model may have been fitted to some of the measurements.
 
     Raises:
-        MeasurementError: they cannot be used; the message names the fault.
+        MeasurementError: the measurements cannot be used; the message names the fault.
     """
     if settings.measured is None:
         return ()

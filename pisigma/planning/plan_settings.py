@@ -1,4 +1,4 @@
-"""Settings of a plan: numbers in the units of files, and files by their paths."""
+"""Settings of a plan: numbers in the units of files, and paths of files."""
 
 import math
 import os

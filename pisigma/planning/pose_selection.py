@@ -1,4 +1,4 @@
-"""Select the poses to measure from many candidates, such that the remaining uncertainty is minimal."""
+"""Select the poses to measure from many candidates so that the remaining uncertainty is minimal."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,14 +12,14 @@ from pisigma.files.errors import PlanningError
 from pisigma.planning.plan_settings import Criterion
 
 DROPPED_VARIANCE = 1e-10
-"""Largest share of the task's variance in directions that are dropped. If a base may be anywhere within a metre,
-errors of a tenth of a millimetre, for which a plan is made, are 1e-8 of the variance."""
+"""Largest share of the task's variance in directions that are dropped. If a base may be anywhere within a metre, the
+errors of a tenth of a millimetre for which a plan is made are 1e-8 of the variance."""
 _MAX_EXCHANGED = 400
 """Number of candidates that take part in the exchange: the selected ones, and the best of the others."""
 _MIN_GAIN = 1e-6
 """Gain below which candidates are not exchanged [nats, or share of the variance]."""
 _MIN_REMAINING = 1e-3
-"""Remaining share of a value's standard deviation below which a pose cannot be removed without a total loss of
+"""Remaining share of a value's standard deviation below which the removal of a pose would lose all numerical
 accuracy."""
 _MAX_PASSES = 3
 """Largest number of passes over the selected poses in the exchange."""
@@ -34,11 +34,11 @@ def select_poses(
     """Select poses to measure, the most useful first.
 
     "D" (D-optimal) maximises the information on all unknowns, `log det(1 + Σ B_i^T B_i)`; "I" (I-optimal) minimises the
-    mean variance of the tool's position over the task, `tr(C W)`. Poses are first added one by one, always the best
-    pose by D given the previous ones: a pivoted block Cholesky factorisation of the covariance of all values. Then
-    every pose is exchanged for the best other candidate as long as the criterion improves; for I this starts both
-    from the greedy selection and from the result for D, and the better result is used. The selected poses are sorted
-    by the criterion, so that the first n poses are a good selection of n poses.
+    mean variance of the tool's position over the task, `tr(C W)`. Poses are first added one by one, each time the best
+    pose by D given the previous poses, as in a pivoted block Cholesky factorisation of the covariance of all values.
+    Then every pose is exchanged for the best other candidate as long as the criterion improves; for I, this is started
+    both from the greedy selection and from the result for D, and the better result is used. The selected poses are
+    sorted by the criterion, so that the first n poses are a good selection of n poses.
 
     Source: exchange of Fedorov 1972, "Theory of Optimal Experiments", section 3.3; greedy selection of Krause, Singh
     and Guestrin 2008, JMLR 9, 235-284; for robots Borm and Menq 1991 select poses by observability.
@@ -53,7 +53,7 @@ def select_poses(
         Indices of candidates, without repetition.
 
     Raises:
-        PlanningError: there are fewer candidates, or no task.
+        PlanningError: there are fewer candidates than poses, or there is no task.
     """
     if not 1 <= count <= len(B):
         raise PlanningError(
@@ -89,7 +89,7 @@ def select_poses(
 
 
 def condense_derivatives(D: Float64[Tensor, "tasks 3 directions"]) -> Float64[Tensor, "rank directions"]:
-    """Compute few rows W with the same mean variance, `W^T W = mean(D_i^T D_i)`, up to `DROPPED_VARIANCE`."""
+    """Compute a few rows W with the same mean variance, `W^T W = mean(D_i^T D_i)`, up to `DROPPED_VARIANCE`."""
     values, vectors = torch.linalg.eigh(torch.einsum("tcd,tce->de", D, D) / len(D))
     left_out = values.clamp(min=0).cumsum(0)
     kept = left_out > DROPPED_VARIANCE * left_out[-1]
@@ -133,13 +133,13 @@ class PoseSelection:
         criterion: Criterion,
         chosen: Sequence[int] = (),
     ) -> None:
-        """Start with the given poses, or without any.
+        """Start with the given poses, or with none.
 
         Args:
             B: derivatives of the measured values, see `RobotPosterior.sensitivities`.
             goal: rows of the task, see `condense_derivatives`.
             criterion: see `select_poses`.
-            chosen: indices of candidates that are selected already.
+            chosen: indices of candidates that are already selected.
         """
         self.chosen = list(chosen)
         self._B, self._goal, self._criterion = B, goal, criterion
@@ -157,7 +157,7 @@ class PoseSelection:
     def add_candidate(self, number: int) -> None:
         """Add a candidate to the selection."""
         change = self._change(number, 1.0)
-        assert change is not None  # adding a candidate does not lose accuracy
+        assert change is not None  # adding a candidate loses no numerical accuracy
         self._take(change)
         self.chosen.append(number)
 
@@ -218,7 +218,7 @@ class PoseSelection:
     def _change(self, number: int, sign: float) -> _Change | None:
         """Compute the effect of adding (+1) or removing (-1) a candidate; None if removal is numerically impossible."""
         G = self._C @ self._B[number].t()
-        # Woodbury: a pose changes C by rank k only, the number of its values.
+        # Woodbury: a pose changes C by a matrix of rank k only, the number of its values.
         here = torch.eye(G.shape[1]).to(G) + sign * self._B[number] @ G
         lower, failed = torch.linalg.cholesky_ex(here)
         if sign < 0 and (int(failed) or float(lower.diagonal().min()) < _MIN_REMAINING):
@@ -252,7 +252,7 @@ def complete_selection(
     count: int,
     criterion: Criterion = "I",
 ) -> Int64[Tensor, " count"]:
-    """Add the most useful of other candidates to a selection, and sort all; see `select_poses`.
+    """Add the most useful of the other candidates to a selection, and sort all of them; see `select_poses`.
 
     Args:
         B: derivatives of the measured values of the candidates under the prior.
@@ -268,7 +268,8 @@ def complete_selection(
     if not len(kept):
         return others[select_poses(B[others], D, count, criterion)]
     if added := count - len(kept):
-        # a candidate is worth what it adds to the poses already selected: both are taken under their posterior
+        # the value of a candidate is what it adds to the poses already selected, so B and D are taken under their
+        # posterior
         measured = B[kept].flatten(0, 1)
         after, task = multiply_updated_root(B[others], measured), multiply_updated_root(D, measured)
         kept = torch.cat([kept, others[select_poses(after, task, added, criterion)]])

@@ -1,4 +1,4 @@
-"""Normal distribution of all unknowns of a robot, before or after measuring poses."""
+"""Normal distribution of all unknowns of a robot, before or after poses are measured."""
 
 from dataclasses import dataclass, replace
 
@@ -32,7 +32,8 @@ from pisigma.robot.robot_class import RobotClass
 from pisigma.robot.se3 import skew
 
 _WIDE_PRIOR = (*(1.0,) * 6, *(0.1,) * 3, *(1.0,) * 3)
-"""Standard deviations of base and tool before any measurement [m, rad, m, rad]; they are too wide to have an effect."""
+"""Standard deviations of base and tool before any measurement [m, rad, m, rad], which are too wide to have an
+effect."""
 
 _POSES_PER_CHUNK = 512
 """Number of poses whose derivatives are computed together (some MB)."""
@@ -44,8 +45,8 @@ class Instrument:
 
     Attributes:
         kind: "position" of a target, its "pose", its "distance" from an anchor, or a "camera" that sees a board.
-        sigma: standard deviation of a coordinate or a distance [m]. The default is between the residuals of a laser
-            tracker's coordinates after hybrid calibrations of the measured UR5 and UR10, 0.028 and 0.043 mm.
+        sigma: standard deviation of a coordinate or a distance [m]. The default lies between the residuals of a laser
+            tracker's coordinates after hybrid calibrations of the measured UR5 (0.028 mm) and UR10 (0.043 mm).
         sigma_rotation: standard deviation of an angle about an axis [rad]; the default is the value of the UR10's
             target.
         anchor: origin of distances in the measuring frame [m].
@@ -63,7 +64,7 @@ class Instrument:
 class RobotPosterior:
     """Normal distribution of geometry, base, tool and the weights of a joint correction, and the instrument.
 
-    It predicts poses of the first target in the first measuring frame.
+    The predicted poses are those of the first target in the first measuring frame.
 
     Attributes:
         uncertainty: covariance `R R^T` of all unknowns, and the geometry at which derivatives are computed.
@@ -90,7 +91,7 @@ class RobotPosterior:
         Args:
             robot: nominal robot; its tool should be near the target.
             instrument: the measuring instrument.
-            hybrid: whether the joint correction is unknown in addition to the geometry.
+            hybrid: whether the joint correction is unknown, as well as the geometry.
             gravity: direction of gravity in the robot's base frame.
         """
         space = ParameterSpace(robot)
@@ -132,9 +133,9 @@ class RobotPosterior:
         )
 
     def updated_with(self, rows: Measurements) -> "RobotPosterior":
-        """Return the posterior given measured rows, from a hybrid calibration with them.
+        """Return the posterior given measured rows, from a hybrid calibration with these rows.
 
-        If the rows are too few for a calibration, only the covariance is updated, from their joint values.
+        If there are too few rows for a calibration, only the covariance is updated, from the joint values.
 
         Raises:
             PoseError: the joint values do not fit the robot.
@@ -150,7 +151,7 @@ class RobotPosterior:
             return self.after_measuring(rows.q)
 
     def after_measuring(self, q: Float64[Tensor, "poses dof"]) -> "RobotPosterior":
-        """Return the posterior after measuring poses, independent of the values: `C' = R (1 + B^T B)^-1 R^T`.
+        """Return the posterior after measuring poses, which is independent of the values: `C' = R (1 + B^T B)^-1 R^T`.
 
         Args:
             q: commanded joint values [rad or m].
@@ -173,9 +174,9 @@ class RobotPosterior:
     def tool(self, q: Float64[Tensor, "poses dof"]) -> Float64[Tensor, "poses 3 directions"]:
         """Compute the derivative D of the target's position with respect to standard normal numbers.
 
-        The covariance of the position is `D D^T`. The position is in the measuring frame; for distances, which do
-        not determine where the robot is, it is in the robot's base frame. For a camera, a rigid motion of all poses
-        together is ignored, because the pose of the board's frame is known through the arm only.
+        The covariance of the position is `D D^T`. The position is in the measuring frame or, for distances, which do
+        not determine where the robot is, in the robot's base frame. For a camera, a rigid motion of all poses together
+        is ignored, because the pose of the board's frame is known only through the arm.
         """
         columns = self.columns(q)[:, :3]
         if self.instrument.sight is not None:
@@ -200,7 +201,7 @@ class RobotPosterior:
             away = forward_kinematics(geometry.robot, self.corrected_joints(q))[:, :3, 3] - q.new_tensor(
                 instrument.anchor
             )
-            # A wire measures the motion along its direction only.
+            # A wire measures only the motion along its direction.
             columns = (away / away.norm(dim=1, keepdim=True))[:, None] @ columns[:, :3] / instrument.sigma
         elif instrument.kind == "position":
             columns = columns[:, :3] / instrument.sigma
@@ -215,7 +216,7 @@ class RobotPosterior:
     def _with_joint_noise(
         self, columns: Float64[Tensor, "poses values unknowns"]
     ) -> Float64[Tensor, "poses values unknowns"]:
-        """Divide values of noise 1 by the noise that includes the repeatability of the joints, `1 + J J^T`."""
+        """Divide values with unit noise by the noise that includes the repeatability of the joints, `1 + J J^T`."""
         deviation = RobotClass.from_robot(self.uncertainty.space.robot).joint_repeatability
         if not deviation:
             return columns
@@ -227,7 +228,7 @@ class RobotPosterior:
     def with_unknown_base_and_tool(
         self, base: Float64[np.ndarray, " 6"], tool: Float64[np.ndarray, " 6"]
     ) -> "RobotPosterior":
-        """Return the distribution for the same arm in another measuring frame and at another target, both unknown.
+        """Return the distribution for the same arm in another measuring frame with another target, both unknown.
 
         Args:
             base: approximate pose of the robot's base in that frame, as x, y, z, roll, pitch, yaw [m, rad].

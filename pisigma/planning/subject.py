@@ -35,8 +35,8 @@ class Subject:
 
     Attributes:
         robot: nominal robot.
-        model: calibrated model; None for a robot that was not calibrated yet.
-        folder: folder of the model; None if it is in memory only, or there is none.
+        model: calibrated model; None for a robot that has not been calibrated.
+        folder: folder of the model; None if the model is only in memory or there is none.
     """
 
     robot: Robot
@@ -102,8 +102,8 @@ class Subject:
         """Return the distribution of the unknowns before the first pose of the plan is measured.
 
         Raises:
-            IdentificationError: the model keeps no posterior.
-            MeasurementError: the rows that were measured cannot be used.
+            IdentificationError: the model stores no posterior.
+            MeasurementError: the measured rows cannot be used.
             PlanningError: the settings do not fit together.
         """
         views = views_of(settings, arm)

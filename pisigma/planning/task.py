@@ -1,4 +1,4 @@
-"""Task of a plan: joint values or tool poses where the robot has to be accurate."""
+"""Task of a plan: joint values or tool poses at which the robot must be accurate."""
 
 import os
 from collections.abc import Sequence
@@ -24,9 +24,9 @@ from pisigma.robot.kinematics.tolerances import LIMIT_TOLERANCE
 REACHED = (Status.REACHED, Status.OUTSIDE_DOMAIN)
 """Statuses of poses whose joint values can be used."""
 TASK_POSES = 300
-"""Number of joint vectors that represent the task, if more or none are stated."""
+"""Number of joint vectors that represent the task if more, or none, are stated."""
 _STARTS = 200
-"""Number of joint vectors from which the inverse kinematics of a robot without a closed form starts."""
+"""Number of joint vectors at which the inverse kinematics of a robot without a closed form starts."""
 
 
 def task_poses(
@@ -35,7 +35,7 @@ def task_poses(
     q: Float64[Tensor, "poses dof"],
     model: CalibratedModel | None = None,
 ) -> Float64[Tensor, "tasks dof"]:
-    """Return joint values [rad or m] of the task: from the task file, otherwise from the workspace.
+    """Return the joint values [rad or m] of the task, from the task file or else from the workspace.
 
     Args:
         arm: the robot in its surroundings.
@@ -54,7 +54,7 @@ def task_poses(
 
 
 def read_task(path: str | os.PathLike[str], model: CalibratedModel) -> Float64[Tensor, "tasks dof"]:
-    """Return joint values [rad or m] in a file, or joint values by inverse kinematics of the poses in it.
+    """Return the joint values [rad or m] in a file, or those that reach its poses, by inverse kinematics.
 
     Args:
         path: CSV file with columns of joint values, or of poses (see `read_poses`).

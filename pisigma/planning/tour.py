@@ -15,9 +15,9 @@ from pisigma.planning.surroundings.motion import Motions
 from pisigma.robot.description import Robot
 
 FIRST_STAGE = 20
-"""Number of poses of the first calibration of a robot that was never measured; fewer do not determine its unknowns."""
+"""Number of poses in the first calibration of a robot that was never measured; fewer do not determine its unknowns."""
 _MAX_REORDERINGS = 8
-"""Largest number of attempts to avoid blocked motions by another order; remaining blocked motions get waypoints."""
+"""Largest number of attempts to avoid blocked motions by reordering; remaining blocked motions get waypoints."""
 _MIN_SPEED = 1e-3
 """Smallest valid speed [rad/s or m/s]."""
 _MAX_SETTLING = 3600.0
@@ -67,8 +67,8 @@ class Tour:
     """An order of poses, with waypoints between them.
 
     Attributes:
-        order: indices of the poses in their order, without poses to which no free motion leads.
-        before: waypoints before each pose in this order [rad or m]; mostly none.
+        order: indices of the poses in their order, without poses that no free motion reaches.
+        before: waypoints before each pose in this order [rad or m]; usually none.
         left_out: indices of the poses to which no free motion was found.
         seconds: total duration [s].
     """
@@ -88,11 +88,12 @@ def plan_tour(
 ) -> Tour:
     """Order poses for a short duration, with collision-free motions.
 
-    Nearest neighbour, then 2-opt (Croes 1958, Operations Research 6(6)), on the duration of the straight joint motions.
-    Blocked motions are made expensive and the order is improved again; motions that remain blocked get waypoints.
+    The nearest-neighbour order is improved by 2-opt (Croes 1958, Operations Research 6(6)), with the durations of the
+    straight joint motions. Blocked motions are made expensive and the order is improved again; motions that remain
+    blocked get waypoints.
 
     Args:
-        motions: motions of the robot in its surroundings, which keep the results of earlier tours.
+        motions: motions of the robot in its surroundings, which store the results of earlier tours.
         q: joint values of the poses, which are all free of collisions [rad or m].
         pace: speeds and settling time.
         start: current joint values of the robot [rad or m]; None for any.
@@ -111,7 +112,7 @@ def plan_tour(
 
 
 def order_of_use(chosen: int, check: int) -> Int64[Tensor, " poses"]:
-    """Return an order with test poses evenly distributed among the others, which are sorted by usefulness.
+    """Return an order in which test poses are evenly distributed among the others, which are sorted by usefulness.
 
     Args:
         chosen: number of poses to calibrate with, numbered from 0.
@@ -122,7 +123,7 @@ def order_of_use(chosen: int, check: int) -> Int64[Tensor, " poses"]:
 
 
 def stage_ends(poses: int) -> tuple[int, ...]:
-    """Return numbers of poses after which a calibration may be good enough: `FIRST_STAGE` times powers of two."""
+    """Return the numbers of poses after which a calibration may suffice: `FIRST_STAGE` times powers of two."""
     return tuple(FIRST_STAGE * 2**k for k in range(poses.bit_length()) if FIRST_STAGE * 2**k < poses)
 
 
@@ -153,7 +154,7 @@ _BLOCKED = 1e4
 
 
 def _nearest_neighbours(seconds: Float64[np.ndarray, "poses poses"], fixed_start: bool) -> np.ndarray:
-    """Return the best order by nearest neighbours from every pose, or from the first pose only."""
+    """Return the best nearest-neighbour order from every pose, or only from the first pose."""
     best: list[int] = []
     shortest = math.inf
     for first in range(1 if fixed_start else len(seconds)):
@@ -170,7 +171,7 @@ def _nearest_neighbours(seconds: Float64[np.ndarray, "poses poses"], fixed_start
 
 
 def _two_opt(seconds: Float64[np.ndarray, "poses poses"], order: np.ndarray, fixed_start: bool) -> np.ndarray:
-    """Return the order after reversing parts of it as long as this saves time; the ends are open."""
+    """Return the order after reversing parts of it as long as this saves time; both ends are open."""
     count, first = len(order), 1 if fixed_start else 0
     while count > 2:
         times = seconds[np.ix_(order, order)]

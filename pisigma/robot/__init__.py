@@ -1,4 +1,4 @@
-"""Robot descriptions, robot files, the catalogue, and kinematics in torch and in compiled kernels.
+"""Robot descriptions, robot files, the catalogue, and kinematics with torch and in compiled kernels.
 
 Names are loaded on first use, so that kernels do not import torch; `__init__.pyi` declares them to type checkers.
 """

@@ -1,4 +1,4 @@
-"""Convert robots to joint frames and back, independent of the DH convention of their rows."""
+"""Convert robots to joint frames and back, independently of the DH convention of their rows."""
 
 from dataclasses import replace
 
@@ -34,11 +34,11 @@ def robot_of_origins(
     Args:
         like: the other robot, with the same number of joints.
         origins: joint frames as returned by `joint_origins`.
-        end: transform from the last joint to the frame that the tool is attached to.
+        end: transform from the last joint to the frame to which the tool is attached.
         nearly_parallel: see `rows_of_chain`.
 
     Returns:
-        A robot with one row per joint, in DH parameters or, between nearly parallel axes, Hayati's.
+        A robot with one row per joint, in DH parameters or, between nearly parallel axes, Hayati parameters.
     """
     joints = tuple(
         ChainJoint(
@@ -58,5 +58,5 @@ def robot_of_origins(
 
 
 def with_one_row_per_joint(robot: Robot) -> Robot:
-    """Return an equivalent robot with one row per joint, and Hayati's rows for nearly parallel axes."""
+    """Return an equivalent robot with one row per joint, and Hayati parameters for nearly parallel axes."""
     return robot_of_origins(robot, *joint_origins(robot))

@@ -27,12 +27,12 @@ LIMIT_TOLERANCE = 1e-9
 class FourBar:
     """A four-bar linkage of ground, crank, coupler and rocker; the rocker is the joint.
 
-    The pivot of the crank is the origin, that of the rocker is at (ground, 0). The crank end P at the angle ψ and the
-    rocker end Q at the angle φ are one coupler length apart (Freudenstein 1955), in the assembly without crossing. With
-    equal opposite sides the linkage is a parallelogram and φ = ψ.
+    The pivot of the crank is the origin, and that of the rocker is at (ground, 0). The crank end P at the angle ψ and
+    the rocker end Q at the angle φ are one coupler length apart (Freudenstein 1955), in the assembly whose bars do not
+    cross. With equal opposite sides the linkage is a parallelogram and φ = ψ.
 
     Attributes:
-        ground: distance of the pivots [m].
+        ground: distance between the pivots [m].
         crank: length of the driven bar [m].
         coupler: length of the bar between crank and rocker [m].
         rocker: length of the bar that rotates with the joint [m].
@@ -80,11 +80,11 @@ class Coupling:
 
     Attributes:
         axes: axes that the controller commands, with the limits of its values.
-        turning: for every joint, whether it is revolute.
+        turning: whether each joint is revolute.
         matrix: `(dof, axes)`: C, [rad or m] of a joint per [rad or m] of an axis.
         offset: `(dof,)`: b [rad or m].
-        driven: `(dof, axes)`: which axes the file's entry of a coupled joint names, possibly with the factor 0; all
-            False for a joint without an entry.
+        driven: `(dof, axes)`: mask of the axes named in the file's entry of a coupled joint, possibly with the factor
+            0; all False for a joint without an entry.
         four_bars: index and linkage of every joint that is driven by a linkage.
         stops: index and mechanical limits [rad or m] of every joint that has limits in addition to those of the axes.
     """
@@ -148,15 +148,15 @@ class Coupling:
         return slope
 
     def approach_to_dh(self, approach: Any) -> Any:
-        """Convert approach directions of axes to those of joints: +1 or -1 if all axes of a joint agree, else 0."""
+        """Convert approach directions of axes to those of joints: +1 or -1 if all axes of a joint agree, or 0."""
         return _sides(approach, np.sign(self.matrix))
 
     def approach_to_controller(self, approach: Any) -> Any:
-        """Convert approach directions of joints to those of axes: +1 or -1 where the joints determine it, else 0."""
+        """Convert approach directions of joints to those of axes: +1 or -1 if the joints determine them, or 0."""
         return _sides(approach, np.sign(np.round(np.linalg.pinv(self.matrix), 12)))
 
     def is_within_limits(self, q: Float[np.ndarray, "*batch dof"]) -> Bool[np.ndarray, "*batch"]:
-        """Return whether DH values are within the stops and the controller's values within its limits; NaN is not."""
+        """Return whether DH values are within the stops, and the controller's within its limits; False for NaN."""
         values, (lower, upper) = self.to_controller(q), self.limits.T
         inside = ((values >= lower - LIMIT_TOLERANCE) & (values <= upper + LIMIT_TOLERANCE)).all(-1)
         for joint, (least, most) in self.stops:
@@ -170,12 +170,12 @@ class Coupling:
 
         Args:
             q: DH values [rad or m].
-            near: reference values; of the shifts within the limits the one nearest to them is taken. None: the smallest
-                shift.
+            near: reference values; among the shifts within the limits, the one nearest to them is used. None for the
+                smallest shift.
 
         Returns:
             The shifted DH values, and whether the controller's values are within its limits; rows for which no shift
-            achieves that are unchanged.
+            achieves this are unchanged.
         """
         turns = 2 * math.pi * self._turns()
         every = q[:, None] + turns
@@ -193,7 +193,7 @@ class Coupling:
         return np.array(list(itertools.product(*choices)), dtype=np.float64)
 
     def _by_four_bars(self, values: Any, change: Any) -> Any:
-        """Replace the values of joints that a linkage drives by a function of linkage and value."""
+        """Replace the values of joints that a linkage drives with a function of linkage and value."""
         if not self.four_bars:
             return values
         bars = dict(self.four_bars)
@@ -211,7 +211,8 @@ def dh_limits(coupling: Coupling) -> Float64[np.ndarray, "dof 2"]:
     Raises:
         RobotError: a four-bar linkage does not close everywhere within the limits.
     """
-    # Every DH value is a sum over the axes, so it is extreme where each term is, at one of the ends of its axis.
+    # Every DH value is a sum over the axes, so it is extreme where every term is extreme, at one of the ends of its
+    # axis.
     ends = coupling.matrix[..., None] * np.where(np.isfinite(coupling.limits), coupling.limits, 0.0)
     unbounded = ((coupling.matrix != 0) & ~np.isfinite(coupling.limits).all(1)).any(1)
     lower, upper = ends.min(-1).sum(1) + coupling.offset, ends.max(-1).sum(1) + coupling.offset
@@ -226,7 +227,7 @@ def dh_limits(coupling: Coupling) -> Float64[np.ndarray, "dof 2"]:
 
 
 def _driven(bar: FourBar, turn: np.ndarray, stops: tuple[float, float], joint: int) -> tuple[float, float]:
-    """Return the smallest and largest value [rad] of a joint with a linkage, which has to close everywhere between."""
+    """Return the smallest and largest value [rad] of a joint with a linkage, which must close everywhere in between."""
     with np.errstate(invalid="ignore"):  # an arccosine out of range is NaN, which is reported below
         ends = bar.crank_rotation(np.array(stops))
         x = np.linspace(np.fmax(turn[0], ends[0]), np.fmin(turn[1], ends[1]), 181)
@@ -286,7 +287,7 @@ def _times(values: Any, matrix: np.ndarray) -> Any:
 
 
 def _sides(approach: Any, signs: np.ndarray) -> Any:
-    """Return the approach direction, +1 or -1, of a sum of moving values if all of them agree, else 0."""
+    """Return the approach direction, +1 or -1, of a sum of moving values if all of them agree, otherwise 0."""
     count = _like(approach, np.abs(signs).sum(1))
     total = _times(approach, signs)
     return (abs(total) == count) * total / count.clip(1)

@@ -1,4 +1,4 @@
-"""Sections of robot files for coupled joints, in millimetres and degrees."""
+"""Sections for coupled joints in robot files, in millimetres and degrees."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -42,8 +42,8 @@ class CoupledJointSection(Section):
     Attributes:
         joint: name of the joint's row.
         factors: motion of the joint [deg or mm] per 1 deg or 1 mm of the controller's value, by row name. Values that
-            are not named, including the joint's own, have the factor 0. The errors of the joint may depend on the named
-            values only, so a value may be named with the factor 0.
+            are not named, including the joint's own, have the factor 0. The errors of the joint may depend only on the
+            named values, so a value may be named with the factor 0.
         offset_deg: offset of a revolute joint [deg].
         offset_mm: offset of a prismatic joint [mm].
         four_bar: linkage that drives the joint, if any.

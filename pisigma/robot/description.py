@@ -38,8 +38,8 @@ class Robot:
         base: x, y, z [m], roll, pitch, yaw [rad] of `Trans(x, y, z) · RotZ(roll) · RotY(pitch) · RotX(yaw)`.
         tool: pose of the tool in the frame after the last row, in the same form as `base`.
         coupling: relation between the joint values of the rows (DH values) and the controller's values; None if they
-            are equal. Joint values are DH values everywhere except in files, in results of `CorrectedIK` and where a
-            name or docstring says that they are the controller's.
+            are equal. Joint values are DH values everywhere except in files, in results of `CorrectedIK`, and where a
+            name or docstring states that they are the controller's.
         urdf: content of the URDF file that describes the robot, for exports; None if it was not read from one.
     """
 
@@ -54,7 +54,7 @@ class Robot:
     urdf: bytes | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
-        """Check that the parts are consistent and make the arrays read-only."""
+        """Check that the attributes are consistent, and make the arrays read-only."""
         robot = f"robot '{self.name}'"
         for name, shape in (("dh", (len(self.rows), 5)), ("base", (6,)), ("tool", (6,))):
             values = np.array(getattr(self, name), dtype=np.float64)
@@ -97,7 +97,8 @@ class Robot:
             tip: link of a URDF file that is the tool; None if only one link has no child.
 
         Raises:
-            UnknownRobotError: neither a catalogue name nor a file; the message lists the names of the catalogue.
+            UnknownRobotError: `robot` is neither a catalogue name nor a file; the message lists the names in the
+                catalogue.
             RobotError: the file does not describe a robot, or links are given for a file that is not URDF.
         """
         return Robot(*read_robot(robot, base, tip))
@@ -137,12 +138,12 @@ class Robot:
 
     @property
     def limits(self) -> Float64[np.ndarray, " dof 2"]:
-        """Lower and upper limit of every joint [rad or m]; of a coupled joint the range that the axes allow."""
+        """Lower and upper limit of every joint [rad or m]; for a coupled joint, the range that the axes allow."""
         return np.array([[joint.lower, joint.upper] for joint in self.joints])
 
     @property
     def without_limits(self) -> "Robot":
-        """The robot without joint limits, for joint values that may be swapped or in another unit."""
+        """The robot without joint limits, for joint values that may be swapped or in the wrong unit."""
 
         def without_limits(rows: Sequence[Row]) -> tuple[Row, ...]:
             return tuple(replace(row, lower=-np.inf, upper=np.inf) for row in rows)
@@ -162,7 +163,7 @@ class Robot:
 
     @cached_property
     def reach(self) -> float:
-        """Upper bound of the distance of the tool from the origin of the first row [m].
+        """Upper bound on the distance of the tool from the origin of the first row [m].
 
         Prismatic joints contribute their larger limit, or nothing if they have no limits.
         """
@@ -212,7 +213,7 @@ class Robot:
 
 
 def _check_row(row: Row, place: str) -> None:
-    """Check type, direction and limits of a row; `place` precedes the message."""
+    """Check the type, direction and limits of a row; `place` precedes the message."""
     types = get_args(JointType)
     if row.type not in types:
         hint = nearest_choice(row.type, types)
@@ -237,7 +238,7 @@ def serial_chain(robot: Robot) -> "pytorch_kinematics.SerialChain":
 
     The frame of a joint is that of its row after `RotZ(theta) · Trans(0, 0, d)`. The joint moves about or along z, in
     the opposite sense if its direction is -1; `Trans(a, 0, 0) · RotX(alpha) · RotY(beta)` leads to the next joint.
-    Everything is computed in float64: a chain that is built in float32 and converted is off by 2e-8 m.
+    Everything is computed in float64, because a chain that is built in float32 and converted is off by 2e-8 m.
 
     Args:
         robot: the robot; its rows are the frames of the chain, between `base_link` and `tool0`, and joints have the

@@ -15,7 +15,7 @@ _ALTERNATIONS = 10
 """Number of alternating projections onto rotations that refine the initial guess of base and tool."""
 MAX_ITERATIONS = 20
 AFFINE_UNKNOWNS = 13
-"""Number of unknowns per coordinate of an affine base and tool; as many positions or fewer do not determine them."""
+"""Number of unknowns per coordinate of an affine base and tool, which only a larger number of positions determines."""
 CONVERGENCE_TOLERANCE = 1e-6
 """Relative decrease of the cost below which the fit of base and tool has converged."""
 INITIAL_DAMPING = 1e-6
@@ -41,7 +41,7 @@ class MeasuredPoses:
     def from_tensors(
         position: Float64[Tensor, "rows 3"] | None, rotation: Float64[Tensor, "rows 3 3"] | None, lever: float
     ) -> "MeasuredPoses":
-        """Return measured poses from positions [m] and from rotations, which are not finite where none was measured."""
+        """Return measured poses from positions [m] and rotations, which are not finite where none was measured."""
         assert position is not None
         rows, eye = len(position), torch.eye(3, dtype=torch.float64)
         if rotation is None:
@@ -76,7 +76,7 @@ class MeasuredPoses:
 
     @property
     def spread(self) -> float:
-        """Root mean square distance [m] from the mean pose, as `squared_errors` measures it."""
+        """Root mean square distance [m] from the mean pose, as measured by `squared_errors`."""
         off = (self.position - self.position.mean(0)).square().sum(-1).mean()
         R = self.rotation[self.has_rotation]
         # Mean of |R - mean R|² / 2, because |R|² = 3.
@@ -108,9 +108,9 @@ def best_base(
 def best_tool(
     T: Float64[Tensor, "*batch rows 4 4"], measured: MeasuredPoses
 ) -> Float64[Tensor, "*batch 4 4"]:
-    """Find the transform X (without rotations a translation) that minimises the distance of `T X` from poses."""
+    """Find the transform X (a translation without rotations) that minimises the distance of `T X` from poses."""
     R = T[..., :3, :3]
-    # `T X` is separable: its position depends on the tool's translation only, its rotation on the tool's rotation.
+    # `T X` is separable: its position depends only on the tool's translation, its rotation only on the tool's rotation.
     offset = (R.mT @ (measured.position - T[..., :3, 3])[..., None])[..., 0].mean(-2)
     if not bool(measured.has_rotation.any()):
         return transform(torch.eye(3).to(T), offset)
@@ -123,10 +123,10 @@ def affine_error(
 ) -> Float64[Tensor, "*#batch"]:
     """Compute the residual mean squared error [m²] per row of the best affine base and tool, a bound for rigid ones.
 
-    Without the rotation constraint every coordinate of `R_base (R t + p) + p_base` is linear in 13 unknowns, and
+    Without the rotation constraint, every coordinate of `R_base (R t + p) + p_base` is linear in 13 unknowns, and
     `|R_measured - R_base R R_tool|² / 2` is at least 3 minus three times the largest singular value of the mean of
-    `R_measured ⊗ R` (Shah 2013, J. Mechanisms Robotics 5(3)). This compares thousands of hypotheses in closed form.
-    Squared lengths are divided by the remaining degrees of freedom.
+    `R_measured ⊗ R` (Shah 2013, J. Mechanisms Robotics 5(3)). With this bound, thousands of hypotheses are compared in
+    closed form. Squared lengths are divided by the remaining degrees of freedom.
 
     Args:
         T: predicted poses.
@@ -148,7 +148,7 @@ def best_base_and_tool(
 ) -> tuple[Float64[Tensor, "*batch 4 4"], Float64[Tensor, "*batch 4 4"]]:
     """Find transforms X, Y that minimise the distance of `X T Y` from measured poses.
 
-    Without measured rotations Y is a translation.
+    Without measured rotations, Y is a translation.
 
     The initial guess is the affine fit of `affine_error` with its matrices replaced by the nearest rotations. It is
     refined by the Levenberg-Marquardt method on all batches at once.
@@ -158,7 +158,7 @@ def best_base_and_tool(
         measured: measured poses.
     """
     base, tool = _affine_base_and_tool(T, measured)
-    # The closed form minimises a norm other than that of the errors, so a few steps of Levenberg-Marquardt follow.
+    # The closed form minimises a norm that differs from that of the errors, so a few Levenberg-Marquardt steps follow.
     damping = torch.full_like(T[..., 0, 0, 0], INITIAL_DAMPING)
     cost = measured.squared_errors(base[..., None, :, :] @ T @ tool[..., None, :, :]).sum(-1)
     for _ in range(MAX_ITERATIONS):
@@ -302,12 +302,13 @@ def base_and_tool_step(
     if free is not None:
         weight = measured.lever * measured.has_rotation.to(T)[..., None]
         along = torch.cat([free[..., :3], weight * free[..., 3:]], -1)[..., None]
-        # Projecting out this direction solves each row's own unknown implicitly.
+        # Projecting out this direction implicitly solves for the unknown of each row.
         along = along / along.norm(dim=-2, keepdim=True).clamp(min=1e-12)
         J, residual = J - along @ (along.mT @ J), residual - along @ (along.mT @ residual)
     J, residual = J.flatten(-3, -2), residual.flatten(-3, -2)
     normal = J.mT @ J
-    # The constant keeps unknowns without effect solvable, such as the tool's rotation without orientations.
+    # The constant keeps the system solvable for unknowns without effect, such as the tool's rotation without
+    # orientations.
     scale = normal.diagonal(dim1=-2, dim2=-1) * damping[..., None] + 1e-12 * T.shape[-3]
     step: Tensor = torch.linalg.solve(normal + torch.diag_embed(scale), J.mT @ residual)
     return step[..., 0]

@@ -47,7 +47,7 @@ class MjcfDrawing:
 
     Attributes:
         path: the file.
-        root: its root element.
+        root: root element of the file.
         compiler: attributes of all `compiler` elements.
         defaults: default attributes of joints by class; "" for joints without a class.
     """
@@ -62,7 +62,7 @@ class MjcfDrawing:
         """Parse a file.
 
         Raises:
-            RobotError: the file cannot be read, is not an MJCF, or includes others.
+            RobotError: the file cannot be read, is not an MJCF file, or includes other files.
         """
         from lxml import etree
 
@@ -102,14 +102,14 @@ class MjcfDrawing:
 
     @property
     def degree(self) -> float:
-        """Unit of angles of the file [rad]."""
+        """Unit of the file's angles [rad]."""
         return 1.0 if self.compiler.get("angle", "degree") == "radian" else math.pi / 180
 
     def moved_bodies(self, nominal: Robot, tip: str | None) -> list[MovedBody]:
-        """Return the bodies that the joints of a robot move, in its order.
+        """Return the bodies that the joints of a robot move, in the order of the joints.
 
         Raises:
-            RobotError: the file has other joints.
+            RobotError: the joints of the file are not those of the robot.
         """
         rows = [row for row in nominal.rows if row.type != "fixed"]
         bodies = [body for body in self.root.iter("body") if body.find("joint") is not None]

@@ -1,4 +1,4 @@
-"""Tool poses with one axis moved at a time, for comparison of a robot description with the teach pendant."""
+"""Tool poses with one axis moved at a time, to compare a robot description with the teach pendant."""
 
 import math
 import os

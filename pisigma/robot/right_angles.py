@@ -15,7 +15,7 @@ def cosine_sine(angle: float) -> tuple[float, float]:
 
 
 def snap_right_angle(value: float) -> float:
-    """Replace an angle [rad] that is a multiple of 90 deg up to a rounding error by that multiple, in (-pi, pi]."""
+    """Replace an angle [rad] within rounding of a multiple of 90 deg with that multiple, in (-pi, pi]."""
     quarters = round(value / (math.pi / 2))
     if abs(value - quarters * (math.pi / 2)) > ROUNDING:
         return float(value)

@@ -1,4 +1,4 @@
-"""Classes of robots: typical and largest sizes of geometric errors, and changes by wear or a collision."""
+"""Classes of robots: typical and largest sizes of geometric errors, and changes due to wear or a collision."""
 
 import math
 from collections.abc import Sequence
@@ -30,8 +30,8 @@ class GeometricSizes:
 
     Attributes:
         joint_offset: size for theta [rad].
-        length: size for d and a with a nominal value other than 0 [m].
-        no_length: size for d and a with the nominal value 0 [m].
+        length: size for d and a with a nonzero nominal value [m].
+        no_length: size for d and a with a nominal value of 0 [m].
         between_axes: size for alpha and beta [rad].
     """
 
@@ -47,11 +47,11 @@ class GeometricSizes:
 
 @dataclass(frozen=True)
 class ChangeLimits:
-    """Largest changes of parameters by wear or a collision, in an arm that still works.
+    """Largest changes of parameters due to wear or a collision in an arm that still works.
 
     A belt that jumps a tooth or a brake that slips moves the zero of a joint by some degrees; a casting that is bent
     by more than these lengths and angles is visibly broken. The base, the tool or the zero of a single joint may change
-    by any amount, because people move and zero them.
+    by any amount, because people move or reset them.
 
     Attributes:
         joint_zero: largest change of the zeros of several joints at once [rad].
@@ -75,10 +75,10 @@ class RobotClass:
         bands: prior standard deviations of the weights of `FourierSeries` [rad], by band of `BAND_STARTS`.
         harmonics: number of harmonics of the series.
         largest: standard deviations of geometric errors that no robot of the class exceeds.
-        change: largest changes by wear or a collision.
+        change: largest changes due to wear or a collision.
         remaining: errors after a calibration, as a share of the reach, that no robot of the class exceeds.
         joint_repeatability: standard deviation of the values of a revolute joint from image to image [rad]; 0 if the
-            repeatability of the pose that is stated for images contains it.
+            pose repeatability stated for images includes it.
     """
 
     name: ClassName
@@ -93,7 +93,7 @@ class RobotClass:
 
     @staticmethod
     def from_robot(robot: Robot) -> "RobotClass":
-        """Return the class of a robot by its maker; `INDUSTRIAL` if the maker is not known."""
+        """Return the class of a robot by its manufacturer; `INDUSTRIAL` if the manufacturer is unknown."""
         if robot.maker.startswith("Universal Robots"):
             return UNIVERSAL_ROBOTS
         if robot.maker.startswith(_COBOT_MAKERS):
@@ -121,9 +121,9 @@ INDUSTRIAL: Final = RobotClass(
 
 The sizes are 1.5 times the medians of the sizes that maximise the evidence of hybrid calibrations of simulated kr10,
 irb120, arm7 and scara arms (two each, 400 positions) and of the measured FANUC R-2000iC (720 positions). The factor
-makes predicted errors correct for few poses, from which a calibration has to estimate the sizes too: for 15 such arms
-the median of predicted over true RMS is 1.05 after 15 planned poses, 1.1 after 30 and 1.1 after 60; without the factor
-it is 0.74, 0.93 and 1.1. The largest sizes are twice those of the worst healthy arm that was measured."""
+makes predicted errors correct for few poses, from which a calibration must also estimate the sizes: for 15 such arms,
+the median ratio of predicted to true RMS is 1.05 after 15 planned poses, 1.1 after 30 and 1.1 after 60; without the
+factor it is 0.74, 0.93 and 1.1. The largest sizes are twice those of the worst healthy arm that was measured."""
 
 COBOT: Final = replace(
     INDUSTRIAL,
@@ -131,8 +131,8 @@ COBOT: Final = replace(
     largest=replace(INDUSTRIAL.largest, joint_offset=20e-3),
     change=ChangeLimits(joint_zero=0.1, length=0.008, angle=0.02),
 )
-"""Light arms with harmonic drives, whose zeros are set by hand after a repair and slip in a collision. Gear errors
-are taken from industrial arms unless arms of the maker were measured."""
+"""Light arms with harmonic drives, whose zeros are set by hand after a repair and slip in a collision. Gear errors are
+those of industrial arms unless arms of the manufacturer were measured."""
 
 UNIVERSAL_ROBOTS: Final = replace(
     COBOT,
@@ -142,8 +142,8 @@ UNIVERSAL_ROBOTS: Final = replace(
     harmonics=31,
 )
 """Arms of Universal Robots, with sizes between the two that maximise the evidence of hybrid calibrations of the
-measured UR5 (1,000 positions) and UR10 (1,941 poses). Their gear errors have many harmonics, which the pose sets of
-other robots cannot distinguish."""
+measured UR5 (1,000 positions) and UR10 (1,941 poses). The gear errors have many harmonics, which the pose sets of other
+robots cannot distinguish."""
 
 HOBBY: Final = replace(
     COBOT,
@@ -153,8 +153,8 @@ HOBBY: Final = replace(
     change=ChangeLimits(joint_zero=0.3, length=0.02, angle=0.1),
     remaining=7.5e-3,
 )
-"""Arms without a reliable zero: built by hobbyists or in a laboratory, surgical arms with potentiometers, and old arms
-that were reassembled. Their zeros are wrong by 20 to 50 mrad."""
+"""Arms without a reliable zero: arms built by hobbyists or in a laboratory, surgical arms with potentiometers, and old
+arms that were reassembled. Their zeros are wrong by 20 to 50 mrad."""
 
 SERVO: Final = replace(
     HOBBY,
@@ -164,7 +164,7 @@ SERVO: Final = replace(
     remaining=0.04,
     joint_repeatability=math.radians(0.5),
 )
-"""Arms of servos, whose zeros are set by eye in the middle of the range and are wrong by up to 17 deg
+"""Arms built from servos, whose zeros are set by eye in the middle of the range and are wrong by up to 17 deg
 (huggingface/lerobot, issue 3758). Servos repeat to 0.3 to 2 deg, of which 2 deg move the tool of an SO-101 by 4 % of
 its reach."""
 

@@ -1,4 +1,4 @@
-"""Fields of a robot file before they are checked together."""
+"""Fields of a robot file before they are checked for consistency."""
 
 from typing import NamedTuple
 
@@ -21,7 +21,7 @@ class RobotFields(NamedTuple):
         base: frame in the order of `FRAME_COLUMNS`.
         tool: frame in the order of `FRAME_COLUMNS`.
         coupling: relation of joint values and controller values; None if they are equal.
-        urdf: content of the file if it is a URDF file, else None.
+        urdf: content of the file if it is a URDF file, otherwise None.
     """
 
     name: str

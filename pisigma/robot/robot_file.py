@@ -144,7 +144,7 @@ class RobotDocument(Section):
         """Return the fields of the robot in SI units.
 
         Raises:
-            RobotError: the coupling does not fit the rows, or a row of the modified convention has a beta.
+            RobotError: the coupling does not fit the rows, or a row in the modified convention has a beta.
         """
         rows, coupling = rows_and_coupling([row.to_row() for row in self.rows], self.coupling)
         dh, base = np.array([row.to_si() for row in self.rows]), self.base.to_si()

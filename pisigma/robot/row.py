@@ -17,7 +17,7 @@ FRAME_COLUMNS = ("x", "y", "z", "roll", "pitch", "yaw")
 """Names and order of the parameters of base and tool; x, y, z [m], roll, pitch, yaw [rad]."""
 
 MAX_MAGNITUDE = 1e9
-"""Largest magnitude of any number of a robot, pose or measurement, in the unit of the file (mm or deg)."""
+"""Largest magnitude of any number in a robot, pose or measurement, in the unit of the file (mm or deg)."""
 
 BoundedFloat = Annotated[float, Field(ge=-MAX_MAGNITUDE, le=MAX_MAGNITUDE)]
 """A number in a robot file, finite and of limited magnitude."""
@@ -53,9 +53,9 @@ class Row:
         name: unique name in the robot, such as "theta_1".
         type: "revolute", "prismatic" or "fixed".
         direction: +1 or -1, the sign of the controller's values; the joint moves by `direction · q`.
-        lower: smallest joint value [rad or m], with the sign of the controller; -inf without a limit.
+        lower: smallest joint value [rad or m], with the sign of the controller; -inf if there is no limit.
         upper: largest joint value [rad or m].
-        urdf_origin: position of the joint's origin in a URDF file, in the frame before the row [m]; kinematics does
+        urdf_origin: position of the joint's origin in a URDF file, in the frame before the row [m]; the kinematics do
             not depend on it.
     """
 
@@ -68,7 +68,7 @@ class Row:
 
     @property
     def file_unit(self) -> str:
-        """Unit of the joint values in files: "mm" for a prismatic joint, else "deg"."""
+        """Unit of the joint values in files: "mm" for a prismatic joint, otherwise "deg"."""
         return "mm" if self.type == "prismatic" else "deg"
 
     def in_file_unit(self, value: float) -> float:

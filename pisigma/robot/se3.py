@@ -101,8 +101,8 @@ def rotation_from_vector(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*b
 def rotation_vector(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]:
     """Return the rotation vector [rad] of a rotation: axis times angle in [0, pi].
 
-    Near the identity the factor of the vector part of `R - R^T` is a series; near pi the axis is computed from
-    `R + R^T`. Gradients are finite everywhere.
+    Near the identity, the factor of the vector part of `R - R^T` is a series; near pi, the axis is computed from `R +
+    R^T`. Gradients are finite everywhere.
     """
     twice_sine_axis = torch.stack(
         [R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], -1
@@ -122,7 +122,7 @@ def rotation_vector(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]
 def _rotation_vector_near_pi(
     R: Float[Tensor, "*batch 3 3"], twice_sine_axis: Float[Tensor, "*batch 3"], angle: Float[Tensor, "*batch"]
 ) -> Float[Tensor, "*batch 3"]:
-    """Compute the axis by the largest column of the symmetric part, `axis · axis_k (1 - cos)`; sign from R - R^T."""
+    """Compute the axis from the largest column of the symmetric part, `axis · axis_k (1 - cos)`; sign from R - R^T."""
     symmetric = (R + R.mT) / 2 + torch.eye(3, dtype=R.dtype, device=R.device)
     trace = R[..., 0, 0] + R[..., 1, 1] + R[..., 2, 2]
     # (R + R^T)/2 = cos·I + (1 - cos)·n n^T, so the sum above minus (1 + cos)·I is (1 - cos)·n n^T.
@@ -200,7 +200,7 @@ def check_transforms(T: Tensor, name: str, tolerance: float = 1e-6) -> None:
 
     Raises:
         PoseError: the shape or dtype is wrong, an entry is not finite, a rotation is not orthonormal or is left-handed,
-            or the last row is wrong; the message and `value` give the index of the first such matrix.
+            or the last row is wrong; the message and `value` state the index of the first such matrix.
     """
     if T.ndim < 2 or T.shape[-2:] != (4, 4):
         shape = tuple(T.shape)
@@ -227,7 +227,7 @@ def transform_faults(
         tolerance: see `check_transforms`.
 
     Returns:
-        For every fault, the mask of the matrices that have it, a text that says what was expected, and a remedy.
+        For every fault, the mask of the matrices that have it, a text that states what was expected, and a remedy.
     """
     eye = torch.eye(4, dtype=T.dtype, device=T.device)
     finite = torch.isfinite(T).all(-1).all(-1)
@@ -249,7 +249,7 @@ def transform_faults(
 def nearest_rotation(M: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
     """Return the rotation nearest to a matrix in the Frobenius norm (orthogonal Procrustes, Kabsch's sign).
 
-    It is computed on the CPU, because the matrices are few and every operation on a device takes longer.
+    It is computed on the CPU, because there are few matrices and every operation on another device takes longer.
     """
     U, _, Vh = np.linalg.svd(M.cpu().numpy())
     U[..., 2] *= np.sign(np.linalg.det(U @ Vh))[..., None]

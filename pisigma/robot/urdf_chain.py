@@ -14,7 +14,7 @@ from pisigma.robot.urdf_file import parse_xml, read_urdf
 from pisigma.robot.urdf_frames import Frame, frame_of
 
 _AXIS_LENGTH_TOLERANCE = 1e-2
-"""Largest deviation of an axis from unit length, which files write with few digits."""
+"""Largest deviation of an axis from unit length, because files state axes with few digits."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,10 +24,10 @@ class ChainJoint:
     Attributes:
         name: name of the joint in the file.
         type: "revolute" (also for a continuous joint) or "prismatic".
-        origin: frame of the joint at joint value 0, in the frame of the preceding joint (of the first joint: in the
-            base link).
+        origin: frame of the joint at joint value 0, in the frame of the preceding joint, or in the base link for the
+            first joint.
         axis: unit vector of the joint axis in the joint's frame.
-        lower: smallest joint value [rad or m]; -inf for a continuous joint and for one that mimics another.
+        lower: smallest joint value [rad or m]; -inf for a continuous joint or one that mimics another.
         upper: largest joint value [rad or m].
         mimic: name of the mimicked joint, multiplier [rad or m per rad or m] and offset [rad or m]; None for a
             commanded joint.
@@ -199,7 +199,8 @@ def _moving(joint: Any, origin: Frame, at: Place, commanded: Collection[str]) ->
     """Convert a moving joint of the URDF file to a `ChainJoint`.
 
     Raises:
-        RobotError: the joint mimics one outside the chain, or has another type, an invalid axis or invalid limits.
+        RobotError: the joint mimics one outside the chain, or has an unsupported type, an invalid axis or invalid
+            limits.
     """
     if joint.mimic is not None and joint.mimic.joint not in commanded:
         raise RobotError(

@@ -14,7 +14,7 @@ from pisigma.robot.row import MAX_MAGNITUDE
 _JOINT_TYPES = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
 
 _MAX_ELEMENTS = 10_000
-"""Largest number of links and joints of a file; a whole cell has some hundreds."""
+"""Largest number of links and joints in a file; a whole cell has a few hundred."""
 
 _KEPT = {"origin": ("xyz", "rpy"), "axis": ("xyz",), "parent": ("link",), "child": ("link",)}
 _KEPT |= {"limit": ("lower", "upper"), "mimic": ("joint", "multiplier", "offset")}
@@ -26,15 +26,15 @@ def read_urdf(path: str | os.PathLike[str], root: Any = None) -> tuple[Any, Call
 
     Args:
         path: the file.
-        root: root element if the XML was parsed already; see `parse_xml`.
+        root: root element if the XML has already been parsed; see `parse_xml`.
 
     Returns:
         The robot of pytorch-kinematics' URDF parser, with links and joints only, and a function that returns the place
         of a joint in the file.
 
     Raises:
-        RobotError: the file cannot be read, is not valid XML, is truncated, xacro or not a URDF, or an element is
-            missing, duplicate or not a number; the exception has file and line.
+        RobotError: the file cannot be read, is not valid XML, is truncated, is xacro or not URDF, or an element is
+            missing, duplicated or not a number; the exception states file and line.
     """
     from lxml import etree
 
@@ -107,7 +107,7 @@ def _is_of_xacro(element: Any) -> bool:
 
 
 def _insert_properties(root: Any, path: str | os.PathLike[str]) -> None:
-    """Replace references to plain xacro properties by their values, as used in files of `pisigma export`."""
+    """Replace references to plain xacro properties, as used in files of `pisigma export`, with their values."""
     from lxml import etree
 
     values: dict[str, str] = {}
@@ -181,7 +181,7 @@ def _check_value(element: Any, tag: str, key: str, joint: str, at: Place) -> Non
         numbers = [float(word) for word in text.split()]
     except ValueError:
         numbers = []
-    # some files state 1e16 for no limit
+    # some files use 1e16 to state that there is no limit
     largest = MAX_MAGNITUDE**2 if tag == "limit" else MAX_MAGNITUDE / 1e3
     if len(numbers) != count or not all(abs(number) <= largest for number in numbers):
         expected = "three finite numbers separated by spaces" if count == 3 else "a finite number"

@@ -1,1 +1,1 @@
-"""State of a cell, one robot on its mount: its sessions, events and models, and the model in use."""
+"""State of a cell, which is one robot on its mount: sessions, events, models, and the model in use."""

@@ -1,4 +1,4 @@
-"""Acceptance of a cell's robot: instrument, uncertainty budget, measured errors, and who accepted it."""
+"""Acceptance of a cell's robot: instrument, uncertainty budget, measured errors, and the person who accepted it."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from pisigma.validation.uncertainty.components import SCATTER
 from pisigma.validation.uncertainty.instrument import Instrument
 
 _EXPLAINED = 0.999
-"""Probability with which errors that the budget explains are found to be explained by it."""
+"""Probability with which errors that the budget explains pass the test of `contradicted`."""
 _MAX_FREEDOM = 1e9
 """Degrees of freedom that are treated as infinite."""
 _NO_PATHS = "AT and RT: the sessions of a cell contain no measured paths."
@@ -24,11 +24,11 @@ class MeasuredAccuracy:
 
     Attributes:
         session: name of the session.
-        day: its day (ISO 8601).
+        day: day of the session (ISO 8601).
         rows: number of rows.
         fitted: "base" or "tool" or both, if they were changed after the calibration and therefore fitted to the rows.
         errors: position errors of the model in use [mm].
-        doubt: why the rows must not be trusted; empty if they can be.
+        doubt: reason why the rows must not be trusted; empty if they can be trusted.
     """
 
     session: str
@@ -58,19 +58,19 @@ class MeasuredAccuracy:
 
 @dataclass(frozen=True)
 class Acceptance:
-    """Statements by which the robot of a cell is accepted.
+    """Statements on which the acceptance of a cell's robot is based.
 
     Attributes:
         model: name of the model in use.
         limit_mm: limit on the 95 % quantile of the position errors [mm]; None if the cell has none.
-        instrument: the instrument, as far as it is stated.
-        repeatability_mm: pose repeatability RP that the maker of the robot states [mm]; None if it is not stated.
-        temperatures: mean temperature of every valid session [deg C], by its name; None if unknown.
+        instrument: the instrument, with the data that are stated.
+        repeatability_mm: pose repeatability RP stated by the manufacturer of the robot [mm]; None if it is not stated.
+        temperatures: mean temperature of every valid session [deg C], by name of the session; None if unknown.
         budget: uncertainty budget.
         measured: errors on the newest session to which the model was not fitted; None if there is no such session.
-        repeats: ISO 9283 figures of the poses that were measured more than once, of all valid sessions.
-        accepted: acceptances of models of this cell, the newest last.
-        missing: what is not stated, one sentence each, apart from components of the budget.
+        repeats: ISO 9283 figures of the poses that were measured more than once in valid sessions.
+        accepted: acceptances of models of this cell, newest last.
+        missing: missing statements, one sentence each, apart from components of the budget.
     """
 
     model: str
@@ -92,11 +92,11 @@ class Acceptance:
 
     @property
     def contradicted(self) -> bool:
-        """Whether the measured errors are larger than the budget explains, beyond chance.
+        """Whether the measured errors are larger than the budget and chance explain.
 
-        It is False for a budget without the scatter of the calibration. Otherwise the mean square of the measured
-        coordinates over `u_c²` is compared with the quantile `_EXPLAINED` of the F distribution. Its degrees of freedom
-        are the number of rows, because the coordinates of a row may be correlated, and those of the budget.
+        It is False for a budget without the scatter of the calibration. Otherwise the ratio of the mean square of the
+        measured coordinates to `u_c²` is compared with the quantile `_EXPLAINED` of the F distribution. The degrees of
+        freedom are the number of rows, because the coordinates of a row may be correlated, and those of the budget.
         """
         if self.measured is None or all(one.name != SCATTER for one in self.budget.components):
             return False
@@ -140,8 +140,8 @@ def missing_statements(
 
     Args:
         instrument: the instrument.
-        repeatability_mm: pose repeatability that the maker states [mm]; None if it is not stated.
-        measured: why there are no measured errors; empty if there are some.
+        repeatability_mm: pose repeatability stated by the manufacturer [mm]; None if it is not stated.
+        measured: reason why there are no measured errors; empty if there are some.
         repeats: figures of repeated poses.
     """
     names = ("name", "serial", "certificate", "calibrated")

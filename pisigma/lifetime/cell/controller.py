@@ -1,9 +1,9 @@
-"""Exports that are active on the controller of a cell, and their consequences for every command.
+"""Exports that are active on the controller of a cell, and the consequences for every command.
 
-Two kinds of exports are active on a controller. Its *kinematics* convert joint values to poses; the joint values of the
-arm keep their meaning, so measured rows do not depend on them. Its *joint zeros* change what joint values mean: a model
-describes the arm with those zeros that were active when its rows were measured, and corrects twice, or not at all, with
-any others. All other exports contain corrected values or are used by other programs, and are not active there.
+Two kinds of exports are active on a controller. *Kinematics* convert joint values to poses; the joint values of the arm
+keep their meaning, so measured rows do not depend on them. *Joint zeros* change the meaning of joint values: a model
+describes the arm with the zeros that were active when its rows were measured; with any others, it corrects twice or not
+at all. All other exports contain corrected values or are used by other programs, and are not active on the controller.
 """
 
 import datetime
@@ -19,8 +19,9 @@ from pisigma.lifetime.cell.layout import is_cell, model_folder
 from pisigma.measurement.dates import EXPECTED_DATE, is_date
 
 Situation = Literal["kinematics", "same_zeros", "other_zeros"]
-"""The controller computes with exported kinematics; exported joint zeros are active, with which the rows of the model
-were measured; the active joint zeros differ from the joint zeros with which the rows of the model were measured."""
+"""Situations: the controller computes with exported kinematics; the active joint zeros are exported ones with which the
+rows of the model were measured; the active joint zeros differ from those with which the rows of the model were
+measured."""
 Effect = Literal["allow", "warn", "refuse"]
 
 RULES: dict[str, tuple[Effect, Effect, Effect]] = {
@@ -82,12 +83,12 @@ class ActiveExport:
     since: str
 
     def __str__(self) -> str:
-        """Return how messages name it."""
+        """Return the name of the export for messages."""
         one = self.export
         return f"'{one.file}' ({one.format} of model '{one.model}', active since {self.since})"
 
     def to_json(self) -> dict[str, str]:
-        """Return it as plain values."""
+        """Return the export as plain values."""
         one = self.export
         return {
             "contains": one.contains,
@@ -104,7 +105,7 @@ class Controller:
     """History of the exports that were active on a controller.
 
     Attributes:
-        changes: all changes in the order of their days.
+        changes: all changes, in the order of their days.
         exports: all exports.
     """
 
@@ -117,11 +118,11 @@ class Controller:
         return Controller(history.controller(), history.exports())
 
     def active(self, day: str = "9999", time: str = "") -> dict[Contents, ActiveExport]:
-        """Return the exports that were active after a day, by their contents.
+        """Return the exports that were active at the end of a day, by contents.
 
         Args:
             day: the day (ISO 8601).
-            time: time (ISO 8601, UTC): a change of this day is regarded only if it was recorded until then.
+            time: time (ISO 8601, UTC); a change on this day counts only if it was recorded by then.
         """
         exports, found = {one.sha256: one for one in self.exports}, dict[Contents, ActiveExport]()
         for one in self.changes:
@@ -135,7 +136,7 @@ class Controller:
         return found
 
     def active_during(self, session: SessionEntry) -> dict[Contents, ActiveExport]:
-        """Return the exports that were active during a session; of its day, those recorded before it was added."""
+        """Return the exports that were active during a session; on its day, only those recorded before it was added."""
         return self.active(session.day, session.taken_in)
 
     @property
@@ -173,7 +174,7 @@ class Controller:
 
         Args:
             command: a key of `RULES`.
-            model: the model that the command uses; None if it uses none.
+            model: the model that the command uses; None if the command uses none.
             sessions: all sessions of the cell.
             at: exports that were active when the rows were measured; None for the exports that are active now.
         """
@@ -207,7 +208,7 @@ class Findings:
     """Consequences for a command of the exports that are active on the controller.
 
     Attributes:
-        refusal: why the command is refused; empty if it is not.
+        refusal: reason why the command is refused; empty if it is not refused.
         warnings: warnings, one sentence each.
     """
 
@@ -235,8 +236,8 @@ def valid_sessions(
 ) -> tuple[SessionEntry, ...]:
     """Return the sessions that describe the current state of the arm.
 
-    They are not set aside, and were measured since the last event that changed the arm, with the joint zeros that are
-    active on the controller now.
+    These sessions are not set aside, and were measured after the last event that changed the arm, with the joint zeros
+    that are now active on the controller.
     """
     since = max((one.day for one in events if one.kind in ARM_EVENTS), default="")
     present = [one for one in sessions if not one.set_aside and one.day >= since]
@@ -262,7 +263,7 @@ def checked_model_folder(path: Path, command: str) -> tuple[Path, tuple[str, ...
     """Return the folder of a cell's model in use, and warnings; a path that is not a cell is returned unchanged.
 
     Raises:
-        ModelError: no model of the cell is in use, or the command is refused because of what is active on the
+        ModelError: no model of the cell is in use, or the command is refused because of an export that is active on the
             controller.
     """
     return model_folder(path), model_in_use_warnings(path, command)
@@ -272,7 +273,7 @@ def model_in_use_warnings(path: Path, command: str) -> tuple[str, ...]:
     """Return warnings for a command on the model in use of a cell; () without a model in use or a cell.
 
     Raises:
-        ModelError: the command is refused because of what is active on the controller.
+        ModelError: the command is refused because of an export that is active on the controller.
     """
     if not is_cell(path):
         return ()
@@ -285,7 +286,7 @@ def record_controller(history: History, sha256: str, day: str, note: str) -> Con
 
     Args:
         history: history of the cell.
-        sha256: SHA-256 of the exported file; empty: no export is active after it.
+        sha256: SHA-256 of the exported file; empty if no export is active from then on.
         day: day from which the export is active (ISO 8601); "" for today.
         note: free text.
 

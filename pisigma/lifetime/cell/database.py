@@ -1,4 +1,4 @@
-"""SQLite file whose tables are classes: a column is an attribute, and a row is an object.
+"""SQLite file whose tables are classes: columns are attributes, and rows are objects.
 
 Every change is one transaction. SQLite's rollback journal restores the state before a transaction whose process was
 killed or whose disk was full, and SQLite's lock ends with its process.
@@ -30,7 +30,7 @@ _SQL_TYPES: dict[Any, str] = {
     float | None: "REAL",
     bytes: "BLOB NOT NULL",
 }
-"""SQL types of columns by types of attributes; any other attribute consists of texts."""
+"""SQL types of columns by types of attributes; attributes of any other type are texts."""
 
 
 NETWORK_TYPES = frozenset(
@@ -54,11 +54,11 @@ NETWORK_TYPES = frozenset(
         *("fuse.juicefs", "fuse.rclone", "fuse.s3fs", "fuse.smbnetfs", "fuse.sshfs"),
     }
 )
-"""Types of file systems that several machines can write to, by their names in mount tables."""
+"""Types of file systems to which several machines can write, by their names in mount tables."""
 MOUNTINFO = Path("/proc/self/mountinfo")
 """File with the table of mounts on Linux."""
 _TYPES: dict[tuple[Path, int], str | None] = {}
-"""Cached results of `_network_type` by mount table and device number, which changes with the mounted file system."""
+"""Cached results of `_network_type`, by mount table and device number (which changes with the mounted file system)."""
 _DRIVE_REMOTE = 4
 """Return value of the Windows function `GetDriveTypeW` for a network drive."""
 _MACOS_MOUNT = re.compile(r"^.* on (?P<point>/.*) \((?P<type>\w+)[,)]", re.MULTILINE)
@@ -140,7 +140,7 @@ def file_system_type(path: str, mounts: Iterable[tuple[str, str]]) -> str | None
 
     Args:
         path: an absolute path without links.
-        mounts: mount points and types in the order of mounting; a later mount hides an earlier one at the same place.
+        mounts: mount points and types in the order of mounting; a later mount hides an earlier mount at the same place.
 
     Returns:
         The type, such as "ext4" or "nfs4"; None if no mount point contains the path.
@@ -156,7 +156,8 @@ class Table:
 
     Attributes:
         name: name of the table.
-        key: columns that identify a row; a new row replaces a row with the same values. If empty, every row is kept.
+        key: columns that identify a row; a new row replaces a row with equal values in these. If empty, every row is
+            kept.
     """
 
     name: str
@@ -171,8 +172,8 @@ class Database:
         path: path of the file, which is created with the first row.
         tables: table of every class.
         version: version of the schema, which the file states as `PRAGMA user_version`.
-        take_over: function that adds what an earlier version stored elsewhere, in the transaction that upgrades the
-            file; returns the files that are removed after it.
+        take_over: function that adds data that an earlier version stored elsewhere, within the transaction that
+            upgrades the file; it returns the files to remove after the transaction.
     """
 
     path: Path
@@ -199,7 +200,7 @@ class Database:
             database.execute(f"INSERT OR REPLACE INTO {table} ({names}) VALUES ({marks})", [*values.values()])
 
     def read(self, kind: type[Row]) -> tuple[Row, ...]:
-        """Return all rows of a class in the order in which they were added; none if there is no file yet.
+        """Return all rows of a class in the order in which they were added; empty if there is no file yet.
 
         Raises:
             OutputError: the file cannot be read; see `open`.
@@ -242,7 +243,7 @@ class Database:
 
     @contextmanager
     def transaction(self) -> Iterator[sqlite3.Connection]:
-        """Open the file for changes that are made together, or not at all; other processes wait before they write.
+        """Open the file for changes that are made all together or not at all; other processes wait before they write.
 
         Raises:
             OutputError: the file cannot be written; see `open`.
@@ -252,11 +253,11 @@ class Database:
 
     @contextmanager
     def open(self) -> Iterator[sqlite3.Connection]:
-        """Open the file; one of an earlier version is upgraded first, completely or not at all.
+        """Open the file; a file of an earlier version is first upgraded, completely or not at all.
 
         Raises:
-            OutputError: the file is not a database, has a newer version, cannot be opened or upgraded, or is on the
-                file system of a network.
+            OutputError: the file is not a database, has a newer version, cannot be opened or upgraded, or is on a
+                network file system.
         """
         if self._snapshot:
             yield self._snapshot[0]
@@ -328,7 +329,7 @@ class Database:
 
 @contextmanager
 def _transaction(database: sqlite3.Connection) -> Iterator[None]:
-    """Make all changes in the block together, or none of them."""
+    """Make either all changes in the block or none of them."""
     database.execute("BEGIN IMMEDIATE")  # waits for another process that writes
     try:
         yield

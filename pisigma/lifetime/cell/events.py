@@ -1,4 +1,4 @@
-"""Events of a cell: what was changed on its robot, tool or instrument, and who accepted a model."""
+"""Events of a cell: changes of its robot, tool or instrument, and acceptances of models."""
 
 from dataclasses import dataclass
 from typing import Literal, get_args
@@ -9,8 +9,8 @@ from pisigma.measurement.dates import EXPECTED_DATE, is_date
 EventKind = Literal[
     "instrument", "tool", "mastering", "encoder", "collision", "maintenance", "firmware", "accepted"
 ]
-"""Kind of event: the instrument (tracker, camera, board) was set up again, the tool or reflector was replaced, or
-the arm was changed (see `ARM_EVENTS`). "firmware" and "accepted", by a person, are only recorded."""
+"""Kind of event: the instrument (tracker, camera, board) was set up again, the tool or reflector was replaced, or the
+arm was changed (see `ARM_EVENTS`). "firmware" and "accepted" (by a person) are only recorded."""
 ARM_EVENTS: frozenset[EventKind] = frozenset(("mastering", "encoder", "collision", "maintenance"))
 """Events after which earlier sessions no longer describe the arm."""
 CHANGING_EVENTS: frozenset[EventKind] = ARM_EVENTS | {"instrument", "tool"}
@@ -23,12 +23,12 @@ class Event:
 
     Attributes:
         day: day of the event (ISO 8601); sessions of that day were measured after the event.
-        kind: what happened: "instrument", "tool", "mastering", "encoder", "collision", "maintenance", "firmware" or
+        kind: kind of event: "instrument", "tool", "mastering", "encoder", "collision", "maintenance", "firmware" or
             "accepted".
         note: free text.
         recorded: time of recording (ISO 8601, UTC).
-        person: who accepted the model or reported the change; empty if that is not stated.
-        model: name of the accepted model; empty for all other kinds.
+        person: person who accepted the model or reported the change; empty if not stated.
+        model: name of the accepted model; empty for all other kinds of events.
     """
 
     day: str
@@ -40,7 +40,7 @@ class Event:
 
     @property
     def sentence(self) -> str:
-        """Day, kind and person, with the note, as one line."""
+        """Day, kind, person and note as one line."""
         what = f"model '{self.model}' was accepted" if self.kind == "accepted" else self.kind
         by, note = f" by {self.person}" if self.person else "", f" ({self.note})" if self.note else ""
         return f"{self.day}: {what}{by}{note}."
@@ -57,7 +57,7 @@ def check_event(kind: str, day: str, person: str) -> None:
     Args:
         kind: kind of the event.
         day: day of the event (ISO 8601).
-        person: who accepted the model or reported the change.
+        person: person who accepted the model or reported the change.
 
     Raises:
         MeasurementError: the kind is unknown, the day is not a valid date, or the person who accepted is not named.

@@ -1,4 +1,4 @@
-"""Entries of a history about exported files, and about the file that is active on the controller."""
+"""Entries in a history about exported files, and about the file that is active on the controller."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -8,7 +8,7 @@ Contents = Literal["joint_values", "poses", "description", "kinematics", "joint_
 controller that computes with the nominal robot, a description of the robot for other programs, the kinematics with
 which a controller converts joint values to poses, or the zeros of the joints on a controller."""
 ON_CONTROLLER: tuple[Contents, ...] = ("kinematics", "joint_zeros")
-"""Contents that are active on a controller from the moment at which they are entered."""
+"""Contents that are active on a controller as soon as they are entered."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class ControllerEntry:
 
     Attributes:
         day: day from which the export is active (ISO 8601).
-        sha256: SHA-256 of the exported file; empty if no export is active after it.
+        sha256: SHA-256 of the exported file; empty if no export is active from then on.
         note: free text.
         recorded: time of recording (ISO 8601, UTC).
     """

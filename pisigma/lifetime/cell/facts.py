@@ -1,4 +1,4 @@
-"""Read the facts about a cell without reading its robot, so that the status of many cells is read quickly."""
+"""Read the facts about a cell without reading its robot, so that the status of many cells can be read quickly."""
 
 import datetime
 import hashlib
@@ -23,12 +23,12 @@ from pisigma.lifetime.cell.layout import CELL_FILE, MODELS, PLANS, SESSIONS, new
 from pisigma.measurement.dates import date_in_name
 
 _BEFORE_FIT = ("plan", "import")
-"""Commands whose checks do not draw conclusions from measured rows."""
+"""Commands whose checks draw no conclusions from measured rows."""
 _MIN_MEASURED_SHARE = 0.9
-"""Smallest measured share of the poses of a plan with which it is treated as complete; some poses may be out of
+"""Smallest measured share of a plan's poses with which the plan is treated as complete; some poses may be out of
 sight."""
 NOT_TRUSTED = ("implausible", "setup_fault", "not_trusted")
-"""Verdicts of `verify`, `monitor` and `recalibrate` after which nothing is concluded from a session."""
+"""Verdicts of `verify`, `monitor` and `recalibrate` after which no conclusions are drawn from a session."""
 
 
 @dataclass(frozen=True)
@@ -46,14 +46,14 @@ class CellFacts:
         in_use: the model in use; None if there is none.
         limit_mm: limit on the 95 % quantile of the position errors [mm]; None if there is none.
         today: day (ISO 8601).
-        not_taken_in: names of the files in `sessions/` that are not in the history yet, by their dates.
+        not_taken_in: names of the files in `sessions/` that are not yet in the history, by their dates.
         not_read: names of the files in `sessions/` that are not measurement files and were not imported.
-        no_plan_reason: why no poses can be planned; "" if they can.
+        no_plan_reason: reason why no poses can be planned; "" if they can be planned.
         settings_sha256: SHA-256 of the current settings of a calibration; see `Check`.
-        changed_models: names of those models, of the model in use and the newest model, that were changed or removed
-            after they were made.
-        incomplete: number of measured poses of the newest plan as a text, if they are too few; otherwise "".
-        controller: what was active on the controller, with the times.
+        changed_models: names of the model in use and of the newest model, if these were changed or removed after they
+            were made.
+        incomplete: number of measured poses of the newest plan as a text, if there are too few; otherwise "".
+        controller: exports that were active on the controller, with the times.
     """
 
     folder: str
@@ -81,7 +81,7 @@ class CellFacts:
 
     @property
     def newest_model(self) -> ModelEntry | None:
-        """The newest unchanged model that was fitted to valid sessions only; None if there is none."""
+        """The newest unchanged model that was fitted only to valid sessions; None if there is none."""
         valid = {one.name for one in self.valid_sessions}
         made = [one for one in self.unchanged_models if one.made_of and valid.issuperset(one.made_of)]
         return made[-1] if made else None
@@ -92,9 +92,9 @@ class CellFacts:
         return [one for one in self.models if one.name not in self.changed_models]
 
     def later_event(self, model: ModelEntry) -> str:
-        """Return the event that was recorded after a model had been fitted to rows before and after it; "" if none.
+        """Return the event that was recorded after a model had been fitted to rows before and after it, or "".
 
-        A recalibration finds what has moved since its parent, so only the original calibration is considered.
+        A recalibration finds what has moved since its parent was made, so only the original calibration is considered.
         """
         models = {one.name: one for one in self.models}
         while (parent := models.pop(model.parent, None)) is not None:
@@ -123,13 +123,13 @@ class CellFacts:
         return shlex.join(["pisigma", "import", rows, "--cell", self.folder])
 
     def checks_of(self, model: str, *commands: str) -> list[Check]:
-        """Return the checks of a model by given commands, newest last, except of excluded sessions."""
+        """Return the checks of a model by given commands, newest last, except those of excluded sessions."""
         aside = {one.name for one in self.sessions if one.set_aside}
         checks = [one for one in self.checks if one.model == model and one.command in commands]
         return [one for one in checks if one.session not in aside]
 
     def trusted_checks_of(self, model: str, *commands: str) -> list[Check]:
-        """Return the checks of a model whose rows are trusted, so that the errors are errors of the model."""
+        """Return the checks of a model whose rows are trusted, so that their errors are errors of the model."""
         return [one for one in self.checks_of(model, *commands) if one.verdict not in NOT_TRUSTED]
 
     def new_sessions(self, model: ModelEntry) -> list[SessionEntry]:
@@ -138,7 +138,7 @@ class CellFacts:
 
 
 class _Stated(BaseModel):
-    """Keys of `cell.yaml` from which the next step follows; commands that use the other keys check them."""
+    """Keys of `cell.yaml` that determine the next step; the other keys are checked by the commands that use them."""
 
     model_config = ConfigDict(frozen=True, allow_inf_nan=False)
     sensor: str = "tracker"
@@ -151,7 +151,7 @@ class _Stated(BaseModel):
     calibrate: Any = None
 
     def settings_hash(self, folder: Path) -> str:
-        """Return the SHA-256 of the settings that a calibration depends on, and of the files that they name."""
+        """Return the SHA-256 of the settings on which a calibration depends and of the files that they name."""
         camera = self.camera if isinstance(self.camera, dict) else {}
         names = [str(self.robot), *map(str, (*camera.get("camera", ()), *camera.get("board", ())))]
         stated = [self.robot, self.base, self.tip, self.camera, self.calibrate or None]
@@ -159,10 +159,10 @@ class _Stated(BaseModel):
         return hashlib.sha256(json.dumps([stated, hashes], sort_keys=True, default=str).encode()).hexdigest()
 
     def no_plan_reason(self, model: ModelEntry | None) -> str:
-        """Return why no poses can be planned; "" if they can.
+        """Return the reason why no poses can be planned; "" if they can be planned.
 
         Args:
-            model: the model in use, which states the pose of the board; None without a model.
+            model: the model in use, which states the pose of the board; None if there is no model.
         """
         view = (self.surroundings or {}).get("view")
         if self.sensor != "camera" or (view and (model is not None or "frame" in view)):
@@ -223,7 +223,7 @@ def _facts(folder: Path, history: History) -> CellFacts:
 
 
 def _incomplete(folder: Path, sessions: Sequence[SessionEntry], checks: Sequence[Check]) -> str:
-    """Return a text with the number of measured poses of the newest plan if they are too few; otherwise ""."""
+    """Return a text with the number of measured poses of the newest plan if there are too few; otherwise ""."""
     planned = [one.checked for one in checks if one.command == "plan"]
     if not planned or not any((folder / PLANS).glob("*.csv")):
         return ""
@@ -244,7 +244,7 @@ def sha256_of(path: Path) -> str:
 
 
 def unrecorded_files(folder: Path, sessions: Sequence[SessionEntry]) -> tuple[str, ...]:
-    """Return the names of the files in the folder of sessions that are not in the history yet, by their dates."""
+    """Return the names of the files in the folder of sessions that are not yet in the history, by their dates."""
     names = {one.name for one in sessions}
     found = [path.name for path in folder.glob("*.csv") if path.stem not in names]
     return tuple(sorted(found, key=lambda name: (date_in_name(name), name)))

@@ -1,6 +1,6 @@
-"""History in an SQLite file: sessions, events, models, checks, models in use with their times, and more.
+"""History in an SQLite file: sessions, events, models, checks, changes of the model in use, and more.
 
-A cell has one history; a model outside of a cell has a history next to its folder, with monitored sessions only.
+A cell has one history; a model outside a cell has a history next to its folder, with only monitored sessions.
 DuckDB and pandas can read the tables directly: `TABLES` maps the classes below to tables, and columns are named
 after attributes.
 """
@@ -21,9 +21,9 @@ from pisigma.lifetime.cell.exports import ControllerEntry, ExportEntry
 HISTORY = "history.sqlite"
 """Name of the history of a cell."""
 MODEL_HISTORY = ".history.sqlite"
-"""Suffix of the history of a model outside of a cell, after the name of its folder."""
+"""Suffix, after the name of the folder, of the history of a model outside a cell."""
 SCHEMA_VERSION = 6
-"""Version of the schema. Version 1 had no monitored sessions: each model had a file for them, without a version.
+"""Version of the schema. Version 1 had no monitored sessions, for which each model had a file without a version.
 Version 2 had no exports, and changes of the model in use could not be undone. Version 3 had no scatter of models,
 version 4 no poses of sessions, and version 5 no settings of checks."""
 
@@ -42,8 +42,8 @@ class SessionEntry:
         temperature_c: mean temperature [deg C]; None if the rows do not state it.
         judged_by: reference of the checks of the rows: "robot" (the nominal robot), or the name of a model.
         remark: warnings of the check.
-        set_aside: why the session is not used; empty if it is used.
-        poses: number of different joint values of the rows; 0 if it is unknown.
+        set_aside: reason why the session is not used; empty if it is used.
+        poses: number of different joint values in the rows; 0 if unknown.
     """
 
     name: str
@@ -68,14 +68,14 @@ class ModelEntry:
         sha256: SHA-256 of its `model.yaml`.
         made: time at which its rows and events were read (ISO 8601, UTC).
         sessions: names of the sessions to which the model was fitted, separated by commas.
-        day: day of the newest of them (ISO 8601).
+        day: day of the newest of these sessions (ISO 8601).
         frame_day: day of the instrument event with which the newest frame of the model begins; empty if the model has
             only the first frame.
         target_day: day of the tool event with which the newest target of the model begins; empty if it has only the
             first target.
         parent: name of the model that was recalibrated; empty for a calibration.
         p95_mm: 95 % quantile of the position errors of held-out rows [mm]; None if no rows were held out.
-        remark: why it is or is not in use.
+        remark: reason why the model is or is not in use.
         scatter_mm: standard deviation of a measured coordinate about the model [mm], from the sensor and the
             repeatability of the robot, as the calibration identified it; None if it is unknown.
         has_posterior: whether the model stores the posterior of its parameters, which `monitor` and `recalibrate`
@@ -97,7 +97,7 @@ class ModelEntry:
 
     @property
     def made_of(self) -> tuple[str, ...]:
-        """Names of the sessions to which the model was fitted; empty if it was made outside of the cell."""
+        """Names of the sessions to which the model was fitted; empty if it was made outside the cell."""
         return tuple(filter(None, self.sessions.split(",")))
 
 
@@ -115,7 +115,7 @@ class Check:
         recalibrate: whether recalibrating with the session is due.
         checked: time of the check (ISO 8601, UTC).
         rms_mm: RMS position error [mm] of held-out rows or, without a validation, of the rows of a calibration; for
-            `verify` and `monitor` of the session. None if it is unknown.
+            `verify` and `monitor`, of the session. None if it is unknown.
         settings_sha256: SHA-256 of the settings in `cell.yaml` that a calibration depends on, and of the files that it
             names; empty if it is unknown, and for all other commands.
     """
@@ -139,7 +139,7 @@ class Use:
     Attributes:
         model: name of the model; empty if no model was in use.
         since: time from which the model was in use (ISO 8601, UTC).
-        reason: why it was put into use.
+        reason: reason why the model was put into use.
         undo: whether this change undid the last change that had not been undone.
     """
 
@@ -201,20 +201,20 @@ _SESSIONS_OF_MODEL = """SELECT model, rows, file, date, json_extract(session, '$
     1e3 * json_extract(session, '$.rms_after'), session, zeros FROM sessions"""
 """Monitored sessions in the file of a model before schema version 2."""
 _OF_MODELS = "models/*.history.sqlite"
-"""These files in a cell."""
+"""Pattern of these files in a cell."""
 
 
 def now() -> str:
-    """Return the time as stored in a history (ISO 8601, UTC, to the millisecond)."""
+    """Return the current time as stored in a history (ISO 8601, UTC, to the millisecond)."""
     return datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="milliseconds")
 
 
 class History:
-    """The history of a cell, or of a model outside of a cell.
+    """The history of a cell, or of a model outside a cell.
 
     Attributes:
         path: path of its SQLite file, which is created with the first entry.
-        database: its tables. A file of an earlier schema version is upgraded when it is opened.
+        database: tables of the file. A file of an earlier schema version is upgraded when it is opened.
     """
 
     def __init__(self, path: Path) -> None:
@@ -244,7 +244,7 @@ class History:
         return self.database.read(MonitoredSession)
 
     def uses(self) -> tuple[Use, ...]:
-        """Return the changes of the model in use; the last one names the model in use now."""
+        """Return the changes of the model in use; the last one names the current model."""
         return self.database.read(Use)
 
     def exports(self) -> tuple[ExportEntry, ...]:
@@ -257,7 +257,7 @@ class History:
 
     @property
     def model_after_undo(self) -> str | None:
-        """Name of the model that an undo puts into use, "" for no model; None if there is nothing to undo."""
+        """Name of the model that an undo would put into use, "" for no model; None if there is nothing to undo."""
         states = [""]
         for one in self.uses():
             if one.undo:
@@ -291,7 +291,7 @@ class History:
         self.database.add(entries)
 
     def add_session(self, session: SessionEntry, *also: Entry) -> bool:
-        """Add a session and other entries, unless another session in use has its content; return whether it did.
+        """Add a session and other entries unless another session in use has its content; return whether it did so.
 
         Raises:
             OutputError: the history cannot be written.
@@ -319,17 +319,17 @@ class History:
                 )
 
     def record(self, kind: str, day: str = "", note: str = "", person: str = "") -> Event:
-        """Record a change, or that the model in use was accepted; see `EventKind`.
+        """Record a change, or the acceptance of the model in use; see `EventKind`.
 
         Args:
             kind: kind of the event.
             day: day of the event (ISO 8601); "" for today.
             note: free text.
-            person: who accepted the model or reported the change.
+            person: person who accepted the model or reported the change.
 
         Raises:
             MeasurementError: the kind is unknown, the day is not a valid date, or the person who accepted is not named.
-            ModelError: no model is in use that could be accepted.
+            ModelError: no model is in use, so none can be accepted.
         """
         day, model = day or datetime.date.today().isoformat(), ""
         check_event(kind, day, person)
@@ -347,8 +347,8 @@ class History:
     def _take_over(self, database: sqlite3.Connection) -> Sequence[Path]:
         """Add the records that earlier versions stored elsewhere.
 
-        Versions before 2 stored monitored sessions in a file next to each model of the cell; only the description of a
-        model states whether it has a posterior.
+        Versions before 2 stored monitored sessions in a file next to each model of the cell; whether a model has a
+        posterior is stated only in its description.
         """
         names = database.execute(f"SELECT name FROM {TABLES[ModelEntry].name}").fetchall()
         without = [one for one in names if _lacks_posterior(self.path.parent / "models" / one[0])]

@@ -43,9 +43,9 @@ def newest_plan(path: str | os.PathLike[str]) -> Path:
 
 
 def _made(plan: Path) -> tuple[str, list[tuple[int, str]]]:
-    """Return a sort key of plans: the day in the name, otherwise of the last change, and the numbers in the name.
+    """Return a sort key of plans: the day in the name (or else of the last change), and the numbers in the name.
 
-    Plans of one day are numbered; the times of files may be lost when a cell is copied.
+    Plans made on the same day are numbered, because the times of files may be lost when a cell is copied.
     """
     changed = datetime.date.fromtimestamp(plan.stat().st_mtime).isoformat()
     parts = re.findall(r"(\d+)|(\D+)", plan.stem)
@@ -53,7 +53,7 @@ def _made(plan: Path) -> tuple[str, list[tuple[int, str]]]:
 
 
 def previous_and_current_model(path: str | os.PathLike[str]) -> tuple[Path, Path]:
-    """Return the folders of the model that was in use before and of the model in use.
+    """Return the folders of the model that was previously in use and of the model in use.
 
     Raises:
         ModelError: fewer than two models have been in use.
@@ -74,7 +74,7 @@ def model_folder(path: str | os.PathLike[str]) -> Path:
     """Return the folder of a cell's model in use; a path that is not a cell is returned unchanged.
 
     Raises:
-        ModelError: no model of the cell is in use, or it was changed or removed.
+        ModelError: no model of the cell is in use, or the model was changed or removed.
     """
     if not is_cell(path):
         return Path(path)
@@ -105,7 +105,7 @@ def checked_model(cell: Path, model: ModelEntry) -> Path:
 
 
 def cell_of_model(folder: str | os.PathLike[str]) -> Path | None:
-    """Return the cell of a model folder, as the folder was named; None if the folder is outside of a cell."""
+    """Return the cell of a model folder, named as the folder was named; None if the folder is outside a cell."""
     model = Path(os.path.realpath(folder))
     if model.parent.name != MODELS or not is_cell(model.parent.parent):
         return None
@@ -114,9 +114,9 @@ def cell_of_model(folder: str | os.PathLike[str]) -> Path | None:
 
 
 def history_of_model(folder: str | os.PathLike[str]) -> History:
-    """Return the history with a model's monitored sessions: in its cell, otherwise in a file next to its folder.
+    """Return the history with a model's monitored sessions, in its cell or else in a file next to its folder.
 
-    The file of a model outside of a cell is `MODEL.history.sqlite`.
+    The file of a model outside a cell is `MODEL.history.sqlite`.
 
     Args:
         folder: folder of the model.

@@ -1,4 +1,4 @@
-"""Follow the model in use of a cell, in a background thread that looks for changes of the history."""
+"""Follow the model in use of a cell with a background thread that looks for changes of the history."""
 
 import os
 import threading
@@ -14,21 +14,21 @@ from pisigma.lifetime.cell.history import HISTORY, History
 from pisigma.lifetime.cell.layout import model_folder
 
 INTERVAL = 0.1
-"""Time between two checks of the history [s], one `os.stat` each."""
+"""Time between two checks of the history [s], each of which is one `os.stat`."""
 SETTLED = 0.05
-"""Age above which the time of a file's last change is unambiguous [s]; file systems round it."""
+"""Age above which the time of a file's last change is unambiguous [s], because file systems round it."""
 
 
 class ModelInUse:
     """The model in use of a cell.
 
-    The history is compared by `os.stat`: opening the file a second time would end SQLite's locks of this process.
+    Changes are found with `os.stat`, because opening the file a second time would end SQLite's locks of this process.
 
     Attributes:
         cell: folder of the cell.
-        folder: folder of the model that was loaded last.
-        problem: why the model in use is not loaded; empty if it is.
-        findings: consequences of the exports that are active on the controller; with a refusal no model must be used.
+        folder: folder of the model loaded last.
+        problem: reason why the model in use is not loaded; empty if it is loaded.
+        findings: consequences of the exports that are active on the controller; after a refusal, no model must be used.
     """
 
     def __init__(self, cell: Path, command: str, load: Callable[[Path], None]) -> None:
@@ -38,15 +38,15 @@ class ModelInUse:
             cell: folder of the cell.
             command: command that uses the model, a key of `controller.RULES`.
             load: function that loads a model folder and replaces the model that answers. If it raises an error, the
-                model before continues to answer.
+                previous model continues to answer.
 
         Raises:
-            ModelError: no model is in use, it cannot be loaded, or it must not be used with what is active on the
-                controller.
+            ModelError: no model is in use, the model cannot be loaded, or it must not be used with an export that is
+                active on the controller.
         """
         self.cell, self._command, self._load, self.problem = cell, command, load, ""
         self._lock, self._is_followed = threading.Lock(), False
-        self._seen: tuple[int, int, int] | None = None  # the first look reads the history again
+        self._seen: tuple[int, int, int] | None = None  # the first check reads the history again
         self.folder = model_folder(cell)
         self.findings = self._find()
         self.findings.checked_warnings(cell)
@@ -56,7 +56,8 @@ class ModelInUse:
         """Load the model in use if it has changed.
 
         Args:
-            always: also load a model again that could not be loaded before, and the same model if it was changed.
+            always: whether to also retry a model that could not be loaded before, and reload the same model if it was
+                changed.
         """
         with self._lock:
             state = self._state()
@@ -74,7 +75,7 @@ class ModelInUse:
                 self.problem = str(problem)
 
     def follow(self, report: Callable[[str], None] = lambda sentence: None) -> None:
-        """Look for changes in a background thread, until `stop` is called or this object is no longer used.
+        """Look for changes in a background thread until `stop` is called or this object is no longer used.
 
         Args:
             report: function that is called with every new sentence of `warnings`.
@@ -89,7 +90,7 @@ class ModelInUse:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Findings for the user: that the model is refused, why it is not loaded, and warnings."""
+        """Findings for the user: a refusal of the model, the reason why it is not loaded, and warnings."""
         return tuple(filter(None, (self.findings.refusal, self.problem, *self.findings.warnings)))
 
     def _find(self) -> Findings:
@@ -98,7 +99,7 @@ class ModelInUse:
         return findings(history, self._command, history.in_use)
 
     def _state(self) -> tuple[int, int, int] | None:
-        """Return values that change with every change of the history; None without a history."""
+        """Return values that change with every change of the history; None if there is no history."""
         try:
             found = os.stat(self.cell / HISTORY)
         except OSError:
@@ -107,7 +108,7 @@ class ModelInUse:
 
 
 def _start_following(followed: "weakref.ref[ModelInUse]", report: Callable[[str], None]) -> None:
-    """Start the thread, also in a forked process, which has no thread and perhaps a lock that is never released."""
+    """Start the thread, also in a forked process, which has no thread and possibly a lock that is never released."""
     if (model := followed()) is not None and model._is_followed:
         model._lock = threading.Lock()
         threading.Thread(target=_follow, args=(followed, report), daemon=True).start()

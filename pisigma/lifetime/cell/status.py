@@ -14,9 +14,9 @@ from pisigma.lifetime.cell.layout import SESSIONS
 from pisigma.lifetime.cell.step import COMPUTED, State, Step
 
 MAX_DAYS_UNVERIFIED = 92
-"""Time without a session after which the model in use has to be verified again [days]: a quarter of a year."""
+"""Time without a session after which the model in use must be verified again [days]: a quarter of a year."""
 VERIFICATION_POSES = 10
-"""Number of poses of a session for verification or monitoring."""
+"""Number of poses in a session for verification or monitoring."""
 _MEASURE_AND = f"measure {VERIFICATION_POSES} poses, import them, and"
 _CAN_VERIFY = "is not in use; session '{}', to which it was not fitted, can verify it"
 _JUDGING = ("verify", "monitor", "recalibrate")
@@ -47,12 +47,12 @@ class CellStatus:
 
     @property
     def is_due(self) -> bool:
-        """Whether there are steps that need neither new rows nor a decision of a person."""
+        """Whether there are steps that need neither new rows nor a decision by a person."""
         return self.step.verb is not None or self.step.state in ("not_taken_in", "file_refused")
 
     @property
     def last_error(self) -> Check | None:
-        """The last check that found an RMS error of the model in use or, if there is none, of the newest model."""
+        """The last check that determined an RMS error of the model in use or, if there is none, of the newest model."""
         model = self.facts.in_use or (self.facts.models[-1] if self.facts.models else None)
         checks = [] if model is None else self.facts.trusted_checks_of(model.name, *COMPUTED)
         known = [one for one in checks if one.rms_mm is not None]
@@ -101,7 +101,7 @@ def status_of(folder: Path) -> CellStatus:
 
 
 def next_step(facts: CellFacts) -> Step:
-    """Return the step of the first of `RULES` and `RULES_IN_USE` that applies; a plan is measured before the next."""
+    """Return the step of the first of `RULES` and `RULES_IN_USE` that applies; an open plan is measured first."""
     step = due_step(facts)
     if facts.incomplete and step.verb in ("calibrate", "verify", "monitor"):
         why = f"{facts.incomplete}; measure and import the others, or continue with `{step.command}`"
@@ -127,7 +127,7 @@ def due_step(facts: CellFacts) -> Step:
 
 
 def plans_check(facts: CellFacts) -> bool:
-    """Return whether a few poses are due to check the current model, instead of the poses of a calibration."""
+    """Return whether a few poses for checking the current model are due, rather than the poses of a calibration."""
     return bool(facts.models) and due_step(facts).state != "outside_limit"
 
 
@@ -195,7 +195,7 @@ def _not_calibrated(facts: CellFacts) -> Step | None:
 
 
 def _calibrate(facts: CellFacts, state: State, reason: str) -> Step:
-    """Return the step "calibrate"; more rows are measured instead if these must not be trusted."""
+    """Return the step "calibrate", or a step that measures more rows if the present rows must not be trusted."""
     last = _last_calibration(facts)
     newest = [one.taken_in for one in facts.valid_sessions]
     newest += [one.recorded for one in facts.events if one.kind in CHANGING_EVENTS]
@@ -240,13 +240,13 @@ def _not_verified(facts: CellFacts) -> Step | None:
 
 
 def _not_judged(facts: CellFacts, model: ModelEntry, *commands: str) -> list[str]:
-    """Return the names of sessions that are new to a model, and that no command has compared with it."""
+    """Return the names of sessions that are new to a model and that no command has compared with it."""
     judged = {one.session for one in facts.checks_of(model.name, *commands)}
     return [one.name for one in facts.new_sessions(model) if one.name not in judged]
 
 
 def _after(facts: CellFacts, last: Check, failed: tuple[str, ...]) -> Step | None:
-    """Return the step that follows from the last check of a model; `failed`: verdicts that ask for a calibration."""
+    """Return the step that follows from the last check of a model; `failed` are verdicts that require a calibration."""
     if last.verdict in NOT_TRUSTED:
         return Step(
             "session_not_trusted",
@@ -292,7 +292,7 @@ def _session_not_judged(facts: CellFacts, model: ModelEntry) -> Step | None:
 
 
 def _last_verdict(facts: CellFacts, model: ModelEntry) -> Step | None:
-    """Return the step that follows from the last session that was compared with the model in use."""
+    """Return the step that follows from the last session compared with the model in use."""
     checks = facts.checks_of(model.name, *_JUDGING)
     return _after(facts, checks[-1], ("not_better",)) if checks else None
 
@@ -384,7 +384,7 @@ RULES: tuple[Callable[[CellFacts], Step | None], ...] = (
     _not_calibrated,
     _not_verified,
 )
-"""Rules until a model is in use, in order."""
+"""Rules that apply until a model is in use, in order."""
 RULES_IN_USE: tuple[Callable[[CellFacts, ModelEntry], Step | None], ...] = (
     _other_joint_zeros,
     _session_not_judged,

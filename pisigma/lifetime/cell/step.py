@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 COMPUTED = ("calibrate", "verify", "monitor", "recalibrate")
-"""Commands that need neither new rows nor a decision of a person."""
+"""Commands that need neither new rows nor a decision by a person."""
 
 State = Literal[
     "model_changed",
@@ -56,7 +56,7 @@ class Step:
 
     Attributes:
         state: state of the cell.
-        reason: why the step is due, in one sentence without its full stop.
+        reason: reason why the step is due, in one sentence without its full stop.
         command: command to run; empty if no step is due.
     """
 
@@ -70,7 +70,7 @@ class Step:
 
     @property
     def verb(self) -> str | None:
-        """Name of the command, if it needs neither rows nor the decision of a person; otherwise None."""
+        """Name of the command if it needs neither rows nor a decision by a person; otherwise None."""
         words = self.command.split()[1:2]
         return words[0] if words and words[0] in COMPUTED else None
 

@@ -1,1 +1,1 @@
-"""Comparison of two models of one robot: parameters, tool positions, and programs taught with either model."""
+"""Comparison of two models of one robot: parameters, tool positions, and programs taught with either of them."""

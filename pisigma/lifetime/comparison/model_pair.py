@@ -17,14 +17,14 @@ from pisigma.robot.se3 import invert, pose_error, transform_from_xyzrpy
 from pisigma.validation.held_out.pose_statistics import PoseErrors
 
 FrameChoice = Literal["fitted", "fixed"]
-"""Whether base and tool of the second model are fitted to those of the first model, or equal by name."""
+"""Whether base and tool of the second model are fitted to those of the first model, or identified by name."""
 
 _POINTS = 60
-"""Number of joint configurations at which models are compared with their uncertainties, half from each model."""
+"""Number of configurations, half from each model, at which models are compared with their uncertainties."""
 _SAMPLES = 3_000
-"""Samples of the workspace."""
+"""Number of samples of the workspace."""
 _FITTED_SAMPLES = 300
-"""Samples to which base and tool are fitted."""
+"""Number of samples to which base and tool are fitted."""
 _MAX_NOMINAL_DIFFERENCE = 0.02
 """Difference of nominal parameters [rad, or share of the reach] up to which models belong to one robot."""
 
@@ -37,7 +37,7 @@ class ModelPair:
         first: reference model.
         second: model that is compared with it.
         frames: how bases and tools are aligned.
-        frame_names: names of the frame and the target that each model is compared in.
+        frame_names: names of the frame and the target in which each model is compared.
         T_base: transform from the frame of the second model to that of the first; the identity for fixed frames.
         T_tool: pose of the first model's tool in the tool frame of the second; the identity for fixed frames.
     """
@@ -56,11 +56,11 @@ class ModelPair:
         Args:
             first: reference model.
             second: model that is compared with it.
-            frames: "fitted" moves base and tool of the second model such that the arms agree best.
+            frames: "fitted" moves base and tool of the second model so that the arms agree best.
 
         Raises:
-            ModelError: the models belong to different robots, have no frame or target in common where these are fixed,
-                or store no joint values at which both predict a pose.
+            ModelError: the models belong to different robots, have no frame or target in common although these are
+                fixed, or store no joint values at which both predict a pose.
         """
         _check_one_robot(first, second)
         frame_names = _frame_names(first, second, frames)
@@ -81,7 +81,7 @@ class ModelPair:
 
     @property
     def training_joints(self) -> Float64[Tensor, "points dof"]:
-        """Joint values that the models store from their training rows, half from each [rad or m]."""
+        """Joint values of training rows that the models store, half from each [rad or m]."""
         generator = torch.Generator().manual_seed(0)
         sampled = [
             model.starts[torch.randperm(len(model.starts), generator=generator)[: _POINTS // 2]]
@@ -133,7 +133,7 @@ class ModelPair:
 def frames_of(
     model: CalibratedModel, frame_names: tuple[str, str]
 ) -> tuple[Float64[Tensor, "4 4"], Float64[Tensor, "4 4"]]:
-    """Return base and tool of the geometry that a model predicts with, by the names of a frame and a target."""
+    """Return base and tool of the geometry with which a model predicts, for the names of a frame and a target."""
     robot = model.identified
     bases, tools = (
         (model.bases, model.tools) if model.hybrid is None else (model.hybrid_bases, model.hybrid_tools)
@@ -151,7 +151,7 @@ def nominal_robot(model: CalibratedModel) -> Robot:
 def _frame_names(
     first: CalibratedModel, second: CalibratedModel, frames: FrameChoice
 ) -> tuple[tuple[str, str], tuple[str, str]]:
-    """Return frame and target in which each model is compared: the first common names, otherwise each model's first."""
+    """Return the frame and target in which each model is compared: the first common names, or each model's first."""
     names_of_models: tuple[list[str], list[str]] = ([], [])
     for what, mine, others in (
         ("frame", first.bases, second.bases),
@@ -186,7 +186,7 @@ def _check_one_robot(first: CalibratedModel, second: CalibratedModel) -> None:
 
 
 def _difference(one: Robot, other: Robot) -> tuple[str, str]:
-    """Return the quantity in which two nominal robots differ, and how; both are "" for the same robot."""
+    """Return the quantity in which two nominal robots differ, and the difference; both are "" for the same robot."""
     if one.dof != other.dof:
         return "joints", f"one has {one.dof} joints and the other {other.dof}"
     types = [[row.type for row in robot.rows] for robot in (one, other)]
@@ -224,7 +224,7 @@ class Displacement:
     Attributes:
         source: description of the poses.
         q: joint values of poses that both models predict [rad or m].
-        number: number of every pose among all of the source, from 1.
+        number: number of every pose among all poses of the source, from 1.
         place: position of the tool in the robot's base frame under the first model [m].
         errors: distance [m] and angle [rad] between the poses of both models.
         not_predicted: number of poses that are left out because a model does not predict them.

@@ -1,4 +1,4 @@
-"""Which base of several arms, or which frame that they share, was moved: their poses now against those of before."""
+"""Find the base of several arms, or the shared frame, that was moved, from poses before and now."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,19 +15,19 @@ from pisigma.model.frame_model import FittedFrames
 from pisigma.robot.se3 import invert, rotation_from_vector, rotation_vector, skew, transform_from_xyzrpy
 
 _FALSE_ALARMS = 1e-3
-"""Probability that arms and frames that did not move are said to have moved."""
+"""Probability that arms and frames that did not move are reported to have moved."""
 _CERTAIN = 5.0
-"""Difference of log likelihoods above which one moved body is a better explanation than another one."""
+"""Difference of log likelihoods above which one moved body is a better explanation than another."""
 
 
 @dataclass(frozen=True, eq=False)
 class ArmBefore:
-    """An arm before and now.
+    """An arm as calibrated before and as measured now.
 
     Attributes:
         posterior: posterior of its model.
-        T_first_base: its base in the base of the first arm, at the time of its model.
-        now: its bases now, fitted with the arm of the model.
+        T_first_base: its base relative to the base of the first arm, when its model was made.
+        now: its current bases, fitted with the arm of the model.
     """
 
     posterior: ArmPosterior
@@ -36,7 +36,7 @@ class ArmBefore:
 
     @property
     def frames(self) -> tuple[str, ...]:
-        """Frames in which the base was determined before and now."""
+        """Frames in which the base was determined both before and now."""
         return tuple(
             name
             for name in self.now.fit.solved.geometry.bases
@@ -44,27 +44,27 @@ class ArmBefore:
         )
 
     def _rows(self, frame: str) -> list[int]:
-        """Return the numbers of the base in a frame among the fitted coordinates."""
+        """Return the indices of the base in a frame among the fitted coordinates."""
         parameters = self.now.fit.parameters
         return [k for k, one in enumerate(parameters) if one.group == "base" and one.owner == frame]
 
     def _noise(self, frame: str) -> Float64[Tensor, "6 directions"]:
-        """Return a root of the covariance of the base now by the noise of the rows."""
+        """Return a root of the covariance of the current base due to the noise of the rows."""
         fit = self.now.fit
         return fit.solved.root[[fit.frames[k] for k in self._rows(frame)]]
 
     @property
     def freedom(self) -> float:
-        """Number of values from which the noise now was estimated, minus the parameters fitted to them."""
+        """Number of values from which the current noise was estimated, minus the parameters fitted to them."""
         return sum(one.values - one.used for one in self.now.fit.solved.result().noise)
 
     def displacement(self, frame: str) -> tuple[Float64[Tensor, " 6"], Float64[Tensor, "6 directions"]]:
         """Return the displacement of the base relative to a frame, with a root of its covariance.
 
         Returns:
-            Translation [m] and rotation vector [rad] of the rigid motion that moves the base before onto the base now,
-            in the coordinates of the first arm's base before; and their derivatives along the directions of the root
-            of the model, followed by those of the noise now.
+            Translation [m] and rotation vector [rad] of the rigid motion that moves the previous base onto the current
+            base, in the coordinates of the previous base of the first arm; and their derivatives along the directions
+            of the root of the model, followed by those of the current noise.
         """
         before = self.posterior.values[list(self.posterior.base_rows(frame))]
         now = torch.from_numpy(self.now.fit.solved.geometry.bases[frame].copy())
@@ -89,11 +89,11 @@ class MovedBody:
 
     Attributes:
         kind: "arm" (its base) or "frame".
-        name: its name.
-        shift: shift of its origin along the axes of the first arm's base [m].
+        name: name of the arm or frame.
+        shift: shift of the origin along the axes of the first arm's base [m].
         rotation: rotation about these axes [rad].
         covariance: covariance of both [m and rad].
-        log_likelihood: log likelihood if it alone moved, relative to none having moved.
+        log_likelihood: log likelihood if only this body moved, relative to no motion.
     """
 
     kind: str
@@ -106,12 +106,12 @@ class MovedBody:
 
 @dataclass(frozen=True, eq=False)
 class MovedBases:
-    """What moved between the calibration of arms and new rows.
+    """Bodies that moved between the calibration of arms and new rows.
 
     Attributes:
         probability: probability of differences this large if nothing moved.
-        bodies: arms and frames, the best explanation first; each as if it alone had moved.
-        is_one_body: whether the motion of the first one explains the differences; otherwise more than one moved.
+        bodies: arms and frames, best explanation first, each as if only it had moved.
+        is_one_body: whether the motion of the first body explains the differences; otherwise more than one body moved.
     """
 
     probability: float
@@ -120,7 +120,7 @@ class MovedBases:
 
     @cached_property
     def named(self) -> tuple[MovedBody, ...]:
-        """The body whose motion explains the differences best; several if they cannot be distinguished, or none."""
+        """The body whose motion explains the differences best; several if these cannot be distinguished, or none."""
         if self.probability >= _FALSE_ALARMS:
             return ()
         best = self.bodies[0].log_likelihood
@@ -130,16 +130,16 @@ class MovedBases:
 def find_moved_bases(arms: Sequence[ArmBefore]) -> MovedBases:
     """Find the arm's base or the frame that was moved since the arms were calibrated.
 
-    The bases now are fitted with the arms as calibrated, so that errors of an arm, which shift its base before and now
-    alike, cancel; this is contained in the covariance. Under every hypothesis, one body moved by an unknown rigid
-    motion. The noise is estimated from few rows, so differences are compared with an F distribution with its degrees of
-    freedom.
+    The current bases are fitted with the arms as calibrated. Errors of an arm shift its base equally before and now, so
+    they cancel, which the covariance takes into account. Under every hypothesis, one body moved by an unknown rigid
+    motion. The noise is estimated from few rows, so differences are compared with an F distribution with the degrees of
+    freedom of this estimate.
 
     Args:
-        arms: the arms, each measured now in one or more frames of before.
+        arms: the arms, each now measured in one or more of its previous frames.
 
     Raises:
-        IdentificationError: the base of an arm is not determined in a named frame of before.
+        IdentificationError: the base of an arm is not determined in a previous frame with a name.
     """
     owners, motions, roots = [], [], []
     for number, arm in enumerate(arms):
@@ -177,7 +177,7 @@ def find_moved_bases(arms: Sequence[ArmBefore]) -> MovedBases:
 def _joint_covariance(
     owners: Sequence[tuple[int, str]], roots: Sequence[Float64[Tensor, "6 directions"]]
 ) -> Float64[Tensor, "motions motions"]:
-    """Return the covariance of all motions; those of one arm have directions in common."""
+    """Return the covariance of all motions; motions of the same arm have directions in common."""
     covariance = torch.zeros(6 * len(owners), 6 * len(owners), dtype=torch.float64)
     for i, (one, _) in enumerate(owners):
         for k, (other, _) in enumerate(owners):
@@ -193,7 +193,7 @@ def _if_moved(
     L: Float64[Tensor, "motions motions"],
     white: Float64[Tensor, " motions"],
 ) -> MovedBody:
-    """Return the motion of a body if it alone moved: of a frame, the arms see the opposite motion."""
+    """Return the motion of a body if only this body moved; the arms see the opposite motion of a frame."""
     kind, name = body
     signs = [
         (1.0 if arms[number].posterior.name == name else 0.0)

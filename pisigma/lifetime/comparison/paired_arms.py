@@ -1,4 +1,4 @@
-"""Compare the joint values of two arms in the same postures, such as a leader and a follower: zeros that differ."""
+"""Find different joint zeros of two arms, such as a leader and a follower, from joint values in the same postures."""
 
 import math
 from dataclasses import dataclass
@@ -17,13 +17,14 @@ from pisigma.robot.se3 import wrap_to_pi
 Verdict = Literal["different", "same", "unknown"]
 Moved = Literal["leader", "follower", "both", "unknown"]
 _FALSE_ALARMS = 1e-3
-"""Probability that a joint of a pair of arms without differences is named."""
+"""Probability that a joint is named although the two arms do not differ."""
 _MISSED = 0.025
-"""Probability that a joint whose difference is as large as the tolerance is found to be the same."""
+"""Probability that a joint whose difference equals the tolerance is called the same."""
 TOLERANCE = math.radians(0.5)
-"""Smallest difference that is named [rad]: backlash and gravity shift the means of servos by such angles."""
+"""Smallest difference that is named [rad], because backlash and gravity shift the means of servos by such angles."""
 _BLOCKS, _MIN_ROWS = 20, 10
-"""Blocks of consecutive rows, whose means are independent although neighbouring rows of a log are not."""
+"""Number of blocks of consecutive rows, whose means are independent although neighbouring rows of a log are not, and
+smallest number of rows."""
 _CERTAIN = 5.0
 """Log odds above which the arm that moved is named."""
 _ITERATIONS = 10
@@ -36,8 +37,8 @@ class ZeroChanges:
     """Changes of the zeros of an arm since its calibration.
 
     Attributes:
-        values: changes [rad], to be added to its joint values.
-        covariance: their covariance [rad²].
+        values: changes [rad], which are added to the joint values of the arm.
+        covariance: covariance of the changes [rad²].
     """
 
     values: Float64[np.ndarray, " joints"]
@@ -51,11 +52,11 @@ class JointDifference:
     Attributes:
         joint: name of the joint.
         value: follower minus leader [rad], in (-pi, pi].
-        standard_error: its standard error [rad].
+        standard_error: standard error of the difference [rad].
         verdict: "different" if the difference is significant and larger than the tolerance, "same" if it is smaller
-            than the tolerance with a confidence of 97.5 %, else "unknown": more rows would show it.
+            than the tolerance with a confidence of 97.5 %, otherwise "unknown", which more rows would decide.
         moved: the arm whose zero moved, if the joint is different; "both" if the measured positions of an arm exclude
-            that only one moved, "unknown" if they do not show it.
+            that only one zero moved, "unknown" if they do not show which zero moved.
     """
 
     joint: str
@@ -70,14 +71,14 @@ def estimate_zero_changes(
 ) -> ZeroChanges:
     """Fit changes of all zeros of an arm to measured positions of its tool; base and tool are those of the model.
 
-    The prior standard deviation of a change is pi, which remains where the positions do not show a zero. The
+    The prior standard deviation of a change is pi, which remains for zeros that the positions do not determine. The
     covariance is estimated from the residuals of every row (White 1980), because the noise of servos depends on the
     posture.
 
     Args:
         model: calibrated model of the arm.
         q: joint values [rad].
-        position: measured positions of its tool [m] in the frame of the model.
+        position: measured positions of the tool [m] in the frame of the model.
 
     Raises:
         MeasurementError: the arrays do not belong to this arm or to each other, there are fewer than 10 rows, or no
@@ -112,7 +113,7 @@ def _check_rows(rows: Float64[np.ndarray, "rows columns"], option: str) -> None:
     """Check that there are enough rows of numbers.
 
     Raises:
-        MeasurementError: there are not.
+        MeasurementError: there are too few rows, or they contain other values than numbers.
     """
     if len(rows) < _MIN_ROWS or not np.isfinite(rows).all():
         finite = int(np.isfinite(rows).all(1).sum())
@@ -124,10 +125,10 @@ def _check_rows(rows: Float64[np.ndarray, "rows columns"], option: str) -> None:
 
 
 def _check_explained(model: CalibratedModel, rms: float) -> None:
-    """Check that the positions fit the arm with other zeros, up to errors [m] that robots of its class have.
+    """Check that the positions fit the arm with changed zeros, up to errors [m] that robots of its class have.
 
     Raises:
-        MeasurementError: they do not.
+        MeasurementError: the positions do not fit.
     """
     limit = RobotClass.from_robot(model.robot).remaining * model.robot.reach
     if rms > limit:
@@ -150,22 +151,23 @@ def compare_paired_arms(
     follower_zeros: ZeroChanges | None = None,
     tolerance: float = TOLERANCE,
 ) -> tuple[JointDifference, ...]:
-    """Compare the joint values of two arms of one kind that were in the same postures, row by row.
+    """Compare the joint values of two arms of the same type in the same postures, row by row.
 
-    The postures have to be the same in space, for example in a jig or at the same touched points. Logs of
-    teleoperation do not show differences, because the follower is commanded to the joint values of the leader.
+    The postures must be the same in space, for example in a jig or at the same touched points. Logs of teleoperation do
+    not show differences, because the follower is commanded to the joint values of the leader.
 
     Args:
-        leader: its joint values [rad] of revolute joints, in the order of their recording; full turns do not matter.
-        follower: those of the follower.
+        leader: joint values of the leader [rad], whose joints are revolute, in the order of recording; full turns do
+            not matter.
+        follower: joint values of the follower [rad].
         names: names of the joints.
         leader_zeros: changes of the leader's zeros since its calibration, see `estimate_zero_changes`.
-        follower_zeros: those of the follower's zeros.
+        follower_zeros: changes of the follower's zeros.
         tolerance: smallest difference that is named [rad].
 
     Returns:
-        One difference per joint, which is significant if a pair without differences would have one as large in less
-        than one of 1,000 comparisons.
+        One difference per joint, which is significant if arms without differences would show one as large in fewer than
+        one of 1,000 comparisons.
 
     Raises:
         MeasurementError: the arrays do not have one value per joint and row, or there are fewer than 10 rows.
@@ -210,9 +212,9 @@ def _moved(
 ) -> Moved:
     """Return the arm whose zero moved, from the changes of the leader's and the follower's zero.
 
-    The leader's zero has to change by `value`, or the follower's by `-value`, to explain the difference; the zero of
-    the other arm did not change then. An explanation is excluded if a measured change deviates from it as far as a
-    difference that is named.
+    To explain the difference, the leader's zero must have changed by `value`, or the follower's by `-value`, while the
+    zero of the other arm did not change. An explanation is excluded if a measured change deviates from it by as much as
+    a difference that is named.
     """
     arms: tuple[Moved, Moved] = ("leader", "follower")
     misfit, excluded = {}, {}

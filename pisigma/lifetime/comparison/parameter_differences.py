@@ -18,7 +18,8 @@ from pisigma.model.accuracy import parameter_posterior
 from pisigma.model.calibrated_model import CalibratedModel
 
 _LEVEL = 0.01
-"""Family-wise significance level: probability of calling any parameter different where two models differ by chance."""
+"""Family-wise significance level: probability of calling any parameter different if two models differ only by
+chance."""
 _FACTORS = dict(SHOWN_UNITS.values())
 """Factors from SI by the shown unit, such as "mm" or "deg"."""
 
@@ -33,10 +34,10 @@ class ParameterDifference:
         first: value in the first model.
         second: value in the second model.
         deviations: posterior standard deviations; None if a model stores no posterior.
-        shift: estimated difference given the significant differences, with base and tool free if these are fitted;
-            None without posteriors, and if the parameter moves the tool like those parameters.
+        shift: estimated difference given the significant differences, with base and tool free if these are fitted; None
+            without posteriors, or if the parameter moves the tool in the same way as those parameters.
         deviation: standard deviation of the shift.
-        p: probability of at least such a shift by chance, times the number of tested parameters (Bonferroni).
+        p: probability of a shift at least this large by chance, times the number of tested parameters (Bonferroni).
         alike: names of parameters with the same effect on the tool.
     """
 
@@ -62,8 +63,8 @@ class Remainder:
     """Test of the displacement that base, tool and the significant parameters do not explain.
 
     Attributes:
-        p: probability of at least such a displacement by chance.
-        significant: whether p is below the level.
+        p: probability of a displacement at least this large by chance.
+        significant: whether p is below the significance level.
     """
 
     p: float
@@ -77,7 +78,7 @@ class ParameterDifferences:
     Attributes:
         parameters: all DH parameters of the arm.
         differing: significant differences, estimated together; a joint zero counts in the direction of the joint.
-        frames: distances and angles by which base and tool of the second model differ; for fitted frames only.
+        frames: distances and angles by which base and tool of the second model differ, for fitted frames only.
         remainder: test of the remaining displacement; None without posteriors.
         level: family-wise significance level.
     """
@@ -95,9 +96,9 @@ def parameter_differences(pair: ModelPair, level: float = _LEVEL) -> ParameterDi
     Differences e of the parameters displace the tool by `d = J e`. Under posteriors with covariances `C1` and `C2`, d
     is normal with the covariance `X1 C1 X1^T + X2 C2 X2^T`, where X are derivatives with respect to all unknowns,
     including the weights of a joint correction. The corrections may therefore be of different kinds, and unobservable
-    differences are ignored. Base and tool are free where frames are fitted. The parameter whose shift alone explains
-    most of d is tested, at the level over the number of parameters (Bonferroni); then the next parameter in
-    addition, until no further parameter is significant.
+    differences are ignored. Base and tool are free if frames are fitted. The parameter whose shift alone explains most
+    of d is tested, at the level over the number of parameters (Bonferroni); further parameters are then added one by
+    one until no other parameter is significant.
 
     Args:
         pair: the models.
@@ -125,7 +126,7 @@ def _tested(
     chosen: Sequence[int],
     parameters: Sequence[ParameterDifference],
 ) -> ParameterDifference:
-    """Test a parameter given the significant parameters, without itself and parameters with the same effect."""
+    """Test a parameter given the significant parameters, except itself and parameters with the same effect."""
     alike = effects.parameters_with_same_effect(number)
     estimate = effects.shift(number, [one for one in chosen if one not in (number, *alike)])
     if estimate is None:

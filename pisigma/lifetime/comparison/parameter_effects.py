@@ -20,7 +20,8 @@ from pisigma.robot.kinematics.parameter_jacobian import identification_jacobian
 from pisigma.robot.se3 import rotation_from_vector, rotation_vector, skew, xyzrpy_from_transform
 
 _MODEL_ERROR = 2e-5
-"""Standard deviation of predicted coordinates [m] in addition to the posteriors, about a robot's repeatability."""
+"""Standard deviation of predicted coordinates [m] in addition to that of the posteriors, about a robot's
+repeatability."""
 _MIN_DISTINCT_SHARE = 0.01
 """Share of a parameter's effect that is distinct from other effects, below which the parameter is unobservable."""
 _ALIKE = 1 - _MIN_DISTINCT_SHARE**2
@@ -46,7 +47,7 @@ class Difference:
 
     @property
     def sentence(self) -> str:
-        """Clause such as "joint 3 by 0.25 ± 0.01 deg"."""
+        """Clause, such as "joint 3 by 0.25 ± 0.01 deg"."""
         alike = f" (or, equivalently, {' or '.join(self.alike)})" if self.alike else ""
         return f"{self.shift.what}{alike} by {self.shift.size}"
 
@@ -58,14 +59,14 @@ class Difference:
 class ParameterEffects:
     """Displacement of the tool between two models, and the effects of parameters on it, both whitened.
 
-    With d the displacement at the points of a pair and J its derivatives with respect to the parameters, values are
+    With the displacement d at the points of a pair and its derivatives J with respect to the parameters, values are
     `L^-1 d` and columns `L^-1 J`, where `L L^T` is the covariance of d under both posteriors. The parameters are those
     of the arm (theta, d, a, alpha, beta of every row), then translation and rotation of the base, about its origin and
     along the axes of the measuring frame, and those of the tool, along its own axes.
 
     Attributes:
-        tested: indices of the tested parameters: one of several exchangeable parameters, and no parameter that moves
-            the tool as base and tool do where these are free.
+        tested: indices of the tested parameters: only one of several exchangeable parameters, and no parameter that
+            moves the tool as a free base or tool does.
     """
 
     def __init__(self, pair: ModelPair) -> None:
@@ -117,7 +118,8 @@ class ParameterEffects:
         """Estimate the shift of a parameter given others, and its standard deviation [m or rad].
 
         Returns:
-            The shift and its standard deviation; None if the parameter moves the tool like the given ones.
+            The shift and its standard deviation; None if the parameter moves the tool in the same way as the given
+            parameters.
         """
         left, observable = self._left(given)
         if not bool(observable[number]):
@@ -126,7 +128,7 @@ class ParameterEffects:
         return float(left[:, number] @ self._y[:, 0]) / size**2, 1 / size
 
     def standard_scores(self, given: Sequence[int]) -> Float64[Tensor, " parameters"]:
-        """Compute shift over standard deviation of every tested parameter given others; 0 for those not tested."""
+        """Compute the ratio of shift to standard deviation of every tested parameter given others; 0 if not tested."""
         left, observable = self._left(given)
         tested = torch.zeros_like(observable)
         tested[self.tested] = True
@@ -135,7 +137,7 @@ class ParameterEffects:
         return scores
 
     def unexplained_probability(self, given: Sequence[int]) -> float:
-        """Compute the probability by chance of the displacement that the given parameters do not explain.
+        """Compute the probability that the displacement not explained by the given parameters is due to chance.
 
         The sum of squares is compared with that of normal values with the covariance of the posteriors, by
         Satterthwaite's approximation (1946, Biometrics Bulletin 2(6), 110-114).

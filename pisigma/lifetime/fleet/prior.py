@@ -1,4 +1,4 @@
-"""Fleet prior: distribution of the errors of robots of a type by empirical Bayes, and consistency with it."""
+"""Fleet prior: distribution of the errors of robots of one type by empirical Bayes, and consistency with it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -42,7 +42,7 @@ class FleetPrior:
     """Distribution of the errors of a fleet.
 
     Attributes:
-        model: mean robot, with the uncertainty of another robot of the fleet.
+        model: mean robot, with the uncertainty that applies to a further robot of the fleet.
         population: mean and covariance of the errors between robots.
         names: names of the geometric parameters.
         odd: indices of robots that were not used, because they are inconsistent with the other robots.
@@ -69,7 +69,7 @@ def fleet_prior(name: str, robot: Robot, fleet: Sequence[Measurements]) -> Fleet
     """Estimate the distribution of the errors of a fleet.
 
     Every robot has errors `u ~ N(μ, Σ)` and rows that are linear in them. Expectation-maximisation (Dempster, Laird and
-    Rubin 1977, J. Royal Statistical Society B 39(1), 1-38) finds μ and Σ, so that each robot is treated as far as its
+    Rubin 1977, J. Royal Statistical Society B 39(1), 1-38) finds μ and Σ, to which each robot contributes as far as its
     rows determine its errors. The usual errors of the robot's class have a small weight, see
     `pisigma.estimation.population.CLASS_ROBOTS`. Robots whose rows are too improbable given the others are left out,
     and the estimate is repeated.
@@ -131,7 +131,7 @@ def mean_robot(
         name: name of the model.
         posterior: prior of the nominal robot, with the unknowns of the population.
         population: errors of the robots.
-        fleet: rows of robots, from which the measured joint values follow.
+        fleet: rows of robots, which define the measured joint values.
         noise: noise of each sensor, see `Adaptation.noise`.
     """
     usual, size = posterior.uncertainty, population.geometric
@@ -211,12 +211,12 @@ def evidence_of(
     normal = kept.t() @ kept - kept.t() @ others @ taken[:, :-1]
     descent = kept.t() @ y - kept.t() @ others @ taken[:, -1]
     normal = (normal + normal.t()) / 2
-    # Linearised at the mean, the residuals determine errors minus mean: add the mean.
+    # Linearised at the mean, the residuals determine the errors minus the mean, so the mean is added.
     return RobotEvidence(normal, descent + normal @ mean, adaptation.noise)
 
 
 def _medians(noises: Sequence[CalibrationNoise]) -> CalibrationNoise:
-    """Return the median noise of each sensor; of the robots whose rows state standard deviations, if some do."""
+    """Return the median noise of each sensor, over robots whose rows state standard deviations if there are any."""
     value, stated = dict[str, float](), dict[str, float]()
     for name in dict.fromkeys(name for noise in noises for name in noise.value):
         of_sensor = [noise for noise in noises if name in noise.value]
@@ -234,7 +234,7 @@ class FleetConsistency:
     """Consistency of a robot with the other robots of its fleet.
 
     Attributes:
-        probability: probability that a robot of the fleet is as far from its mean, or farther.
+        probability: probability that a robot of the fleet is at least as far from its mean.
         gain: log evidence of its rows under the fleet prior, minus that under the prior of its class.
     """
 
@@ -270,7 +270,7 @@ class FleetConsistency:
 
     @property
     def sentence(self) -> str:
-        """The result of the comparison as a sentence."""
+        """Sentence with the result of the comparison."""
         if self.is_inconsistent:
             return (
                 f"This robot is inconsistent with the fleet: fewer than 1 in {1 / FALSE_ALARM:,.0f} robots of the "

@@ -1,4 +1,4 @@
-"""Typed figures of a fleet prior, which its card, tables and JSON render."""
+"""Typed figures of a fleet prior, from which its card, tables and JSON are made."""
 
 import math
 from collections.abc import Sequence
@@ -32,7 +32,7 @@ class WeightSpreadFigures(Section):
     """Standard deviation between robots of the weights of a feature.
 
     Attributes:
-        group: name such as "harmonics 1 to 1".
+        group: name of the group, such as "harmonics 1 to 1".
         deg: root mean square over the weights of the group [deg; lengths are divided by the reach].
     """
 
@@ -45,8 +45,8 @@ class FleetPriorSummary(AbstractSummary):
 
     Attributes:
         robots: number of robots that were used.
-        odd: ids of robots that were not used, because they are inconsistent with the other robots.
-        refused: reasons by id of robots whose files cannot be read.
+        odd: ids of robots that were not used because they are inconsistent with the other robots.
+        refused: reasons, by id of the robot, why files cannot be read.
         remarks: remarks on the rows of the robots that were used, one sentence each.
         rows: number of rows of all robots.
         parameters: distributions of the geometric parameters.

@@ -1,4 +1,4 @@
-"""Status of a fleet, a folder of cells: which cells need attention, and the largest errors."""
+"""Status of a fleet, which is a folder of cells: cells that need attention, and the largest errors."""
 
 import datetime
 import os
@@ -25,7 +25,7 @@ class FleetStatus:
     Attributes:
         folder: folder of the cells.
         cells: status of every cell that can be read, sorted by name.
-        unreadable: why the status of other cells cannot be read, by their names.
+        unreadable: reasons, by name of the cell, why the status of other cells cannot be read.
     """
 
     folder: Path
@@ -49,7 +49,7 @@ class FleetStatus:
 
     @cached_property
     def states(self) -> dict[str, tuple[str, ...]]:
-        """Names of the cells in every state, states that need attention first."""
+        """Names of the cells in every state; states that need attention come first."""
         states: dict[str, tuple[str, ...]] = {UNREADABLE: tuple(self.unreadable)} if self.unreadable else {}
         for one in sorted(self.cells, key=urgency):
             states[one.step.state] = (*states.get(one.step.state, ()), one.name)
@@ -57,7 +57,7 @@ class FleetStatus:
 
     @cached_property
     def by_error(self) -> tuple[tuple[CellStatus, Check], ...]:
-        """Cells with a known error and the check that found it, the largest RMS error first."""
+        """Cells with a known error, and the check that determined it, largest RMS error first."""
         known = [(one, check) for one in self.cells if (check := one.last_error) is not None]
         return tuple(sorted(known, key=lambda one: -(one[1].rms_mm or 0.0)))
 

@@ -24,7 +24,7 @@ class Event:
 
     Attributes:
         number: index of the first value after the change.
-        alone: whether only that value is changed, rather than all later values as well.
+        alone: whether only this value is changed, rather than also all later values.
     """
 
     number: int
@@ -66,10 +66,10 @@ class Series:
         return torch.cat([columns, *(one.column(len(self.values))[:, None] for one in events)], 1)
 
     def events(self, steady: Tensor, drift: Tensor) -> tuple[tuple[Event, ...], bool]:
-        """Find the events, and whether there is a drift in addition.
+        """Find the events, and whether there is also a drift.
 
-        Both with and without a drift, events are added one by one, always the event that explains most, as long as it
-        explains more than the best of as many candidates would by chance. The two fits are compared by the Bayesian
+        Both with and without a drift, events are added one by one, each time the event that explains most, as long as
+        it explains more than the best of all candidates would by chance. The two fits are compared by the Bayesian
         information criterion (Schwarz 1978, Annals of Statistics 6, 461-464).
 
         Args:
@@ -82,7 +82,7 @@ class Series:
         return (drift_events, True) if drifts else (steady_events, False)
 
     def _added(self, columns: Tensor) -> tuple[tuple[Event, ...], float]:
-        """Add events to columns; return them, and the remaining square sum plus penalty."""
+        """Add events to columns; return the events, and the remaining sum of squares plus a penalty."""
         count, chosen = len(self.values), tuple[Event, ...]()
         penalty = 2 * math.log(max(len(self._tried), 1)) + math.log(count)
         while columns.shape[1] + len(chosen) + _MIN_DEGREES_OF_FREEDOM < count and len(chosen) < _MAX_EVENTS:
@@ -105,7 +105,7 @@ class Series:
         return chosen
 
     def _best(self, columns: Tensor, chosen: tuple[Event, ...]) -> tuple[Event, float]:
-        """Return the event that explains most given other events, and the resulting decrease of the square sum."""
+        """Return the event that explains most given other events, and the resulting decrease of the sum of squares."""
         left, Q = self._left(columns, chosen)
         tried = self.whiten(torch.stack([one.column(len(self.values)) for one in self._tried], 1))
         tried = tried - Q @ (Q.t() @ tried)
@@ -124,7 +124,7 @@ class Series:
 
     @cached_property
     def _tried(self) -> tuple[Event, ...]:
-        """Candidate events: a jump before every value but the first, every value alone but the first and the last."""
+        """Candidate events: jumps before every value except the first, and single values except the first and last."""
         count = len(self.values)
         return (
             *(Event(number, False) for number in range(1, count)),

@@ -13,9 +13,9 @@ from torch import Tensor
 from pisigma.measurement.sensors.sensor import ShownUnit
 
 FALSE_ALARMS_PER_YEAR = 0.05
-"""Number of false alarms of all charts of a robot together per year, if nothing changes."""
+"""Number of false alarms per year of all charts of a robot together, if nothing changes."""
 SESSIONS_PER_YEAR = 12
-"""Number of sessions per year, by which a rate per year is converted to a rate per session."""
+"""Number of sessions per year, with which a rate per year is converted to a rate per session."""
 _WEIGHT = 0.2
 """Weight of the newest session in the moving average."""
 _ALLOWANCE = 0.5
@@ -43,7 +43,7 @@ class Limits:
 
 @dataclass(frozen=True, eq=False)
 class Chart:
-    """Control chart of a quantity, which compares sessions with predictions from earlier sessions and the model.
+    """Control chart of a quantity, which compares sessions with predictions from the model and earlier sessions.
 
     Attributes:
         what: charted quantity, such as "joint 2" or "error".
@@ -100,7 +100,7 @@ class Chart:
 
     @property
     def alarm(self) -> int | None:
-        """Index of the first session since which a statistic has been outside its limit; None if neither is."""
+        """Index of the session since which a statistic has been outside its limit; None if neither is outside now."""
         outside = torch.stack(list(self.sessions_outside.values())).any(0)
         if not len(outside) or not bool(outside[-1]):
             return None
@@ -136,8 +136,8 @@ def innovations(
 ) -> Float64[Tensor, " sessions"]:
     """Compute independent scores of correlated values, such as values with a common error of the model.
 
-    With the covariance `L L^T` the scores are `L^-1 values`: every value minus its prediction from earlier values,
-    divided by the standard deviation of the difference. NaN remains NaN.
+    With the covariance `L L^T`, the scores are `L^-1 values`: every value minus its prediction from earlier values,
+    divided by the standard deviation of this difference. NaN remains NaN.
     """
     scores = torch.full_like(values, torch.nan)
     there = torch.isfinite(values).nonzero()[:, 0]
@@ -148,7 +148,7 @@ def innovations(
 
 @cache
 def limits_of(charts: int, one_sided: bool = False) -> Limits:
-    """Compute the limits with which all charts of a robot together have `FALSE_ALARMS_PER_YEAR`.
+    """Compute the limits for which all charts of a robot together have `FALSE_ALARMS_PER_YEAR`.
 
     The mean number of sessions to a false alarm is that of Brook and Evans 1972 (Biometrika 59(3)) for the moving
     average, as a Markov chain, and of Siegmund 1985 (Sequential Analysis, eq. 2.57) for the sums.
@@ -185,7 +185,7 @@ def mean_sessions_to_cusum_alarm(limit: float) -> float:
 
 
 def _solved(sessions_of: Callable[[float], float], target: float, low: float, high: float) -> float:
-    """Find the limit with a given mean number of sessions by bisection."""
+    """Find the limit that has a given mean number of sessions, by bisection."""
     for _ in range(40):
         middle = (low + high) / 2
         low, high = (middle, high) if sessions_of(middle) < target else (low, middle)

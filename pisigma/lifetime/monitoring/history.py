@@ -1,4 +1,4 @@
-"""Monitored sessions of a model: their entries in the history, and the rows that are new."""
+"""Monitored sessions of a model: entries in the history, and selection of new rows."""
 
 import io
 from collections.abc import Sequence
@@ -33,7 +33,7 @@ class Record:
         temperature_c: mean temperature of the rows [°C]; None if they do not state it.
         session: result of the session.
         zeros: zeros of the joints.
-        values: joint values and readings of the rows, by which repeated rows are recognised; None in histories of
+        values: joint values and readings of the rows, for the recognition of repeated rows; None in histories of
             earlier versions.
     """
 
@@ -68,8 +68,8 @@ class Record:
 def store_sessions(history: History, model: str, records: Sequence[Record]) -> tuple[Record, ...]:
     """Store sessions in a history and return all sessions of the model.
 
-    All sessions are stored in one transaction, or none if the process ends before. A session with the same rows
-    replaces the stored session.
+    All sessions are stored in one transaction, or none if the process ends earlier. A session with the same rows as a
+    stored session replaces it.
 
     Args:
         history: history of the model, or of its cell.
@@ -161,7 +161,7 @@ def new_rows(
     earlier: Sequence[Record],
     judged: Sequence[Record],
 ) -> tuple[Measurements, tuple[str, ...]]:
-    """Return the rows without rows with which the model was calibrated, and without rows of other sessions.
+    """Return the rows that neither belong to the calibration of the model nor to other sessions.
 
     Args:
         model: the model.
@@ -171,7 +171,7 @@ def new_rows(
         judged: sessions of this call.
 
     Returns:
-        The other rows, and a warning for each set of rows that was left out.
+        The new rows, and a warning for each set of rows that was left out.
     """
     sha256 = rows_hash(rows)
     warnings = [

@@ -37,14 +37,14 @@ ZERO_PRIOR = 0.02
 _UNOBSERVABLE = 0.005
 """Posterior standard deviation [rad, or share of the reach] above which a joint zero is unobservable, about 0.3 deg."""
 _MIN_GAIN_RATIO = 1.05
-"""Expected ratio of errors before and after a recalibration above which it is recommended."""
+"""Expected ratio of errors before and after a recalibration above which a recalibration is recommended."""
 _MAX_NOISE_FACTOR = 2.0
 """Factor on the noise of the calibration up to which an explanation is complete."""
 _MIN_NAMED_PROBABILITY = 0.05
 """Probability above which an ambiguous explanation is named."""
 _MAX_LINEARISATIONS = 4
 _CONVERGENCE_TOLERANCE = 1.0
-"""RMS change of predicted values, over their noise, below which linearisation ends."""
+"""RMS change of predicted values, relative to their noise, below which linearisation ends."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +73,7 @@ class Session:
         rows: number of rows.
         unchanged: probability that no part moved.
         moved: movements; movements of the arm come first.
-        candidates: names and probabilities of possible movements where these are ambiguous; otherwise empty.
+        candidates: names and probabilities of possible movements if these are ambiguous; otherwise empty.
         rms: RMS position error under the model, with the current base and tool [m].
         rms_after: RMS position error expected after a recalibration [m].
         rotation_ratio: ratio of orientation errors to the errors expected after a recalibration; 1 if none was
@@ -82,9 +82,9 @@ class Session:
         values: number of measured values.
         standing: names of bases and tools that were moved since the model was made.
         observable: whether the rows determine the zero of each joint.
-        outliers: places of rows that are not used, because they contradict the other rows under any movement.
-        score_ratio: for images, whose poses have more noise than error: RMS of values over their standard deviations,
-            divided by that expected after a recalibration; otherwise 1.
+        outliers: file and line of rows that are not used because they contradict the other rows under any movement.
+        score_ratio: for images, whose poses have more noise than error, RMS ratio of values to their standard
+            deviations, divided by that expected after a recalibration; otherwise 1.
     """
 
     rows: int
@@ -110,7 +110,7 @@ class Session:
 
     @property
     def recalibrate(self) -> bool:
-        """Whether the arm changed so much that a recalibration is recommended."""
+        """Whether the arm has changed so much that a recalibration is recommended."""
         arm = any(not is_frame(one.what) for one in self.moved) or bool(self.candidates)
         return arm and (
             self.rms > _MIN_GAIN_RATIO * self.rms_after
@@ -119,7 +119,7 @@ class Session:
 
     @property
     def sentence(self) -> str:
-        """The verdict as a clause with a full stop."""
+        """Clause that states the verdict, with a full stop."""
         if self.verdict == "unclear":
             named = (
                 f"{what} ({format_probability(share)})"
@@ -129,7 +129,7 @@ class Session:
             return f"something changed, but these rows cannot distinguish what: {' or '.join(named)}."
         if self.verdict == "unchanged":
             return "nothing moved beyond its uncertainty."
-        # of a base or a tool that moved, not its rotation where only its origin did, and the other way round
+        # for a base or a tool, omit the rotation if only the origin moved, and the other way round
         clear = [one for one in self.moved if one.is_significant or not is_frame(one.what)] or self.moved
         moved = (f"{one.sentence} ({format_probability(one.probability)})" for one in clear)
         return f"{'; '.join(moved)}."
@@ -151,7 +151,7 @@ class Session:
 
     @property
     def gain(self) -> float:
-        """Expected decrease of the RMS error of such rows by a recalibration [m]."""
+        """Expected decrease of the RMS error of such rows due to a recalibration [m]."""
         return max(self.rms - self.rms_after, 0.0)
 
 
@@ -161,7 +161,7 @@ def judge_session(
     rows: Measurements,
     stated: Set[FrameKey] | None = None,
 ) -> tuple[Session, JointZeros]:
-    """Compare all movements that are possible since a model was made, by their evidence.
+    """Compare, by their evidence, all movements that may have happened since a model was made.
 
     Args:
         model: the model.
@@ -173,7 +173,7 @@ def judge_session(
         The result of the session, and the zeros of all joints for charts.
 
     Raises:
-        IdentificationError: nothing usable was measured, or too little to guess a moved base or tool.
+        IdentificationError: there are no usable rows, or too few to guess a moved base or tool.
         PoseError: the joint values do not fit the robot.
     """
     solved = _solve(model, posterior, rows, stated or frozenset())
@@ -186,7 +186,7 @@ def judge_session(
 def _with_relocated(
     model: CalibratedModel, posterior: ModelPosterior, rows: Measurements, still: "_Solved"
 ) -> tuple["_Solved", dict[FrameKey, float]]:
-    """Find which bases and tools were moved: the base, the tool, or both where neither alone explains the rows."""
+    """Find which bases and tools were moved: the base, the tool, or both if neither alone explains the rows."""
     bases, tools = known_frames(posterior, rows)
     tried: dict[frozenset[FrameKey], _Solved] = {frozenset(): still}
     for owners in (bases, tools, bases | tools):
@@ -217,7 +217,7 @@ class _Solved:
 
     @property
     def probable_movements(self) -> tuple[Motion, ...]:
-        """Movements, or the most probable movement if they are ambiguous."""
+        """Movements, or only the most probable one if they are ambiguous."""
         return self.explanation.motions or self.explanation.candidates[:1]
 
     @property
@@ -227,11 +227,11 @@ class _Solved:
 
     @property
     def frame_moved(self) -> bool:
-        """Whether a base or a tool has moved so far that its motion is not linear."""
+        """Whether a base or a tool has moved too far for its motion to be linear."""
         return any(is_frame(one.group.what) and one.size >= MIN_MOVE for one in self.probable_movements)
 
     def arm_with(self, motions: tuple[DriftGroup, ...]) -> AdaptedArm:
-        """Return the arm with moved bases and tools and given movements fitted, and otherwise as in the model."""
+        """Return the arm of the model, with moved bases and tools and given movements fitted."""
         return AdaptedArm.from_unknowns(self.problem, self.unknowns(motions))
 
     def score_ratio(self, before: tuple[DriftGroup, ...], after: tuple[DriftGroup, ...]) -> float:
@@ -295,7 +295,7 @@ def _sized(motion: Motion) -> DriftGroup:
 
 
 def _freed(motion: Motion) -> DriftGroup:
-    """Return the group of a movement with a prior of at least `ZERO_PRIOR`."""
+    """Return the group of a movement, with a prior of at least `ZERO_PRIOR`."""
     return replace(motion.group, size=max(motion.size, ZERO_PRIOR))
 
 

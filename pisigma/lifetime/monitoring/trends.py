@@ -1,4 +1,4 @@
-"""Sessions over months: charts of joints and errors, drift with time and temperature, and a forecast for a limit."""
+"""Sessions over months: charts of joints and errors, drift with time and temperature, forecast for a limit."""
 
 import datetime
 import math
@@ -20,9 +20,9 @@ from pisigma.measurement.sensors.sensor import SHOWN_UNITS, ShownUnit
 _DAYS_PER_MONTH = 365.25 / 12
 """Mean length of a month [days]."""
 _MIN_SESSIONS = 4
-"""Sessions on different days from which a drift is estimated."""
+"""Smallest number of sessions on different days from which a drift is estimated."""
 _MIN_TEMPERATURE_SPREAD = 3.0
-"""Standard deviation of the temperatures [K] above which a dependence on them is estimated."""
+"""Standard deviation of the temperatures [K] above which a dependence on temperature is estimated."""
 _MAX_MONTHS = 120.0
 """Range of forecasts: ten years."""
 
@@ -58,7 +58,7 @@ class Trend:
 
     @property
     def sentence(self) -> str:
-        """The drift as a sentence."""
+        """Sentence that states the drift."""
         half = NORMAL_95 * self.deviation
         return f"{self.what} drifts by {self.slope:.4f} ± {half:.4f} {self.unit} per {self.over}"
 
@@ -70,16 +70,16 @@ class Trend:
 
 @dataclass(frozen=True)
 class Jump:
-    """Jump of a joint zero between two sessions, as after a collision, or in a single session.
+    """Jump of a joint zero between two sessions, as after a collision, or deviation in a single session.
 
     Attributes:
         what: quantity that jumped, such as "joint 2".
         unit: unit of the jump.
         size: size of the jump [`unit`].
         deviation: standard deviation of the size [`unit`].
-        before: date of the last session before it.
-        after: date of the first session after it.
-        alone: whether that session alone deviates.
+        before: date of the last session before the jump.
+        after: date of the first session after the jump.
+        alone: whether only that session deviates.
     """
 
     what: str
@@ -92,7 +92,7 @@ class Jump:
 
     @property
     def sentence(self) -> str:
-        """The change as a sentence."""
+        """Sentence that states the change."""
         half = NORMAL_95 * self.deviation
         if self.alone:
             return f"{self.what} deviated by {self.size:.4f} ± {half:.4f} {self.unit} on {self.after} only"
@@ -117,8 +117,8 @@ class Forecast:
     Attributes:
         limit_mm: the limit [mm].
         passed: whether the error of the last session is above the limit.
-        date: date on which the trend reaches the limit; None if it does not within ten years.
-        earliest: start of the 95 % confidence interval of the date; None if it is not reached within ten years.
+        date: date on which the trend reaches the limit; None if it does not do so within ten years.
+        earliest: start of the 95 % confidence interval of the date; None if this is more than ten years away.
     """
 
     limit_mm: float
@@ -128,7 +128,7 @@ class Forecast:
 
     @property
     def sentence(self) -> str:
-        """The forecast as a sentence."""
+        """Sentence that states the forecast."""
         if self.passed:
             return f"The RMS error of the last session is above the limit of {self.limit_mm:g} mm."
         if self.date is None:
@@ -190,7 +190,7 @@ def trends_of(revolute: Sequence[bool], records: Sequence[Record]) -> tuple[Tren
 
 
 def jumps_of(revolute: Sequence[bool], records: Sequence[Record]) -> tuple[Jump, ...]:
-    """Find jumps of joint zeros between sessions, where these explain them better than a drift.
+    """Find jumps of joint zeros between sessions, where jumps explain the zeros better than a drift.
 
     Args:
         revolute: whether each joint of the robot is revolute.
@@ -218,7 +218,7 @@ def jumps_of(revolute: Sequence[bool], records: Sequence[Record]) -> tuple[Jump,
 
 
 def _overs(records: Sequence[Record]) -> list[tuple[Literal["month", "kelvin"], Tensor]]:
-    """Return the quantities with which zeros may drift: time, and temperature if it varies."""
+    """Return the quantities with which zeros may drift: time and, if it varies, temperature."""
     temperature = torch.tensor(
         [math.nan if one.temperature_c is None else one.temperature_c for one in records], dtype=torch.float64
     )
@@ -237,7 +237,7 @@ class _Zero:
         sessions: indices of these sessions.
         columns: columns of the regression: 1, months and, if they vary, temperatures minus their means.
         events: jumps, and single deviating sessions.
-        drifts: whether there is a drift with time in addition.
+        drifts: whether there is also a drift with time.
     """
 
     series: Series
@@ -269,7 +269,7 @@ class _Zero:
 
 
 def forecast_of(records: Sequence[Record], limit_mm: float) -> Forecast:
-    """Forecast when the RMS error of a session passes a limit, by a straight line through all sessions."""
+    """Forecast when the RMS error of a session passes a limit, from a straight line through all sessions."""
     months, last = months_of(records), records[-1]
     rms = torch.tensor([one.session.rms * 1e3 for one in records], dtype=torch.float64)
     passed = bool(rms[-1] > limit_mm)
@@ -277,7 +277,7 @@ def forecast_of(records: Sequence[Record], limit_mm: float) -> Forecast:
     if not passed and bool((rms > 0).all()) and len(torch.unique(months)) >= _MIN_SESSIONS:
         # The RMS of n values has a relative standard deviation of sqrt(1 / 2n).
         spread = rms * torch.tensor([math.sqrt(0.5 / one.session.values) for one in records]).double()
-        # A jump must exceed the usual noise between sessions; the fit of the line estimates its scatter below.
+        # A jump must exceed the usual noise between sessions; the fit of the line below estimates this scatter.
         usual = rms * torch.tensor([_log_spread(one) for one in records]).double()
         columns = torch.stack([torch.ones_like(months), months - months[-1]], 1)
         events, _ = Series(rms, usual.square().diag()).events(columns[:, :1], columns[:, 1:])
@@ -326,7 +326,7 @@ def _log_spread(record: Record) -> float:
 
 
 def _after(date: str, months: float) -> str | None:
-    """Return the date some months after another; None beyond the range of forecasts."""
+    """Return the date that is some months after another; None beyond the range of forecasts."""
     if months > _MAX_MONTHS:
         return None
     days = datetime.timedelta(days=max(months, 0.0) * _DAYS_PER_MONTH)

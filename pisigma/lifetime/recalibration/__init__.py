@@ -1,1 +1,1 @@
-"""Recalibration of a model with few new rows, and what moved since it was made."""
+"""Recalibration of a model with a few new rows, and movements since the model was made."""

@@ -1,4 +1,4 @@
-"""Adaptation of a model to new rows: posterior of all unknowns and sizes of their drift, by repeated linearisation."""
+"""Adaptation of a model to new rows: posterior of all unknowns and sizes of their drift, by iterated linearisation."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -24,7 +24,7 @@ from pisigma.measurement.sensors.registry import measured_errors
 
 _MAX_LINEARISATIONS = 5
 _CONVERGENCE_TOLERANCE = 0.05
-"""RMS change of predicted values, over their noise, below which linearisation ends."""
+"""RMS change of predicted values, relative to their noise, below which linearisation ends."""
 MAX_VALUES = 360
 """Largest number of values from which the sizes of the drift are estimated; the posterior uses all values."""
 _FIRST_NOISE = {"m": 1e-4, "rad": 1e-4}
@@ -45,7 +45,7 @@ class AdaptedArm:
 
     @staticmethod
     def from_unknowns(problem: RecalibrationProblem, x: Float64[Tensor, " unknowns"]) -> "AdaptedArm":
-        """Return the arm at unknowns x of a problem, parameters counted from `design.problem.nominal`."""
+        """Return the arm at the unknowns x of a problem, with parameters relative to `design.problem.nominal`."""
         design = problem.design
         point = design.problem.nominal.index_add(0, design.problem.active, x[: design.active])
         return AdaptedArm(
@@ -54,7 +54,7 @@ class AdaptedArm:
         )
 
     def errors_of(self, measurements: Measurements) -> dict[str, Float64[Tensor, "rows components"]]:
-        """Compute measured - predicted values; see `CalibrationResult.errors_of`."""
+        """Compute measured minus predicted values; see `CalibrationResult.errors_of`."""
         moved = measurements
         if self.correction is not None:
             with torch.no_grad():
@@ -72,11 +72,11 @@ class Adaptation:
         problem: the problem that was solved.
         arm: geometry, frames and joint correction.
         drift: sizes of the drift of each group, and the noise.
-        shift: change of all unknowns, parameters relative to the anchors.
+        shift: change of all unknowns, with parameters relative to the anchors.
         effective: number of directions that the new rows determine.
         rounds: number of linearisations.
         search: evidence at the solution, from which movements are estimated.
-        values: values that count at the solution.
+        values: values in use at the solution.
         update: posterior update at the solution.
     """
 
@@ -92,7 +92,7 @@ class Adaptation:
 
     @property
     def wrong_rows(self) -> list[int]:
-        """Rows that are not used: dropped by the loss as far off, or wrong by evidence."""
+        """Rows that are not used, because the loss rejects them or the evidence shows that they are wrong."""
         rows: list[int] = self.problem.setup.rows[self.problem.wrong_rows(self.values)].tolist()
         return rows
 
@@ -111,7 +111,7 @@ class Adaptation:
         return CalibrationNoise(value, stated_sigmas(sensors))
 
     def errors_of(self, measurements: Measurements) -> dict[str, Float64[Tensor, "rows components"]]:
-        """Compute measured - predicted values; see `CalibrationResult.errors_of`."""
+        """Compute measured minus predicted values; see `CalibrationResult.errors_of`."""
         return self.arm.errors_of(measurements)
 
 
@@ -139,13 +139,13 @@ def adapt(
         rounds += 1
         rows = linearise_rows(design, x, effective, group)
         values = replace(linear_values(problem, rows), wrong=wrong)
-        # Sizes of the drift and wrong rows come first, because both determine how far the posterior may follow the
-        # values.
+        # Sizes of the drift and wrong rows are estimated first, because both determine how far the posterior may follow
+        # the values.
         search = _searched(problem, values, drift, usual)
         drift, wrong = search.drift, search.values.wrong
         values = replace(values, wrong=wrong)
         update = PosteriorUpdate(problem.root, values, drift)
-        # Convergence is judged by predicted values, as badly determined unknowns may still wander.
+        # Convergence is assessed with predicted values, because poorly determined unknowns may still wander.
         step = values.X @ (mean + update.shift - x) / values.deviation(drift.noise)
         x, effective = mean + update.shift, update.effective
         if float(step.square().mean().sqrt()) < _CONVERGENCE_TOLERANCE:
@@ -190,7 +190,7 @@ def linear_values(problem: RecalibrationProblem, rows: Rows) -> LinearValues:
 
 
 def _with_sizes(groups: tuple[DriftGroup, ...], like: tuple[DriftGroup, ...]) -> tuple[DriftGroup, ...]:
-    """Return the groups with the sizes of the groups of the same names."""
+    """Return the groups with the sizes of groups that have the same names."""
     sizes = {one.what: one.size for one in like}
     return tuple(one if one.fixed_size else replace(one, size=sizes.get(one.what, 0.0)) for one in groups)
 
@@ -198,7 +198,7 @@ def _with_sizes(groups: tuple[DriftGroup, ...], like: tuple[DriftGroup, ...]) ->
 def _searched(
     problem: RecalibrationProblem, values: LinearValues, drift: Drift, usual: Float64[Tensor, " sensors"]
 ) -> DriftSearch:
-    """Estimate sizes of the drift and wrong rows by evidence, from a selection of the values if there are many."""
+    """Estimate sizes of the drift and find wrong rows by evidence, from a selection of the values if there are many."""
     if len(values.y) > MAX_VALUES:
         values = values.select(randomly_chosen_rows(len(values.y), MAX_VALUES).sort().values)
     A = values.X @ problem.root

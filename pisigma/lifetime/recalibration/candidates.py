@@ -39,7 +39,7 @@ MIN_RATIO = 1.05
 CLEAR_RATIO = 2.0
 """Ratio of RMS errors above which a candidate is better, for any distribution of the errors."""
 _OUTLIER_FACTOR = 5.0
-"""Ratio to the median error above which rows that every candidate predicts badly are ignored."""
+"""Ratio to the median error above which rows that every candidate predicts poorly are ignored."""
 
 
 @dataclass(frozen=True)
@@ -48,10 +48,10 @@ class CandidateChoice:
 
     Attributes:
         kept: "recalibrated", unless another candidate is better by more than 5 %, and significantly.
-        rms: RMS error of held-out rows under each candidate [m]; None if the rows are too few for it.
+        rms: RMS error of held-out rows under each candidate [m]; None if there are too few rows for the candidate.
         rows: number of held-out rows that were used.
         p95: 95 % quantile of the same errors [m].
-        names: names of the candidates, at the start of a sentence.
+        names: names of the candidates, as at the start of a sentence.
     """
 
     kept: Kept
@@ -68,7 +68,7 @@ class CandidateChoice:
 
     @property
     def smallest_error_choice(self) -> "CandidateChoice":
-        """The choice of the candidate with the smallest error, by however little."""
+        """The choice of the candidate with the smallest error, however small the difference."""
         sizes = {name: size for name, size in self.rms.items() if size is not None}
         return replace(self, kept=min(sizes, key=lambda name: sizes[name])) if sizes else self
 
@@ -99,15 +99,15 @@ def choose_candidate(
     calibrator: Calibrator,
     progress: Progress,
 ) -> CandidateChoice:
-    """Predict every fold of the rows by every candidate that was made without it, and choose the one to keep.
+    """Predict every fold of the rows with every candidate made without this fold, and choose the one to keep.
 
     Args:
         model: the model that is recalibrated.
-        whole: adaptation of it to all rows.
+        whole: adaptation of the model to all rows.
         relocated: bases and tools that were moved since the model was made.
         rows: new rows, frames and targets by the names of the model.
         calibrator: calibrator for the calibration from scratch.
-        progress: called with the fold that is being predicted.
+        progress: callback that is called with the fold that is being predicted.
     """
     posterior, noise = whole.problem.posterior, whole.drift.noise
     folds = min(_FOLDS, int(groups_to_keep_whole(rows).max()) + 1)
@@ -153,11 +153,11 @@ def _decided(errors: Mapping[Kept, Float64[Tensor, " rows"]]) -> CandidateChoice
 
 
 def _clearly_better(errors: Float64[Tensor, " rows"], than: Float64[Tensor, " rows"]) -> bool:
-    """Return whether the RMS of errors is smaller by more than 5 %, and by a factor of 2 or by more than chance.
+    """Return whether the RMS of errors is smaller by more than 5 %, and by a factor of 2 or significantly.
 
-    Paired t-tests at the level of 0.5 % each, because the recalibrated model also knows the arm where these rows are
-    not: of the squares, and of the logarithms, since a few large squares can hide what most rows show. Errors of metres
-    have tails so heavy that neither test is significant, hence the factor of 2.
+    The tests are paired t-tests at the level of 0.5 % each, because the recalibrated model also knows the arm at poses
+    without rows. They compare squares, and logarithms, because a few large squares can hide what most rows show. Errors
+    of metres have tails so heavy that neither test is significant, hence the factor of 2.
     """
     count = len(errors)
     if not bool(torch.isfinite(than).all()):
@@ -174,7 +174,7 @@ def _clearly_better(errors: Float64[Tensor, " rows"], than: Float64[Tensor, " ro
 
 
 def _predictable(rows: Measurements, test: Tensor, training: Measurements) -> Tensor:
-    """Return which test rows have a frame, a target and an anchor that also occur in training rows."""
+    """Return the mask of test rows whose frame, target and anchor also occur in training rows."""
     frames = set(training.frame)
     framed = torch.tensor([rows.frame[row] in frames for row in test.tolist()])
     try:

@@ -1,4 +1,4 @@
-"""Movements since a model was made, for models that store a posterior, and reasons not to trust them."""
+"""Movements since a model was made, for models that store a posterior, and reasons not to trust the movements."""
 
 import math
 from collections.abc import Collection, Sequence
@@ -32,7 +32,7 @@ _MAX_ROWS = 60
 def judged_motion(
     model: CalibratedModel, rows: Measurements, fitted: Collection[FrameKind] = ()
 ) -> Session | None:
-    """Find the joints, lengths, base or tool that moved since a model was made; see `judge_session`.
+    """Find the joints, lengths, base or tool that have moved since a model was made; see `judge_session`.
 
     Args:
         model: the model.
@@ -62,7 +62,7 @@ def judged_motion(
 def session_diagnostics(
     model: CalibratedModel, rows: Measurements, session: Session
 ) -> tuple[Diagnostic, ...]:
-    """Return findings about why a session is implausible although the checks of its rows found nothing.
+    """Return findings that state why a session is implausible although the checks of its rows found nothing.
 
     Args:
         model: model with which the session was compared.
@@ -84,7 +84,7 @@ def session_diagnostics(
 
 
 def motion_sentence(motion: Session, comparison: ModelComparison) -> str:
-    """Return a sentence about movements of the arm, their probability, and the expected gain of a recalibration."""
+    """Return a sentence about movements of the arm, their probability, and the gain expected of a recalibration."""
     means = (length_text(comparison.models[index].position.statistics["mean"] / 1e3) for index in (-1, 0))
     errors = (length_text(rms) for rms in (motion.rms, motion.rms_after))
     return (
@@ -124,12 +124,12 @@ def _subject(what: str) -> str:
 
 
 def excessive_change_diagnostics(robot: Robot, moved: Sequence[Movement]) -> tuple[Diagnostic, ...]:
-    """Return a diagnostic of changes larger than wear or a collision causes.
+    """Return a diagnostic of changes that are larger than those due to wear or a collision.
 
     Bases, tools and the zero of a single joint may move by any amount.
 
     Args:
-        robot: robot, whose class has the limits; see `RobotClass.change`.
+        robot: robot, whose class states the limits; see `RobotClass.change`.
         moved: movements that were found.
     """
     of_class = RobotClass.from_robot(robot)

@@ -29,9 +29,9 @@ class Movement:
     """Movement of one joint zero, parameter, base or tool between two times or two models.
 
     Attributes:
-        what: what moved, such as "joint 3", "a_2", "base" or "tool".
+        what: name of what moved, such as "joint 3", "a_2", "base" or "tool".
         shift: signed change of a joint zero or parameter [`unit`]; a joint zero counts in the positive direction of the
-            joint. Of a base or a tool: the distance of its origins, or the angle of its rotation.
+            joint. For a base or a tool, the distance between its origins or the angle of its rotation.
         deviation: standard deviation of the shift [`unit`].
         unit: "mm" or "deg"; a base or a tool has a movement in each unit.
         probability: posterior probability of this explanation among all others; None if it was not computed.
@@ -64,17 +64,17 @@ class Movement:
 
     @property
     def sentence(self) -> str:
-        """Clause such as "joint 3 moved by 0.25 ± 0.01 deg"."""
+        """Clause, such as "joint 3 moved by 0.25 ± 0.01 deg"."""
         return f"{self.what} moved by {self.size}"
 
     def to_json(self) -> dict[str, object]:
-        """Return plain values; the key of the shift carries the unit: `shift_mm` or `shift_deg`."""
+        """Return plain values; the key of the shift ends with the unit: `shift_mm` or `shift_deg`."""
         plain = {"what": self.what, f"shift_{self.unit}": self.shift, "interval": list(self.interval)}
         return plain if self.probability is None else plain | {"probability": self.probability}
 
 
 def _fields(stored: Any) -> Any:
-    """Convert stored forms of a movement to its fields: `to_json`, and what histories held before."""
+    """Convert stored forms of a movement to its fields: that of `to_json`, and that of earlier histories."""
     if not isinstance(stored, Mapping):
         return stored
     if isinstance(stored.get("moved"), Mapping):  # histories nested the movement in its probability
@@ -95,11 +95,11 @@ SummaryMovement = Annotated[Movement, BeforeValidator(_fields), PlainSerializer(
 
 
 def significant_movements(adaptation: Adaptation) -> tuple[Movement, ...]:
-    """Return the movements above `CLEAR` standard deviations: joints first, then lengths and angles, bases and tools.
+    """Return the movements above `CLEAR` standard deviations: joints, then lengths and angles, then bases and tools.
 
     The shift of a joint zero is estimated without a prior, together with everything else that has drifted. It is
-    positive in the positive direction of the joint: a joint with the shift 0.1 deg is 0.1 deg beyond the value that
-    its controller shows.
+    positive in the positive direction of the joint: a joint with a shift of 0.1 deg is 0.1 deg beyond the value that
+    its controller displays.
     """
     moved: list[Movement] = []
     for number, group in enumerate(adaptation.drift.groups):
@@ -116,13 +116,13 @@ def movements_of_group(
     shift: Float64[Tensor, " members"],
     covariance: Float64[Tensor, "members members"],
 ) -> list[Movement]:
-    """Return the movements of a group: one per parameter of the arm, or a distance and an angle of a base or a tool.
+    """Return the movements of a group: one per arm parameter, or a distance and an angle of a base or a tool.
 
     Args:
         problem: recalibration problem to which the group belongs.
         after: geometry after the movement.
         group: group that moved.
-        shift: shifts of its unknowns [m or rad].
+        shift: shifts of the unknowns of the group [m or rad].
         covariance: their covariance [m or rad, squared].
     """
     kind, _, name = group.what.partition(" ")
@@ -166,7 +166,7 @@ def _of_frame(
     column = group.index - frame_slice(space, kind, name).start
     motion, covariance = torch.zeros(6).double(), torch.zeros(6, 6).double()
     motion[column], covariance[column[:, None], column] = shift, of_members
-    if group.fixed_size:  # relocated: `shift` counts from the initial guess, not from the frame of the model
+    if group.fixed_size:  # relocated: `shift` is relative to the initial guess, not to the frame of the model
         old, new = (transform_from_xyzrpy(torch.from_numpy(np.asarray(one[name]))) for one in (before, after))
         turn = rotation_vector(new[:3, :3] @ old[:3, :3].mT)
         motion = torch.cat([new[:3, 3] - old[:3, 3], turn])

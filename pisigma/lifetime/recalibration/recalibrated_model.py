@@ -30,14 +30,14 @@ from pisigma.validation.setup_faults.explanations import PLAUSIBLE_SHARE
 
 KIND = "recalibration"
 _SUSPICIOUS_FACTOR = 5.0
-"""Ratio of the errors of held-out rows to the scatter of positions in the calibration above which it is suspicious."""
+"""Ratio of the errors of held-out rows to the scatter of positions in the calibration that is suspicious."""
 
 
 def recalibrated_model(model: CalibratedModel, adaptation: Adaptation, rows: Measurements) -> CalibratedModel:
-    """Return the recalibrated model, which again stores a posterior.
+    """Return the recalibrated model, which also stores a posterior.
 
     The geometric calibration that a hybrid stores in addition to the hybrid's geometry is updated as well: its
-    parameters change by the same amounts, and its bases and tools move like the hybrid's.
+    parameters change by the same amounts, and its bases and tools move as those of the hybrid do.
 
     Args:
         model: parent model.
@@ -92,7 +92,7 @@ def recalibrated_model(model: CalibratedModel, adaptation: Adaptation, rows: Mea
 
 
 def _taken_along(frames: Frames, from_: Frames, onto: Frames, before: bool) -> Frames:
-    """Move frames like reference frames of the same names; frames without a counterpart are copied from the reference.
+    """Move frames as the reference frames of the same names; frames without counterpart are copied from the reference.
 
     Args:
         frames: frames to move.
@@ -125,7 +125,7 @@ def recalibration_diagnostics(
     wrong: Sequence[int],
     moved: Sequence[Movement],
 ) -> tuple[Diagnostic, ...]:
-    """Return findings about why the result is implausible although the checks of the rows found nothing.
+    """Return findings that state why the result is implausible although the checks of the rows found nothing.
 
     Args:
         parent: model that was recalibrated.

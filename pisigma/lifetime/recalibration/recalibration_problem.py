@@ -1,4 +1,4 @@
-"""Recalibration problem: new rows, and the posterior of a model as prior of all unknowns."""
+"""Recalibration problem: new rows, and the posterior of a model as the prior of all unknowns."""
 
 import math
 from collections.abc import Collection, Sequence, Set
@@ -37,9 +37,9 @@ RELOCATION_PRIOR: dict[ParameterUnit, float] = {"m": 0.1, "rad": 0.1, "px": 100.
 _CORRECTION_SCALE = 10.0
 """Drift of a correction at size 1, as a multiple of the RMS of its weights."""
 _CORRECTION_PENALTY = 12.0
-"""Penalty on a drift of the correction [nats], whose many weights explain errors of few rows by chance."""
+"""Penalty on a drift of the correction [nats], whose many weights explain the errors of few rows by chance."""
 _MOVEMENT_PENALTY = math.log(100)
-"""Penalty on a movement [nats]: prior odds of 1 to 100 that a given joint, base or tool moved since the calibration."""
+"""Penalty on a movement [nats]: prior odds of 1 to 100 that a given joint, base or tool has moved."""
 
 
 def frame_keys(rows: Measurements, kinds: Collection[str]) -> frozenset[FrameKey]:
@@ -51,7 +51,7 @@ def frame_keys(rows: Measurements, kinds: Collection[str]) -> frozenset[FrameKey
 def known_frames(
     posterior: ModelPosterior, rows: Measurements
 ) -> tuple[frozenset[FrameKey], frozenset[FrameKey]]:
-    """Return the keys of the bases and of the tools of rows that a model has, which may have been moved since."""
+    """Return the keys of the rows' bases and tools that a model has and that may have been moved since it was made."""
     known = {("base", name) for name in posterior.geometry.bases}
     known |= {("tool", name) for name in posterior.geometry.tools}
     return frame_keys(rows, ("base",)) & known, frame_keys(rows, ("tool",)) & known
@@ -65,8 +65,8 @@ class RecalibrationProblem:
         posterior: posterior of the model.
         setup: rows, relative to the current bases and tools.
         design: unknowns: all parameters of the model and the rows, and the weights of the correction.
-        mean: prior mean of the unknowns, parameters counted from `design.problem.nominal`.
-        root: root of their prior covariance, parameters relative to the anchors of the setup.
+        mean: prior mean of the unknowns, with parameters relative to `design.problem.nominal`.
+        root: root of the prior covariance of the unknowns, with parameters relative to the anchors of the setup.
         change: derivative of the parameters in the user's coordinates with respect to the problem's parameters.
         groups: groups that may drift, with size 0, and moved bases and tools.
         standing: root of the covariance of unknowns that are held fixed.
@@ -92,7 +92,7 @@ class RecalibrationProblem:
         return wrong | torch.isin(self.configuration, torch.tensor([*values.wrong]))
 
     def with_fixed_arm(self) -> "RecalibrationProblem":
-        """Return the problem with the arm held fixed: only moved bases and tools are unknown."""
+        """Return the problem with the arm held fixed, in which only moved bases and tools are unknown."""
         relocated = tuple(group for group in self.groups if group.fixed_size)
         return replace(self, root=self.standing, groups=relocated, standing=self.root)
 
@@ -106,8 +106,8 @@ def recalibration_problem(
         model: the model.
         posterior: posterior of the model.
         rows: new rows, frames and targets by the names of the model.
-        relocated: bases and tools that were moved since the model was made; those that the model does not have need not
-            be named.
+        relocated: bases and tools that were moved since the model was made; those that the model lacks need not be
+            named.
 
     Raises:
         IdentificationError: no usable values were measured, or too few to guess a moved base or tool.
@@ -144,8 +144,8 @@ def recalibration_problem(
 def _joined_space(space: ParameterSpace, rows: Measurements) -> ParameterSpace:
     """Return the parameters of a model and of rows.
 
-    Frames and targets of the model come first. Owners of sensor unknowns are in the order of the rows, in which the
-    sensors number them, followed by those that the rows lack, in their previous frames.
+    Frames and targets of the model come first. Owners of sensor unknowns are in the order of the rows, which is that of
+    the sensors' indices, followed by those that the rows lack, in their previous frames.
     """
     of_rows = {own.name: own for own in unknown_groups(rows)}
     before = {own.name: own for own in space.unknowns}
@@ -168,7 +168,7 @@ def _guess(
     rows: Measurements,
     new: Set[FrameKey],
 ) -> InitialGuess:
-    """Return bases, tools and sensor unknowns of the model; moved or new ones are guessed."""
+    """Return the model's bases, tools and sensor unknowns; moved or new ones are guessed."""
     geometry = posterior.geometry
     bases, tools = dict(geometry.bases), dict(geometry.tools)
     unknowns = {group: dict(owners) for group, owners in geometry.unknowns.items()}
@@ -293,11 +293,11 @@ def _arm_groups(space: ParameterSpace, free: Bool[Tensor, " parameters"]) -> lis
 
 
 def movement_hypotheses(problem: RecalibrationProblem) -> tuple[DriftGroup, ...]:
-    """List all single movements: of a joint, base, tool, single length or angle, or of the correction.
+    """List all single movements: of a joint, a base, a tool, a single length or angle, or the correction.
 
     A change of the correction represents joint errors that changed in many ways, which no single movement explains.
-    Joint zeros slip more often than arms are bent: all lengths together have a tenth of the odds of a joint, and so
-    have all angles.
+    Joint zeros slip more often than arms are bent, so all lengths together have a tenth of the odds of a joint, as do
+    all angles together.
     """
     parameters = problem.design.problem.space.parameters
     single: list[DriftGroup] = []

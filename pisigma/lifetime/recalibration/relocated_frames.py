@@ -1,4 +1,4 @@
-"""Bases and tools that were moved since a model was made, by the evidence of new rows."""
+"""Find the bases and tools that were moved since a model was made, by the evidence of new rows."""
 
 from collections.abc import Set
 from contextlib import suppress
@@ -15,7 +15,7 @@ from pisigma.model.model_posterior import ModelPosterior
 _MAX_ROWS = 30
 """Largest number of rows that are used for the decision."""
 MIN_MOVE = 1e-3
-"""Size of the drift [m, or share of the reach] below which a base or a tool was not moved."""
+"""Size of the drift [m, or share of the reach] below which a base or a tool is treated as not moved."""
 
 
 def relocated_frames(
@@ -23,8 +23,8 @@ def relocated_frames(
 ) -> frozenset[FrameKey]:
     """Find the bases and tools of a model that were moved.
 
-    Under each hypothesis joints, geometry and correction may drift, and the base, the tool, both or none have a wide
-    prior around a closed-form guess. The hypothesis with the largest evidence is chosen.
+    Under each hypothesis, joints, geometry and correction may drift, and the base, the tool, both or neither have a
+    wide prior around a closed-form guess. The hypothesis with the largest evidence is chosen.
 
     Args:
         model: the model.
@@ -32,7 +32,7 @@ def relocated_frames(
         rows: new rows, frames and targets by the names of the model.
 
     Returns:
-        The bases and tools that were moved, without frames and targets that the model does not have.
+        The bases and tools that were moved, without frames and targets that the model lacks.
 
     Raises:
         IdentificationError: see `recalibration_problem`.

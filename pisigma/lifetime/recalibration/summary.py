@@ -1,4 +1,4 @@
-"""Figures of a recalibration that are shown on cards, in tables and as JSON, and stored in the model folder."""
+"""Figures of a recalibration, which appear on cards, in tables and in JSON, and are stored in the model folder."""
 
 from pisigma.files.yaml_file import Section
 from pisigma.lifetime.recalibration.candidates import Kept
@@ -9,7 +9,7 @@ from pisigma.validation.held_out.summary import AbstractSummary
 
 
 class HeldOutFigures(Section):
-    """RMS position error of held-out rows under a candidate [mm]; None if the rows are too few for it."""
+    """RMS position error of held-out rows under a candidate [mm]; None if there are too few rows for the candidate."""
 
     rms_mm: float | None
 
@@ -18,15 +18,15 @@ class RecalibrationSummary(AbstractSummary):
     """All figures of a recalibration.
 
     Attributes:
-        parent: model that was recalibrated; its `sha256` is that of its `model.yaml`.
+        parent: model that was recalibrated; its `sha256` is the hash of its `model.yaml`.
         date: date of the recalibration, such as "2026-11-22".
         rows: number of rows that were used.
         outliers: rows that were left out.
         kept: candidate that was kept.
         verdict: sentence about the candidate that was kept, with the errors of all candidates.
-        left_out: number of rows that were held out in cross-validation and used.
+        left_out: number of rows that were held out in cross-validation and used in the comparison.
         cross_validation: errors of held-out rows by candidate.
-        changed: sentence on what moved.
+        changed: sentence that states what moved.
         moved: significant movements.
         elsewhere: bases and tools that were moved since the parent was made.
         effective_parameters: number of directions of the unknowns that the rows determine.

@@ -1,1 +1,1 @@
-"""Measuring sessions: judgement of rows as they arrive, accuracy so far, and when to stop."""
+"""Measuring sessions: checks of rows as they arrive, accuracy so far, and advice on when to stop."""

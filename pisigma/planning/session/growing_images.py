@@ -1,4 +1,4 @@
-"""Read corners in a growing file image by image as measurements."""
+"""Read corners in a growing file, image by image, as measurements."""
 
 import os
 from dataclasses import replace
@@ -24,7 +24,7 @@ def growing_file(path: str | os.PathLike[str], robot: Robot, settings: PlanSetti
 
 
 class ImageReader:
-    """Reader that reads every image of a file of corners separately, so that a faulty image does not affect others.
+    """Reader of a file of corners that reads every image separately, so that a faulty image does not affect others.
 
     An image is complete when rows of another image follow, or at the end of the session.
     """
@@ -79,7 +79,7 @@ def _images(table: Table) -> list[Table]:
 
 
 def _left_out(problem: MeasurementError, image: Table) -> UnusableRow:
-    """Return the faulty row (the first of the image if the exception names none) with the reason."""
+    """Return the faulty row, or the first row of the image if the exception names none, with the reason."""
     line = problem.line or image.lines[0]
     if not problem.expected:
         return UnusableRow(line, str(problem).removesuffix("."))

@@ -18,12 +18,13 @@ _SAME_READING = 2e-6
 _SAME_VALUE = 1e-9
 """Difference below which numbers are the same up to rounding in the file [SI units]."""
 _SAME_POSE, NEAR_POSE = 0.1, 3.0
-"""Differences of joint values [deg or mm] below which a row is at a pose, and below which it is intended to be at
-the pose."""
+"""Differences of joint values [deg or mm] below which a row is at a pose, and below which it is meant to be at the
+pose."""
 _SWAPPED_SHARE = 0.2
-"""Share of its error below which the distance of a point from another pose shows that it belongs to that pose."""
+"""Share of a point's error below which the distance of the point from another pose shows that it belongs to that
+pose."""
 _AMBIGUOUS_ROWS = 6
-"""Number of rows up to which another row may be the wrong one."""
+"""Number of rows up to which a different row may be the wrong one."""
 
 
 def unreadable_alarm(row: UnusableRow) -> Alarm:
@@ -73,7 +74,7 @@ def other_joint_values(
     poses: Float64[Tensor, "poses dof"],
     names: Sequence[str],
 ) -> Iterator[Alarm]:
-    """Yield alarms about rows from `start` whose joint values are not planned; they are used nevertheless."""
+    """Yield alarms about rows from `start` with joint values that are not planned; these rows are still used."""
     for row in range(start, rows.rows):
         off = joint_differences(robot, rows.q[row : row + 1], poses)[0].abs()
         pose = int(off.amax(1).argmin())
@@ -117,11 +118,11 @@ def contradiction_alarm(
     poses: Float64[Tensor, "poses dof"],
     names: Sequence[str],
 ) -> Alarm:
-    """Return the alarm about a row that others contradict, with the pose to which its point may belong.
+    """Return the alarm about a row that others contradict, naming the pose to which its point may belong.
 
     Args:
         rows: all rows.
-        judgement: judgement of the rows.
+        judgement: result of `judge_rows` for the rows.
         row: index of the row.
         poses: joint values of the planned poses [rad or m].
         names: names of the planned poses.
@@ -181,7 +182,7 @@ def joint_differences(
 
 
 def is_wrong(judgement: RowJudgement) -> Tensor:
-    """Return the mask of rows that the others contradict."""
+    """Return the mask of rows that are contradicted by the others."""
     if judgement.errors is None:
         return torch.zeros_like(judgement.counts)
     return ~judgement.counts & (judgement.errors.chance < FALSE_ALARMS)

@@ -1,4 +1,4 @@
-"""Judge rows: every row is predicted from all others, again whenever rows arrive."""
+"""Check rows by predicting every row from all others, again whenever rows arrive."""
 
 import contextlib
 import math
@@ -41,13 +41,13 @@ from pisigma.robot.se3 import (
 FALSE_ALARMS = 1e-3
 """Expected share of correct rows that are called wrong."""
 FEW_ROWS = 12
-"""Number of rows up to which all rows are judged again with every new row, and every row is tried as the wrong one."""
+"""Number of rows up to which all rows are checked again with every new row, and every row is tried as the wrong one."""
 _CONTRADICTORY_FACTOR = 2.0
 """Factor on the errors of the robot's class above which few rows contradict each other."""
 _MIN_MISFIT_GAIN = 8.0
 """Decrease of the misfit above which an older row is called wrong instead of a newer one."""
 _REPEATABILITY = {"m": 8e-5, "rad": 1e-4}
-"""Repeatability of robots of any class [m, rad], in addition to the noise of the sensor."""
+"""Repeatability of robots of any class [m, rad], which adds to the noise of the sensor."""
 _USUAL_NOISE = {"m": 5e-5, "rad": 2e-4}
 """Noise of a sensor whose noise is not stated [m, rad]."""
 _CLASS_VALUES = 20
@@ -61,10 +61,10 @@ class LeaveOneOutErrors:
     """Errors of rows that are each predicted from the others.
 
     Attributes:
-        chance: probability that a correct row has an error at least as improbable; NaN for rows that cannot be judged.
-        length: size of the error of the measured length [m]; NaN for rows that cannot be judged.
-        angle: size of the error of the measured orientation [rad]; NaN for rows that cannot be judged.
-        position: measured minus predicted position in the frame of the row [m]; NaN for rows that cannot be judged.
+        chance: probability that a correct row has an error at least as improbable; NaN for rows that cannot be checked.
+        length: size of the error of the measured length [m]; NaN for rows that cannot be checked.
+        angle: size of the error of the measured orientation [rad]; NaN for rows that cannot be checked.
+        position: measured minus predicted position in the frame of the row [m]; NaN for rows that cannot be checked.
         scale: ratio of this robot's errors to the errors of its class, at least 1.
     """
 
@@ -79,10 +79,10 @@ class LeaveOneOutErrors:
 class RowModel:
     """Linear model of rows, with the prior of the robot's class on geometry, gravity and a Fourier series per joint.
 
-    With X the columns of the unknowns with a prior S, and G the columns of base, tool and sensors, which have no
-    prior, the covariance of the values is `V = X S X^T + noise²`, and `P = V^-1 - V^-1 G (G^T V^-1 G)^-1 G^T V^-1`.
-    A row i that is left out has the error `P_ii^-1 (P r)_i` with the covariance `P_ii^-1` (Rasmussen and Williams
-    2006, sections 2.7 and 5.4.2), and its contribution to `r^T P r` is chi-square distributed.
+    With the columns X of the unknowns that have a prior S, and the columns G of base, tool and sensors, which have no
+    prior, the covariance of the values is `V = X S X^T + noise²`, and `P = V^-1 - V^-1 G (G^T V^-1 G)^-1 G^T V^-1`. If
+    row i is left out, its error is `P_ii^-1 (P r)_i` with covariance `P_ii^-1` (Rasmussen and Williams 2006,
+    sections 2.7 and 5.4.2), and its contribution to `r^T P r` is chi-square distributed.
 
     Attributes:
         setup: rows, and initial guesses of base and tool.
@@ -115,7 +115,7 @@ class RowModel:
             kept: rows to which base and tool are fitted.
 
         Raises:
-            IdentificationError: the rows are too few for base and tool.
+            IdentificationError: there are too few rows for base and tool.
             PoseError: the joint values do not fit the robot.
         """
         calibrator = GeometricCalibrator(robot)
@@ -154,10 +154,10 @@ class RowModel:
         return float(self._residual[kept] @ self._projection(kept)[0] @ self._residual[kept])
 
     def leave_one_out(self) -> LeaveOneOutErrors:
-        """Predict every kept row from the other kept ones, and all other rows from the kept ones.
+        """Predict every kept row from the other kept rows, and all other rows from the kept rows.
 
-        A robot may have larger errors than its class: the scale is estimated from the kept rows, so squared errors
-        are compared with Fisher's F distribution.
+        A robot may have larger errors than its class. The scale is therefore estimated from the kept rows, and squared
+        errors are compared with Fisher's F distribution.
         """
         from scipy.special import fdtrc  # imported here, because scipy.stats takes a second to import
 
@@ -170,9 +170,10 @@ class RowModel:
         # The row itself must not affect the scale with which it is compared.
         left = _CLASS_VALUES + len(kept) - determined - torch.where(self.kept, count, 0.0)
         misfit = self.misfit
-        # At least 1, the scale of the class: rows that happen to agree must not make the limits stricter.
+        # The scale is at least 1, that of the class, because rows that happen to agree must not make the limits
+        # stricter.
         whole = ((_CLASS_VALUES + misfit - torch.where(self.kept, square, 0.0)) / left).clamp(min=1.0)
-        # For rows that are not used, the scale is at least the one that leave-one-out errors of the kept rows show.
+        # For rows that are not used, the scale is at least that of the leave-one-out errors of the kept rows.
         each = float((_CLASS_VALUES + square.sum()) / (_CLASS_VALUES + count.sum()))
         scale = torch.where(self.kept, whole, whole.clamp(min=each))
         for row in (~self.kept).nonzero()[:, 0]:
@@ -210,7 +211,7 @@ class RowModel:
             start += block.numel()
             (angle if sensor.unit == "rad" else length)[one.row] = block.norm(dim=1)
             if isinstance(sensor, CornerSensor):
-                # Residuals of corners are multiplied by weights; undo this to get lengths and angles.
+                # Residuals of corners are multiplied by weights, which is undone to get lengths and angles.
                 block = torch.linalg.solve(sensor.weight.permute(2, 0, 1)[one.row], block[..., None])[..., 0]
                 length[one.row], angle[one.row] = block[:, :3].norm(dim=1), block[:, 3:].norm(dim=1)
             if sensor.name in ("position", "corner"):
@@ -244,7 +245,7 @@ class RowModel:
 
     @cached_property
     def _residual(self) -> Float64[Tensor, " values"]:
-        """Measured minus predicted values at the start parameters, by linearisation."""
+        """Measured minus predicted values at the start parameters, from the linearisation."""
         moved = (self.point - self.setup.start)[self.setup.problem.active]
         return torch.cat([(one.residual + one.geometry @ moved).flatten() for one in self.values])
 
@@ -260,7 +261,7 @@ class RowModel:
 
 
 def _start_at(setup: CalibrationSetup, geometry: IdentifiedGeometry) -> Float64[Tensor, " parameters"]:
-    """Return the start parameters with the bases and tools of another fit, as far as it has them."""
+    """Return the start parameters with the bases and tools of another fit, where it has them."""
     bases, tools = (block.clone() for block in setup.problem.space.split(setup.start)[1:])
     for number, frame in enumerate(setup.problem.space.frames):
         if frame in geometry.bases:
@@ -295,12 +296,12 @@ def _noise(
 
 @dataclass(frozen=True, eq=False)
 class RowJudgement:
-    """Judgement of rows.
+    """Result of checking rows against each other.
 
     Attributes:
-        counts: mask of the rows that others do not contradict.
-        model: model of the used rows; None if they are too few to fit base and tool.
-        errors: errors of all rows under this model; None without a model.
+        counts: mask of the rows that the others do not contradict.
+        model: model of the used rows; None if there are too few to fit base and tool.
+        errors: errors of all rows under this model; None if there is no model.
     """
 
     counts: Bool[Tensor, " rows"]
@@ -311,7 +312,7 @@ class RowJudgement:
 def judge_rows(
     robot: Robot, rows: Measurements, sigma: float | None, trusted: Bool[Tensor, " rows"]
 ) -> RowJudgement:
-    """Judge new rows by the rows accepted so far, and these by each other.
+    """Check new rows against the rows accepted so far, and accepted rows against each other.
 
     Args:
         robot: nominal robot.
@@ -344,9 +345,9 @@ def _contradicted(
     errors: LeaveOneOutErrors,
     few: bool,
 ) -> tuple[RowModel, LeaveOneOutErrors] | None:
-    """Return the judgement without the row that the other rows contradict; None if there is no such row.
+    """Return the result without the row that the other rows contradict; None if there is no such row.
 
-    A wrong row among few moves base and tool so far that it can be found only by leaving out every row once.
+    A wrong row among few moves base and tool so far that it can only be found by leaving out every row once.
     """
     counts = model.kept
     chance = torch.where(counts, errors.chance, torch.nan)

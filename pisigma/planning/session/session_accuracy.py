@@ -1,4 +1,4 @@
-"""Accuracy of a calibration with the rows so far, and the expected benefit of the remaining poses."""
+"""Accuracy of a calibration with the rows so far, and expected benefit of the remaining poses."""
 
 import math
 from dataclasses import dataclass, replace
@@ -49,7 +49,7 @@ def session_accuracy(
     task: Float64[Tensor, "tasks dof"],
     progress: Progress = lambda what: None,
 ) -> SessionAccuracy | None:
-    """Compute accuracy and posterior given the rows of a plan; None if they are too few or contradict each other.
+    """Compute accuracy and posterior given the rows of a plan; None if these are too few or contradictory.
 
     Args:
         plan: plan for a nominal robot, which is calibrated with the rows, or for a model, whose posterior is updated by
@@ -57,7 +57,7 @@ def session_accuracy(
         before: prior of the session, including the instrument.
         rows: rows to calibrate with.
         check: rows that test the calibration; None if there are none yet. They are not used with a model.
-        task: joint values where the robot has to be accurate [rad or m].
+        task: joint values at which the robot must be accurate [rad or m].
         progress: called with the name of each step.
     """
     if not rows.rows:
@@ -87,7 +87,7 @@ def _calibrated(
     result = fit_if_better(HybridCalibrator(robot), rows, progress)
     assert isinstance(result, HybridResult)
     if result.learned is None and np.array_equal(result.geometric.robot.dh, robot.dh):
-        # with too few rows the arm remains nominal, so the posterior of the fit does not contain its errors
+        # with too few rows, the arm remains nominal, so the posterior of the fit does not contain the errors of the arm
         posterior = before.after_measuring(rows.q)
     else:
         posterior = RobotPosterior.from_result(result, before.instrument)
@@ -104,7 +104,7 @@ def with_cross_validation(
     Args:
         robot: nominal robot.
         so_far: accuracy and posterior given the rows so far.
-        progress: called with the name of each step; an exception that it raises ends the computation.
+        progress: callback that is called with the name of each step; an exception that it raises ends the computation.
     """
     rows = so_far.rows
     if rows is None:
@@ -126,14 +126,14 @@ def expected_accuracy(
     task: Float64[Tensor, "tasks dof"],
     step: int,
 ) -> tuple[AccuracyPoint, ...]:
-    """Predict the accuracy after the remaining poses, and after as many random candidates.
+    """Predict the accuracy after the remaining poses, and after the same number of random candidates.
 
     Args:
         posterior: posterior given the rows so far.
         measured: number of poses so far.
         poses: joint values of the remaining poses, beginning with the next [rad or m].
         candidates: joint values of poses that could be measured instead [rad or m].
-        task: joint values where the robot has to be accurate [rad or m].
+        task: joint values at which the robot must be accurate [rad or m].
         step: number of poses between two points of the curve.
     """
     counts = [*range(step, len(poses), step), len(poses)] if len(poses) else []
@@ -148,7 +148,7 @@ def expected_accuracy(
 
 
 def _rms_p95(errors: Float64[Tensor, " rows"]) -> tuple[float, float]:
-    """Return the root mean square and the 95 % quantile of errors [m]; NaN without errors."""
+    """Return the root mean square and the 95 % quantile of errors [m]; NaN if there are no errors."""
     errors = errors[errors.isfinite()]
     if not len(errors):
         return math.nan, math.nan

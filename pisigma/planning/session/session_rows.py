@@ -1,4 +1,4 @@
-"""Rows of a measuring session: which rows are used, alarms about the others, and replanning of remaining poses."""
+"""Rows of a measuring session: selection of rows to use, alarms about others, replanning of remaining poses."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -40,16 +40,16 @@ from pisigma.validation.gate import check_rows
 _MAX_CANDIDATES = 1_000
 """Largest number of candidates of the plan that are considered."""
 _MAX_REPLACEMENTS = 3
-"""Largest number of attempts to replace poses to which no free motion leads."""
+"""Largest number of attempts to replace poses that no free motion reaches."""
 
 
 class SessionRows:
-    """Rows of a session, each judged by all others as they arrive.
+    """Rows of a session, each checked against all others as they arrive.
 
     Attributes:
         rows: all readable rows in the order of the file; None if there are none.
-        usable: rows that are not copies of others.
-        judgement: judgement of the usable rows.
+        usable: rows that are not copies of other rows.
+        judgement: result of `judge_rows` for the usable rows.
         alarms: alarms on single rows.
     """
 
@@ -86,7 +86,7 @@ class SessionRows:
         planned: Float64[Tensor, "poses dof"],
         names: Sequence[str],
     ) -> list[Alarm]:
-        """Add new rows and judge all rows together.
+        """Add new rows, and check all rows together.
 
         Args:
             new: new rows in their order; None if there are none.
@@ -115,7 +115,7 @@ class SessionRows:
     def _judge(
         self, rows: Measurements, planned: Float64[Tensor, "poses dof"], names: Sequence[str]
     ) -> list[Alarm]:
-        """Judge all usable rows and return the new alarms."""
+        """Check all usable rows, and return the new alarms."""
         numbers = self.usable.nonzero()[:, 0]
         usable, judgement = rows.select(numbers), self.judgement
         for upto in _steps(len(judgement.counts), len(numbers)):
@@ -134,7 +134,7 @@ class SessionRows:
         return [*new, *agreed]
 
     def errors(self) -> tuple[Float64[np.ndarray, "rows 3"], Float64[np.ndarray, "rows 3"]]:
-        """Return the predicted position of the target and measured - predicted, in the robot's base frame [m].
+        """Return the predicted position of the target, and measured minus predicted, in the robot's base frame [m].
 
         NaN where they are unknown.
         """
@@ -152,10 +152,10 @@ class SessionRows:
 
 
 def _steps(known: int, count: int) -> Iterator[int]:
-    """Yield the numbers of rows after which rows are judged, if `known` rows were judged before.
+    """Yield the numbers of rows after which rows are checked, if `known` rows have already been checked.
 
-    Rows are judged by the rows accepted before, so no more than their number are added at once. Rows that are added
-    together are then also judged by each other.
+    Rows are checked against the rows accepted before, so at most as many rows are added at once. Rows that are added
+    together are then also checked against each other.
     """
     upto = known
     while upto < count:
@@ -170,7 +170,7 @@ def setup_sentence(
 ) -> str:
     """Return a sentence about a fault that all rows have in common; "" if there is none.
 
-    If a quarter of the rows or more contradict the others, all rows are judged, including these.
+    If a quarter of the rows or more contradict the others, all rows are checked, including these.
 
     Args:
         rows: all usable rows.
@@ -190,7 +190,7 @@ class FurtherPoses:
         q: joint values [rad or m].
         number: number of each pose among the candidates of the plan.
         motions: motions between poses.
-        task: joint values where the robot has to be accurate [rad or m].
+        task: joint values at which the robot must be accurate [rad or m].
     """
 
     q: Float64[Tensor, "candidates dof"]
@@ -235,7 +235,7 @@ class FurtherPoses:
         posterior = so_far.posterior
         if not len(first) or not 0 < count <= len(new):
             return None
-        # The robot is already on its way to the next pose: it counts as measured, unless it only tests the model.
+        # The robot is already on its way to the next pose, which counts as measured unless it only tests the model.
         if not bool(plan.check[first]):
             posterior = posterior.after_measuring(plan.q[first])
         seen, tool = posterior.sensitivities(self.q), posterior.tool(self.task)
@@ -243,7 +243,8 @@ class FurtherPoses:
             if count > len(new):
                 return None
             chosen = new[select_poses(seen[new], tool, count, plan.settings.criterion)]
-            # Poses that test the model are spread among the others, so that a session that ends early has both kinds.
+            # Poses that test the model are spread among the others, so that a session that ends early contains both
+            # kinds.
             use = order_of_use(count, len(check))
             q = torch.cat([self.q[chosen], plan.q[check]])[use]
             way = plan_tour(self.motions, q, plan.settings.pace, plan.q[first[0]], stages=(_AHEAD,))
@@ -264,13 +265,13 @@ class FurtherPoses:
         )
 
     def _new(self, plan: StoredPlan, known: Float64[Tensor, "known dof"]) -> Int64[Tensor, " new"]:
-        """Return the indices of candidates that are neither measured nor next."""
+        """Return the indices of candidates that are neither measured nor the next pose."""
         off = joint_differences(plan.arm.robot, self.q, known).abs().amax(-1)
         return (off > NEAR_POSE).all(1).nonzero()[:, 0]
 
 
 _AHEAD = 10
-"""Number of next poses whose expected benefit decides whether to stop."""
+"""Number of upcoming poses whose expected benefit decides whether to stop."""
 
 
 def stopping_advice(
@@ -280,13 +281,13 @@ def stopping_advice(
     expected: Sequence[AccuracyPoint],
     left: int,
 ) -> Advice:
-    """Return the advice whether to continue measuring or to stop, with the reason.
+    """Return advice on whether to continue measuring or to stop, with the reason.
 
     Args:
         limit_mm: limit on the 95 % quantile of the errors [mm]; None for no limit.
-        least_gain_mm: decrease of that quantile by the next `_AHEAD` poses below which to stop [mm].
-        reached: accuracy so far. The limit is reached when the last two points are below it: estimates from few rows
-            scatter, so a first point is often below the limit by chance.
+        least_gain_mm: decrease of this quantile due to the next `_AHEAD` poses, below which to stop [mm].
+        reached: accuracy so far. The limit is reached when the last two points are below it, because estimates from few
+            rows scatter and the first point below the limit is often there by chance.
         expected: expected accuracy after the remaining poses.
         left: number of remaining poses.
     """

@@ -12,12 +12,10 @@ from torch import Tensor
 from pisigma.robot.description import Robot
 
 AlarmKind = Literal["setup", "unreadable", "duplicate", "frozen", "swapped", "off", "pose", "cleared"]
-"""Kind of an alarm.
-
-"setup": all rows have the same fault, such as a wrong unit. "unreadable": the row cannot be read. "duplicate": it
-equals another one. "frozen": the sensor shows an old value. "swapped": the values of two poses are swapped. "off": the
-other rows contradict the value. "pose": the joint values are not those of a planned pose (a remark: the row counts).
-"cleared": an alarm is withdrawn, because later rows agree with the row.
+"""Kind of an alarm. "setup": all rows have the same fault, such as a wrong unit. "unreadable": the row cannot be read.
+"duplicate": the row equals another row. "frozen": the sensor shows an old value. "swapped": the values of two poses are
+swapped. "off": the other rows contradict the value. "pose": the joint values are not those of a planned pose (a remark;
+the row is used). "cleared": an alarm is withdrawn because later rows agree with the row.
 """
 
 
@@ -30,7 +28,7 @@ class Alarm:
         kind: kind of the alarm.
         sentence: what was expected, what was measured, and what to do.
         repeat: whether to measure the pose again.
-        counts: whether the row is used nevertheless.
+        counts: whether the row is used despite the alarm.
     """
 
     line: int
@@ -48,7 +46,7 @@ class RowsSoFar:
         line: line of every row in the file.
         q: commanded joint values [rad or m].
         position: predicted position of the target in the robot's base frame [m]; NaN while base and tool are unknown.
-        error: measured minus predicted position in the robot's base frame [m]; NaN for rows that cannot be judged.
+        error: measured minus predicted position in the robot's base frame [m]; NaN for rows that cannot be checked.
         check: mask of the rows of the set "test", which test the calibration and are not used for it.
         alarmed: mask of the rows that are not used.
     """
@@ -69,14 +67,14 @@ class RowsSoFar:
 
 @dataclass(frozen=True, eq=False)
 class NextPose:
-    """The pose to be measured next.
+    """The next pose to measure.
 
     Attributes:
         number: number of the pose, which does not change when the remaining poses are replanned.
         count: largest number of a pose so far.
         q: joint values [rad or m].
-        check: whether it tests the calibration.
-        commanded: controller values, if they differ from the joint values [rad or m].
+        check: whether the pose tests the calibration.
+        commanded: controller values [rad or m], if they differ from the joint values.
     """
 
     number: int
@@ -120,7 +118,7 @@ class AccuracyPoint:
         cross_validated_p95: 95 % quantile of these errors.
         checked_rms: root mean square of the errors of the test poses, which include the noise of the sensor.
         checked_p95: 95 % quantile of these errors.
-        random_rms: predicted root mean square after as many random poses.
+        random_rms: predicted root mean square after the same number of random poses.
     """
 
     poses: int
@@ -140,7 +138,7 @@ class AccuracyPoint:
 
 @dataclass(frozen=True)
 class Advice:
-    """Advice about what to do next.
+    """Advice on what to do next.
 
     Attributes:
         action: "measure" the next pose, "repeat" a pose, "correct" a fault that affects all rows, or "stop".
@@ -158,7 +156,7 @@ class SessionState:
     Attributes:
         rows: all rows that were read.
         alarms: alarms on rows, in the order of the file.
-        next_pose: pose to be measured next; None if the plan is finished.
+        next_pose: next pose to measure; None if the plan is finished.
         remaining: joint values of all remaining poses, beginning with the next [rad or m].
         coverage: measured range of every joint.
         reached: accuracy so far, one point per computation; the last point is valid.
@@ -228,7 +226,7 @@ class SessionState:
 
     @property
     def is_finished(self) -> bool:
-        """Whether no poses remain, or more poses would not help."""
+        """Whether no poses remain, or whether more poses would not help."""
         return self.advice.action == "stop"
 
 
@@ -240,11 +238,11 @@ def _number(value: float) -> float | None:
 def coverage(
     robot: Robot, measured: Float64[Tensor, "rows dof"], planned: Float64[Tensor, "poses dof"]
 ) -> tuple[JointSpan, ...]:
-    """Return the measured range of every joint relative to the plan; empty without rows.
+    """Return the measured range of every joint relative to the plan; empty if there are no rows.
 
     Args:
         robot: nominal robot.
-        measured: joint values of the rows that count [rad or m].
+        measured: joint values of the rows in use [rad or m].
         planned: joint values of all planned poses [rad or m].
     """
     if not len(measured):

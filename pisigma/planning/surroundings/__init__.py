@@ -1,1 +1,1 @@
-"""Surroundings of a robot: which poses and motions are collision-free, and which poses are visible."""
+"""Surroundings of a robot, which decide which poses and motions are collision-free and which poses are visible."""

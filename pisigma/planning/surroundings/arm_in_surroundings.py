@@ -28,7 +28,7 @@ class Faults:
     """Reasons why poses are not allowed.
 
     Attributes:
-        reasons: possible reasons, each a sentence without full stop.
+        reasons: possible reasons, each a sentence without a full stop.
         failed: mask of the poses that fail, for every reason.
     """
 
@@ -62,8 +62,8 @@ class ArmInSurroundings:
         capsules: capsules along the links.
         capsule_pairs: pairs of capsules that may touch each other.
         room: distance to keep between the capsules of each pair [m].
-        beam_blockers: capsules that may block the tracker's beam: not those of the link with the reflector, and not
-            those so near to the reflector that they touch every beam.
+        beam_blockers: capsules that may block the tracker's beam, without those of the link that carries the reflector
+            and those so near to the reflector that they touch every beam.
         limits: limits of the controller's values including margins [rad or m].
     """
 
@@ -140,7 +140,7 @@ class ArmInSurroundings:
         """Find the faults of joint values [rad or m].
 
         Raises:
-            PoseError: they do not fit the robot.
+            PoseError: the joint values do not fit the robot.
         """
         self.robot.check_joint_count(q.shape[-1])
         chunks = [self._faults(chunk) for chunk in torch.split(q, POSES_PER_CHUNK)]
@@ -165,7 +165,8 @@ class ArmInSurroundings:
             bounds = [abs(bound) for bound in (row.lower, row.upper) if math.isfinite(bound)]
             strokes[index] = max(bounds, default=0.0) if row.type == "prismatic" else 0.0
             strokes[index] += float(np.linalg.norm(row.urdf_origin))
-        # A point is at most the sum of all lengths behind an axis away from it, so it moves by at most this per radian.
+        # The distance of a point from an axis is at most the sum of all lengths after the axis, so the point moves by
+        # at most this sum per radian.
         lengths = np.append(np.hypot(d + strokes, self.robot.dh[:, 2]), np.linalg.norm(self.robot.tool[:3]))
         beyond = np.cumsum(lengths[::-1])[::-1][list(self.robot.joint_rows)]
         return torch.from_numpy(np.where(self.robot.revolute, beyond, 1.0))
@@ -186,7 +187,7 @@ class ArmInSurroundings:
         return faults
 
     def _gaps(self, segments: Float64[Tensor, "poses pieces 2 3"]) -> dict[str, Float64[Tensor, " poses"]]:
-        """Return, by reason, distances between the links and every obstacle, minus the clearance [m]."""
+        """Return the distances between the links and every obstacle, minus the clearance [m], by reason."""
         clearance, radius = self.surroundings.clearance, self.capsules.radius
         infinite = segments.new_full((len(segments), 1), torch.inf)
         gaps = {"links of the robot touch each other": _least(self._apart(segments) - self.room, infinite)}
@@ -208,12 +209,12 @@ class ArmInSurroundings:
     def blocked_lines_of_sight(
         self, q: Float64[Tensor, "poses dof"], lines: Float64[Tensor, "poses lines 2 3"], what: str
     ) -> dict[str, Bool[Tensor, " poses"]]:
-        """Return the masks of the poses in which a line of sight is blocked, by what blocks it.
+        """Return the masks of the poses in which a line of sight is blocked, by blocking object.
 
         Args:
             q: joint values [rad or m].
             lines: both ends of the lines in the frame of the nominal base [m].
-            what: what would be hidden, such as "the reflector from the tracker".
+            what: description of what would be hidden, such as "the reflector from the tracker".
         """
         return self._hidden(self.capsules.segments(q), lines, what)
 
@@ -223,7 +224,7 @@ class ArmInSurroundings:
         lines: Float64[Tensor, "poses lines 2 3"],
         what: str,
     ) -> dict[str, Bool[Tensor, " poses"]]:
-        """Return, by reason, masks of the poses in which an obstacle is too near to a line of sight."""
+        """Return the masks of the poses in which an obstacle is too near to a line of sight, by reason."""
         clearance = self.surroundings.clearance
         infinite = lines.new_full((len(lines), 1), torch.inf)
         distance = (

@@ -17,14 +17,14 @@ from pisigma.robot.kinematics.forward import Geometry, iterate_rows
 from pisigma.robot.urdf_frames import inverse, row_frame
 
 _RADIUS_SHARES = (0.05, 0.05, 0.05, 0.035)
-"""Default radii of links from the first joint on, as shares of the length of the nominal arm; the last share applies
-to all further links."""
+"""Default radii of links from the first joint on, as shares of the length of the nominal arm; the last share applies to
+all remaining links."""
 TOOL_RADIUS = 0.025
 """Default radius of the tool [m]: a bracket with a reflector of 1.5 inches."""
 _MIN_LENGTH = 1e-6
 """Length below which a piece of a link needs no capsule [m], because its neighbours cover it."""
 _SAMPLES = 500
-"""Number of random poses by which capsules that touch by construction are found."""
+"""Number of random poses with which capsules that touch by construction are found."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,11 +37,11 @@ class Capsules:
 
     Attributes:
         robot: nominal robot with the tool.
-        frame: frame to which each end of a piece is fixed: 0 is the base, i the frame after row i.
+        frame: frame to which each end of a piece is fixed: 0 for the base, i for the frame after row i.
         point: position of each end in that frame [m].
         link: number of the joint that moves each piece; 0 for fixed pieces.
         radius: radius of each piece [m].
-        carrier: whether each piece carries the robot, because it is before the first joint or on its axis.
+        carrier: whether each piece carries the robot, because the piece is before the first joint or on its axis.
     """
 
     robot: Robot
@@ -92,7 +92,7 @@ class Capsules:
         return capsules._of((segments[:, :, 1] - segments[:, :, 0]).norm(dim=-1).amax(0) > _MIN_LENGTH)
 
     def _of(self, kept: Bool[Tensor, " pieces"]) -> "Capsules":
-        """Return the capsules of the kept pieces only."""
+        """Return only the capsules of the kept pieces."""
         values = (self.frame, self.point, self.link, self.radius, self.carrier)
         return Capsules(self.robot, *(value[kept] for value in values))
 
@@ -106,10 +106,10 @@ class Capsules:
         return [as_transform(frame, q[..., 0]) for frame in (rows[0].before, *(row.after for row in rows))]
 
     def pairs_to_check(self, clearance: float) -> Int64[Tensor, "pairs 2"]:
-        """Return the pairs of pieces, of links that are not neighbours, that must not touch each other.
+        """Return the pairs of pieces, on links that are not neighbours, that must not touch each other.
 
-        Pairs that touch in more than half of random poses do so by construction, as in a wrist; the joint limits
-        have to keep them apart. Pairs whose distance never changes are not checked.
+        Pairs that touch in more than half of random poses do so by construction, as in a wrist; the joint limits must
+        keep them apart. Pairs whose distance never changes are not checked.
 
         Args:
             clearance: distance to keep between pieces [m].
@@ -123,7 +123,7 @@ class Capsules:
         return torch.stack([first, second], -1)[checked]
 
     def random_joints(self) -> Float64[Tensor, "poses dof"]:
-        """Draw joint values within the limits [rad or m], the same for every call."""
+        """Draw joint values within the limits [rad or m], the same ones in every call."""
         generator = torch.Generator().manual_seed(0)
         limits = torch.from_numpy(self.robot.axis_limits).clamp(-np.pi, np.pi)
         draws = torch.rand(_SAMPLES, len(limits), generator=generator, dtype=torch.float64)
@@ -170,6 +170,6 @@ def _pieces_of_rows(robot: Robot, tip: Float64[np.ndarray, " 3"]) -> Iterator[_P
 
 
 def _behind(robot: Robot, row: int, point: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, " 3"]:
-    """Return a point [m], given in the frame before a row, in the frame after it, at the joint value 0."""
+    """Transform a point [m] from the frame before a row to the frame after it, at the joint value 0."""
     result: np.ndarray = (inverse(row_frame(*robot.dh[row].tolist())) @ np.append(point, 1.0))[:3]
     return result

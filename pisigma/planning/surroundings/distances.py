@@ -1,4 +1,4 @@
-"""Distances of line segments from each other and from boxes, batched."""
+"""Distances between line segments, and from line segments to boxes, batched."""
 
 import torch
 from jaxtyping import Float64
@@ -12,7 +12,7 @@ Segments = Float64[Tensor, "*#batch 2 3"]
 
 
 def segment_distance(first: Segments, second: Segments) -> Float64[Tensor, "*_batch"]:
-    """Compute the distance of line segments [m].
+    """Compute the distance between line segments [m].
 
     The nearest points of two segments are the nearest points of their lines, clamped to the segments one after the
     other (Ericson 2005, Real-Time Collision Detection, section 5.1.9). The batches broadcast.
@@ -35,8 +35,8 @@ def segment_distance(first: Segments, second: Segments) -> Float64[Tensor, "*_ba
 def box_distance(segments: Segments, half_size: Float64[Tensor, "*#batch 3"]) -> Float64[Tensor, "*_batch"]:
     """Compute the distance of line segments from boxes centred at the origin, 0 inside [m].
 
-    The squared distance along a segment is convex, and its slope is linear between the planes of the box's faces: where
-    it is 0 follows from the slopes at the two planes around it.
+    The squared distance along a segment is convex, and its slope is linear between the planes of the box's faces, so
+    the zero of the slope follows from the slopes at the two planes around it.
 
     Args:
         segments: segments in the frame of the box [m].
@@ -48,7 +48,7 @@ def box_distance(segments: Segments, half_size: Float64[Tensor, "*#batch 3"]) ->
     planes = [torch.where(level, 0.0, (face - start) / steps).clamp(0, 1) for face in (-half_size, half_size)]
     first = torch.zeros_like(planes[0][..., :1])
     t = torch.cat([first, *planes, first + 1.0], -1)
-    # Half the slope of the squared distance at both ends and at every plane.
+    # half the slope of the squared distance at both ends and at every plane
     slope = torch.zeros_like(t)
     for s, u, half in zip(
         *(values[..., None].unbind(-2) for values in (start, along, half_size)), strict=True

@@ -1,4 +1,4 @@
-"""Straight joint motions between poses: whether they are collision-free, and waypoints for blocked motions."""
+"""Straight joint motions between poses: check for collisions, and waypoints for blocked motions."""
 
 import torch
 from jaxtyping import Bool, Float64
@@ -14,7 +14,7 @@ _MAX_WAYPOINTS_TRIED = 60
 BATCH = 20
 """Number of waypoints that are checked together."""
 _SAMPLE = 50
-"""Number of poses to which motions are checked, to find which of two poses is harder to leave."""
+"""Number of poses to which motions are checked in order to find which of two poses is harder to leave."""
 
 
 class Motions:
@@ -45,7 +45,7 @@ class Motions:
     def points_between(
         self, start: Float64[Tensor, " dof"], end: Float64[Tensor, " dof"]
     ) -> Float64[Tensor, "points dof"] | None:
-        """Return the waypoints of a motion; empty if none are required, None if none were found."""
+        """Return the waypoints of a motion; empty if none are needed, None if none were found."""
         if bool(self.are_free(start[None], end[None])):
             return self.pool[:0]
         (pair,) = zip(_names(start[None]), _names(end[None]), strict=True)
@@ -95,7 +95,7 @@ def waypoints(
     end: Float64[Tensor, " dof"],
     pool: Float64[Tensor, "poses dof"],
 ) -> Float64[Tensor, "points dof"] | None:
-    """Find one or two waypoints that make a motion collision-free, by the shortest of the tried ways.
+    """Find one or two waypoints that make a motion collision-free, on the shortest of the paths tried.
 
     Args:
         arm: the robot in its surroundings.
@@ -104,7 +104,7 @@ def waypoints(
         pool: joint values of free poses that can be waypoints [rad or m].
 
     Returns:
-        Joint values of the waypoints [rad or m]; None if no way was found.
+        Joint values of the waypoints [rad or m]; None if no path was found.
     """
     to, back = _travel(arm, start, pool), _travel(arm, pool, end)
     tried = (to + back).argsort()[:_MAX_WAYPOINTS_TRIED]

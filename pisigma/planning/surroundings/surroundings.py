@@ -182,9 +182,9 @@ class LensSection(Section):
     def sharp_depths(self, f: float) -> tuple[float, float]:
         """Compute the nearest and the farthest sharp depth [m]; the farthest may be infinite.
 
-        With the image at v = f · pixel behind the lens, focused at s, the focal length is `v s / (v + s)` (thin lens),
-        and a point at depth z has an image of diameter `A v |1/s - 1/z|` for the aperture A (Hecht, "Optics", section
-        5.2.3).
+        With the image at the distance v = f · pixel behind the lens, focused at s, the focal length is `v s / (v + s)`
+        (thin lens), and a point at depth z has an image of diameter `A v |1/s - 1/z|` for the aperture A (Hecht,
+        "Optics", section 5.2.3).
 
         Args:
             f: focal length of the focused camera [px].
@@ -204,7 +204,7 @@ class ViewSection(Section):
             board's x axis runs along its rows, y from row to row, and z away from the viewer.
         near_mm: smallest depth of the board in front of the camera [mm]; None to compute it from the lens.
         far_mm: largest depth of the board [mm]; None to compute it from the lens.
-        lens: lens data, if the depths are not stated.
+        lens: lens data, needed if the depths are not stated.
         oblique_deg: largest angle between the board's normal and the line of sight [deg].
         margin_px: distance that the board keeps from the edges of the image [px].
     """
@@ -245,14 +245,14 @@ class Surroundings(Section):
     """Surroundings of a robot. All sections are optional, in the robot's base frame in mm and deg.
 
     Attributes:
-        clearance_mm: distance that links and the tracker's beam keep from everything; links keep half of it from each
-            other [mm].
+        clearance_mm: distance that links and the tracker's beam keep from everything else [mm]; links keep half of it
+            from each other.
         floor_mm: height of the floor [mm]; None for no floor.
         joints: joint margins and limits.
         boxes: boxes that the robot must not touch.
         links: radii of the links.
         tool: pose of the reflector, or of the camera or board on the flange; None for the tool of the robot.
-        tracker: tracker that has to see the reflector; None if the sensor needs no line of sight.
+        tracker: tracker that must see the reflector; None if the sensor needs no line of sight.
         reflector: reflector with an acceptance cone; None if it is turned to the tracker at every pose.
         view: conditions under which a camera sees its board; None without a camera.
     """
@@ -318,7 +318,7 @@ def read_surroundings(path: str | os.PathLike[str], robot: Robot) -> Surrounding
         robot: robot in the surroundings.
 
     Raises:
-        PlanningError: the file cannot be used, or it names links or joints that the robot does not have.
+        PlanningError: the file cannot be used, or it names links or joints that the robot lacks.
     """
     surroundings = read_yaml(path, Surroundings, PlanningError)
     names = [row.name for row in robot.rows]

@@ -86,7 +86,7 @@ def cross(u: Vector, v: Vector) -> Vector:
 
 
 def cosine_sine(angle: Scalar) -> tuple[Scalar, Scalar]:
-    """Return cosine and sine, for a float as in `pisigma.robot.right_angles`."""
+    """Return cosine and sine, using `pisigma.robot.right_angles` for a float."""
     if isinstance(angle, float):
         return right_angles.cosine_sine(angle)
     return torch.cos(angle), torch.sin(angle)
@@ -141,7 +141,7 @@ def compose_row(frame: Frame, row: Sequence[Scalar]) -> Frame:
 
 
 def stack_components(values: Sequence[Scalar], like: Tensor) -> Tensor:
-    """Stack scalars to a tensor `(*batch, len(values))`, a view whose batch dimension is contiguous in memory.
+    """Stack scalars into a tensor `(*batch, len(values))`, a view whose batch dimension is contiguous in memory.
 
     Args:
         values: floats, or tensors that broadcast to the shape of `like`.
@@ -173,7 +173,7 @@ def frame_of(T: Tensor) -> Frame:
 
 
 def as_tensors(frame: Frame) -> Columns:
-    """Convert all scalars of a frame to tensors; scalars that are equal for all poses get no batch dimensions."""
+    """Convert all scalars of a frame to tensors; scalars that are common to all poses get no batch dimensions."""
     like = next(value for column in frame for value in column if isinstance(value, Tensor))
 
     def tensor(value: Scalar) -> Tensor:

@@ -1,4 +1,4 @@
-"""Joint Jacobian of the tool pose in closed form, batched, and a measure of its distance from a singularity."""
+"""Joint Jacobian of the tool pose in closed form, batched, and a measure of the distance from a singularity."""
 
 from collections.abc import Sequence
 
@@ -26,9 +26,8 @@ def joint_jacobian(
 ) -> tuple[Float[Tensor, "*batch 4 4"], Float[Tensor, "*batch 6 dof"]]:
     """Compute the tool pose and the geometric Jacobian, in the base frame and at the tool's origin.
 
-    Column j is `direction_j · [z × (p_tool - p); z]` for a revolute and `direction_j · [z; 0]` for a
-    prismatic joint, with z and p the axis and origin of the frame before the joint's row (Siciliano et al.
-    2009, eq. 3.30).
+    Column j is `direction_j · [z × (p_tool - p); z]` for a revolute joint and `direction_j · [z; 0]` for a prismatic
+    joint, where z and p are the axis and origin of the frame before the joint's row (Siciliano et al. 2009, eq. 3.30).
 
     Args:
         robot: the robot.
@@ -36,7 +35,7 @@ def joint_jacobian(
 
     Returns:
         T_base_tool, and J with `J @ dq` = [translation [m]; rotation vector [rad]] of the tool, both in the
-        base frame. Both may be views in which the batch dimension is contiguous; call ``.contiguous()`` where that
+        base frame. Both may be views in which the batch dimension is contiguous; call ``.contiguous()`` if this
         matters.
 
     Raises:
@@ -69,7 +68,7 @@ def _jacobian_chunk(
 def motion_components(
     robot: Robot, geometry: Geometry, q: Sequence[Scalar]
 ) -> tuple[Frame, list[list[Scalar]]]:
-    """Compute the tool frame and the six rows of the joint Jacobian on components; see `joint_jacobian`.
+    """Compute the tool frame and the six rows of the joint Jacobian from components; see `joint_jacobian`.
 
     Args:
         robot: the robot.
@@ -113,7 +112,7 @@ def singularity_measure(robot: Robot, q: Float[Tensor, "*batch dof"]) -> Float[T
     """Return the smallest singular value of the joint Jacobian in characteristic lengths (`dimensionless_jacobian`).
 
     It is 0 at a singularity and at most about 1. It is close to the sine of the angle by which a joint differs from its
-    singular value, so that 0.05 means about 3 deg.
+    singular value, so 0.05 means about 3 deg.
 
     Args:
         robot: the robot.
@@ -129,6 +128,6 @@ def singularity_measure(robot: Robot, q: Float[Tensor, "*batch dof"]) -> Float[T
 def smallest_singular_value(
     robot: Robot, J: Float[Tensor, "*batch 6 dof"], rows: int = 6
 ) -> Float[Tensor, "*batch"]:
-    """Return the `singularity_measure` for a given joint Jacobian with the given number of rows that are not 0."""
+    """Return the `singularity_measure` for a given joint Jacobian with the given number of nonzero rows."""
     values: Tensor = torch.linalg.svdvals(dimensionless_jacobian(robot, J).contiguous())
     return values[..., min(rows, robot.dof) - 1]

@@ -1,4 +1,4 @@
-"""Joint limits: wrap values into them by full turns, and detect values that cannot belong to the joint."""
+"""Joint limits: shift values into them by full turns, and detect values that cannot belong to the joint."""
 
 import numpy as np
 import torch
@@ -22,7 +22,7 @@ def wrapped_difference(
 def wrap_into_limits(
     robot: Robot, q: Float[Tensor, "*batch dof"]
 ) -> tuple[Float[Tensor, "*batch dof"], Bool[Tensor, "*batch"]]:
-    """Shift revolute joints that are outside their limits by full turns, if that brings them inside.
+    """Shift revolute joints that are outside their limits by full turns, if this brings them inside.
 
     Args:
         robot: the robot with the limits; for coupled joints, those of the controller's values.
@@ -42,7 +42,7 @@ def wrap_into_limits(
     moved = q + (up - down) * turn
     inside = (moved >= lower) & (moved <= upper)
     moved, every = torch.where(inside, moved, q), inside.all(-1)
-    # A full turn of a coupled joint turns others too, so the controller's values decide which turns are possible.
+    # A full turn of a coupled joint also turns others, so the controller's values decide which turns are possible.
     if robot.coupling is None:
         return moved, every
     turned, allowed = robot.coupling.wrapped_within_limits(
@@ -76,22 +76,22 @@ def nearest_turn(
 
 
 _GROSS_ANGLE = np.pi / 4
-"""Excess over the limits [rad] above which a value must be of another joint, in another unit, or relative to another
-zero; stated limits of published robots were wrong by up to 14 deg."""
+"""Excess over the limits [rad] above which a value must belong to another joint, be in another unit, or be relative to
+another zero; limits stated for published robots were wrong by up to 14 deg."""
 _GROSS_SHARE = 0.25
-"""Excess over the limits of a prismatic joint, as a share of its stroke, above which a value must be of another
-joint, in another unit, or relative to another zero."""
+"""Excess over the limits of a prismatic joint, as a share of its stroke, above which a value must belong to another
+joint, be in another unit, or be relative to another zero."""
 
 
 def beyond_limits(
     q: Float64[np.ndarray, " rows"], axis: Row, slack: float = LIMIT_TOLERANCE
 ) -> Bool[np.ndarray, " rows"]:
-    """Return which values [rad or m] exceed the limits of an axis by more than `slack`."""
+    """Return the mask of values [rad or m] that exceed the limits of an axis by more than `slack`."""
     outside: np.ndarray = (q < axis.lower - slack) | (q > axis.upper + slack)
     return outside
 
 
 def far_beyond_limits(q: Float64[np.ndarray, " rows"], axis: Row) -> Bool[np.ndarray, " rows"]:
-    """Return which values cannot belong to an axis, even if its stated limits are inaccurate."""
+    """Return the mask of values that cannot belong to an axis, even if its stated limits are inaccurate."""
     stroke = axis.upper - axis.lower
     return beyond_limits(q, axis, _GROSS_SHARE * stroke if axis.type == "prismatic" else _GROSS_ANGLE)

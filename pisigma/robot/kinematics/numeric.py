@@ -93,26 +93,27 @@ def solve_numeric(
     Each step solves `(JᵀJ + λ) dq = Jᵀe`, with lengths in characteristic lengths and the damping λ proportional to the
     squared error (Sugihara 2011), so convergence is quadratic near the solution. For each pose, a step that
     increases the error is rejected and the damping factor increased; otherwise the factor is decreased. Converged poses
-    are no longer updated. No gradients flow through the solution; joint limits are checked at the end only.
+    are no longer updated. No gradients flow through the solution; joint limits are checked only at the end.
 
     Args:
         robot: the robot, with any number of joints.
         T: target T_base_tool, `(*batch, 4, 4)` [m].
         start: initial joint values [rad or m]; batch dimensions broadcast with those of T.
-        tolerance: residuals at which the iteration has converged [m and rad]; None: 1e-13 in float64, 1e-5 in float32.
+        tolerance: residuals at which the iteration has converged [m and rad]; None for 1e-13 in float64 and 1e-5 in
+            float32.
         max_iterations: largest number of steps.
-        motion: pose and Jacobian of an arm with joint corrections; its Jacobian need not be exact. None: those of the
-            robot.
+        motion: pose and Jacobian of an arm with joint corrections; the Jacobian need not be exact. None for those of
+            the robot.
         axes: tool axes and tolerances of the task.
-        weights: weights of the six tool axes in least squares, 0 for an ignored one; None: `axes.weights`.
+        weights: weights of the six tool axes in least squares, 0 for an ignored axis; None for `axes.weights`.
 
     Returns:
         The solution to which the iteration converged. If it did not converge, the status is NOT_CONVERGED, and q
         contains the best values found, with the stated residuals.
 
     Raises:
-        PoseError: T is not a stack of rigid transforms, or start is not finite or does not have the shape that robot
-            and T require.
+        PoseError: T is not a stack of rigid transforms, or start is not finite or lacks the shape that robot and T
+            require.
     """
     check_transforms(T, "T_base_tool")
     _check_start(robot, T, start)
@@ -183,7 +184,7 @@ class TaskMotion:
 
     @property
     def rows(self) -> int:
-        """Number of task axes whose weight is not 0."""
+        """Number of task axes with a nonzero weight."""
         return int(self.weights.count_nonzero())
 
     def errors(
@@ -233,14 +234,14 @@ def damped_step(
     damping: Float[Tensor, " poses"],
     rows: int = 6,
 ) -> Float[Tensor, "poses dof"]:
-    """Compute the damped least-squares step [rad or m] from the smaller of both forms of the normal equations.
+    """Compute the damped least-squares step [rad or m] from the smaller of the two forms of the normal equations.
 
     Args:
         robot: the robot.
         J: joint Jacobian.
         scaled_error: pose error with translation in characteristic lengths.
         damping: factor of the squared error in the damping; the product is kept above the rounding level.
-        rows: number of rows of the Jacobian that are not 0.
+        rows: number of nonzero rows of the Jacobian.
     """
     A = dimensionless_jacobian(robot, J).contiguous()
     small = A.mT @ A if robot.dof < rows else A @ A.mT
@@ -339,7 +340,7 @@ def approach_preferred(
         if not active.any():
             break
         error, J = task.errors(T, best)
-        # Where the joints would go without the pose; a joint at its limit (scale 0) no longer moves.
+        # Motion of the joints if the pose did not matter; a joint at its limit (scale 0) no longer moves.
         pull = torch.where(scale > 0, share * (preferred - best), 0.0)
         A = rows[:, None] * J * scale[:, None]
         # The smallest scaled motion that reaches the pose cancels the effect of the pull on the tool.

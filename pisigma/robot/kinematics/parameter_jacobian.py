@@ -42,8 +42,8 @@ class ToolMotion:
     Attributes:
         position: position of the tool in the measuring frame [m].
         rotation: rotation of the tool in the measuring frame.
-        derivative: for every parameter the tool's translation [m] and, if requested, its rotation [rad], both in the
-            measuring frame; the order is that of `motion_order`.
+        derivative: for every parameter, the tool's translation [m] and, if requested, its rotation [rad], both in the
+            measuring frame, in the order of `motion_order`.
     """
 
     position: Float[Tensor, "3 poses"]
@@ -57,7 +57,7 @@ def motion_order(rows: int) -> list[int]:
     The rotation axes are every third vector of `_walk_rows`; some of them belong to no parameter.
 
     Returns:
-        The index of theta, d, a, alpha, beta of every row, then of base and tool (x, y, z, roll, pitch, yaw each).
+        The indices of theta, d, a, alpha, beta of every row, then of base and tool (x, y, z, roll, pitch, yaw each).
     """
     d, a, base, tool = (start + 3 * rows + 9 for start in (0, rows, 2 * rows, 2 * rows + 3))
     order = [
@@ -117,7 +117,7 @@ def tool_motion(
         base: x, y, z [m], roll, pitch, yaw [rad] of the base; one for all poses, or one per measuring frame.
         tool: x, y, z [m], roll, pitch, yaw [rad] of the tool; one for all poses, or one per target.
         q: joint values [rad or m].
-        turning: whether to compute also the derivative of the rotation.
+        turning: whether to also compute the derivative of the rotation.
         frame: index of the base for every pose, if there are several.
         target: index of the tool for every pose, if there are several.
     """
@@ -165,8 +165,8 @@ def _walk_rows(
     The rotation about z is `(x, y) cos + (y, -x) sin`; one small matrix leads from a rotated frame to the next row.
 
     Returns:
-        For every row and the frame after the last one: x and y as rotated by the row before, then x, y, -x, origin and
-        z before the row. Every third vector is a rotation axis of a parameter, through this origin. The first entry
+        For every row and the frame after the last one: x and y as rotated by the previous row, then x, y, -x, origin
+        and z before the row. Every third vector is a rotation axis of a parameter, through this origin. The first entry
         contains the rotation axes of the base (roll, pitch, yaw) and its origin in the same form.
     """
     frames = q.new_empty((len(robot.rows) + 2, 7, 3, q.shape[0]))

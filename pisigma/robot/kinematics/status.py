@@ -1,4 +1,4 @@
-"""Status of an inverse kinematics solution: a number that fits in a tensor, and a sentence that people can act on."""
+"""Status of an inverse kinematics solution: a number that fits in a tensor, and a sentence with advice for users."""
 
 import enum
 
@@ -7,8 +7,8 @@ class Status(enum.IntEnum):
     """Status of inverse kinematics for one pose and one branch.
 
     Joint values are NaN if and only if the status is UNREACHABLE or INVALID_POSE. If several apply, the most severe is
-    returned, in the order REACHED, OUTSIDE_DOMAIN, SINGULAR, OUTSIDE_JOINT_LIMITS, NOT_CONVERGED or UNREACHABLE: a
-    singular pose is never hidden, and the domain has a measure of its own.
+    returned, in the order REACHED, OUTSIDE_DOMAIN, SINGULAR, OUTSIDE_JOINT_LIMITS, NOT_CONVERGED or UNREACHABLE, so
+    that a singular pose is never hidden; the domain also has a separate measure.
     """
 
     REACHED = 0

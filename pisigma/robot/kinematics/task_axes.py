@@ -25,14 +25,14 @@ class TaskAxes:
     """Requirements of a task on the tool pose, in the axes of the tool frame.
 
     Position errors are `R^T (p_target - p)` [m] along the axes of the target tool. Rotation errors are the rotation
-    from the reached to the target tool [rad], about the axes of the reached one: a rotation vector or, if one axis
-    differs from the two others (`pivot`), the twist about that axis and its swing, so that ignored rotations do not
+    from the reached to the target tool [rad], about the axes of the reached tool: a rotation vector or, if one axis
+    differs from the other two (`pivot`), the twist about that axis and its swing, so that ignored rotations do not
     affect the others.
 
     Attributes:
-        tolerance: tolerances of `AXES` [m, rad]: 0 for an axis that has to be met exactly, infinity for one that is
-            ignored, a positive number for a deviation that is accepted if the pose cannot be reached exactly, and a
-            negative number for an axis that is free within that deviation.
+        tolerance: tolerances of `AXES` [m, rad]: 0 for an axis that must be met exactly, infinity for an ignored axis,
+            a positive number for a deviation that is accepted if the pose cannot be reached exactly, and a negative
+            number for an axis that is free within that deviation.
         elbow_angle: elbow angle of an arm with seven revolute joints [rad], the arm angle of Kreutz-Delgado et al.
             1992: about the line from the shoulder (origin of the second joint's axis) to the wrist (that of the sixth),
             from the plane through this line and the direction of the first axis to the elbow (origin of the fourth
@@ -54,7 +54,7 @@ class TaskAxes:
 
     @cached_property
     def whole(self) -> bool:
-        """Whether all axes have to be met exactly."""
+        """Whether all axes must be met exactly."""
         return not any(self.tolerance)
 
     @property
@@ -73,7 +73,7 @@ class TaskAxes:
 
     @property
     def loose_weights(self) -> tuple[float, ...]:
-        """Weights in least squares: relative inverse tolerances; exact axes have 1000 times the largest of them."""
+        """Weights in least squares: relative inverse tolerances; exact axes have 1000 times the largest of these."""
         least = min((value for value in self.tolerance if value > 0), default=1.0)
         share = 1e-3 if 0.0 in self.tolerance else 1.0
         return tuple(
@@ -114,8 +114,8 @@ WHOLE = TaskAxes()
 def default_axes(joints: int) -> TaskAxes:
     """Return the default task of an arm with the given number of joints: all six axes for six or more.
 
-    With five joints the rotation about the tool's z axis is free. With four joints roll and pitch are free up to
-    `MAX_TILT`. With three joints the orientation is ignored.
+    With five joints, the rotation about the tool's z axis is free. With four joints, roll and pitch are free up to
+    `MAX_TILT`. With three joints, the orientation is ignored.
     """
     free = -MAX_TILT if joints == 4 else math.inf
     return TaskAxes(tuple(free if name in _FREE.get(joints, ()) else 0.0 for name in AXES))
@@ -157,7 +157,7 @@ def task_axes(
 
 
 def _three(what: str, stated: float | Sequence[float]) -> list[float]:
-    """Return the tolerances of three axes from one number or three.
+    """Return the tolerances of three axes from one number or three numbers.
 
     Raises:
         PoseError: the option `what` is neither one number >= 0 nor three.

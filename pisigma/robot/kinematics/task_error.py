@@ -15,7 +15,7 @@ def task_error(
 ) -> tuple[Float[Tensor, "poses 6"], Float[Tensor, "poses 6 6"]]:
     """Compute pose errors in all tool axes, and the matrices that convert pose Jacobians to Jacobians of the errors.
 
-    For the rotation D from the reached to the target tool and a tool axis k, the swing of the axis is
+    With the rotation D from the reached to the target tool, the swing of a tool axis k is
     `atan2(|k × Dk|, k · Dk)` about `k × Dk`, and the twist about it is `atan2(D_ji - D_ij, D_ii + D_jj)` with i, j, k
     cyclic, with the derivative `(k + Dk) · ω / (1 + k · Dk)`. Derivatives of rotation vectors and swings are those for
     small rotations, as in all Gauss-Newton steps of this package.
@@ -39,7 +39,7 @@ def task_error(
     if k >= 0:
         i, j = (k + 1) % 3, (k + 2) % 3
         sine = torch.hypot(D[:, i, k], D[:, j, k])
-        # angle / sine tends to 1 at 0; at 180 deg the axis of the swing is arbitrary, so no swing is asked for there.
+        # angle / sine tends to 1 at 0; at 180 deg, the axis of the swing is arbitrary, so no swing is requested there.
         straight = torch.where(D[:, k, k] > 0, 1.0, 0.0).to(D)
         safe = torch.where(sine > 1e-12, sine, 1.0)
         factor = torch.where(sine > 1e-12, torch.atan2(sine, D[:, k, k]) / safe, straight)

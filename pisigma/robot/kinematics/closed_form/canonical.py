@@ -1,7 +1,7 @@
 """Convert rows to the twists of a textbook robot, so that one set of formulas also covers mirrored robots.
 
-`RotX(pi) · RotZ(t) · Trans(a, 0, d) = RotZ(-t) · Trans(a, 0, -d) · RotX(pi)`: a twist that differs from the
-textbook's by 180 deg changes the sign of t and d in all later rows; the remaining RotX becomes part of the tool.
+`RotX(pi) · RotZ(t) · Trans(a, 0, d) = RotZ(-t) · Trans(a, 0, -d) · RotX(pi)`: a twist that differs by 180 deg from that
+of the textbook changes the sign of t and d in all later rows; the remaining RotX becomes part of the tool.
 """
 
 import math
@@ -33,7 +33,7 @@ class CanonicalRows:
     joint variable v (t of a revolute, d of a prismatic joint) is `sign · (direction · q + offset)`.
 
     Attributes:
-        T_base_first: frame before the first joint; base and leading fixed rows.
+        T_base_first: frame before the first joint, from the base and leading fixed rows.
         T_last_tool: tool in the last joint's frame after its rotation: the remainder of the row, trailing fixed rows
             and tool.
         sign: +1 or -1 for every joint.
@@ -64,10 +64,10 @@ class CanonicalRows:
 
 
 def canonical_rows(robot: Robot, types: Sequence[JointType], twists: Sequence[float]) -> CanonicalRows | None:
-    """Convert the rows to the given twists [rad], or return None if the robot has other joints or twists.
+    """Convert the rows to the given twists [rad], or return None if the robot has different joints or twists.
 
     Args:
-        robot: the robot; fixed rows are allowed before the first and after the last joint only.
+        robot: the robot; fixed rows are allowed only before the first and after the last joint.
         types: required joint types.
         twists: alpha of every joint's row except the last, modulo 180 deg; beta must be 0 in these rows.
     """

@@ -22,11 +22,11 @@ Own = TypeVar("Own", bound="AbstractClosedForm")
 
 @dataclass(frozen=True, eq=False)
 class InverseSolutions:
-    """Joint values of all branches for every pose, with a status each.
+    """Joint values and status of all branches for every pose.
 
     Attributes:
-        q: joint values [rad or m]; revolute ones in (-pi, pi], or shifted by a full turn if only that is within the
-            limits. NaN if and only if the status is UNREACHABLE.
+        q: joint values [rad or m]; revolute joints in (-pi, pi], or shifted by a full turn if only the shifted value is
+            within the limits. NaN if and only if the status is UNREACHABLE.
         status: a `Status` for every pose and branch.
         branches: names of the branches, in the order of the branch dimension.
     """
@@ -41,7 +41,7 @@ class AbstractClosedForm(ABC):
     """A closed-form inverse of one robot.
 
     Attributes:
-        branches: names of the branches in order: the combinations of choices between two solutions (forks), with the
+        branches: names of the branches in order, the combinations of choices between two solutions (forks), with the
             last fork varying fastest.
         robot: the robot.
         rows: rows of the robot with canonical twists.
@@ -76,7 +76,7 @@ class AbstractClosedForm(ABC):
         """Return canonical joint variables, whether they reach the pose, and whether it is singular.
 
         Args:
-            T: pose of the last joint's rotated frame in the frame before the first joint, on components.
+            T: pose of the last joint's rotated frame in the frame before the first joint, as components.
             signs: +1 or -1 for every fork, numbers or tensors that broadcast with the components of T.
         """
 
@@ -87,7 +87,7 @@ class AbstractClosedForm(ABC):
             T: T_base_tool, `(*batch, 4, 4)` [m].
 
         Raises:
-            PoseError: T is not a stack of rigid transforms; the message states the index.
+            PoseError: T is not a stack of rigid transforms; the message states the index of the first fault.
         """
         check_transforms(T, "T_base_tool")
         q, inside, reached, singular = self._solve_branches(T)
@@ -115,7 +115,7 @@ class AbstractClosedForm(ABC):
         return tuple(self.branches[i] for i in order if counts[i] > 0)
 
     def start_values(self, T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch branches dof"]:
-        """Return joint values of all branches; where a branch does not reach a pose, the arm is stretched or folded.
+        """Return joint values of all branches; if a branch does not reach a pose, its arm is stretched or folded.
 
         They serve as starts for an arm that differs slightly from this one and may reach the pose. A small margin
         keeps them away from singular joint values, which an iteration cannot leave.
@@ -171,6 +171,6 @@ class AbstractClosedForm(ABC):
     def _wrapped(
         self, q: Float[Tensor, "*batch dof"]
     ) -> tuple[Float[Tensor, "*batch dof"], Bool[Tensor, "*batch"]]:
-        """Wrap joint values to the turn nearest to 0, or to another turn if only that one is within the limits."""
+        """Wrap joint values to the turn nearest to 0, or to another turn if only this one is within the limits."""
         revolute = torch.tensor(self.robot.revolute, device=q.device)
         return wrap_into_limits(self.robot, torch.where(revolute, wrap_to_pi(q), q))

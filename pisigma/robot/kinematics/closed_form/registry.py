@@ -7,13 +7,13 @@ from pisigma.robot.kinematics.closed_form.spherical_wrist import SphericalWristA
 from pisigma.robot.kinematics.closed_form.three_parallel import ThreeParallelArm
 
 CLOSED_FORMS: dict[str, type[AbstractClosedForm]] = {}
-"""Closed forms by name; the first whose `from_robot` accepts a robot is used."""
+"""Closed forms by name; the first form whose `from_robot` accepts a robot is used."""
 
 
 def register_closed_form(form: type[AbstractClosedForm]) -> type[AbstractClosedForm]:
     """Register a closed form after the existing ones; may be used as a decorator.
 
-    A form with compiled functions makes the kernels recompile at its first use, which requires numba
+    The kernels are recompiled at the first use of a form with compiled functions, which requires numba
     (`pip install 'pisigma[compile]'`).
 
     Raises:
@@ -27,7 +27,7 @@ def register_closed_form(form: type[AbstractClosedForm]) -> type[AbstractClosedF
 def closed_form_solver(robot: Robot) -> AbstractClosedForm | None:
     """Return the closed-form inverse of a robot, or None if no registered form accepts it.
 
-    The rows have to match exactly: twists with a calibrated error or a beta other than 0 result in None.
+    The rows must match exactly; twists with a calibrated error or a nonzero beta result in None.
     Signs of twists, offsets, directions, base, tool, fixed rows before the first and after the last joint do
     not matter, nor do twist and beta of the last row.
     """
