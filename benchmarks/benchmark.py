@@ -1,9 +1,10 @@
 """The benchmark of kinematic calibration on public measurements of real arms.
 
 `python benchmarks/benchmark.py run` fits every method to every split of every series, and stores errors of all held-out
-rows in `benchmarks/results`; `--quick` runs the first fold of the first split of every series, and stores only in
-`--out`. `page` writes the page of the documentation from the stored results. `data` lists the series and what is
-missing; the files are looked for in `PISIGMA_DATA`. `rows SERIES SPLIT` prints the row numbers of a split as JSON.
+rows in `benchmarks/results`; splits that are stored there with the same hashes of data, split and code are not run
+again. `--quick` runs the first fold of the first split of every series, and stores only in `--out`. `page` writes the
+page of the documentation from the stored results. `data` lists the series and what is missing; the files are looked for
+in `PISIGMA_DATA`. `rows SERIES SPLIT` prints the row numbers of a split as JSON.
 Packages that need other versions run with another Python: `--python pybotics=PATH`.
 """
 
@@ -16,7 +17,7 @@ import threading
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from shared_benchmark.fits import fits_of, overrun_rows
+from shared_benchmark.fits import fits_of, inputs_of, overrun_rows
 from shared_benchmark.methods import NAMES as METHODS
 from shared_benchmark.methods import method_of
 from shared_benchmark.page import write_page
@@ -25,7 +26,7 @@ from shared_benchmark.rows import Method
 from shared_benchmark.series import NAMES as SERIES
 from shared_benchmark.series import series_of
 from shared_benchmark.splits import SPLITS, folds_of
-from shared_benchmark.store import RESULTS, errors_of, replace, tables_of
+from shared_benchmark.store import RESULTS, errors_of, replace, stored_fits, tables_of
 
 STORING = threading.Lock()
 
@@ -70,35 +71,44 @@ def main() -> None:
 
 def run_methods(options: argparse.Namespace) -> None:
     """Run the chosen methods, several at a time, and store each split when it is complete."""
-    chains = []
+    there = []
     for name in options.series:
         series = series_of(name)
         missing = series.missing()
         if missing is None:
-            chains += [(options, series, method_of(method)) for method in options.method]
+            there.append(series)
         else:
             print(f"{name}: {missing}", file=sys.stderr)
+    methods = sorted(map(method_of, options.method), key=lambda method: method.slow)
+    pairs = [(series, method) for method in methods for series in there]
     with ThreadPoolExecutor(options.jobs) as pool:
-        list(pool.map(lambda chain: run_splits(*chain), chains))
+        list(pool.map(lambda pair: run_splits(options, *pair), pairs))
 
 
 def run_splits(options: argparse.Namespace, series: Series, method: Method) -> None:
     """Run a method on the splits of a series, with few training rows first, and print one line for each."""
-    pythons = dict(one.split("=", 1) for one in options.python)
+    python = dict(one.split("=", 1) for one in options.python).get(method.name, sys.executable)
+    folder = options.out or (None if options.quick else RESULTS)
     splits = [split for split in series.splits if split in options.split]
     if options.quick:
         splits = [] if method.slow else splits[:1]
     below = math.inf
     for split in sorted(splits, key=lambda split: len(folds_of(series, split)[0].train)):
-        python = pythons.get(method.name, sys.executable)
-        new = tables_of(fits_of(series, split, method, python, 1 if options.quick else None, below))
+        folds = 1 if options.quick else len(folds_of(series, split))
+        with STORING:
+            stored = folder and stored_fits(folder, inputs_of(series, split, method), folds)
+        if stored:
+            below = min(below, overrun_rows(stored))
+            print(f"{series.name:10s} {split:14s} {method.name:15s} stored", flush=True)
+            continue
+        new = tables_of(fits_of(series, split, method, python, folds, below))
         below = min(below, overrun_rows(new[0].to_pylist()))
         status = "; ".join(dict.fromkeys(new[0]["status"].to_pylist()))
         errors = errors_of(new[1], series.name, split, method.name)
         error = f"{errors.rms:.4f} mm" if len(errors.row) else ""
         with STORING:
-            if options.out is not None or not options.quick:
-                replace(options.out or RESULTS, new)
+            if folder is not None:
+                replace(folder, new)
             print(f"{series.name:10s} {split:14s} {method.name:15s} {error:12s} {status}", flush=True)
 
 

@@ -23,19 +23,32 @@ LIMIT_S = 300
 """Largest time of the processor for a fit [s], with one thread."""
 PATIENCE = 6
 """Factor on the limit after which a fit that waits for other programs is ended."""
+WAITED = "ended after"
+"""First words of the status of such a fit, which is run again."""
 REPOSITORY = Path(__file__).parents[2]
 PACKAGE = Path(__file__).parent
+ROOMS = (
+    "files",
+    "robot",
+    "estimation",
+    "measurement",
+    "network",
+    "joint_correction",
+    "simulation",
+    "calibration",
+)
+"""Rooms of pisigma that a calibration may import; the others come later in the order of imports."""
 
 Fit = dict[str, Any]
 """What is stored of a fit, by column."""
 
 
-def code_hash(method: Method) -> str:
-    """Return the SHA-256 of the files that decide what a method predicts."""
+def code_hash(method: Method, series: Series) -> str:
+    """Return the SHA-256 of the nominal arm and of the files that decide what a method predicts."""
     files = {PACKAGE / "rows.py", *_with_imports(PACKAGE / "methods" / f"{method.name}.py")}
     if "pisigma" in method.packages:
-        files |= set((REPOSITORY / "pisigma").rglob("*.py"))
-    digest = hashlib.sha256()
+        files |= {path for room in ROOMS for path in (REPOSITORY / "pisigma" / room).rglob("*.py")}
+    digest = hashlib.sha256(np.round(series.arm.dh, 9).tobytes())
     for path in sorted(files):
         digest.update(path.relative_to(REPOSITORY).as_posix().encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()
@@ -67,7 +80,7 @@ def predict(task: Task, method: str, python: str) -> tuple[Fit, Prediction | Non
                 timeout=PATIENCE * LIMIT_S,
             )
         except subprocess.TimeoutExpired:
-            return {"status": f"over {LIMIT_S} s"}, None
+            return {"status": f"{WAITED} {PATIENCE * LIMIT_S} s of other programs"}, None
         if done.returncode in (-signal.SIGXCPU, -signal.SIGKILL):
             return {"status": f"over {LIMIT_S} s"}, None
         if done.returncode:
@@ -94,15 +107,9 @@ def fits_of(
         folds: number of folds to run, from the first; None for all.
         below: number of training rows from which folds are not tried, because a fit overran; an overrun lowers it.
     """
-    key = {"series": series.name, "split": split, "method": method.name}
-    hashes = {
-        "data_sha256": series.sha256,
-        "split_sha256": series.splits[split],
-        "code_sha256": code_hash(method),
-        "seed": SEED,
-    }
+    inputs = inputs_of(series, split, method)
     for number, fold in enumerate(folds_of(series, split)[:folds]):
-        base = {**key, "fold": number, "train_rows": len(fold.train), **hashes}
+        base = {**inputs, "fold": number, "train_rows": len(fold.train)}
         if series.measured not in method.measured:
             yield {**base, "status": f"does not use rows of the kind '{series.measured}'"}, None
             return
@@ -120,6 +127,19 @@ def fits_of(
         errors = row_errors(test_series, prediction, test, numbers, split == "session")
         distance = errors_between_sockets(prediction, test, test_series.known_distances(test))
         yield {**base, **fit, "distance_mm": distance}, errors
+
+
+def inputs_of(series: Series, split: str, method: Method) -> Fit:
+    """Return what decides the results of a split: its names, the hashes of data, split and code, and the seed."""
+    return {
+        "series": series.name,
+        "split": split,
+        "method": method.name,
+        "data_sha256": series.sha256,
+        "split_sha256": series.splits[split],
+        "code_sha256": code_hash(method, series),
+        "seed": SEED,
+    }
 
 
 def overrun_rows(fits: list[Fit]) -> float:
