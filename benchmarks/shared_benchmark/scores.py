@@ -93,12 +93,26 @@ def ratio_interval(first: RowErrors, second: RowErrors, share: float = 0.95) -> 
     Efron and Tibshirani 1993, An Introduction to the Bootstrap, chapter 13 (percentiles).
     """
     assert np.array_equal(first.row, second.row)
-    number = np.unique(first.group, return_inverse=True)[1]
-    sums = [np.bincount(number, np.square(one.error).sum(1)) for one in (first, second)]
-    draws = np.random.default_rng(0).multinomial(len(sums[0]), np.full(len(sums[0]), 1 / len(sums[0])), DRAWS)
-    ratios = np.sqrt((draws @ sums[0]) / (draws @ sums[1]))
-    low, high = np.quantile(ratios, [(1 - share) / 2, (1 + share) / 2])
+    _, sums = _samples([first, second])
+    low, high = np.quantile(np.sqrt(sums[0] / sums[1]), [(1 - share) / 2, (1 + share) / 2])
     return float(low), float(high)
+
+
+def rms_interval(errors: RowErrors, share: float = 0.95) -> tuple[float, float]:
+    """Return the interval of an RMS error [mm], by a bootstrap over groups."""
+    counts, sums = _samples([errors])
+    low, high = np.quantile(np.sqrt(sums[0] / counts), [(1 - share) / 2, (1 + share) / 2])
+    return float(low), float(high)
+
+
+def _samples(several: list[RowErrors]) -> tuple[Array, list[Array]]:
+    """Return the number of rows of every bootstrap sample, and the sums of squared errors of every method."""
+    number = np.unique(several[0].group, return_inverse=True)[1].ravel()
+    groups = int(number.max()) + 1
+    draws = np.random.default_rng(0).multinomial(groups, np.full(groups, 1 / groups), DRAWS)
+    return draws @ np.bincount(number), [
+        draws @ np.bincount(number, np.square(one.error).sum(1)) for one in several
+    ]
 
 
 def _fitted(T: Array, rows: Rows, series: Series) -> Array:

@@ -160,6 +160,52 @@ def test_results_of_a_split_replace_those_before(module, tmp_path):
         assert found.group.tolist() == (np.arange(400) // 2).tolist()
 
 
-def test_the_page_is_made_from_the_stored_results(module):
-    page, store = module("page"), module("store")
-    assert page.PAGE.read_text(encoding="utf-8") == page.page_of(page.Results(*store.read(store.RESULTS)))
+def test_stored_fits_with_the_same_inputs_are_not_run_again(module, tmp_path):
+    """A fold that is missing, waited too long or has another hash is run again."""
+    store, fits = module("store"), module("fits")
+    series = module("series").series_of("fanuc")
+    inputs = fits.inputs_of(series, "random", module("methods").method_of("nominal"))
+
+    def stored(*statuses, wanted=2, **changed):
+        found = [{**inputs, "fold": fold, "status": status} for fold, status in enumerate(statuses)]
+        store.replace(tmp_path, store.tables_of((fit, None) for fit in found))
+        return store.stored_fits(tmp_path, {**inputs, **changed}, wanted)
+
+    assert len(stored("done", "over 300 s")) == 2
+    assert len(stored("does not use rows of the kind 'socket'")) == 1
+    assert stored("done") is None
+    assert stored("done", f"{fits.WAITED} 1800 s of other programs") is None
+    assert stored("done", "not installed: pybotics") is None
+    assert stored("done", "done", code_sha256="0") is None
+
+
+def test_a_network_has_the_derivatives_of_its_outputs_and_learns(module):
+    network_of = module("methods.lm_network")._Network
+    x = np.concatenate([RNG.uniform(-1, 1, (60, 3)), np.ones((60, 1))], 1)
+    network = network_of(3, 8, 2, np.random.default_rng(0))
+    weights, step = network.weights, 1e-6
+    columns = [
+        (network.outputs(weights + step * one, x) - network.outputs(weights - step * one, x)).ravel()
+        for one in np.eye(len(weights))
+    ]
+    assert_close(network.jacobian(weights, x), np.stack(columns, 1) / (2 * step), atol=1e-8)
+    y = np.stack([np.sin(2 * x[:, 0]), x[:, 1] * x[:, 2]], 1)
+    assert network.train(x, y, np.arange(60) % 6 == 0) < 0.02 * y.var()
+
+
+def test_intervals_of_an_error_and_of_a_coverage(module):
+    """The interval of an RMS error scales with it, and exact intervals are within binomial scatter."""
+    scores, coverage = module("scores"), module("coverage")
+    one, two = make_errors(scores, 1.0), make_errors(scores, 2.0)
+    low, high = scores.rms_interval(one)
+    assert low < one.rms < high
+    assert_close(scores.rms_interval(two), [2 * low, 2 * high], rtol=1e-12)
+    low, high = coverage.binomial_interval(one, 0.95)
+    assert low < one.coverage(0.95) < high
+
+
+def test_the_page_is_made_from_the_stored_results_and_explains_every_loss(module):
+    page, store, comparison = module("page"), module("store"), module("comparison")
+    results = module("results").Results(*store.read(store.RESULTS))
+    assert page.PAGE.read_text(encoding="utf-8") == page.page_of(results)
+    assert set(comparison.losses(results)) <= set(comparison.LOSSES)

@@ -1,0 +1,63 @@
+"""Tables of times, memory, failed fits and versions."""
+
+import json
+
+import numpy as np
+
+from shared_benchmark.fits import LIMIT_S
+from shared_benchmark.methods import NAMES as METHODS
+from shared_benchmark.results import Results, table
+
+
+def cost_table(results: Results) -> str:
+    """Return times and memory of the fits of every method."""
+    done = [fit for fit in results.fits.to_pylist() if fit["status"] == "done"]
+    rows = []
+    for method in METHODS:
+        fits = [fit for fit in done if fit["method"] == method]
+        if fits:
+            seconds = [fit["seconds"] for fit in fits]
+            memory = max(fit["memory_mb"] for fit in fits)
+            figures = [f"{np.median(seconds):.1f}", f"{max(seconds):.1f}", f"{sum(seconds):.0f}"]
+            rows.append([f"`{method}`", f"{len(fits)}", *figures, f"{memory:.0f}"])
+    return table(["method", "fits", "median [s]", "largest [s]", "all [s]", "memory [MB]"], rows)
+
+
+def total_text(results: Results) -> str:
+    """Return how long all stored fits took together, and how busy the machine was."""
+    fits = results.fits.to_pylist()
+    done = [fit for fit in fits if fit["status"] == "done"]
+    overran = sum(fit["status"].startswith("over ") for fit in fits)
+    total = sum(fit["seconds"] for fit in done) + overran * LIMIT_S
+    waits = [fit["elapsed_seconds"] / fit["seconds"] for fit in done if fit["elapsed_seconds"] is not None]
+    text = f"The {len(done)} stored fits took {total / 3600:.1f} h of processor time"
+    if overran:
+        text += f", with {overran} overruns of {LIMIT_S} s"
+    if waits:
+        text += (
+            ". Other programs used the machine at the same time: by the clock, a fit took "
+            f"{np.median(waits):.1f} times as long in the median"
+        )
+    return text + "."
+
+
+def failures_table(results: Results) -> str:
+    """Return the splits where a fit crashed, overran or was not tried."""
+    rows = []
+    for (name, split, method), statuses in results.statuses.items():
+        wrong = [status for status in dict.fromkeys(statuses) if status != "done"]
+        if wrong and not wrong[0].startswith("does not use"):
+            done = f"{statuses.count('done')} of {len(statuses)}"
+            status = "; ".join(wrong).replace("|", "/")
+            rows.append([f"`{name}`", f"`{split}`", f"`{method}`", done, status])
+    return table(["series", "split", "method", "folds done", "status"], rows)
+
+
+def versions_text(results: Results) -> str:
+    """Return the versions of all packages."""
+    found: dict[str, set[str]] = {}
+    for text in dict.fromkeys(results.fits["versions"].to_pylist()):
+        for package, version in json.loads(text or "{}").items():
+            found.setdefault(package, set()).add(version)
+    versions = ((package, " and ".join(sorted(several))) for package, several in sorted(found.items()))
+    return ", ".join(f"{package} {several}" for package, several in versions)
