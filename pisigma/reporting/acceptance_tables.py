@@ -36,8 +36,8 @@ def acceptance_sentences(acceptance: Acceptance) -> tuple[str, ...]:
             f"The {' and the '.join(measured.fitted)} {'were' if several else 'was'} fitted to these rows, because "
             f"{'they were' if several else 'it was'} changed."
         )
-    if measured is not None and measured.doubt:
-        lines.append(measured.doubt)
+    if measured is not None and measured.distrust_reason:
+        lines.append(measured.distrust_reason)
     if acceptance.contradicted:
         lines.append(contradiction(acceptance))
     of_model = [one for one in acceptance.accepted if one.model == acceptance.model]

@@ -98,7 +98,7 @@ class ComparedModels:
             "rows": None if self.rows is None else {**self.rows.to_json(), "better": self.better},
             "diagnostics": [one.model_dump() for one in self.diagnostics],
             "program": None if self.program is None else self.program.to_json(first.robot),
-            "says": list(self.sentences),
+            "summary": list(self.sentences),
             "warnings": list(self.warnings),
             "seconds": round(self.seconds, 3),
         }
@@ -260,7 +260,7 @@ def _parameter_json(one: ParameterDifference) -> dict[str, Any]:
         "shift_deviation": one.deviation,
     }
     with_unit = {f"{name}_{one.unit}": value for name, value in figures.items()}
-    return {"name": one.name, **with_unit, "p": one.p, "alike": list(one.alike)}
+    return {"name": one.name, **with_unit, "p": one.p, "equivalent": list(one.equivalent)}
 
 
 def _warnings(pair: ModelPair, sources: Sequence[ModelSource]) -> tuple[str, ...]:

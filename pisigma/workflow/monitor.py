@@ -183,7 +183,7 @@ class MonitoringResult:
             "trends": [one.to_json() for one in self.trends],
             "jumps": [one.to_json() for one in self.jumps],
             "forecast": None if self.forecast is None else vars(self.forecast),
-            "says": list(self.sentences),
+            "summary": list(self.sentences),
             "warnings": list(self.warnings),
         }
 

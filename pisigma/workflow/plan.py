@@ -61,10 +61,10 @@ class Plan:
         candidates: poses that they were chosen from.
         curve: expected errors of the tool's position over the task against the number of poses, from 0 poses where
             there are earlier measurements.
-        needed: number of poses with which the limit is expected to be reached; None without a limit, or if it is
+        poses_needed: number of poses with which the limit is expected to be reached; None without a limit, or if it is
             not reached.
-        remaining: sources of the expected remaining error, the largest first.
-        travel: time of the measurement [s].
+        error_sources: sources of the expected remaining error, the largest first.
+        duration: time of the measurement [s].
         warnings: sentences with further remarks.
         camera: what limits a calibration with images; None without a camera.
         seconds: computing time [s].
@@ -73,9 +73,9 @@ class Plan:
     stored: StoredPlan
     candidates: Candidates
     curve: tuple[ExpectedAccuracy, ...]
-    needed: int | None
-    remaining: tuple[RemainingError, ...]
-    travel: float
+    poses_needed: int | None
+    error_sources: tuple[RemainingError, ...]
+    duration: float
     warnings: tuple[str, ...]
     camera: CameraProspects | None
     seconds: float
@@ -86,16 +86,16 @@ class Plan:
         return int((~self.stored.check).sum())
 
     @property
-    def checks(self) -> int:
+    def check_poses(self) -> int:
         """Number of poses to test the calibration with."""
         return int(self.stored.check.sum())
 
     @property
-    def weak(self) -> tuple[str, ...]:
+    def main_error_sources(self) -> tuple[str, ...]:
         """Groups of unknowns that will remain uncertain, and the contribution of each to the expected error."""
         return tuple(
             f"{error.name}: {error.rms * 1e3:.3f} mm, {100 * error.share:.0f} % of the variance"
-            for error in self.remaining
+            for error in self.error_sources
             if error.share >= _MIN_WEAK_SHARE
         )
 
@@ -104,7 +104,7 @@ class Plan:
         last, settings = self.curve[-1], self.stored.settings
         return {
             "poses": self.poses,
-            "check_poses": self.checks,
+            "check_poses": self.check_poses,
             "criterion": settings.criterion,
             "candidates": len(self.candidates.q),
             "refused": dict(self.candidates.refused.most_common()),
@@ -120,10 +120,10 @@ class Plan:
                 for point in self.curve
             ],
             "limit_mm": settings.limit_mm,
-            "poses_needed": self.needed,
-            "minutes": self.travel / 60,
+            "poses_needed": self.poses_needed,
+            "minutes": self.duration / 60,
             "way_points": sum(map(len, self.stored.waypoints)),
-            "weak": list(self.weak),
+            "main_error_sources": list(self.main_error_sources),
             "warnings": list(self.warnings),
             **({} if self.camera is None else {"camera": self.camera.to_json()}),
             "seconds": self.seconds,

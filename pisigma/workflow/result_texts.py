@@ -46,7 +46,10 @@ def plan_text(planned: Plan, files: Sequence[Path]) -> ResultText:
     ]
     title = "expected errors of the tool position by number of poses"
     short = rows if len(rows) <= MAX_POINTS else [*rows[:: -(-len(rows) // MAX_POINTS)], rows[-1]]
-    weak = ["Main contributions to the expected error:", *(f"- {line}" for line in planned.weak)]
+    weak = [
+        "Main contributions to the expected error:",
+        *(f"- {line}" for line in planned.main_error_sources),
+    ]
     points = sum(map(len, planned.stored.waypoints))
     lines = [planned.candidates.sentence, f"The poses are joined with {count_text(points, 'waypoint')}."]
     return ResultText(
@@ -70,13 +73,13 @@ def _plan_verdict(planned: Plan, file: Path) -> Verdict:
     """Return the verdict on the expected accuracy of a calibration with the poses."""
     last, settings, warnings = planned.curve[-1], planned.stored.settings, planned.warnings
     cautions = f"with caution ({count_text(len(warnings), 'warning')})" if warnings else "yes"
-    checked = f"; {count_text(planned.checks, 'pose')} will check it" if planned.checks else ""
+    checked = f"; {count_text(planned.check_poses, 'pose')} will check it" if planned.check_poses else ""
     more = "" if planned.curve[0].poses else "more "
     return Verdict(
         f"{rounded(last.rms * 1e3)} mm RMS and {rounded(last.p95 * 1e3)} mm (95 %) expected for the tool position "
         f"with {planned.poses} {more}poses; {rounded(last.random_rms * 1e3)} mm RMS with random poses.",
         f"{cautions}, if the sensor scatters as stated{checked}.",
-        f"measure the poses, about {planned.travel / 60:.0f} min at {settings.speed_deg_s:g} deg/s and "
+        f"measure the poses, about {planned.duration / 60:.0f} min at {settings.speed_deg_s:g} deg/s and "
         f"{settings.settling_s:g} s per pose, with `pisigma measure {file} --rows ROWS.csv`.",
     )
 
@@ -90,12 +93,14 @@ def _curve_lines(planned: Plan) -> list[str]:
             "Criterion D determines all unknowns of the robot and need not lower the error of the tool's position; use "
             "criterion I for that."
         )
-    if limit is not None and planned.needed is None:
+    if limit is not None and planned.poses_needed is None:
         lines.append(
             f"More than {planned.poses} poses are needed to keep 95 % of the errors below {limit:g} mm."
         )
     elif limit is not None:
-        needed = f"with {planned.needed} poses" if planned.needed else "already, without more poses"
+        needed = (
+            f"with {planned.poses_needed} poses" if planned.poses_needed else "already, without more poses"
+        )
         lines.append(f"95 % of the errors are expected below {limit:g} mm {needed}.")
     return lines
 

@@ -119,7 +119,7 @@ class Verification:
             "rows": self.rows,
             "frame_fitted": self.settings.fit_frame,
             "tool_fitted": self.settings.fit_tool,
-            "explained_better": self.accepted,
+            "accepted": self.accepted,
             "verdict": self.verdict,
             "sentence": self.sentence,
             "ratio": None if np.isnan(self.ratio) else self.ratio,

@@ -105,7 +105,7 @@ def test_corners_show_whether_a_model_still_holds(run, files, calibrated):
         ("unchanged", False),
         ("moved", True),
     ]
-    assert any("--camera" in sentence for sentence in result["says"])
+    assert any("--camera" in sentence for sentence in result["summary"])
 
 
 def test_corners_are_compared_for_two_models_and_reported(run, refuses, files, calibrated):

@@ -30,7 +30,7 @@ def test_json_has_the_figures_of_the_plan(folder):
     assert {"poses", "rms_mm", "random_rms_mm"} <= set(printed["curve"][0])
     assert 0.5 < printed["minutes"] < 10
     assert printed["criterion"] == "I"
-    assert printed["weak"]
+    assert printed["main_error_sources"]
 
 
 def test_the_terminal_shows_a_table_and_the_remaining_uncertainty(run, folder):

@@ -35,7 +35,7 @@ def test_measurements_that_are_explained_better(run, models, files):
     assert result.exit_code == 0
     assert result.stderr == ""
     printed = json.loads(result.stdout)
-    assert printed["explained_better"] is True
+    assert printed["accepted"] is True
     assert printed["verdict"] == "better"
     assert printed["setup_faults"] == []
     assert [model["name"] for model in printed["models"]] == ["nominal", "corrected"]
@@ -54,7 +54,7 @@ def test_the_nominal_robot_ends_with_status_3(run, models, files):
     result = run("verify", models / "kiro3", files / "nominal.csv", "--json")
     assert result.exit_code == 3
     printed = json.loads(result.stdout)
-    assert printed["explained_better"] is False
+    assert printed["accepted"] is False
     assert printed["setup_faults"][0]["kinds"] == ["correction"]
     assert result.stderr == f"pisigma: {printed['sentence']}\n"
     assert printed["verdict"] == "not_better"

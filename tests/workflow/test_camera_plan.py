@@ -29,7 +29,7 @@ def planned(settings: PlanSettings) -> Plan:
 def test_every_planned_pose_sees_the_board(planned: Plan, settings: PlanSettings):
     arm, camera = planned.stored.arm, settings.camera
     assert camera is not None
-    assert planned.poses + planned.checks == len(planned.stored.q) >= 14
+    assert planned.poses + planned.check_poses == len(planned.stored.q) >= 14
     radius = arm.capsules.radius.numpy()
     assert all(sees_board(arm, camera, q, radius) for q in planned.stored.q.numpy())
     assert bool(arm.faults(planned.stored.q).allowed.all())

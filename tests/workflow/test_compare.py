@@ -45,7 +45,7 @@ def test_the_report_is_whole(compared):
     theta = next(one for one in report["parameters"] if one["name"] == "theta_3")
     assert_close(theta["shift_deg"], 0.1, atol=0.005)
     assert theta["p"] < 1e-6
-    assert "joint 3" in report["says"][0]
+    assert "joint 3" in report["summary"][0]
     assert report["rows"]["better"] == "rows_61"
 
 

@@ -57,7 +57,7 @@ def test_a_collision_calls_for_action():
     assert moved[0]["interval"][0] < 0.25 < moved[0]["interval"][1]
     assert report["sessions"][1]["recalibrate"]
     assert report["forecast"]["passed"]
-    assert any("pisigma recalibrate" in line for line in report["says"])
+    assert any("pisigma recalibrate" in line for line in report["summary"])
     settings = MonitorSettings(dates=("2026-03-01", "2026-02-01"))
     repaired = monitor(
         original_model(), [rows_after_change(10, 30), rows_after_change(10, 31, COLLISION)], settings

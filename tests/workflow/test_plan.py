@@ -61,13 +61,13 @@ def test_more_poses_lower_the_expected_error(planned: Plan):
     assert [point.poses for point in planned.curve] == [10, 11]
     assert planned.curve[0].rms > planned.curve[1].rms > 0
     assert planned.curve[1].random_rms > planned.curve[1].rms
-    assert planned.needed is not None
+    assert planned.poses_needed is not None
     assert (
         planned.curve[-1].rms < planned.curve[-1].p95 < 2e-3
     )  # as in a session, 95 % of the errors keep the limit
-    assert 1 <= planned.needed <= 11
-    assert planned.travel > 14 * 3.0
-    assert planned.weak
+    assert 1 <= planned.poses_needed <= 11
+    assert planned.duration > 14 * 3.0
+    assert planned.main_error_sources
 
 
 def test_the_measured_plan_is_a_measurement_file(planned: Plan, tmp_path: Path):
@@ -95,7 +95,7 @@ def test_existing_measurements_are_used(planned: Plan, tmp_path: Path):
     with no_type_checker():
         more = plan("fanuc_r2000", settings, CELL)
     assert [point.poses for point in more.curve] == [0, 2]
-    assert more.checks == 0
+    assert more.check_poses == 0
 
 
 @pytest.mark.parametrize(

@@ -28,7 +28,7 @@ class MeasuredAccuracy:
         rows: number of rows.
         fitted: "base" or "tool" or both, if they were changed after the calibration and therefore fitted to the rows.
         errors: position errors of the model in use [mm].
-        doubt: reason why the rows must not be trusted; empty if they can be trusted.
+        distrust_reason: reason why the rows must not be trusted; empty if they can be trusted.
     """
 
     session: str
@@ -36,7 +36,7 @@ class MeasuredAccuracy:
     rows: int
     fitted: tuple[str, ...]
     errors: QuantityErrors
-    doubt: str = ""
+    distrust_reason: str = ""
 
     @property
     def coordinate_p95_mm(self) -> float:
@@ -52,7 +52,7 @@ class MeasuredAccuracy:
             "fitted": list(self.fitted),
             "position_mm": dict(self.errors.statistics),
             "axes_mm": {name: dict(axis) for name, axis in self.errors.axes.items()},
-            "doubt": self.doubt,
+            "distrust_reason": self.distrust_reason,
         }
 
 

@@ -38,7 +38,7 @@ class ParameterDifference:
             without posteriors, or if the parameter moves the tool in the same way as those parameters.
         deviation: standard deviation of the shift.
         p: probability of a shift at least this large by chance, times the number of tested parameters (Bonferroni).
-        alike: names of parameters with the same effect on the tool.
+        equivalent: names of parameters with the same effect on the tool.
     """
 
     name: str
@@ -49,7 +49,7 @@ class ParameterDifference:
     shift: float | None = None
     deviation: float | None = None
     p: float | None = None
-    alike: tuple[str, ...] = ()
+    equivalent: tuple[str, ...] = ()
 
     @property
     def difference(self) -> float:
@@ -139,7 +139,7 @@ def _tested(
         shift=shift * factor,
         deviation=deviation * factor,
         p=min(chance, 1.0),
-        alike=tuple(parameters[one].name for one in alike if one < len(parameters)),
+        equivalent=tuple(parameters[one].name for one in alike if one < len(parameters)),
     )
 
 

@@ -39,21 +39,21 @@ class Difference:
 
     Attributes:
         shift: difference with its name, such as "joint 3" or "a_2"; a joint zero counts in the joint's direction.
-        alike: names of parameters with the same effect on the tool, which may differ instead.
+        equivalent: names of parameters with the same effect on the tool, which may differ instead.
     """
 
     shift: Movement
-    alike: tuple[str, ...]
+    equivalent: tuple[str, ...]
 
     @property
     def sentence(self) -> str:
         """Clause, such as "joint 3 by 0.25 ± 0.01 deg"."""
-        alike = f" (or, equivalently, {' or '.join(self.alike)})" if self.alike else ""
+        alike = f" (or, equivalently, {' or '.join(self.equivalent)})" if self.equivalent else ""
         return f"{self.shift.what}{alike} by {self.shift.size}"
 
     def to_json(self) -> dict[str, object]:
         """Return plain values; see `Movement.to_json`."""
-        return {**self.shift.to_json(), "alike": list(self.alike)}
+        return {**self.shift.to_json(), "equivalent": list(self.equivalent)}
 
 
 class ParameterEffects:

@@ -71,7 +71,7 @@ class FleetStatus:
         return {
             "today": datetime.date.today().isoformat(),
             "states": {state: list(cells) for state, cells in self.states.items()},
-            "worst": [
+            "largest_errors": [
                 {"cell": one.name, "rms_mm": check.rms_mm, "command": check.command}
                 for one, check in self.by_error
             ],

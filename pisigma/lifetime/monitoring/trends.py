@@ -65,7 +65,12 @@ class Trend:
     def to_json(self) -> dict[str, Any]:
         """Return slope and interval as plain values."""
         slope = {f"{self.unit}_per_{self.over}": self.slope}
-        return {"what": self.what, **slope, "interval": list(self.interval), "clear": self.is_significant}
+        return {
+            "what": self.what,
+            **slope,
+            "interval": list(self.interval),
+            "is_significant": self.is_significant,
+        }
 
 
 @dataclass(frozen=True)
@@ -79,7 +84,7 @@ class Jump:
         deviation: standard deviation of the size [`unit`].
         before: date of the last session before the jump.
         after: date of the first session after the jump.
-        alone: whether only that session deviates.
+        is_single_session: whether only that session deviates.
     """
 
     what: str
@@ -88,13 +93,13 @@ class Jump:
     deviation: float
     before: str
     after: str
-    alone: bool = False
+    is_single_session: bool = False
 
     @property
     def sentence(self) -> str:
         """Sentence that states the change."""
         half = NORMAL_95 * self.deviation
-        if self.alone:
+        if self.is_single_session:
             return f"{self.what} deviated by {self.size:.4f} ± {half:.4f} {self.unit} on {self.after} only"
         return f"{self.what} jumped by {self.size:.4f} ± {half:.4f} {self.unit} between {self.before} and {self.after}"
 
@@ -106,7 +111,7 @@ class Jump:
             f"deviation_{self.unit}": self.deviation,
             "before": self.before,
             "after": self.after,
-            "alone": self.alone,
+            "is_single_session": self.is_single_session,
         }
 
 

@@ -198,7 +198,7 @@ class SessionState:
             if following is None
             else {
                 "number": following.number,
-                "of": following.count,
+                "count": following.count,
                 "set": "test" if following.check else "train",
                 "joints": self.in_file_units(following.controller_values),
             },

@@ -199,12 +199,12 @@ class ReportContent:
             "limit": {
                 "noise_rms_mm": self.limit.noise,
                 "share": self.limit.scatter_share,
-                "says": self.verdict.limit if self.accuracies else say("limit", self.limit)[0],
+                "summary": self.verdict.limit if self.accuracies else say("limit", self.limit)[0],
             },
             "accuracy": [
                 {
-                    "of": TITLES[one.origin],
-                    "how": rows_text(one),
+                    "title": TITLES[one.origin],
+                    "summary": rows_text(one),
                     "held_out": one.held_out,
                     "rows": one.rows,
                     "models": {name: figures.figures_by_name for name, figures in one.models.items()},
@@ -214,14 +214,16 @@ class ReportContent:
             "rows": None
             if rows is None
             else {"count": rows.measurements.rows, "origin": rows.origin, "remarks": list(self.remarks)},
-            "residuals": [{"over": one.title, "says": dependence_text(one)} for one in self.dependences],
+            "residuals": [
+                {"variable": one.title, "summary": dependence_text(one)} for one in self.dependences
+            ],
             "frames": [asdict(one) for one in self.frames.names],
             "targets": [asdict(one) for one in self.targets.names],
             "not_identified": list(self.not_identified),
             "observability": {} if self.summary is None else asdict(self.summary.observability),
             "correlated": [list(pair) for pair in self.correlations.pairs],
             "advice": list(self.advice),
-            "missing": list(self.missing),
+            "limitations": list(self.missing),
             "provenance": dict(self.provenance),
         }
         plain: dict[str, Any] = _finite(values)

@@ -102,7 +102,7 @@ def map_data(error_map: ErrorMap, robot: Robot) -> dict[str, Any]:
                 "label": LAYER_LABELS[layer.key],
                 "unit": layer.unit,
                 "values": _packed(layer.values),
-                "says": layer_text(layer, error_map),
+                "summary": layer_text(layer, error_map),
             }
             for layer in error_map.layers
         ],

@@ -194,7 +194,7 @@
       if (!counts[k]) line.className = "empty";
       body.append(line);
     }
-    byId("says").textContent = layer.says;
+    byId("layer-summary").textContent = layer.summary;
   };
   const tell = (i) => {
     const panel = byId("point");

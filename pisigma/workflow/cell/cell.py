@@ -159,7 +159,7 @@ class Cell:
         with self.history.database.transaction():  # so that no other process chooses the same name
             path = free_path(self.folder / PLANS, datetime.date.today().isoformat(), ".csv")
             planned.save(path, programs)
-        made = f"plan '{path.stem}' of {planned.poses + planned.checks} poses"
+        made = f"plan '{path.stem}' of {planned.poses + planned.check_poses} poses"
         of = "" if entry is None else entry.name
         self.history.add(Check("plan", of, "", "planned", made, None, False, now()))
         return planned, path

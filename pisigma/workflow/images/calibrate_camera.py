@@ -113,7 +113,7 @@ class CameraCalibration:
             ],
             "noise_px": calibration.noise,
             "disagreement": calibration.disagreement,
-            "covered": float(calibration.covered.mean()),
+            "covered_share": float(calibration.covered.mean()),
             "tilts_deg": np.rad2deg(calibration.tilts).tolist(),
             **self.detection.to_json(),
             "sentences": list(self.sentences),

@@ -59,7 +59,7 @@ def test_parameters_equivalent_to_base_and_tool_have_no_shift():
     by_name = {one.name: one for one in parameters}
     for name in ("theta_1", "d_1", "theta_6", "d_6", "a_6", "alpha_6"):
         assert by_name[name].shift is None
-    assert by_name["d_2"].alike == ("d_3", "d_4")  # along parallel axes
+    assert by_name["d_2"].equivalent == ("d_3", "d_4")  # along parallel axes
 
 
 def test_a_nominal_robot_has_no_uncertainty():

@@ -73,7 +73,7 @@ def test_the_last_error_of_each_model_is_used(fleet):
 def test_all_figures_are_json(fleet):
     printed = fleet.to_json()
     assert [one["cell"] for one in printed["unreadable"]] == ["broken", "negative"]
-    assert printed["worst"][0] == {"cell": "moved", "rms_mm": 0.8, "command": "verify"}
+    assert printed["largest_errors"][0] == {"cell": "moved", "rms_mm": 0.8, "command": "verify"}
     assert [Path(one["cell"]).name for one in printed["cells"]] == ["edited", "measured", "moved", "new"]
 
 

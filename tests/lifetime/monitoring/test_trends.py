@@ -78,7 +78,9 @@ def test_jumps_and_outliers_are_distinguished_from_a_drift(off, changes, per_mon
     for month, size in off.items():
         made[month].zeros.shift[0] += math.radians(size)
     found = jumps_of(REVOLUTE, made)
-    assert [(one.what, one.after, one.alone) for one in found] == [("joint 1", *one[:2]) for one in changes]
+    assert [(one.what, one.after, one.is_single_session) for one in found] == [
+        ("joint 1", *one[:2]) for one in changes
+    ]
     for one, (_, _, size) in zip(found, changes, strict=True):
         assert_close(one.size, size, atol=0.012)
     clear = [one for one in trends_of(REVOLUTE, made) if one.is_significant]

@@ -324,7 +324,7 @@ def test_a_report_names_one_first_cause(hybrid, tmp_path):
     fault = Diagnostic(kind="setup_fault", severity="implausible", sentence="Joint 2 counts the other way.")
     content = report_content(hybrid[1], tmp_path, rows, diagnostics=(fault,))
     assert content.verdict.limit == content.advice[0] == content.remarks[0] == fault.sentence
-    assert content.to_json()["limit"]["says"] == fault.sentence
+    assert content.to_json()["limit"]["summary"] == fault.sentence
     plain = report_content(hybrid[1], tmp_path, rows)
     assert len(content.verdict.sentence) < len(plain.verdict.sentence)
 
