@@ -1,1 +1,1 @@
-"""Calibrated models for controllers and clients: files that others read, and a server."""
+"""Calibrated models for controllers and clients: files that other programs read, and a server."""

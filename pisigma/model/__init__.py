@@ -1,1 +1,1 @@
-"""Calibrated models: predictions, domain, predicted accuracy, folders and corrected inverse kinematics."""
+"""Calibrated models: predictions, domain, predicted accuracy, folders, and corrected inverse kinematics."""

@@ -21,9 +21,10 @@ def position_accuracy(
     """Compute the standard deviation of the tool's predicted position [m], `sqrt(σx² + σy² + σz²)`.
 
     Args:
-        model: calibrated model; the position is the position of its first target in its first frame.
+        model: calibrated model; the position is that of its first target in its first frame.
         q: commanded joint values [rad or m].
-        approach: +1 or -1 for the direction of approach of every joint, 0 if it is not known; None for all joints.
+        approach: +1 or -1 for the direction of approach of every joint, 0 if it is unknown; None if unknown for all
+            joints.
 
     Returns:
         The standard deviation of every pose; NaN where a joint value is NaN, and everywhere if the model has no
@@ -57,8 +58,8 @@ def position_accuracy(
 def deviation_of_rows(model: CalibratedModel, measurements: Measurements) -> Float64[Tensor, "rows 3"]:
     """Compute the standard deviation of every row's target position along the axes of its frame [m].
 
-    It is the standard deviation of the posterior and of row data that are not stated, such as directions of approach,
-    without measurement noise, inside and outside the measured joint values.
+    It includes the posterior and the effect of conditions that the rows do not state, such as directions of approach,
+    but no measurement noise, both inside and outside the measured joint values.
 
     Returns:
         The standard deviations; NaN if the model has no uncertainty.
@@ -78,8 +79,8 @@ def parameter_posterior(model: CalibratedModel) -> ParameterPosterior | None:
     """Return the joint posterior of all geometric parameters, in the user's coordinates.
 
     Returns:
-        Geometry, bases, tools and unknown sensor parameters with all their correlations, including correlations with
-        the weights of the joint correction; None if the model has no uncertainty.
+        Geometry, bases, tools and unknown sensor parameters with all their correlations, including those with the
+        weights of the joint correction; None if the model has no uncertainty.
     """
     known = model.uncertainty
     return (

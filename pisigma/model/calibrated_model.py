@@ -34,7 +34,7 @@ Frames = dict[str, Float64[np.ndarray, " 6"]]
 CHUNK = 4_096
 """Number of poses whose features are in memory at a time; each has a few hundred feature columns per joint."""
 _DIFFERENCE_STEP = 1e-5
-"""Step of central differences [rad or m]; for a correction with 100 cycles per turn the error is 1e-6 of the slope."""
+"""Step of central differences [rad or m]; for a correction with 100 cycles per turn, the error is 1e-6 of the slope."""
 
 
 @dataclass(frozen=True)
@@ -124,7 +124,7 @@ class CalibratedModel:
 
     @property
     def identified(self) -> Robot:
-        """Robot with the best known geometry: of the hybrid, otherwise `calibrated`, otherwise the nominal robot."""
+        """Robot with the best known geometry: that of the hybrid, or else of `calibrated`, or else nominal."""
         return self.calibrated or self.robot if self.hybrid is None else self.hybrid.robot
 
     @property
@@ -137,7 +137,7 @@ class CalibratedModel:
     def correction(
         self, T: Float64[Tensor, "*batch 4 4"], q_nominal: Float64[Tensor, "*batch dof"]
     ) -> Float64[Tensor, "*batch dof"]:
-        """Compute the correction [rad or m] that `network` adds to nominal joint values of poses T, otherwise 0."""
+        """Compute the correction [rad or m] that `network` adds to nominal joint values of poses T; 0 if it is None."""
         if self.network is None:
             return torch.zeros_like(q_nominal)
         with torch.no_grad():
@@ -153,7 +153,7 @@ class CalibratedModel:
     def forward(self, q: Float64[Tensor, "*batch dof"]) -> Float64[Tensor, "*batch 4 4"]:
         """Predict the pose T_base_tool that the robot takes when commanded to q [rad or m].
 
-        With an identified geometry this is the forward kinematics, including the joint correction of a hybrid.
+        With an identified geometry, this is the forward kinematics, including the joint correction of a hybrid.
         Otherwise it is the pose whose corrected joint values are q, see `nominal_joints`.
 
         Returns:
@@ -191,7 +191,8 @@ class CalibratedModel:
         """Solve `q_nominal = q - Δ(FK(q_nominal), q_nominal)` [rad or m] by fixed-point iteration.
 
         Returns:
-            Joint values that `network` corrects to q: NaN where the iteration does not converge, q without a network.
+            Joint values that `network` corrects to q: NaN where the iteration does not converge; q if there is no
+            network.
         """
         q_nominal, moved = q, torch.zeros_like(q)
         for _ in range(FORWARD_ITERATIONS if self.network is not None else 0):
@@ -214,7 +215,7 @@ def poses_of_rows(model: CalibratedModel, measurements: Measurements) -> Float64
 
     Raises:
         MeasurementError: the model was not calibrated for a frame or target of the rows.
-        PoseError: the number of joint values is not the number of the robot's joints.
+        PoseError: the number of joint values differs from the robot's number of joints.
     """
     arm = model.hybrid
     if arm is not None:
@@ -225,7 +226,7 @@ def poses_of_rows(model: CalibratedModel, measurements: Measurements) -> Float64
 
 
 def nominal_poses_of_rows(model: CalibratedModel, measurements: Measurements) -> Float64[Tensor, "rows 4 4"]:
-    """Predict the poses of the rows without any correction, from the nominal arm with fitted bases and tools.
+    """Predict the poses of the rows without any correction, with the nominal arm and fitted bases and tools.
 
     It raises the same errors as `poses_of_rows`.
     """
@@ -236,7 +237,7 @@ def nominal_poses_of_rows(model: CalibratedModel, measurements: Measurements) ->
 def geometric_poses(
     model: CalibratedModel, q: Float64[Tensor, "*batch rows dof"], measurements: Measurements
 ) -> Float64[Tensor, "*batch rows 4 4"]:
-    """Predict the poses of rows at other joint values q [rad or m] by the identified geometry alone.
+    """Predict the poses of rows at other joint values q [rad or m] with the identified geometry alone.
 
     It raises the same errors as `poses_of_rows`.
     """
@@ -253,7 +254,7 @@ def bases_of_rows(model: CalibratedModel, measurements: Measurements) -> Float64
 def known_names(
     known: Frames, names: tuple[str, ...], what: str, measurements: Measurements
 ) -> tuple[str, ...]:
-    """Return the frame or target of every row, by the name that the model uses for it.
+    """Return the name that the model uses for the frame or target of every row.
 
     A model that was fitted to rows without names accepts rows with any single name, and a model that was fitted to a
     single name accepts rows without names.
@@ -314,7 +315,7 @@ def _seen(
 def _of_rows(
     known: Frames, names: tuple[str, ...], what: str, measurements: Measurements
 ) -> Float64[Tensor, "rows 4 4"] | None:
-    """Return the base or tool of every row; None if the model has only one, which the robot already includes."""
+    """Return the base or tool of every row; None if the model has only one, which the robot already contains."""
     names = known_names(known, names, what, measurements)
     if len(known) < 2:
         return None
@@ -349,8 +350,8 @@ def hybrid_motion(
     Args:
         arm: arm with its joint correction.
         q: commanded joint values [rad or m].
-        exact: whether to include dΔ/dq, which costs several evaluations of Δ. Without it every Newton step reduces the
-            error by a factor |dΔ/dq|, of the order of 1e-2.
+        exact: whether to include dΔ/dq, which costs several evaluations of Δ. Without it, every Newton step multiplies
+            the error by |dΔ/dq|, of the order of 1e-2.
     """
     chunk = CHUNK // (2 * q.shape[1]) if exact else CHUNK
     with torch.no_grad():

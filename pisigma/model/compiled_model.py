@@ -28,7 +28,7 @@ _NUMERIC = ("numeric",)
 _Input = tuple[int, list[float]]
 _Member = tuple[JointGroup, PiSigma]
 _COARSE = 0.01
-"""Share of the largest range of a coordinate below which a coordinate hardly contributes to distances."""
+"""Share of the largest range of any coordinate below which a coordinate hardly contributes to distances."""
 _FUNCTIONS = {"": arrays.ANGLE, "sin": arrays.SINE, "cos": arrays.COSINE}
 
 
@@ -38,7 +38,7 @@ def save_compiled(model: CalibratedModel, file: str | os.PathLike[str], belongs_
     Args:
         model: model to convert.
         file: file to write.
-        belongs_to: `content_hash` of the model folder, which is stored in the file; a file with another hash is out
+        belongs_to: `content_hash` of the model folder, which is stored in the file; a file with a different hash is out
             of date.
 
     Raises:
@@ -61,9 +61,9 @@ def describe_as_arrays(model: CalibratedModel) -> tuple[arrays.Description, tupl
     """Return a model as arrays, and the names of its branches.
 
     Raises:
-        ModelError: the model has a network and an identified geometry, its learned correction uses features without
-            compiled form, it has neither a closed-form inverse nor initial joint values, or its joints are coupled
-            (kernels take DH values, which must not be commanded to a controller).
+        ModelError: the model has both a network and an identified geometry, its learned correction uses features
+            without a compiled form, it has neither a closed-form inverse nor initial joint values, or its joints are
+            coupled (kernels use DH values, which must not be commanded to a controller).
     """
     if model.robot.dof > MAX_JOINTS:
         raise ModelError(
@@ -205,7 +205,7 @@ def _closed_form(model: CalibratedModel, solver: AbstractClosedForm | None) -> a
 
 
 def _network(model: CalibratedModel) -> arrays.Network:
-    """Return the network of a model and its domain as arrays; without a network the result is marked as unused."""
+    """Return the network of a model and its domain as arrays; without a network, the result is marked as unused."""
     dof = model.robot.dof
     members = model.network.members() if model.network else []
     inputs = [_input(group, name) for group, _ in members for name in group.inputs.names]
@@ -259,7 +259,7 @@ class _Domain(NamedTuple):
 
     @staticmethod
     def from_model(model: CalibratedModel, inputs: Sequence[_Input], members: Sequence[_Member]) -> "_Domain":
-        """Return the samples of a model's domain; without a domain the result has no rows."""
+        """Return the samples of a model's domain; without a domain, the result has no rows."""
         none = np.zeros(0, dtype=np.int64)
         if model.network is None or model.domain is None:
             return _Domain(np.zeros((0, 0)), none, np.zeros(0), 0)

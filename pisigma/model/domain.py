@@ -6,7 +6,7 @@ from torch import Tensor, nn
 
 MAX_SAMPLES = 2048
 MARGIN = 1.05
-"""Factor between the radius of a domain and the largest distance between neighbouring training rows."""
+"""Ratio of the radius of a domain to the largest distance between neighbouring training rows."""
 
 REPEAT = 1e-3
 """Distance in scaled inputs from -1 to 1 below which training rows are treated as repeats of one measurement."""
@@ -15,7 +15,7 @@ _CHUNK = 4096
 
 
 class Domain(nn.Module):
-    """Region of the network's scaled inputs that the training rows cover.
+    """Region of the network's scaled inputs that is covered by the training rows.
 
     The measure of a pose is its distance from the nearest training row divided by `radius`, which is the largest
     distance of a training row from its nearest neighbour plus 5 % (repeats are not neighbours). A pose with a

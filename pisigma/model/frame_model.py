@@ -1,4 +1,4 @@
-"""Model of a robot or model whose base, tool or both were calibrated with its arm as given."""
+"""Model of a robot or model whose base, tool or both were calibrated with the arm held fixed."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -30,12 +30,12 @@ _KIND = "frame_calibration"
 
 @dataclass(frozen=True, eq=False)
 class FittedFrames:
-    """Frames that were fitted with the arm of a robot or model.
+    """Frames that were fitted with the arm of a robot or model held fixed.
 
     Attributes:
         fit: the fit.
         model: model with the fitted frames.
-        arm_root: root of the covariance of the fitted coordinates by the uncertainty of the arm [m and rad], in the
+        arm_root: root of the covariance of the fitted coordinates due to the uncertainty of the arm [m and rad], in the
             directions of the root of the model whose arm was used.
         causes: possible causes of the residuals of a hand-eye calibration; see `misfit_causes`.
     """
@@ -47,12 +47,12 @@ class FittedFrames:
 
     @property
     def arm_variance(self) -> tuple[float, ...]:
-        """Variance of every fitted coordinate by the uncertainty of the arm [m² or rad²]."""
+        """Variance of every fitted coordinate due to the uncertainty of the arm [m² or rad²]."""
         return tuple(self.arm_root.square().sum(1).tolist())
 
 
 def frames_of_robot(robot: Robot, rows: Measurements, only: FrameChoice) -> FittedFrames:
-    """Fit frames with the arm of a robot as drawn; for the errors see `fit_frames`."""
+    """Fit frames with the arm of a nominal robot; for the errors see `fit_frames`."""
     fit = fit_frames(robot, rows, only)
     model = model_of_calibration(robot.name, robot, fit.solved.result(), rows)
     return FittedFrames(fit, replace(model, kind=_KIND), _exact_arm(fit), misfit_causes(fit))
@@ -65,13 +65,13 @@ def frames_of_model(model: CalibratedModel, rows: Measurements, only: FrameChoic
     everything else is kept. Its uncertainty includes that of the fitted frames, which depend on the arm's errors.
 
     Args:
-        model: model with an identified or the nominal geometry.
+        model: model with identified or nominal geometry.
         rows: rows; the names of frames or targets that are not fitted are those of the model.
         only: what to fit.
 
     Raises:
         ModelError: a network corrects the nominal joint values of the model's poses, which depend on base and tool.
-        MeasurementError: the model does not have a frame or target of the rows that is not fitted.
+        MeasurementError: the model lacks a frame or target of the rows that is not fitted.
         IdentificationError: see `fit_frames`.
         PoseError: the joint values do not fit the robot.
     """
@@ -106,7 +106,7 @@ def _exact_arm(fit: FrameFit) -> Float64[Tensor, "frames directions"]:
 
 
 def _arm_root(known: ArmUncertainty, fit: FrameFit) -> Float64[Tensor, "frames directions"]:
-    """Return a root of the covariance of the fitted coordinates by everything that was not fitted.
+    """Return a root of the covariance of the fitted coordinates due to everything that was not fitted.
 
     An error δ of the arm changes the predicted values by `X_arm δ`, and least squares moves the fitted directions by
     `-(X^T X)^-1 X^T X_arm δ`.
@@ -163,7 +163,7 @@ def _with_first(robot: Robot, frames: Mapping[str, Frames]) -> Robot:
 
 
 def _moved_along(kind: str, geometric: Robot, before: Robot, after: Frames) -> dict[str, np.ndarray]:
-    """Move the frames of a model's geometric part as the hybrid's frames moved."""
+    """Move the frames of a model's geometric part in the same way as the hybrid's frames."""
     T, was = (
         transform_from_xyzrpy(torch.tensor(one.base if kind == "bases" else one.tool))
         for one in (geometric, before)

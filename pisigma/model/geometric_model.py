@@ -34,7 +34,7 @@ def model_of_calibration(
         nominal: nominal robot.
         result: calibration of the robot.
         measurements: rows with which the robot was calibrated.
-        recipe: name and SHA-256 of the recipe; empty texts without one.
+        recipe: name and SHA-256 of the recipe; empty texts if there is none.
     """
     made_of = stored_training_rows(nominal, measurements)
     provenance = Provenance(
@@ -99,6 +99,6 @@ def with_hybrid(model: CalibratedModel, result: HybridResult, measurements: Meas
 
 
 def branches_of(nominal: Robot, q: Float64[Tensor, "rows dof"]) -> tuple[str, ...]:
-    """Return the names of the nominal arm's branches in joint values, most frequent first; () without closed form."""
+    """Return the names of the nominal arm's branches at joint values, most frequent first; () without a closed form."""
     solver = closed_form_solver(nominal)
     return () if solver is None else solver.most_frequent_branches(nearest_branch(solver, q))

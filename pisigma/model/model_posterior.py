@@ -19,7 +19,7 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 
 FLEET_PRIOR = "fleet_prior"
-"""Kind of a model that contains the prior of a fleet: what robots of a type have in common, except base and tool."""
+"""Kind of a model that contains the prior of a fleet, which robots of a type share except for base and tool."""
 
 
 def check_fleet_prior(model: CalibratedModel) -> None:
@@ -47,8 +47,8 @@ class ModelPosterior:
         geometry: most probable values of the parameters.
         features: features of the joint correction, including products of inputs.
         weights: weights of the used columns of the features.
-        root: `R` with the covariance `R R^T`; first the rows of the parameters, in the user's coordinates, then the
-            rows of the weights.
+        root: root `R` of the covariance `R R^T`, with the rows of the parameters, in the user's coordinates, followed
+            by the rows of the weights.
         noise: noise of the sensors of the calibration.
     """
 
@@ -97,10 +97,10 @@ class ModelPosterior:
         return mean.sqrt()[number]
 
     def with_model_names(self, rows: Measurements) -> Measurements:
-        """Return rows with the model's names of frame and target, if rows or model have a single unnamed one.
+        """Return rows with the model's names of frame and target, if either has a single frame or target without name.
 
         Raises:
-            MeasurementError: the frame of the rows is a target of the model, as when a camera is wrongly taken as
+            MeasurementError: the frame of the rows is a target of the model, as when a camera is wrongly treated as
                 fixed.
         """
         crossed = {*rows.frame} & {*self.geometry.tools} - {"", *self.geometry.bases}
@@ -122,7 +122,7 @@ class ModelPosterior:
         return rows
 
     def positions_in(self, space: ParameterSpace) -> list[int]:
-        """Return the indices of the parameters in a space that contains all of their frames, targets and owners."""
+        """Return the indices of the parameters in a space that contains all their frames, targets and owners."""
         positions = list(range(self.space.arm_size))
         for group, names, among, size in (
             ("base", self.space.frames, space.frames, 6),
@@ -143,7 +143,7 @@ class ModelPosterior:
 def _weights(
     correction: JointCorrection, features: tuple[AbstractFeature, ...]
 ) -> Float64[Tensor, " weights"]:
-    """Return the weights of the used columns of all features; product units give the weights of products."""
+    """Return the weights of the used columns of all features; those of products come from product units."""
     linear = {own.name: weight for own, weight in zip(correction.features, correction.linear, strict=True)}
     blocks = [
         one.weights(correction.weight.detach())

@@ -30,9 +30,9 @@ _BEYOND = {
 }
 """Clause about the extrapolation of a model outside the measured values of a condition."""
 _MIN_TORQUES = 5
-"""Rows with a torque of a joint from which its sign and unit are compared with the calibration."""
+"""Number of rows with a torque of a joint above which its sign and unit are compared with the calibration."""
 _MAX_TORQUE_RATIO = 5.0
-"""Largest ratio of measured to modelled torques, or of modelled to measured ones, that another load explains."""
+"""Largest ratio of measured to modelled torques, or of modelled to measured torques, that a different load explains."""
 
 
 def under_stated_conditions(
@@ -41,10 +41,10 @@ def under_stated_conditions(
     """Return the model at fixed conditions, as a function of the joint values alone.
 
     See `pisigma.joint_correction.conditions.at_conditions`; constant joint shifts are added to the joint offsets of the
-    geometry. `condition_warnings` warns of conditions outside the measured range.
+    geometry. `condition_warnings` warns about conditions outside the measured range.
 
     Args:
-        model: hybrid model, calibrated on rows with columns for the conditions that are given here.
+        model: hybrid model, calibrated with rows that state the conditions given here.
         payload_kg: mass that the robot carries [kg]; None for the mean of the calibration rows.
         temperature_c: temperature of the robot [deg C]; None for the mean of the calibration rows.
 
@@ -85,7 +85,7 @@ def under_stated_conditions(
 
 
 def under_stated_torques(model: CalibratedModel, torques_nm: Sequence[float]) -> CalibratedModel:
-    """Return the model with the constant deflections of the joints by stated torques.
+    """Return the model with constant deflections of the joints due to stated torques.
 
     Args:
         model: hybrid model, calibrated on rows with joint torques.
@@ -125,7 +125,7 @@ def under_stated_torques(model: CalibratedModel, torques_nm: Sequence[float]) ->
 
 
 def condition_warnings(model: CalibratedModel, rows: Measurements | None = None) -> tuple[str, ...]:
-    """Return a warning for every condition outside the range of the calibration, and for torques unlike those of it.
+    """Return warnings about conditions outside the range of the calibration and about torques that differ from it.
 
     Args:
         model: model of any kind; only a hybrid learns the effect of conditions.
@@ -151,7 +151,7 @@ def condition_warnings(model: CalibratedModel, rows: Measurements | None = None)
 
 
 def _torque_warning(model: CalibratedModel, rows: Measurements | None) -> tuple[str, ...]:
-    """Return the warning that modelled torques are used; none if the model needs none or all rows state them."""
+    """Return the warning that modelled torques are used; empty if the model needs no torques or all rows state them."""
     learned = None if model.hybrid is None else learned_torques(model.hybrid.correction)
     if learned is None:
         return ()
@@ -174,9 +174,10 @@ def _torque_warning(model: CalibratedModel, rows: Measurements | None) -> tuple[
 
 
 def _unlike_torques(name: str, learned: JointTorques, rows: Measurements) -> tuple[str, ...]:
-    """Return a warning about torques with another sign or unit than those of the calibration.
+    """Return a warning about torques whose sign or unit differs from that of the calibration.
 
-    Measured torques are compared with the modelled ones of joints that gravity loads more than differences of the load.
+    Measured torques are compared with modelled torques of joints that gravity loads more than differences of the load
+    do.
     """
     assert rows.torque is not None
     modelled, unlike = learned.modelled(JointState(rows.q)), list[str]()
@@ -233,7 +234,7 @@ def _shifted(robot: Robot, shift: Float64[Tensor, " dof"]) -> Robot:
 
 
 def learned_range(model: CalibratedModel, condition: str) -> tuple[float, float] | None:
-    """Return the lowest and highest calibrated value of a condition that a model corrects; None without correction.
+    """Return the lowest and highest calibrated value of a condition that a model corrects; None if it does not.
 
     Args:
         model: model of any kind; only a hybrid learns the effect of conditions.

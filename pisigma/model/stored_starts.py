@@ -24,7 +24,7 @@ class StoredStarts:
         robot: robot to which the joint values belong.
         q: joint values [rad or m].
         T: poses T_base_tool [m] at these joint values.
-        lever: half the robot's reach over sqrt(2) [m], because a small rotation by φ changes R by sqrt(2) φ.
+        lever: half the robot's reach divided by sqrt(2) [m], because a small rotation by φ changes R by sqrt(2) φ.
         points: `(starts, 12)`: the poses as points, see `as_points`.
     """
 
@@ -39,11 +39,11 @@ class StoredStarts:
     def nearest(
         self, T: Float64[Tensor, "poses 4 4"], count: int, axes: TaskAxes = WHOLE
     ) -> Int64[Tensor, "poses _nearest"]:
-        """Return for every pose the indices of the starts with the nearest poses, nearest first.
+        """Return the indices of the starts with the poses nearest to every pose, nearest first.
 
         Args:
             T: target poses T_base_tool.
-            count: number of starts per pose; fewer are returned if there are fewer starts.
+            count: number of starts per pose; fewer are returned if there are not enough.
             axes: axes of the tool that are constrained.
         """
         counted = torch.tensor([True] * 3 + 3 * list(axes.directions))
@@ -53,7 +53,7 @@ class StoredStarts:
         return torch.cat(nearest)
 
     def as_points(self, T: Float64[Tensor, "poses 4 4"]) -> Float64[Tensor, "poses 12"]:
-        """Return poses as points whose distance combines the tools' distance [m] and half the reach per radian."""
+        """Return poses as points whose distances combine those of the tools [m] with half the reach per radian."""
         return torch.cat([T[:, :3, 3], self.lever * T[:, :3, :3].flatten(1)], -1)
 
 

@@ -19,7 +19,7 @@ _MAX_KEPT_ROWS = 10_000
 
 
 def stored_training_rows(robot: Robot, rows: Measurements, before: RowValues | None = None) -> RowValues:
-    """Return the values of training rows that a model stores, after its earlier training rows `before`."""
+    """Return the values of training rows that a model stores, following its earlier training rows `before`."""
     values = RowValues.from_rows(rows.as_fields(), robot)
     values = values if before is None else before + values
     count = len(values.numbers)
@@ -27,7 +27,7 @@ def stored_training_rows(robot: Robot, rows: Measurements, before: RowValues | N
 
 
 def known_rows(model: CalibratedModel, rows: Measurements) -> Bool[Tensor, " rows"]:
-    """Return the mask of training rows of the model, even if they are rounded, reordered or only a part."""
+    """Return the mask of the model's training rows, even if these are rounded, reordered or only some of them."""
     if model.made_of is None:
         whole = bool(model.provenance.data_sha256) and model.provenance.data_sha256 == rows.content_hash()
         return torch.full((rows.rows,), whole)
@@ -35,7 +35,7 @@ def known_rows(model: CalibratedModel, rows: Measurements) -> Bool[Tensor, " row
 
 
 def without_known_rows(model: CalibratedModel, rows: Measurements) -> tuple[Measurements, tuple[str, ...]]:
-    """Return the rows without training rows of the model, and warnings that name these.
+    """Return the rows without training rows of the model, and warnings that list the latter.
 
     Raises:
         MeasurementError: all rows are training rows of the model.
@@ -69,14 +69,14 @@ def training_row_warnings(
 ) -> tuple[str, ...]:
     """Return a warning if rows on which a model is evaluated are among its training rows; empty otherwise.
 
-    A model stores joint values and readings of its rows. A model of an earlier version stores only a hash of all
-    rows and the joint values of some, so poses that were measured again are also treated as training rows.
+    A model stores joint values and readings of its rows. A model of an earlier version stores only a hash of all rows
+    and the joint values of some rows, so poses that were measured again are also treated as training rows.
 
     Args:
         model: model of any kind.
         rows: rows on which the model is evaluated.
-        file: all rows of their file, if `rows` are a part of it.
-        consequence: the consequence, as a clause of the warning.
+        file: all rows of the file, if `rows` are only some of them.
+        consequence: clause of the warning that states the consequence.
     """
     made_of = model.provenance.data_sha256
     if made_of and made_of in (whole.content_hash() for whole in (rows, file or rows)):

@@ -64,11 +64,11 @@ class Calibration(AbstractModelResult):
 
     Attributes:
         model: the calibrated model, with all figures as its metrics, as `pisigma.load` would read it.
-        result: the geometric or hybrid calibration that the model was built from.
+        result: the geometric or hybrid calibration from which the model was built.
         rows: measurements with which the model was calibrated.
-        validation: errors of held-out rows; None without a validation.
-        test: errors of the rows of the set "test"; None without rows of this set.
-        held_out: all held-out rows with their errors, as in the model folder; None without a validation.
+        validation: errors of held-out rows; None if there was no validation.
+        test: errors of the rows of the set "test"; None if there are none.
+        held_out: all held-out rows with their errors, as in the model folder; None if there was no validation.
         summary: all figures.
         texts: description of the model, and limits of its validation.
         settings: settings of the calibration; None for a recipe.
@@ -123,7 +123,7 @@ def calibrate(
 
     Raises:
         RobotError: the robot is unknown.
-        MeasurementError: the data cannot be read, or cannot be split as the settings say.
+        MeasurementError: the data cannot be read, or cannot be split as the settings require.
         IdentificationError: the data do not determine the free parameters.
     """
     started = time.perf_counter()
@@ -189,15 +189,15 @@ def compose_calibration(
 
     Args:
         calibrator: the calibrator.
-        result: its calibration.
+        result: result of the calibrator.
         rows: measurements with which the model was calibrated.
         summary: figures so far.
         texts: texts of the card.
         validation: errors of held-out rows.
         test: errors of the rows of the set "test".
-        held_out: rows of the validation whose errors the model folder stores; None stores no errors.
+        held_out: rows of the validation whose errors the model folder stores; None to store no errors.
         recipe: name and SHA-256 of the recipe; empty without a recipe.
-        found: what was found before the calibration.
+        found: findings before the calibration.
 
     Raises:
         IdentificationError: the measurements cannot come from this robot.
@@ -229,7 +229,7 @@ def compose_calibration(
 
 
 def _class_of(settings: CalibrationSettings, robot: Robot) -> RobotClass:
-    """Return the class of a robot that is stated, otherwise that of its maker."""
+    """Return the stated class of a robot, or else that of its manufacturer."""
     return CLASSES[settings.robot_class] if settings.robot_class else RobotClass.from_robot(robot)
 
 

@@ -40,9 +40,9 @@ class ComparedModels:
         settings: settings of the comparison.
         parameters: all parameters side by side, and the parameters that differ.
         workspace: distances between the tool poses of both models over the workspace.
-        rows: errors of both models on the same rows; None without rows.
-        program: distances along a program that was taught with the first model; None without a program.
-        diagnostics: why the rows must not be trusted; see `pisigma.validation.gate`.
+        rows: errors of both models on the same rows; None if no rows are given.
+        program: distances along a program that was taught with the first model; None if no program is given.
+        diagnostics: reasons why the rows must not be trusted; see `pisigma.validation.gate`.
         warnings: sentences that warn of problems.
         seconds: computing time [s].
     """
@@ -59,7 +59,7 @@ class ComparedModels:
 
     @property
     def better(self) -> str | None:
-        """Name of the model that predicts the rows significantly better; None for neither, or untrusted rows."""
+        """Name of the model that predicts the rows significantly better; None if there is none, or untrusted rows."""
         difference = self._difference
         interval = None if difference is None else difference.intervals["rms"]
         if interval is None or interval[0] <= 0.0 <= interval[1] or self.diagnostics:
@@ -75,7 +75,7 @@ class ComparedModels:
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """Results of the comparison in sentences."""
+        """Sentences that state the results of the comparison."""
         return (
             *_parameters_in_words(self.parameters, *self.models),
             *self._displacements_in_words(),
@@ -109,7 +109,7 @@ class ComparedModels:
         Raises:
             OutputError: the page is not an .html file, or cannot be written.
         """
-        from pisigma.reporting.page.lifetime import comparison_page  # matplotlib takes a second
+        from pisigma.reporting.page.lifetime import comparison_page  # importing matplotlib takes a second
 
         check_page(Path(page))
         says = self.sentences, self.warnings
@@ -121,7 +121,7 @@ class ComparedModels:
         return None if self.rows is None else self.rows.models[1].position.difference
 
     def _displacements_in_words(self) -> tuple[str, ...]:
-        """Return a text on the distances of the tools over the workspace and along a program."""
+        """Return a text on the distances between the tools over the workspace and along a program."""
         first, second = self.models
         figures = self.workspace.errors.figures.figures_by_name
         where = " with base and tool fitted" if self.settings.frames == "fitted" else ""
@@ -138,7 +138,7 @@ class ComparedModels:
         return tuple(lines)
 
     def _rows_in_words(self) -> tuple[str, ...]:
-        """Return a text on which model predicts the rows better."""
+        """Return a text that states which model predicts the rows better."""
         difference = self._difference
         if difference is None or self.rows is None:
             return ()
@@ -171,13 +171,13 @@ def compare(
         first: a model or its folder, or "nominal" (the nominal robot) or "geometric" (the geometric part of a hybrid)
             of the other model.
         second: the model to compare with, given in the same way.
-        rows: measurements, or their file, to compare both models on. Where rows are marked, only those of the set
+        rows: measurements, or their file, on which both models are compared. If rows are marked, only those of the set
             "test" are used.
         program: file of joint values, or of poses in the base frame, that was taught with the first model.
         settings: see `ComparisonSettings`.
 
     Raises:
-        ModelError: a folder cannot be used, or the models are of different robots.
+        ModelError: a folder cannot be used, or the models belong to different robots.
         MeasurementError: rows or program cannot be used.
         PlanningError: the first model does not reach a pose of the program.
         PoseError: the joint values do not fit the robot.
@@ -209,7 +209,9 @@ def compare(
         found = [
             check_rows(right.rows, model, fitted, {"joint_zero"}).implausible for model in loaded.values()
         ]
-        diagnostics = found[0] if all(found) else ()  # rows that one model predicts are of this robot
+        diagnostics = (
+            found[0] if all(found) else ()
+        )  # rows that one of the models predicts belong to this robot
     return ComparedModels(
         models=models,
         settings=settings,
@@ -226,7 +228,7 @@ def compare(
 
 
 def _parameters_in_words(differences: ParameterDifferences, first: str, second: str) -> tuple[str, ...]:
-    """Return which parameters differ, and whether the remaining differences are significant."""
+    """Return a text on the parameters that differ, and on whether the remaining differences are significant."""
     if differences.remainder is None:
         return (
             "A model has no posterior of its parameters, so the significance of their differences is unknown; "

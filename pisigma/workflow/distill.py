@@ -1,7 +1,7 @@
 """Distil a calibrated model into a small Pi-Sigma network on nominal joint values.
 
-Jeong et al. 1998 learn `Δθ = θ_measured - θ_analytic` from measurements; here the full inverse kinematics solution of a
-model takes the role of θ_measured, for poses of a region.
+Jeong et al. 1998 learn `Δθ = θ_measured - θ_analytic` from measurements; here, the full inverse kinematics solution of
+a model takes the place of θ_measured, for poses of a region.
 """
 
 import os
@@ -47,14 +47,14 @@ from pisigma.workflow.settings.distillation import DistillationSettings
 from pisigma.workflow.solved_poses import SINGULAR_BELOW, Region, SolvedPoses, draw_solved_poses
 
 _CHOICE_SHARE, _HELD_OUT_SHARE = 0.2, 0.4
-"""Numbers of poses for model selection and for testing, relative to the number of poses to fit to."""
+"""Numbers of poses for model selection and for testing, relative to the number of fitted poses."""
 
 _MAX_ERROR_SHARE = 0.2
 """Ratio of the error of the network to the nominal error above which a warning is given."""
 
 _DOMAIN_SAMPLES = 512
 _MIN_POSES = 100
-"""Minimum number of poses to fit to."""
+"""Minimum number of fitted poses."""
 
 _MIN_ROWS_PER_JOINT = 20
 """Number of rows per joint below which a region is sparsely covered."""
@@ -62,14 +62,14 @@ _MIN_ROWS_PER_JOINT = 20
 
 @dataclass(frozen=True, eq=False)
 class Distillation(AbstractModelResult):
-    """Result of `distill`: a distilled model, and how well it approximates the full solution.
+    """Result of `distill`: a distilled model, and its deviation from the full solution.
 
     Attributes:
         model: the distilled model, with all figures as its metrics.
-        parent: the model that it was distilled from.
+        parent: the model from which it was distilled.
         region: region of the poses.
         held_out: poses that were used neither for fitting nor for model selection.
-        predicted: corrections of their nominal joint values by the network [rad or m].
+        predicted: corrections that the network adds to their nominal joint values [rad or m].
         summary: all figures.
         seconds: computing time [s].
     """
@@ -105,7 +105,7 @@ def distill(
 
     Raises:
         ModelError: the folder is not that of a model, or the model cannot be distilled.
-        IdentificationError: the robot reaches too few poses of the region, or they are too few for the network's size.
+        IdentificationError: the robot reaches too few poses of the region, or too few for the size of the network.
     """
     started, sha256 = time.perf_counter(), ""
     if isinstance(model, CalibratedModel):
@@ -246,7 +246,7 @@ def _warnings(held_out: DistilledErrors, rows: int, joints: int) -> tuple[str, .
 def _limitations(
     parent: CalibratedModel, errors: ErrorFigures, sizes: tuple[SizeFigures, ...]
 ) -> tuple[str, ...]:
-    """Return the properties of the full solution that the distilled model does not have, one sentence each."""
+    """Return the properties of the full solution that the distilled model lacks, one sentence each."""
     sentences = [
         f"Exactness: on held-out poses of the region the tool is {errors.rms_mm:.4f} mm RMS (95 % within "
         f"{errors.p95_mm:.4f} mm, at most {errors.max_mm:.4f} mm) from the position of the full solution. The "
@@ -281,7 +281,7 @@ def _limitations(
 
 
 def _without_overtones(sizes: tuple[SizeFigures, ...]) -> str:
-    """Return the error with sines and cosines of the joints only, if that was tried but not chosen."""
+    """Return the error with only sines and cosines of the joints, if this was tried but not chosen."""
     smooth = [size for size in sizes if size.harmonics == 1]
     if not smooth or any(size.kept for size in smooth):
         return ""

@@ -1,4 +1,4 @@
-"""The network that a calibrated model is distilled into: sizes, fitting, and model selection."""
+"""The network into which a calibrated model is distilled: sizes, fitting and model selection."""
 
 from dataclasses import dataclass
 
@@ -23,11 +23,11 @@ from pisigma.workflow.solved_poses import SolvedPoses
 _VALIDATION_SHARE = 0.1
 
 _OVERTONE_SCALE = 1e4
-"""Factor by which overtones are scaled down and their weights are scaled up after the fit. Overtones do not show
-where in its range a joint is, and the domain is measured in scaled inputs."""
+"""Factor by which overtones are scaled down, and their weights up, after the fit. Overtones do not show where a joint
+is within its range, and the domain is measured in scaled inputs."""
 
 _NEGLIGIBLE_ERROR = 5e-6
-"""RMS error of the tool's position [m] below which no larger size is tried: no robot repeats better."""
+"""RMS error of the tool's position [m] below which no larger size is tried, because no robot repeats better."""
 _ABOUT_AS_GOOD = 1.1
 """Largest ratio of a smaller size's error to the best error at which the smaller size is chosen."""
 _MIN_POSES_PER_UNKNOWN = 4
@@ -64,14 +64,14 @@ _RIPPLED = (
     NetworkSize((1, 2, 3), 8),
     NetworkSize((1, 2, 3), 24),
 )
-"""Sizes for models with ripple of gears and encoders as well."""
+"""Sizes for models that also have ripple of gears and encoders."""
 
 
 def sizes_for(model: CalibratedModel, poses: int) -> tuple[NetworkSize, ...]:
-    """Return the sizes to try for a model, given the number of poses to fit, in ascending order.
+    """Return the sizes to try for a model, in ascending order, given the number of poses to fit.
 
     Raises:
-        IdentificationError: the poses are too few for any size.
+        IdentificationError: there are too few poses for any size.
     """
     learned = () if model.hybrid is None else model.hybrid.correction.features
     rippled = any(features.fastest > 1 for features in learned)
@@ -98,14 +98,14 @@ def choose_network(
     search: tuple[int, int],
     progress: Progress,
 ) -> tuple[CorrectionNetwork, tuple[SizeFigures, ...]]:
-    """Return the smallest network that is about as good as the best, and the figures of all candidates.
+    """Return the smallest network that is about as good as the best one, and the figures of all candidates.
 
     Args:
         parent: the model that is distilled.
-        poses: poses with its full solutions.
-        chosen: slices of the poses to fit, and of the poses for model selection.
+        poses: poses with the full solutions of the model.
+        chosen: slices of the poses to fit and of the poses for model selection.
         sizes: sizes to fit, in ascending order.
-        search: random seed, and maximum number of iterations for a joint.
+        search: random seed, and maximum number of iterations per joint.
         progress: called with the current step.
     """
     pairs = _pairs(poses, chosen[0])
@@ -152,7 +152,7 @@ def _fit_size(
         size: size of the network.
         pairs: nominal joint values and their corrections.
         seed: random seed of the start and of the validation rows.
-        epochs: maximum number of iterations for a joint.
+        epochs: maximum number of iterations per joint.
         progress: called with the names of the joints that are fitted.
 
     Raises:
@@ -180,7 +180,7 @@ def _fit_size(
 
 
 def _sections(robot: Robot, size: NetworkSize, q: Float64[Tensor, "poses dof"]) -> list[NetworkSection]:
-    """Return one group of all joints, or one group for each joint if its overtones are inputs.
+    """Return one group of all joints, or one group per joint if overtones are inputs.
 
     Raises:
         IdentificationError: no joint moves in the region.
@@ -209,7 +209,7 @@ def _sections(robot: Robot, size: NetworkSize, q: Float64[Tensor, "poses dof"]) 
 
 @torch.no_grad()
 def _shrink_overtones(network: PiSigma, inputs: Inputs) -> None:
-    """Scale inputs with multiples of a joint's value down and their weights up, which leaves the output unchanged."""
+    """Scale inputs that are multiples of a joint's value down, and their weights up, keeping the output unchanged."""
     overtone = [max(inputs.combination(name)[1]) > 1 for name in inputs.names]
     factor = torch.where(torch.tensor(overtone), _OVERTONE_SCALE, 1.0).double()
     network.input_scale.mul_(factor)

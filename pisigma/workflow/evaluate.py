@@ -1,4 +1,4 @@
-"""Evaluate models on measurements that they were not trained on, and accept or reject them."""
+"""Evaluate models on measurements on which they were not trained, and accept or reject them."""
 
 import os
 import time
@@ -36,11 +36,11 @@ them."""
 
 @dataclass(frozen=True)
 class EvaluatedModel:
-    """An evaluated model, without its figures.
+    """Description of an evaluated model, without its figures.
 
     Attributes:
-        model: its folder, or its name.
-        kind: its kind.
+        model: folder or name of the model.
+        kind: kind of the model.
         trained_on: whether it was trained on the same rows.
     """
 
@@ -57,11 +57,11 @@ class Evaluation:
         data: file of the rows.
         rows: number of evaluated rows.
         settings: settings of the evaluation.
-        comparison: figures of every model, with confidence intervals and differences to the first.
-        evaluated: the models by their names in the comparison, without the references.
+        comparison: figures of every model, with confidence intervals and differences from the first model.
+        evaluated: the models, without the references, by their names in the comparison.
         missed: limits that are missed, as clauses without a full stop.
         diagnostics: reasons why errors of a model are too large for a calibrated robot; empty if they are plausible.
-        warnings: sentences with further remarks.
+        warnings: sentences with other remarks.
         seconds: computing time [s].
     """
 
@@ -105,7 +105,7 @@ class Evaluation:
         return values | self._single() | {"warnings": list(self.warnings), "seconds": self.seconds}
 
     def _single(self) -> dict[str, object]:
-        """Return the figures of a single model and of nominal again at top level, where programs find them easily."""
+        """Repeat the figures of a single model and of the nominal robot at top level, where programs expect them."""
         if len(self.models) != 2 or len(self.evaluated) != 1 or self.models[0].name != "nominal":
             return {}
         model, what = self.models[1], self.evaluated[self.models[1].name]
@@ -124,14 +124,15 @@ def evaluate(
     data: Measurements | MeasurementFiles,
     settings: EvaluationSettings | None = None,
 ) -> Evaluation:
-    """Compare models on measurements, with confidence intervals, and check limits of acceptance.
+    """Compare models on measurements, with confidence intervals, and check acceptance limits.
 
     Args:
-        models: one or several models or their folders. Also the words "nominal" (the nominal robot with base and tool
-            fitted) and "geometric" (the geometric part of the first hybrid). A single model is compared with nominal.
-        data: measurements, or their files, in the frames that the models were fitted in. Where rows are marked, only
+        models: one or several models or their folders, or the words "nominal" (the nominal robot with base and tool
+            fitted) and "geometric" (the geometric part of the first hybrid). A single model is compared with the
+            nominal robot.
+        data: measurements, or their files, in the frames in which the models were fitted. If rows are marked, only
             those of the set "test" are used.
-        settings: see `EvaluationSettings`. None: no limits, 2000 resamples.
+        settings: see `EvaluationSettings`; None for no limits and 2000 resamples.
 
     Raises:
         ModelError: a folder cannot be used, or no model is given.
@@ -193,7 +194,7 @@ def test_rows(measurements: Measurements) -> Measurements:
     """Return the rows of the set "test", or all rows if there are no sets.
 
     Raises:
-        MeasurementError: all rows are marked as train.
+        MeasurementError: all rows are marked as "train".
     """
     if measurements.split is None:
         return measurements
@@ -213,7 +214,7 @@ def _text(source: ModelSource) -> str:
 
 
 def models_by_label(stated: Sequence[ModelSource | HasModel]) -> dict[str, ModelSource]:
-    """Return the models by their names in tables: the last part of the folder, or the whole path where two are equal.
+    """Return the models by their names in tables: the last part of the folder, or the whole path if two are equal.
 
     Raises:
         ModelError: a model is given twice.
@@ -253,7 +254,7 @@ def load_models(sources: Mapping[str, ModelSource]) -> dict[str, CalibratedModel
 def with_references(
     labels: Sequence[str], loaded: Mapping[str, CalibratedModel], with_orientation: bool
 ) -> dict[str, CalibratedModel]:
-    """Add the references to the models, in the order in which they were given; nominal before a single model.
+    """Add the references to the models, in the given order; "nominal" comes before a single model.
 
     Args:
         labels: names of models and references.
@@ -275,7 +276,7 @@ def with_references(
 def _diagnostics(
     model: CalibratedModel, figures: ModelFigures, rows: Measurements, fitted: Sequence[FrameKind]
 ) -> Iterator[Diagnostic]:
-    """Return why errors are too large for a calibrated robot, or whether a moved base or tool explains them."""
+    """Return reasons why errors are too large for a calibrated robot, or whether a moved base or tool explains them."""
     implausible = is_implausible(figures, model)
     nominal = nominal_model(model, rows.rotation is not None) if implausible else None
     found = check_rows(rows, model, fitted, nominal=nominal).implausible

@@ -1,4 +1,4 @@
-"""Following of a growing file: rows are checked at once, and the accuracy is updated in another process."""
+"""Follow a growing file: check rows at once, and update the accuracy in another process."""
 
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -16,7 +16,7 @@ from pisigma.robot.description import Robot
 from pisigma.workflow.measure import MeasuringSession
 
 _REST_SUFFIX = ".rest.csv"
-"""Suffix of the remaining plan: that of `poses.csv` is written to `poses.rest.csv`."""
+"""Suffix of the remaining plan; that of `poses.csv` is written to `poses.rest.csv`."""
 PAUSE = 0.01
 """Time between two reads of the file [s]."""
 
@@ -27,10 +27,10 @@ class SessionStep:
 
     Attributes:
         growth: new rows of the file.
-        alarms: faults of the new rows, or of earlier rows that the new rows reveal.
+        alarms: faults of the new rows, or faults of earlier rows that the new rows reveal.
         state: state of the session.
         points: accuracies that were computed since the last step.
-        replanned: whether the remaining poses differ from the planned poses, or from the poses after the last step.
+        replanned: whether the remaining poses differ from the planned poses or from those after the last step.
     """
 
     growth: FileGrowth
@@ -52,9 +52,9 @@ def follow(
     Args:
         session: the session.
         file: the growing file.
-        once: whether to check only the rows that exist, and end.
+        once: whether to check only the existing rows and then end.
         tick: called before every read of the file; an exception that it raises ends the session.
-        arrived: called with new rows before they are checked, which takes longer the more rows there are.
+        arrived: called with new rows before they are checked, because a check takes longer the more rows there are.
 
     Yields:
         A step at the start and whenever there are new rows, a new accuracy, or a file to wait for.
@@ -116,7 +116,7 @@ def remaining_poses_file(plan: Path, rows: Path, stated: Path | None) -> Path:
     Args:
         plan: CSV or YAML file of the plan.
         rows: the growing file of measurements.
-        stated: file for the remaining poses. None: next to the plan.
+        stated: file for the remaining poses; None for a file next to the plan.
 
     Raises:
         OutputError: the file cannot be written.

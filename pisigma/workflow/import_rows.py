@@ -39,7 +39,7 @@ class ImportProposal:
 
     @property
     def is_stated(self) -> bool:
-        """Whether the caller stated the meaning of every column, so that no confirmation is necessary."""
+        """Whether the caller stated the meaning of every column, so that no confirmation is needed."""
         return all(column.is_stated for mapping in self.mappings for column in mapping.columns)
 
     def columns_json(self) -> list[dict[str, object]]:
@@ -73,7 +73,7 @@ class ImportedRows:
         proposal: meaning of the columns.
         content: the measurement file.
         accounts: imported and omitted rows of every file.
-        warnings: sentences with further remarks.
+        warnings: sentences with other remarks.
     """
 
     proposal: ImportProposal
@@ -93,7 +93,7 @@ class ImportedRows:
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """Rows that are left out and why, and warnings."""
+        """Sentences about rows that are left out, with the reasons, and warnings."""
         return (*sentences(self.left_out), *self.warnings)
 
     @property
@@ -105,7 +105,7 @@ class ImportedRows:
         """Write the imported rows as a measurement file.
 
         Raises:
-            OutputError: it cannot be written, or is one of the exports.
+            OutputError: the file cannot be written, or is one of the exports.
         """
         files = [mapping.file.source for mapping in self.proposal.mappings]
         check_output(Path(path), (".csv",), "a measurement file", files)
@@ -129,7 +129,7 @@ def propose_import(
 
     Args:
         files: one or more exports.
-        settings: see `ImportSettings`. None: the defaults.
+        settings: see `ImportSettings`; None for the defaults.
 
     Raises:
         MeasurementError: a file is not a table of numbers, or a setting does not fit the files.
@@ -164,12 +164,12 @@ def import_rows(
 ) -> ImportedRows:
     """Import exports of instruments and controllers as measurements.
 
-    No number is rounded. Lengths are written in mm, and angles in deg or rad as in the export. Rotations
-    are written as quaternions, unless they are RotZ(roll)·RotY(pitch)·RotX(yaw) already.
+    No number is rounded. Lengths are written in mm, and angles in deg or rad as in the export. Rotations are written as
+    quaternions, unless they are already in the form RotZ(roll)·RotY(pitch)·RotX(yaw).
 
     Args:
         files: one or more exports, or the result of `propose_import`.
-        settings: see `ImportSettings`. None: the defaults.
+        settings: see `ImportSettings`; None for the defaults.
 
     Raises:
         MeasurementError: a unit or a rotation convention is not stated, or rows are not measurements. The message names
@@ -198,7 +198,7 @@ def _in_new_frames(content: MeasurementTable, lines: Sequence[int]) -> Measureme
     """Return the content with the names of new frames, which start at given lines, in the column `frame`.
 
     Raises:
-        MeasurementError: the rows are of several files, or see `with_new_frames`.
+        MeasurementError: the rows come from several files, or see `with_new_frames`.
     """
     if not lines:
         return content
@@ -225,11 +225,11 @@ def _joined(
     """Return all rows, and how they were joined; None if the files were concatenated.
 
     Raises:
-        MeasurementError: files are to be joined, but all or none have joint values.
+        MeasurementError: files are to be joined, but either all or none of them have joint values.
     """
     if settings.join is None:
         for _, rows in converted if len(converted) > 1 else ():
-            measurement_table(rows)  # fails here with the name of the file at fault
+            measurement_table(rows)  # a failure here names the faulty file
         return append_rows([rows for _, rows in converted]), None
     joints = [rows for mapping, rows in converted if mapping.has_joints]
     measured = [rows for mapping, rows in converted if not mapping.has_joints]

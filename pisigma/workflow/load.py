@@ -1,4 +1,4 @@
-"""Loading of corrected inverse kinematics from a model folder, or from a cell with its model in use."""
+"""Load corrected inverse kinematics from a model folder, or the model in use of a cell."""
 
 import math
 import os
@@ -21,10 +21,11 @@ from pisigma.robot.row import FRAME_COLUMNS, MAX_MAGNITUDE
 
 
 class CellIK(CorrectedIK):
-    """Corrected inverse kinematics of the model in use of a cell, which takes over a change of this model.
+    """Corrected inverse kinematics of the model in use of a cell, which follows changes of this model.
 
-    Every call, also for a path, is answered by one model, which `Solution.model` names. Copies such as the results
-    of `for_task` and `under` do not change their model. All other attributes are taken from `present`.
+    Every call, including one for a path, is answered by a single model, which `Solution.model` names. Copies, such as
+    the results of `for_task` and `under`, do not change their model. All other attributes are those of the current
+    model.
 
     """
 
@@ -57,11 +58,11 @@ class CellIK(CorrectedIK):
 
     @property
     def warnings(self) -> tuple[str, ...]:  # type: ignore[override]
-        """Return warnings of the model, and reasons for care or for a newer model that could not be loaded."""
+        """Return warnings about the model and the controller, and the reason why a newer model could not be loaded."""
         return (*self._loaded.warnings, *self._in_use.warnings)
 
     def __getattribute__(self, name: str) -> Any:
-        """Return the attributes that this class does not have from the model in use."""
+        """Return attributes that this class lacks from the model in use."""
         of_self = name in ("current", "warnings", "_in_use", "_load", "_loaded") or name.startswith("__")
         return object.__getattribute__(self, name) if of_self else getattr(self.current, name)
 
@@ -71,11 +72,12 @@ def load(folder: str | os.PathLike[str], pin: bool = False) -> CorrectedIK:
 
     Args:
         folder: folder written by `pisigma calibrate`, `pisigma train` or `pisigma new`.
-        pin: of a cell, always use the model that is in use now; otherwise, a change takes effect between two calls.
+        pin: for a cell, whether to always use the model that is in use now; otherwise, a change takes effect between
+            two calls.
 
     Raises:
-        ModelError: the folder is not a complete model; the message names the file at fault; or no model of the cell is
-            in use, or it must not be used with what is active on the controller.
+        ModelError: the folder is not a complete model (the message names the faulty file), no model of the cell is in
+            use, or an export that is active on the controller forbids its use.
     """
     if is_cell(folder) and not pin:
         return CellIK(Path(folder))

@@ -1,4 +1,4 @@
-"""Measuring with a plan: accepts rows one by one, and returns faults, the next pose and advice to stop."""
+"""Measurement with a plan, which accepts rows one by one and returns faults, the next pose and advice to stop."""
 
 import contextlib
 import os
@@ -49,7 +49,7 @@ _STEP = 5
 
 
 class OutdatedError(Exception):
-    """New rows have arrived that a running calculation does not use."""
+    """Error that ends a running calculation because new rows have arrived that it does not use."""
 
 
 class MeasuringSession:
@@ -62,7 +62,7 @@ class MeasuringSession:
 
     Attributes:
         plan: the current plan.
-        replanned: whether it differs from the plan that the session started with.
+        replanned: whether the plan differs from that with which the session started.
     """
 
     def __init__(self, plan: StoredPlan, settings: MeasureSettings = MeasureSettings()) -> None:
@@ -102,7 +102,7 @@ class MeasuringSession:
 
         Raises:
             PlanningError: the file is not a plan.
-            MeasurementError: its poses cannot be used.
+            MeasurementError: the poses of the plan cannot be used.
         """
         return MeasuringSession(read_plan(path), settings)
 
@@ -110,11 +110,11 @@ class MeasuringSession:
         """Add new rows, and check every row against all other rows.
 
         Args:
-            rows: the new rows in their order; None for none.
+            rows: the new rows in order; None if there are none.
             left_out: new rows that cannot be read.
 
         Returns:
-            Faults of the new rows, or of earlier rows that the new rows reveal, in the order of the file.
+            Faults of the new rows, and faults of earlier rows that the new rows reveal, in the order of the file.
         """
         with self._lock:
             alarms = self._judged.add(rows, left_out, self._planned, self._names)
@@ -122,7 +122,7 @@ class MeasuringSession:
 
     @contextlib.contextmanager
     def in_background(self) -> Iterator[None]:
-        """Compute in another process, which `add` and `state` do not wait for, and which ends with the block."""
+        """Compute in another process, for which `add` and `state` do not wait, and which ends with the block."""
         process = BackgroundProcess()
         self._compute = process.compute
         try:
@@ -133,7 +133,7 @@ class MeasuringSession:
 
     @property
     def is_update_due(self) -> bool:
-        """Whether enough new rows exist to update the accuracy; one row before the first update or after the plan."""
+        """Whether there are enough new rows to update the accuracy; one before the first update or after the plan."""
         with self._lock:
             new = self._training_rows - self._worked_out
             soon = self._so_far is None or not len(self._open)
@@ -156,7 +156,7 @@ class MeasuringSession:
         return alarms
 
     def next_step(self) -> Callable[[], tuple[Alarm, ...]] | None:
-        """Return the most urgent step of `update`, except the cross-validation; None if all is done."""
+        """Return the most urgent step of `update`, except the cross-validation; None if all are done."""
         if self.is_update_due:
             return self._calibrate
         if self._so_far is not self._ahead_of:
@@ -179,7 +179,7 @@ class MeasuringSession:
             counting, check, rows = self._counting, self._check, self._rows
         training = rows.select(counting & ~check)
         kept_apart = rows.select(counting & check) if bool((counting & check).any()) else None
-        # a session that starts with rows also gets the point before its first row, like an uninterrupted session
+        # a session that starts with rows also gets the point before its first row, as an uninterrupted session does
         counts = [training.rows] if self._reached else [training.rows - self._settings.every, training.rows]
         parts = [training.select(torch.arange(max(count, 0))) for count in counts]
         found = [
@@ -209,7 +209,7 @@ class MeasuringSession:
         return tuple(new)
 
     def _look_ahead(self, progress: Progress = lambda what: None) -> tuple[Alarm, ...]:
-        """Replan the remaining poses, and compute the accuracy that they are expected to add."""
+        """Replan the remaining poses, and compute the accuracy expected after them."""
         with self._lock:
             so_far, remaining, measured = self._so_far, self._open, self.rows
         assert so_far is not None
@@ -302,7 +302,7 @@ class MeasuringSession:
 
     @property
     def _names(self) -> list[str]:
-        """Names in sentences of the poses that are, or were, planned."""
+        """Names, for sentences, of the poses that are or were planned."""
         return [f"pose {number} of the plan" for number in self._numbers]
 
     def write_remaining(self, path: Path, programs: Sequence[Path] = ()) -> None:
@@ -310,7 +310,7 @@ class MeasuringSession:
 
         Args:
             path: CSV file of the plan.
-            programs: files of robot programs; not written if no poses remain.
+            programs: files of robot programs, which are not written if no poses remain.
 
         Raises:
             OutputError: a file cannot be written.
@@ -322,7 +322,7 @@ class MeasuringSession:
             write_atomically(program, planned_program(remaining, program))
 
     def _adopt(self, plan: StoredPlan) -> None:
-        """Continue with another plan: numbers of known poses remain, and new poses get the next numbers."""
+        """Continue with another plan; known poses keep their numbers, and new poses get the next numbers."""
         is_known = (plan.q[:, None] - self._planned).abs().amax(-1) <= 1e-9
         numbers = [self._numbers[int(row.int().argmax())] if bool(row.any()) else 0 for row in is_known]
         further = counting_from(1 + max(self._numbers))
@@ -354,7 +354,7 @@ class MeasuringSession:
 
     @property
     def _check(self) -> Bool[Tensor, " rows"]:
-        """Return which rows test the calibration: the set "test" or, without sets, rows at test poses of the plan."""
+        """Return the mask of rows that test the calibration: the set "test" or, without sets, rows at test poses."""
         assert self._rows is not None
         if self._rows.split is not None:
             return torch.tensor([name == "test" for name in self._rows.split])
@@ -364,9 +364,9 @@ class MeasuringSession:
 
     @property
     def _open(self) -> Int64[Tensor, " remaining"]:
-        """Remaining poses of the plan, in its order and starting from the pose that was measured last.
+        """Remaining poses of the plan, in order and starting from the pose that was measured last.
 
-        A pose that has to be measured again comes first until another pose is measured, and last afterwards.
+        A pose that must be measured again comes first until another pose is measured, and last afterwards.
         """
         if self._rows is None:
             return torch.arange(len(self.plan.q))

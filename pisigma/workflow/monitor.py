@@ -1,4 +1,4 @@
-"""Monitoring of a robot: comparison of sessions of few rows with its model, one by one and over months."""
+"""Monitor a robot: compare sessions of few rows with its model, individually and over months."""
 
 import datetime
 import os
@@ -60,12 +60,12 @@ _MIN_ROWS = 5
 
 @dataclass(frozen=True)
 class UntrustedSession:
-    """A session that must not be trusted, and is therefore in no chart and no history.
+    """A session that must not be trusted and is therefore left out of charts and history.
 
     Attributes:
         file: file of the rows.
         date: date of the measurement (ISO 8601).
-        diagnostics: why the session must not be trusted.
+        diagnostics: reasons why the session must not be trusted.
     """
 
     file: str
@@ -74,7 +74,7 @@ class UntrustedSession:
 
     @property
     def sentence(self) -> str:
-        """File and date of the session, and why it is left out."""
+        """Sentence with the file and date of the session, and the reason why it is left out."""
         return f"{self.file} of {self.date} is left out: {' '.join(one.sentence for one in self.diagnostics)}"
 
     def to_json(self) -> dict[str, Any]:
@@ -97,11 +97,11 @@ class MonitoringResult:
         charts: control charts of the joint zeros and of the error, over all sessions.
         trends: trends of the joint zeros.
         jumps: jumps of the joint zeros between two sessions.
-        forecast: forecast of the error; None without a limit.
+        forecast: forecast of the error; None if there is no limit.
         warnings: sentences that warn of problems.
         cameras: cameras and boards of files of detected board corners.
         untrusted: sessions of this call that must not be trusted.
-        cell: folder of the cell of the model; None if it is outside of a cell.
+        cell: folder of the cell of the model; None if it is outside a cell.
         seconds: computing time [s].
     """
 
@@ -120,7 +120,7 @@ class MonitoringResult:
 
     @property
     def needs_action(self) -> bool:
-        """Whether action is needed: rows are implausible, recalibrating pays, or a limit is exceeded."""
+        """Whether action is needed: rows are implausible, a recalibration is recommended, or a limit is exceeded."""
         alarmed = any(chart.alarm is not None for chart in self.charts)
         passed = self.forecast is not None and self.forecast.passed
         return (
@@ -129,9 +129,9 @@ class MonitoringResult:
 
     @property
     def advised_session(self) -> Record | None:
-        """The last session with which a recalibration pays.
+        """The last session with which a recalibration is recommended.
 
-        None without such a session, or if a later session that observes as many joints agrees with the model.
+        None if there is no such session, or if a later session that observes as many joints agrees with the model.
         """
         paying = [one for one in self.sessions if one.session.recalibrate]
         if not paying:
@@ -159,7 +159,7 @@ class MonitoringResult:
         advice: tuple[str, ...] = ()
         if (best := self.advised_session) is not None:
             command = RecalibrationSettings(cameras=self.cameras).command(self.model.name, best.file)
-            if self.cell is not None:  # the cell would never use a model folder that it does not know
+            if self.cell is not None:  # the cell would not use a model folder that is not in its history
                 command = shlex.join(["pisigma", "recalibrate", os.fspath(self.cell)])
             advice = (
                 f"Recalibration is worthwhile: errors like those of {best.file} are expected to fall from "
@@ -193,7 +193,7 @@ class MonitoringResult:
         Raises:
             OutputError: the page is not an .html file, or cannot be written.
         """
-        from pisigma.reporting.page.lifetime import monitoring_page  # matplotlib takes a second
+        from pisigma.reporting.page.lifetime import monitoring_page  # importing matplotlib takes a second
 
         check_page(Path(page))
         content = monitoring_page(
@@ -212,7 +212,7 @@ class MonitoringResult:
         write_atomically(Path(page), content)
 
     def _marks(self) -> dict[str, list[tuple[datetime.date, str]]]:
-        """Return the days of events of the cell for all charts, and of jumps for that of their joint."""
+        """Return the days of events of the cell, for all charts, and of jumps, for the charts of their joints."""
         events = () if self.cell is None else History(self.cell / HISTORY).events()
         marks: dict[str, list[tuple[datetime.date, str]]] = {}
         marks[""] = [(datetime.date.fromisoformat(one.day), one.kind) for one in events]
@@ -227,11 +227,11 @@ def monitor(
     settings: MonitorSettings = MonitorSettings(),
     progress: Progress = lambda what: None,
 ) -> MonitoringResult:
-    """Determine for every session whether the robot is unchanged or what moved, and chart all sessions.
+    """Determine for every session whether the robot has changed and what moved, and chart all sessions.
 
     Args:
-        model: model of `pisigma calibrate` or `pisigma recalibrate`, an object that contains one, or its folder. Only
-            a folder has a history.
+        model: model of `pisigma calibrate` or `pisigma recalibrate`, an object that contains one, or a model folder.
+            Only a folder has a history.
         sessions: rows of any sensors, or their files. Rows of several days (column `date`) are several sessions.
         settings: see `MonitorSettings`.
         progress: called with the current step.
@@ -330,7 +330,7 @@ def _by_day(sessions: Sequence[Measurements], dates: Sequence[str]) -> list[tupl
 
 
 def _date_of_file(source: str) -> str:
-    """Return the day in the name of a file, or of its last modification; today for rows without a file."""
+    """Return the day in the name of a file, or else of its last modification; today for rows without a file."""
     path = Path(source)
     if date := date_in_name(path.name):
         return date

@@ -1,4 +1,4 @@
-"""Planning of the poses to measure; a plan is written as a table, and as robot programs."""
+"""Plan the poses to measure, and write the plan as a table and as robot programs."""
 
 import math
 import os
@@ -47,26 +47,26 @@ _STEP = 10
 _MIN_WEAK_SHARE = 0.1
 """Share of the remaining variance above which a warning names its cause."""
 _MIN_RANGE_SHARE = 0.1
-"""Share of the range of a joint that the candidates have to cover in order to represent the workspace."""
+"""Share of a joint's range that the candidates must cover in order to represent the workspace."""
 _MAX_ROUNDS = 6
 """Maximum number of times that poses are added in place of unreachable ones."""
 
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """Result of `plan`: poses to measure, and the accuracy that is expected from them.
+    """Result of `plan`: poses to measure, and the accuracy expected after measuring them.
 
     Attributes:
         stored: the poses in their order, and the settings of the plan.
-        candidates: poses that they were chosen from.
-        curve: expected errors of the tool's position over the task against the number of poses, from 0 poses where
-            there are earlier measurements.
-        poses_needed: number of poses with which the limit is expected to be reached; None without a limit, or if it is
-            not reached.
-        error_sources: sources of the expected remaining error, the largest first.
-        duration: time of the measurement [s].
-        warnings: sentences with further remarks.
-        camera: what limits a calibration with images; None without a camera.
+        candidates: poses from which they were chosen.
+        curve: expected errors of the tool's position over the task, by number of poses, starting from 0 poses if there
+            are earlier measurements.
+        poses_needed: number of poses with which the limit is expected to be reached; None if there is no limit, or if
+            it is not reached.
+        error_sources: sources of the expected remaining error, largest first.
+        duration: duration of the measurement [s].
+        warnings: sentences with other remarks.
+        camera: limits of a calibration with images; None if there is no camera.
         seconds: computing time [s].
     """
 
@@ -169,13 +169,13 @@ def plan(
     surroundings: Surroundings | str | os.PathLike[str] | None = None,
     progress: Progress = lambda what: None,
 ) -> Plan:
-    """Plan which poses to measure and in which order, and predict the accuracy of a calibration with them.
+    """Plan the poses to measure and their order, and predict the accuracy of a calibration with these poses.
 
     Args:
         subject: the nominal robot (a robot, a catalogue name, a robot file in YAML or URDF), or a model of it (a model,
             an object that contains a model, such as a `CorrectedIK` or a `Calibration`, or a folder).
-        settings: see `PlanSettings`. None: the defaults.
-        surroundings: surroundings of the robot, or their YAML file. None: no obstacles.
+        settings: see `PlanSettings`; None for the defaults.
+        surroundings: surroundings of the robot, or their YAML file; None for no obstacles.
         progress: called with the current step.
 
     Raises:
@@ -223,7 +223,7 @@ def plan(
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """The planning problem: robot, surroundings, candidates, task and prior posterior.
+    """The planning problem: robot, surroundings, candidates, task, and distribution of the unknowns.
 
     Attributes:
         subject: the robot or the model.
@@ -231,7 +231,7 @@ class _Problem:
         arm: the robot in its surroundings.
         candidates: poses to choose from.
         posterior: distribution of the unknowns before the first pose is measured.
-        task: joint values at which the robot has to be accurate [rad or m].
+        task: joint values at which the robot must be accurate [rad or m].
     """
 
     subject: Subject
@@ -264,8 +264,8 @@ class _Problem:
     def choose(self, progress: Progress) -> tuple[Int64[Tensor, " chosen"], StoredPlan, Tour]:
         """Choose poses to calibrate with and poses to test with, and order them.
 
-        Poses without a collision-free path are replaced. The most informative poses come first, in stages, so that
-        measuring may end early.
+        Poses without a collision-free path are replaced. The most informative poses come first, in stages, so that the
+        measurement may end early.
         """
         q, count = self.candidates.q, self.settings.count
         free, motions = torch.arange(len(q)), Motions(self.arm, self.candidates.workspace)
@@ -305,7 +305,7 @@ class _Problem:
         self, chosen: Int64[Tensor, " chosen"], points: Sequence[ExpectedAccuracy]
     ) -> int | None:
         """Return the smallest number of the chosen poses with which the limit is expected to be reached."""
-        limit = (self.settings.limit_mm or 0.0) / 1e3  # without a limit: 0 m, which is never reached
+        limit = (self.settings.limit_mm or 0.0) / 1e3  # without a limit, 0 m is used, which is never reached
         reached = next((index for index, point in enumerate(points) if point.p95 <= limit), None)
         if reached is None:
             return None
@@ -318,7 +318,7 @@ class _Problem:
         return high
 
     def expected_camera_accuracy(self, chosen: Int64[Tensor, " chosen"]) -> CameraProspects | None:
-        """Return what limits a calibration with the chosen images; None without a camera."""
+        """Return the limits of a calibration with the chosen images; None if there is no camera."""
         if self.views is None:
             return None
         return CameraProspects.from_candidates(

@@ -13,7 +13,7 @@ from pisigma.validation.held_out.judged_rows import tool_positions
 from pisigma.validation.report.error_map import samples_of_workspace
 
 _POSES_PER_CHUNK = 500
-"""Poses whose derivatives are in memory at the same time."""
+"""Number of poses whose derivatives are in memory at a time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,10 +32,10 @@ class PredictedErrors:
 def predicted_errors(model: CalibratedModel) -> PredictedErrors:
     """Predict the position errors of a model, as `plan` predicts them over a task.
 
-    The samples are those of the report: joint values that the model keeps, and random ones in their ranges.
+    The samples are those of the report: joint values that the model stores, and random ones within their ranges.
 
     Raises:
-        IdentificationError: the model keeps no posterior.
+        IdentificationError: the model stores no posterior.
     """
     posterior, (q, _) = RobotPosterior.from_model(model), samples_of_workspace(model)
     p95 = [p95_at(posterior.tool(some)) for some in torch.split(q, _POSES_PER_CHUNK)]

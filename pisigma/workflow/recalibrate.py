@@ -1,4 +1,4 @@
-"""Recalibrate a model with few new rows."""
+"""Recalibrate a model with a few new rows."""
 
 import datetime
 import time
@@ -64,7 +64,7 @@ class Recalibration(AbstractModelResult):
 
     Attributes:
         model: the recalibrated model, with all figures as its metrics, as `pisigma.load` would read it.
-        parent: the model that the rows were added to.
+        parent: the model to which the rows were added.
         adaptation: adaptation of the parent to all rows.
         gate: errors of held-out rows under every candidate.
         moved: parts that have moved significantly.
@@ -106,14 +106,14 @@ def recalibrate(
         data: new rows of any sensors, or CSV files of them. Rows of the set "test" are not used.
         settings: see `RecalibrationSettings`.
         progress: called with the current step.
-        nominal: nominal robot; the model then has to be the prior of its fleet. None: any model.
+        nominal: nominal robot; the model must then be the prior of its fleet. None for any model.
 
     Returns:
         The chosen model with its figures; `save` writes it as a model folder.
 
     Raises:
-        ModelError: the folder is not that of a model, or the model is of another robot, has no posterior, or is not
-            the prior of a fleet although `nominal` is given.
+        ModelError: the folder is not that of a model, or the model belongs to another robot, has no posterior, or is
+            not the prior of a fleet although `nominal` is given.
         MeasurementError: the data cannot be read.
         IdentificationError: the rows do not determine a base or a tool.
         PoseError: the joint values do not fit the robot.
@@ -185,7 +185,7 @@ def _adapted(
     right = rows.select(torch.tensor(left)) if far else rows
     adaptation = adapt(recalibration_problem(parent, posterior, right, elsewhere))
     wrong = [left[row] for row in adaptation.wrong_rows]
-    if wrong:  # they have biased the first adaptation
+    if wrong:  # wrong rows have biased the first adaptation
         right = rows.select(torch.tensor([row for row in left if row not in wrong]))
         adaptation = adapt(recalibration_problem(parent, posterior, right, elsewhere))
     return right, adaptation, contradicting_rows(adaptation, rows, sorted((*far, *wrong)))
@@ -202,7 +202,7 @@ def _kept(
 ) -> tuple[CandidateChoice, CalibratedModel]:
     """Return the name of the chosen candidate, and its model.
 
-    A robot unlike its fleet keeps the calibration from scratch, if its rows are enough for one.
+    A robot that is unlike its fleet keeps the calibration from scratch, if it has enough rows for one.
     """
     if odd:
         alone = replace(choice, kept="scratch")
@@ -273,7 +273,9 @@ def _fleet_consistency(model: CalibratedModel, rows: Measurements) -> "FleetCons
     """Return how similar the robot of the rows is to its fleet; None if the model is not the prior of a fleet."""
     if model.kind != FLEET_PRIOR:
         return None
-    from pisigma.lifetime.fleet.prior import FleetConsistency  # imports statistics, which takes half a second
+    from pisigma.lifetime.fleet.prior import (
+        FleetConsistency,
+    )  # this imports statistics, which takes half a second
 
     return FleetConsistency.from_rows(model, rows)
 
@@ -281,7 +283,7 @@ def _fleet_consistency(model: CalibratedModel, rows: Measurements) -> "FleetCons
 def _moved_frames(
     model: CalibratedModel, posterior: ModelPosterior, rows: Measurements, settings: RecalibrationSettings
 ) -> frozenset[FrameKey]:
-    """Return the bases and tools that have moved, as stated or, without a statement, as the evidence shows.
+    """Return the bases and tools that have moved, as stated or else as the evidence shows.
 
     With the prior of a fleet, all bases and tools are returned, because they differ between robots.
     """
@@ -304,14 +306,14 @@ def _warnings(model: CalibratedModel, choice: CandidateChoice, rows: Measurement
 
 
 def may_move(settings: RecalibrationSettings) -> frozenset[Move]:
-    """Return what may have moved without being stated: a joint zero, and base and tool where `moved` is None."""
+    """Return what may have moved without a statement: a joint zero, and base and tool if `moved` is None."""
     return MOVES if settings.moved is None else frozenset({"joint_zero"})
 
 
 def filtered_rows(
     settings: RecalibrationSettings, model: CalibratedModel, rows: Measurements
 ) -> FilteredRows:
-    """Return the rows except single wrong rows, with base and tool fitted if these may have moved."""
+    """Return the rows without single wrong rows, with base and tool fitted if these may have moved."""
     right = without_wrong_rows([model], rows, settings.fitted)
     if right.warnings or settings.moved is not None:
         return right

@@ -32,9 +32,9 @@ class Report:
     Attributes:
         content: numbers and sentences.
         figures: drawn figures.
-        diagnostics: why the rows must not be trusted; see `pisigma.validation.gate`.
+        diagnostics: reasons why the rows must not be trusted; see `pisigma.validation.gate`.
         seconds: computing time [s].
-        acceptance: statements for the acceptance of the robot of a cell; None without a cell.
+        acceptance: statements for the acceptance of the robot of a cell; None if there is no cell.
     """
 
     content: ReportContent
@@ -45,11 +45,11 @@ class Report:
 
     @property
     def verdict(self) -> str:
-        """Return a sentence on accuracy, improvement over nominal, place of the largest errors, and their cause."""
+        """Return a sentence on accuracy, improvement over nominal, and place and cause of the largest errors."""
         return self.content.verdict.sentence
 
     def to_json(self) -> dict[str, Any]:
-        """Return numbers and sentences as plain values, without the single rows."""
+        """Return numbers and sentences as plain values, without individual rows."""
         diagnostics = [one.model_dump() for one in self.diagnostics]
         accepted = {} if self.acceptance is None else {"acceptance": self.acceptance.to_json()}
         return self.content.to_json() | {"diagnostics": diagnostics, "seconds": self.seconds} | accepted
@@ -105,8 +105,8 @@ def report(
 
     Args:
         model: folder of the model.
-        data: rows to evaluate it on, or their file, in the frame that the model was fitted in. None: the held-out rows
-            of the folder.
+        data: rows on which the model is evaluated, or their file, in the frame in which the model was fitted; None for
+            the held-out rows of the folder.
         progress: called with the current step.
         cameras: cameras and boards, for files of detected board corners.
         acceptance: statements of a cell that the report contains, see `pisigma.workflow.cell.acceptance`.

@@ -1,4 +1,4 @@
-"""Base of the results that contain a model: conversion to JSON, and writing of the model folder."""
+"""Base class of the results that contain a model, with conversion to JSON and writing of the model folder."""
 
 import os
 from abc import ABC, abstractmethod
@@ -53,9 +53,10 @@ class AbstractModelResult(ABC):
 
         Args:
             folder: folder to write.
-            name: name of the model. None: the name of the folder.
-            command: command that made the model, for the card. None: the Python call.
-            accept_implausible: also write a result that a check found implausible; the card says why.
+            name: name of the model; None for the name of the folder.
+            command: command that made the model, for the card; None for the Python call.
+            accept_implausible: whether to also write a result that a check found implausible; the card states the
+                reason.
             overwrite: whether to replace an existing model.
 
         Returns:

@@ -19,7 +19,7 @@ from pisigma.workflow.verify import Verification
 MAX_POINTS = 8
 """Largest number of rows of the table of expected errors."""
 _MAX_SESSIONS = 6
-"""Number of the last sessions that are shown at once."""
+"""Largest number of sessions that are shown, the last ones."""
 
 _NEXT_STEPS = {
     "better": "use the model, and verify again after a change of tool, base or arm.",
@@ -152,7 +152,7 @@ def session_text(state: SessionState, closing: Sequence[str] = ()) -> ResultText
 
 
 def _narrow(state: SessionState) -> list[str]:
-    """Return a text on the joints that were measured over less than half of the planned range."""
+    """Return a text on joints that were measured over less than half of their planned range."""
     narrow = [span for span in state.coverage if span.planned < 0.5]
     names = ", ".join(f"{span.name} ({100 * span.planned:.0f} %)" for span in narrow)
     return [f"less than half of the planned range was measured of: {names}."] if narrow else []
@@ -202,7 +202,7 @@ def monitoring_text(monitoring: MonitoringResult, closing: Sequence[str] = ()) -
 
 
 def _monitoring_verdict(monitoring: MonitoringResult, advice: str) -> Verdict:
-    """Judge a robot by its sessions; `advice` states how to recalibrate it if that pays."""
+    """Return the verdict on a robot from its sessions; `advice` states how to recalibrate it if this is recommended."""
     sessions, untrusted = monitoring.sessions, len(monitoring.untrusted)
     changed = [one for one in sessions if one.session.verdict != "unchanged"]
     last = f"{sessions[-1].date}, {rounded(sessions[-1].session.rms * 1e3, 0)} mm RMS" if sessions else "none"
@@ -241,7 +241,7 @@ def recalibration_text(recalibration: Recalibration, folder: Path | None) -> Res
 
 
 def _recalibration_verdict(recalibration: Recalibration, folder: Path | None) -> Verdict:
-    """Judge a recalibration."""
+    """Return the verdict on a recalibration."""
     summary, names = recalibration.summary, candidate_names(recalibration.summary)
     errors = {name: one.rms_mm for name, one in summary.cross_validation.items() if one.rms_mm is not None}
     texts = {name: f"{names[name]} {rounded(error, summary.left_out)} mm" for name, error in errors.items()}
@@ -294,7 +294,7 @@ def report_text(result: Report, closing: Sequence[str] = ()) -> ResultText:
 
 
 def report_doubt(result: Report) -> str:
-    """Return the reason why rows of a report must not be trusted or contradict the acceptance; otherwise ""."""
+    """Return the reason why rows of a report must not be trusted or contradict the acceptance, or ""."""
     if result.acceptance is not None and result.acceptance.contradicted and not result.diagnostics:
         return contradiction(result.acceptance)
     return " ".join(one.sentence for one in result.diagnostics)

@@ -1,4 +1,4 @@
-"""Random poses in a region with the inverse kinematics solutions of a calibrated model: training data to distil it."""
+"""Random poses in a region with the inverse kinematics solutions of a calibrated model, to distil the model."""
 
 from dataclasses import dataclass
 
@@ -40,7 +40,7 @@ class Region:
 
     Attributes:
         q: joint values [rad or m]; poses are drawn between a row and its neighbours.
-        box: bounds of the tool's position, with orientations of joint values around `q`. None: no bounds.
+        box: bounds of the tool's position, with orientations from joint values around `q`; None for no bounds.
     """
 
     q: Float64[Tensor, "rows dof"]
@@ -54,9 +54,9 @@ class SolvedPoses:
     Attributes:
         T: poses T_base_tool.
         q_nominal: joint values of the nominal robot [rad or m].
-        correction: correction of these by the full solution [rad or m].
+        correction: correction of these joint values by the full solution [rad or m].
         branch: index of the branch of every pose.
-        status: status of the full solution, REACHED, or OUTSIDE_DOMAIN beyond the measured joint values.
+        status: status of the full solution: REACHED, or OUTSIDE_DOMAIN beyond the measured joint values.
         drawn: number of poses that were drawn.
         refused: number of poses that were refused, by reason.
     """
@@ -94,7 +94,7 @@ def draw_solved_poses(
         progress: called with the number of solved poses.
 
     Raises:
-        IdentificationError: the robot reaches too few poses of the region; the message says why.
+        IdentificationError: the robot reaches too few poses of the region; the message states the reasons.
     """
     kept: list[tuple[Tensor, ...]] = []
     refused: dict[str, int] = {}
@@ -118,7 +118,7 @@ def draw_between(
     """Draw joint values between a row of q and its neighbours, as means with random weights.
 
     The neighbours are `dof` rows, drawn from the 2 `dof` nearest rows. Revolute joints are compared and interpolated
-    the short way round.
+    along the shorter arc.
     """
     first = torch.randint(len(q), (count,), generator=generator)
     nearby = min(2 * robot.dof, len(q) - 1)

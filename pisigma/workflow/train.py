@@ -73,7 +73,7 @@ class InverseTraining(AbstractModelResult):
 
     @property
     def test(self) -> ComparisonFigures | None:
-        """Errors of the rows of the set "test"; None without such rows."""
+        """Errors of the rows of the set "test"; None if there are none."""
         return self.summary.test
 
     @property
@@ -109,7 +109,7 @@ def train(
 
     Raises:
         RecipeError: the recipe cannot be read, or does not use `data` or `settings`.
-        RobotError: its robot cannot be used.
+        RobotError: the robot of the recipe cannot be used.
         MeasurementError: the data cannot be used.
         IdentificationError: the data do not determine the free parameters.
         TrainingError: the training diverged, or there is no checkpoint of this recipe and data to resume.
@@ -346,7 +346,7 @@ def _compared_fold(
 
 
 def _check_one_pose(measurements: Measurements) -> None:
-    """Check that all rows have one frame and one target, as an inverse calibration has one base and one tool.
+    """Check that all rows have one frame and one target, because an inverse calibration has one base and one tool.
 
     Raises:
         MeasurementError: there are several frames or targets; the message names the first row with a second name.

@@ -1,4 +1,4 @@
-"""Verify whether new measurements are explained better by the corrected model than by the nominal robot."""
+"""Verify whether the corrected model explains new measurements better than the nominal robot does."""
 
 import os
 import time
@@ -39,7 +39,7 @@ from pisigma.workflow.settings.verification import VerificationSettings
 _MIN_CONFIGURATIONS = 6
 """Minimum number of different joint vectors for a verdict."""
 _MAX_RESAMPLED_ROWS = 2 * 10**7
-"""Maximum number of random draws for confidence intervals: with many rows, fewer resamples are enough."""
+"""Maximum number of random draws for confidence intervals; with many rows, fewer resamples are sufficient."""
 _RESAMPLES = (200, 2000)
 """Minimum and maximum number of resamples."""
 
@@ -65,19 +65,19 @@ _STARTS: dict[Verdict, str] = {
 
 @dataclass(frozen=True)
 class Verification:
-    """Result of `verify`: what new measurements show about a model.
+    """Result of `verify`, which compares a model with new measurements.
 
     Attributes:
-        model: its folder, or its name.
+        model: folder or name of the model.
         data: file of the rows.
         rows: number of evaluated rows.
         settings: settings of the verification.
         verdict: "better" or "not_better" if the confidence interval of the mean difference shows that the corrected
-            model explains the rows better than the nominal robot, or not; "undecided" if it shows neither; "moved"
-            if the arm has moved according to the posterior of the model and recalibrating pays; "setup_fault" if a
-            setup fault explains the errors, which then prove nothing; "implausible" if the errors are too large for
-            a calibrated robot and no fault explains them.
-        sentence: the verdict with figures.
+            model explains the rows better than the nominal robot, or not; "undecided" if it shows neither; "moved" if
+            parts of the arm have moved according to the posterior of the model and a recalibration is recommended;
+            "setup_fault" if a setup fault explains the errors, which then prove nothing; "implausible" if the errors
+            are too large for a calibrated robot and no fault explains them.
+        sentence: sentence that states the verdict with figures.
         ratio: mean position error of the corrected model divided by the mean position error of the nominal robot;
             NaN if the latter is 0.
         better_share: fraction of the configurations in which the corrected model has the smaller error.
@@ -85,8 +85,8 @@ class Verification:
         diagnostics: why the rows must not be trusted; see `pisigma.validation.gate`.
         setup_faults: setup faults that explain large errors; empty if `motion` explains them.
         motion: parts that have moved since the model was made; None if the model or the rows do not show motions.
-        recalibration: command that updates the model; empty if that does not pay.
-        warnings: sentences with further remarks.
+        recalibration: command that updates the model; empty if this is not recommended.
+        warnings: sentences with other remarks.
         seconds: computing time [s].
     """
 
@@ -142,7 +142,7 @@ def read_for_verification(
     Rows of the set "train" are left out if the file has a column "set".
 
     Raises:
-        MeasurementError: the file cannot be used, or its column `set` leaves no row for tests.
+        MeasurementError: the file cannot be used, or its column `set` leaves no rows for tests.
     """
     return test_rows(read_rows(path, model.robot.without_limits, cameras))
 
@@ -152,12 +152,12 @@ def verify(
     data: str | os.PathLike[str] | Measurements,
     settings: VerificationSettings | None = None,
 ) -> Verification:
-    """Verify that a correction is active and right, and find faults of the setup where errors are large.
+    """Verify that a correction is active and right, and find faults of the setup if errors are large.
 
     Args:
         model: the model or its folder.
         data: new rows, or their file, in frames and of targets that the model has.
-        settings: see `VerificationSettings`. None: the defaults.
+        settings: see `VerificationSettings`; None for the defaults.
 
     Raises:
         MeasurementError: the file cannot be used, no lengths were measured, or the model does not have a frame or a
@@ -229,7 +229,7 @@ def _compared_models(model: CalibratedModel, with_orientation: bool) -> dict[str
 
 
 def _recalibration(name: str, data: str, settings: VerificationSettings, motion: Session | None) -> str:
-    """Return the command that updates a model; empty if recalibrating does not pay."""
+    """Return the command that updates a model; empty if a recalibration is not recommended."""
     if motion is None or not motion.recalibrate:
         return ""
     return RecalibrationSettings(settings.fitted or None, settings.cameras).command(name, data)

@@ -1,4 +1,4 @@
-"""Geometric approximation of a model: the robot with few free parameters that approximates it best."""
+"""Geometric approximation of a model: the robot with a few free parameters that approximates the model best."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -27,11 +27,11 @@ MAX_ITERATIONS = 50
 _UNOBSERVABLE = 1e-6
 """Share of the column of a parameter outside the span of base and tool below which the parameter is unobservable."""
 _NO_EFFECT = 1e-4
-"""Directions of the unknowns with a smaller effect, relative to the largest, are not changed: base and tool would move
-far without a benefit."""
+"""Smallest effect of a direction of the unknowns, relative to the largest, with which it is changed; others would move
+base and tool far without a benefit."""
 _CONVERGENCE_TOLERANCE = 1e-12
 POSES = 1_000
-"""Number of poses for the fit, and of other poses for its evaluation."""
+"""Number of poses for the fit, and number of other poses for its evaluation."""
 
 
 def joint_offsets(robot: Robot) -> tuple[int, ...]:
@@ -54,7 +54,7 @@ class ApproximationProblem:
     Attributes:
         robot: initial robot.
         q: joint values [rad or m] of the poses.
-        T: target poses of the tool at these.
+        T: target poses of the tool at these joint values.
         parameters: indices into the flattened `Robot.dh` of the free parameters.
     """
 
@@ -71,8 +71,8 @@ class ApproximationProblem:
     def residual(self, robot: Robot) -> tuple[Float64[Tensor, " values"], Float64[Tensor, "values unknowns"]]:
         """Compute the residual [m] and its derivatives with respect to parameters, base and tool [m or rad].
 
-        Base and tool change by small translations and rotations, of the base in the frame of the poses, of the tool in
-        the tool frame.
+        Base and tool change by small translations and rotations: the base in the frame of the poses, the tool in the
+        tool frame.
         """
         T, J = identification_jacobian(robot, self.q)
         J = J[..., list(self.parameters)]
@@ -100,8 +100,8 @@ def solve_approximation(problem: ApproximationProblem) -> tuple[Robot, tuple[boo
     """Minimise the sum of squares from the initial robot by Levenberg-Marquardt steps.
 
     Returns:
-        The robot, and for every parameter whether it is observable together with base, tool and the preceding
-        parameters; otherwise it is not changed.
+        The robot, and for every parameter, whether it is observable together with base, tool and the preceding
+        parameters; unobservable parameters are not changed.
     """
     robot = problem.robot
     missing, J = problem.residual(robot)
@@ -162,7 +162,7 @@ def _small(step: Float64[Tensor, " 6"]) -> Float64[Tensor, "4 4"]:
 
 @dataclass(frozen=True)
 class Departure:
-    """Deviation of a robot's tool from that of the whole model.
+    """Deviation of a robot's tool from the tool of the whole model.
 
     Attributes:
         mean_mm: mean distance [mm].
@@ -183,9 +183,9 @@ class GeometricApproximation:
 
     Attributes:
         robot: robot with fitted parameters, base and tool.
-        observable: for every free parameter whether it is observable together with base, tool and preceding parameters.
+        observable: whether each free parameter is observable together with base, tool and the preceding parameters.
         q: held-out joint values [rad or m].
-        T: poses of the model's tool at these.
+        T: poses of the model's tool at these joint values.
     """
 
     robot: Robot
@@ -209,7 +209,7 @@ class GeometricApproximation:
 def departure_from_nominal(robot: Robot, nominal: Robot) -> Departure:
     """Compute the deviation of a robot's tool from that of another robot, each with its base and tool.
 
-    It is evaluated at random joint values within the limits of `nominal`, and within 180 deg (3 m).
+    It is evaluated at random joint values within the limits of `nominal` and within ±180 deg (±3 m).
     """
     low, high = torch.from_numpy(nominal.limits.clip(-torch.pi, torch.pi)).unbind(1)
     share = torch.rand((POSES, nominal.dof), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
@@ -242,7 +242,7 @@ def approximate_model(
 def _poses(
     model: CalibratedModel, generator: torch.Generator
 ) -> tuple[Float64[Tensor, "poses dof"], Float64[Tensor, "poses 4 4"]]:
-    """Draw joint values in the calibrated region, and return them with the predicted poses."""
+    """Draw joint values in the calibrated region; return these and the predicted poses."""
     starts = model.starts
     if not len(starts):
         raise ModelError(

@@ -35,7 +35,7 @@ def dh_json(robot: Robot, comments: tuple[str, ...] = ()) -> str:
 
 
 def dh_csv(robot: Robot, comments: tuple[str, ...] = ()) -> str:
-    """Return the robot as a CSV table: base, one line per row, tool; cells that do not apply are empty.
+    """Return the robot as a CSV table of base, one line per row, and tool; cells that do not apply are empty.
 
     Lines at the top that start with # state the convention and the comments.
     """
@@ -54,7 +54,7 @@ def dh_csv(robot: Robot, comments: tuple[str, ...] = ()) -> str:
 
 
 def _coupling_sentences(robot: Robot) -> tuple[str, ...]:
-    """Return a comment on the coupling of joints; the table itself has limits of the joints only."""
+    """Return a comment on the coupling of joints; the table itself contains only limits of the joints."""
     if robot.coupling is None:
         return ()
     stated = json.dumps(coupling_document(robot.coupling, robot.joints))
@@ -75,7 +75,7 @@ def csv_table(
 
 
 def parameter_columns(names: tuple[str, ...], values: np.ndarray) -> dict[str, str]:
-    """Return parameters by column [mm, deg] at full precision."""
+    """Return parameters by column [mm, deg], with full precision."""
     return {column: repr(value) for column, value in in_file_units(names, values).items()}
 
 

@@ -13,13 +13,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ExportRequest:
-    """Request of an export; options that are not given are None.
+    """Request for an export; options that are not given are None.
 
     Attributes:
         model: model folder.
         out: file to write.
-        like: file whose other content remains; for urdf, mjcf and xacro a URDF file, by default the file in the model
-            folder, and for mjcf also an MJCF file.
+        like: file whose other content is kept; for urdf, mjcf and xacro, a URDF file, by default the one in the model
+            folder; for mjcf, also an MJCF file.
         tip: link of the tool in `like`.
         geometry: "geometric" or "hybrid", for urdf, mjcf and dh.
         poses: file of poses, for targets.
@@ -64,7 +64,7 @@ class ExportRequest:
 
     @property
     def conditions(self) -> dict[str, float]:
-        """Given payload and temperature, by column of measurement files."""
+        """Payload and temperature, if given, by column of measurement files."""
         values = {"payload_kg": self.payload_kg, "temperature_c": self.temperature_c}
         return {name: value for name, value in values.items() if value is not None}
 
@@ -102,17 +102,17 @@ OPTIONS = (
 
 @dataclass(frozen=True)
 class Exported:
-    """Content of an exported file, and the report about it.
+    """Content of an exported file, and a report about it.
 
     Attributes:
         content: content of the file, or of several files by name in a folder.
         facts: values for `--json`, by key.
         remarks: sentences for the reader of the file.
         warnings: warnings, which are printed to stderr.
-        summary: sentence on the written file up to its name; "" for the contents of the format.
-        details: part of that sentence after the file's name.
-        failure: fault of the input although the file was written; None without such a fault.
-        shortfall: sentence on a missed limit although the file was written; None if no limit is missed.
+        summary: sentence about the written file, up to its name; "" for the contents of the format.
+        details: remainder of this sentence after the file's name.
+        failure: fault of the input, although the file was written; None if there is none.
+        shortfall: sentence about a missed limit, although the file was written; None if no limit is missed.
         shown: text that is printed first, such as a diff.
     """
 
@@ -138,7 +138,7 @@ class ExportFormat:
         write: function that returns the content of a file, or raises a `PisigmaError`.
         options: options of `OPTIONS` that the format accepts.
         check: function that raises a `PisigmaError` for invalid requests before anything is loaded.
-        contains: what its files contain, which says whether a correction would be applied twice on a controller.
+        contains: contents of its files, which determine whether a correction would be applied twice on a controller.
     """
 
     name: str
@@ -150,7 +150,7 @@ class ExportFormat:
     contains: Contents = "description"
 
     def contents_for(self, request: ExportRequest) -> Contents:
-        """Return the contents of the file of a request; targets of programs may be poses instead of joint values."""
+        """Return the contents of the requested file; targets of programs may be poses instead of joint values."""
         is_pose = request.program is not None or request.targets == "cartesian"
         return "poses" if is_pose else self.contains
 

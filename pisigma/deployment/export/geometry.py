@@ -11,7 +11,7 @@ from pisigma.model.stated_conditions import condition_warnings
 from pisigma.robot.description import Robot
 
 GEOMETRIC, HYBRID = "geometric", "hybrid"
-"""Names of the geometries of a model: the geometric fit, used alone, and the geometry of a hybrid model."""
+"""Names of the geometries of a model: that of the geometric fit alone, and that of a hybrid model."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,7 +21,7 @@ class ChosenGeometry:
     Attributes:
         name: `GEOMETRIC` or `HYBRID`.
         robot: robot with the geometry, base and tool.
-        comments: sentences for the head of the file.
+        comments: sentences for the top of the file.
     """
 
     name: str
@@ -33,14 +33,14 @@ def check_geometry(request: ExportRequest) -> None:
     """Check the name of the geometry.
 
     Raises:
-        OutputError: it is neither `GEOMETRIC` nor `HYBRID`.
+        OutputError: the name is neither `GEOMETRIC` nor `HYBRID`.
     """
     if request.geometry is not None:
         check_choice(OutputError, "--geometry", request.geometry, (GEOMETRIC, HYBRID))
 
 
 def chosen_geometry(model: CalibratedModel, name: str | None) -> ChosenGeometry:
-    """Return a geometry by name, `GEOMETRIC` for None.
+    """Return a geometry by name; None means `GEOMETRIC`.
 
     Raises:
         ModelError: the model has no geometry of this name.
@@ -121,7 +121,7 @@ def geometry_remarks(model: CalibratedModel) -> tuple[str, ...]:
 
 
 def frame_remarks(model: CalibratedModel) -> tuple[str, ...]:
-    """Return remarks on which base and tool are exported if the model has several."""
+    """Return remarks that state which base and tool are exported if the model has several."""
     several = (("base", "frame", list(model.bases)), ("tool", "target", list(model.tools)))
     return tuple(
         f"The {part} is that of the {what} '{names[0]}'; the model has {len(names)} {what}s ({', '.join(names)})."

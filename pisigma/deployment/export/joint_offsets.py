@@ -1,4 +1,4 @@
-"""Joint offsets alone, for controllers in which only the zero positions can be changed."""
+"""Joint offsets alone, for controllers on which only the zero positions can be changed."""
 
 from dataclasses import asdict, dataclass
 
@@ -22,8 +22,8 @@ class JointOffsets:
 
     Attributes:
         robot: nominal robot except for theta of revolute and d of prismatic joints, base and tool.
-        values: offset of every axis of the controller [rad or m], in its direction: the real robot commanded to q is
-            where the nominal robot is at q + offset.
+        values: offset of every axis of the controller [rad or m], in the direction of the axis: the real robot
+            commanded to q is where the nominal robot is at q + offset.
         unobservable: joints whose offset is set to 0 because base or tool have the same effect.
         lost: remaining deviation from the whole model.
         nominal: deviation of the nominal robot with the model's base and tool, for comparison.
@@ -36,7 +36,7 @@ class JointOffsets:
     nominal: Departure
 
     def departures(self) -> dict[str, object]:
-        """Return both deviations by their keys in files."""
+        """Return both deviations, by their keys in files."""
         return {"off_the_whole_model": asdict(self.lost), "robot_as_drawn": asdict(self.nominal)}
 
 
@@ -61,7 +61,7 @@ def fit_joint_offsets(model: CalibratedModel) -> JointOffsets:
 
 
 def offsets_between(nominal: Robot, corrected: Robot) -> Float64[np.ndarray, " axes"]:
-    """Return offsets of the zero positions of a corrected robot from nominal, per axis of the controller [rad or m].
+    """Return the offsets of a corrected robot's zero positions from nominal, per axis of the controller [rad or m].
 
     Raises:
         RobotError: see `joints_by_axes`.
@@ -97,7 +97,7 @@ _MEANING = (
 
 
 def departure_sentence(what: str, lost: Departure, nominal: Departure) -> str:
-    """Return a sentence on the deviation from the whole model, compared with the nominal robot."""
+    """Return a sentence on the deviation from the whole model, compared with that of the nominal robot."""
     return (
         f"{what} from the whole model by {lost.mean_mm:.4g} mm on average, {lost.p95_mm:.4g} mm at the 95 % quantile, "
         f"{lost.max_mm:.4g} mm at most, and {lost.mean_mrad:.4g} mrad on average (the nominal robot with the model's "

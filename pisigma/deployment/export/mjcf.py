@@ -1,4 +1,4 @@
-"""The calibrated geometry as MJCF: an existing model with calibrated bodies, or a new one of the calibrated URDF."""
+"""The calibrated geometry as MJCF: an existing model with calibrated bodies, or one made from the calibrated URDF."""
 
 import itertools
 import math
@@ -30,13 +30,13 @@ from pisigma.robot.urdf_rows import rows_of_chain
 from pisigma.robot.writing import comment_text, robot_to_urdf, unused_name
 
 _SAME = 2e-3
-"""Largest difference from rows of the existing model, which may be rounded to millimetres [m or rad]."""
+"""Largest difference from rows of the existing model [m or rad], which may be rounded to millimetres."""
 _SNAP = 1e-5
-"""Deviations of drawn right angles [rad] up to this are due to rounding."""
+"""Largest deviation from a right angle [rad] that is due to rounding."""
 _DIGITS = 6
-"""Decimals of drawn positions [m] that are used."""
+"""Number of decimals of the file's positions [m] that are used."""
 _MESHES = (".stl", ".obj", ".msh")
-"""Meshes that MuJoCo reads."""
+"""Suffixes of meshes that MuJoCo reads."""
 _ORIENTATIONS = ("quat", "euler", "axisangle", "xyaxes", "zaxis")
 _HINGES = {"revolute": "hinge", "continuous": "hinge", "prismatic": "slide"}
 
@@ -74,11 +74,11 @@ FORMAT = ExportFormat(
 def urdf_to_mjcf(urdf: str) -> tuple[str, tuple[str, ...]]:
     """Convert a URDF to MJCF with the same forward kinematics, masses, inertias, limits, shapes and meshes.
 
-    Links become bodies, and the names of joints remain. A joint that mimics another becomes an equality constraint,
-    which MuJoCo fulfils while it simulates. Meshes that MuJoCo cannot read are left out.
+    Links become bodies, and joints keep their names. A joint that mimics another becomes an equality constraint, which
+    MuJoCo satisfies during a simulation. Meshes that MuJoCo cannot read are left out.
 
     Returns:
-        The MJCF, and the files of the meshes that were left out.
+        The MJCF text, and the files of the meshes that were left out.
     """
     from lxml import etree
 
@@ -220,7 +220,7 @@ def update_mjcf(
     tip: str | None = None,
     comments: tuple[str, ...] = (),
 ) -> str:
-    """Return an existing MJCF model with calibrated bodies; meshes, inertias, actuators and all else remain.
+    """Return an existing MJCF model with calibrated bodies; meshes, inertias, actuators and all else are kept.
 
     Every moved body after the first has its calibrated pose in the preceding body. Two sites are added:
     `calibrated_frame`, in the body before the first joint, is the frame of the model's poses, and `calibrated_tool`, in
@@ -228,9 +228,9 @@ def update_mjcf(
 
     Args:
         calibrated: robot with identified geometry.
-        nominal: nominal robot, which the file shows.
+        nominal: nominal robot, which the file describes.
         path: MJCF file.
-        tip: body behind the last joint; only needed if the names of joints differ from the robot.
+        tip: body after the last joint; needed only if the names of joints differ from those of the robot.
         comments: sentences to write at the top.
 
     Raises:
@@ -272,17 +272,17 @@ def _segments(robot: Robot) -> list[Frame]:
 
 
 def _row_frames(nominal: Robot, origins: Sequence[Frame], path: str | os.PathLike[str]) -> list[Frame]:
-    """Return the frames of the moved rows of the nominal robot in the drawn frames.
+    """Return the frames of the moved rows of the nominal robot in the frames of the file.
 
-    Both are converted to rows in the same way, so they agree except for the start of the first row along its axis.
+    Both are converted to rows in the same way, so they agree up to the position of the first row along its axis.
 
     Args:
         nominal: the robot.
-        origins: frames of the drawn axes, each in the preceding frame.
+        origins: frames of the axes in the file, each in the preceding frame.
         path: MJCF file, for the message.
 
     Raises:
-        RobotError: the drawing is one of another robot.
+        RobotError: the file describes another robot.
     """
     moving = [row for row in nominal.rows if row.type != "fixed"]
     drawn, own = (
@@ -308,7 +308,7 @@ def _without_rounding(T: Frame) -> Frame:
 
 
 def _chain(rows: Sequence[Row], origins: Sequence[Frame]) -> Chain:
-    """Return a chain of axes along or against z, each in the frame of the preceding axis."""
+    """Return a chain of axes along +z or -z, each in the frame of the preceding axis."""
     joints = [
         ChainJoint(row.name, _kind(row), origin, np.array([0.0, 0.0, row.direction]), -math.inf, math.inf)
         for row, origin in zip(rows, origins, strict=True)

@@ -25,7 +25,7 @@ from pisigma.network.pi_sigma import PiSigma
 
 
 def needs_pose(network: CorrectionNetwork) -> bool:
-    """Return whether an input of the network is a coordinate of the pose."""
+    """Return whether an input of the network is a pose coordinate."""
     return any(set(group.inputs.names) & set(POSE_INPUTS) for group in network.groups)
 
 
@@ -36,7 +36,7 @@ def add_network(graph: OnnxGraph, network: CorrectionNetwork, q: str, T: str | N
         graph: graph to extend.
         network: network of the model.
         q: name of the nominal joint values.
-        T: name of the poses; None if no input is a coordinate of them.
+        T: name of the poses; None if no input is a pose coordinate.
     """
     joints: list[int] = []
     outputs: list[str] = []
@@ -97,7 +97,7 @@ def add_joint_correction(graph: OnnxGraph, correction: JointCorrection, q: str) 
     """Add a correction at the mean conditions, and return the name of its values `(batch, dof)` [rad or m].
 
     Raises:
-        ModelError: it uses features without an ONNX form.
+        ModelError: the correction uses features without an ONNX form.
     """
     correction = with_modelled_torques(correction)
     robot, terms = correction.robot, []
@@ -126,7 +126,7 @@ def add_joint_correction(graph: OnnxGraph, correction: JointCorrection, q: str) 
 
 
 def add_distance_outside(graph: OnnxGraph, coverage: JointCoverage, q: str) -> str:
-    """Add the largest angle of a joint outside its measured values, `(batch, 1)` [rad]; see `JointCoverage`."""
+    """Add the largest angle of any joint from its measured values, `(batch, 1)` [rad]; see `JointCoverage`."""
     node, joint = graph.add_node, coverage.joint.numpy()
     angle = node("Mul", graph.columns(q, joint.tolist()), coverage.rate.numpy()[joint])
     off = node("Sub", angle, coverage.middle.numpy())
@@ -153,8 +153,8 @@ def export_onnx(model: CalibratedModel, model_sha256: str = "") -> bytes:
     domain are in the descriptions of inputs and outputs and in the metadata.
 
     The graph of a network on nominal joint values (inverse calibration, distilled) maps `q_nominal`, and `T_base_tool`
-    if the network uses the pose, to `q_corrected` and `correction`. That of a hybrid's joint correction maps `q` to
-    `correction` and `beyond_measured`.
+    if the network uses the pose, to `q_corrected` and `correction`. The graph of a hybrid's joint correction maps `q`
+    to `correction` and `beyond_measured`.
 
     Args:
         model: model to convert.
@@ -244,7 +244,7 @@ def _forward(model: CalibratedModel, arm: HybridArm, sha256: str) -> bytes:
 
 
 def _metadata(model: CalibratedModel, computes: str, sha256: str) -> dict[str, str]:
-    """Return the metadata as texts, lists and tables as JSON; base and tool belong to the graph."""
+    """Return the metadata as texts, with lists and tables as JSON; base and tool are those of the graph."""
     arm = model.hybrid if computes == FORWARD else None
     robot = model.robot if arm is None else arm.robot
     values: dict[str, Any] = {
@@ -272,7 +272,7 @@ def _metadata(model: CalibratedModel, computes: str, sha256: str) -> dict[str, s
 
 
 def _domain(model: CalibratedModel) -> dict[str, Any]:
-    """Return the range of the training rows, and for a hybrid the measured intervals of every joint."""
+    """Return the range of the training rows and, for a hybrid, the measured intervals of every joint."""
     domain: dict[str, Any] = {}
     if len(model.starts):
         low, high = model.starts.aminmax(dim=0)

@@ -44,7 +44,7 @@ BUILT_IN = {
     "onnx": ("pisigma.deployment.export.onnx_model", "the network alone"),
     "library": ("pisigma.deployment.export.library.c_library", "a shared library for C with a header"),
 }
-"""Module with `FORMAT` (or the attribute after the colon), which is imported on use, and help text, by name."""
+"""Module with `FORMAT` (or the attribute after the colon), which is imported on use, and help text, by format name."""
 
 _REGISTERED: dict[str, ExportFormat] = {}
 

@@ -35,8 +35,8 @@ class RsiAddress:
     """Address and name of the sender in an ETHERNET configuration of RSI.
 
     Attributes:
-        host: IP address to receive at.
-        port: UDP port to receive at.
+        host: IP address at which packets are received.
+        port: UDP port at which packets are received.
         sender: `SENTYPE` of answers.
     """
 
@@ -46,10 +46,10 @@ class RsiAddress:
 
     @staticmethod
     def read(file: Path, option: str = "--rsi") -> "RsiAddress":
-        """Read a file, as given by an option.
+        """Read the file that an option names.
 
         Raises:
-            OutputError: it is not an RSI configuration.
+            OutputError: the file is not an RSI configuration.
         """
         try:
             settings = etree.parse(file).getroot().find("CONFIG")
@@ -72,7 +72,7 @@ def _port(text: str) -> int:
 
 
 EXAMPLE = RsiAddress("192.168.1.10", 49152, _SENDER)
-"""Address in a file that was not made from another one."""
+"""Address in a file that was not made from another file."""
 SET_ADDRESS = (
     f"IP_NUMBER and PORT ({EXAMPLE.host}:{EXAMPLE.port}) are examples: set them to the address at which the computer "
     "that runs `pisigma serve` receives the packets of the controller."
@@ -96,7 +96,7 @@ def check_six_axes(model: CalibratedModel) -> None:
 
 
 def rsi_configuration(host: str, port: int, comments: tuple[str, ...] = ()) -> str:
-    """Write the ETHERNET configuration; comments state units and what the RSI context needs."""
+    """Write the ETHERNET configuration; comments state units and the requirements of the RSI context."""
     root = etree.Element("ROOT")
     for sentence in (*comments, *_REMARKS):
         root.append(etree.Comment(comment_text(sentence)))
@@ -109,7 +109,7 @@ def rsi_configuration(host: str, port: int, comments: tuple[str, ...] = ()) -> s
         etree.SubElement(sent, "ELEMENT", TAG=tag, TYPE=kind, INDX="INTERNAL")
     received = etree.SubElement(etree.SubElement(root, "RECEIVE"), "ELEMENTS")
     for number, axis in enumerate(AXES, 1):
-        # A missed answer keeps the last correction (HOLDON), because 0 would be a jump.
+        # After a missed answer, the last correction is kept (HOLDON), because 0 would be a jump.
         entry = {"TAG": f"AKorr.{axis}", "TYPE": "DOUBLE", "INDX": str(number), "HOLDON": "1"}
         etree.SubElement(received, "ELEMENT", entry)
     return str(etree.tostring(root, pretty_print=True, encoding="unicode"))

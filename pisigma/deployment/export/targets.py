@@ -1,4 +1,4 @@
-"""Corrected targets as a table in millimetres and degrees at full precision, or as a program."""
+"""Corrected targets as a table in millimetres and degrees with full precision, or as a program."""
 
 import csv
 import io
@@ -48,7 +48,7 @@ def targets_csv(targets: Targets) -> str:
     """Return CSV with one row per pose; the values of a pose without a target are empty.
 
     Columns are line (in the file of poses), status, branch, the joint values to command, the nominal robot's pose at
-    these, and the predicted accuracy (1 sigma).
+    these joint values, and the predicted accuracy (1 sigma).
     """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
@@ -88,7 +88,7 @@ def _check(request: ExportRequest) -> None:
 
 
 def _check_options(request: ExportRequest) -> None:
-    """Check that options can be combined."""
+    """Check that the options can be combined."""
     kind = request.targets
     if kind is not None:
         check_choice(OutputError, "--targets", kind, _KINDS)

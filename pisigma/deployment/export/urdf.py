@@ -48,7 +48,7 @@ _SAME = 1e-9
 
 
 def check_tip(request: ExportRequest) -> None:
-    """Check that a tip is given only together with the file that it is a link of."""
+    """Check that a tip is given only together with the file that contains this link."""
     if request.tip is not None and request.like is None:
         raise OutputError(
             "names a link of the file given with --like",
@@ -82,10 +82,10 @@ def updated_urdf_text(
         request: model and options.
         robot: robot with the geometry to write.
         nominal: robot of the model, whose `source` names the links.
-        comments: sentences for the head of the file.
+        comments: sentences for the top of the file.
 
     Returns:
-        The text; None without a URDF file.
+        The text; None if there is no URDF file.
     """
     source = _SOURCE.search(nominal.source)
     like = request.like or (request.model / DRAWING if nominal.urdf else None)
@@ -98,12 +98,13 @@ def updated_urdf_text(
 def to_pinocchio(model: "CalibratedModel | CorrectedIK") -> Any:
     """Return the identified geometry as a `pinocchio.Model`, without the joint correction of a hybrid.
 
-    The pose of a model is that of its frame `calibrated_tool` in `calibrated_frame` if the robot was loaded from a URDF
-    file, whose masses, inertias and limits remain, and of `tool0` in `base_link` otherwise; the joints are in the
-    order of the robot. Pinocchio takes cosine and sine of joints without limits. See `update_urdf`.
+    If the robot was loaded from a URDF file, the pose of the model is that of the frame `calibrated_tool` in
+    `calibrated_frame`, and masses, inertias and limits are those of the file; otherwise it is the pose of `tool0` in
+    `base_link`. The joints are in the order of the robot. Pinocchio represents joints without limits by their cosine
+    and sine. See `update_urdf`.
 
     Args:
-        model: the result of `pisigma.load` or of a calibration.
+        model: result of `pisigma.load` or of a calibration.
 
     Raises:
         MissingExtraError: pinocchio is not installed.
@@ -156,13 +157,13 @@ def update_urdf(
     comments: tuple[str, ...] = (),
     base: str | None = None,
 ) -> str:
-    """Return a URDF file with the origins of a calibrated robot; links, meshes, limits and all else remain.
+    """Return a URDF file with the origins of a calibrated robot; links, meshes, limits and all else are kept.
 
     Every joint after the first has its calibrated pose in the preceding link. The poses of links do not change
     relative to their joints, so that meshes still fit. Two links are added: `calibrated_frame`, the parent of the
     base, is the frame of the model's poses, and `calibrated_tool`, a child of the tip, is the model's tool; the
-    forward kinematics between them is that of the calibrated robot. Masses, inertias, efforts and velocities that
-    are missing or 0 become placeholders, as simulators require them; a comment says so.
+    forward kinematics between them is that of the calibrated robot. Masses, inertias, efforts and velocities that are
+    missing or 0 are replaced by placeholders, because simulators require them; a comment states this.
 
     Args:
         calibrated: robot with identified geometry.
@@ -170,7 +171,7 @@ def update_urdf(
         path: URDF file.
         tip: link that was the tool.
         comments: sentences to write at the top.
-        base: link of the frame of poses; None for the root.
+        base: link whose frame is that of the poses; None for the root.
 
     Raises:
         RobotError: the file cannot be used, or describes another robot.
@@ -260,7 +261,7 @@ def _new_origins(chain: Chain, rows: ChainRows, calibrated: Robot, urdf: Any) ->
 
 
 def _widen_limits(elements: dict[str, Any], nominal: Robot) -> None:
-    """Widen limits of the file that calibration rows exceeded, like the limits of the model."""
+    """Widen limits of the file that calibration rows exceed, as in the model."""
     for axis in nominal.axes:
         limit = next(elements[axis.name].iterchildren("{*}limit"), None)
         if limit is None or limit.get("lower") is None or limit.get("upper") is None:

@@ -1,1 +1,1 @@
-"""Calibrated models for LeRobot: its calibration file, and corrected frames of policies and data sets."""
+"""Calibrated models for LeRobot: calibration file, and corrected frames of policies and data sets."""

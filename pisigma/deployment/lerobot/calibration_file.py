@@ -1,4 +1,4 @@
-"""Corrected zeros of joints in LeRobot's calibration file."""
+"""Corrected joint zeros in LeRobot's calibration file."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -37,7 +37,7 @@ _NOT_EXPRESSED = (
 
 
 def with_offset(motor: Motor, ticks: float, at: Place) -> Motor:
-    """Return a motor whose position 0 deg is moved so that its degrees increase by an offset.
+    """Return a motor whose position of 0 deg is moved so that its values increase by an offset.
 
     Args:
         motor: the motor.
@@ -60,7 +60,7 @@ def with_offset(motor: Motor, ticks: float, at: Place) -> Motor:
 
 
 def with_offsets(motors: Mapping[str, Motor], offsets: Mapping[str, float], file: Path) -> dict[str, Motor]:
-    """Return all motors, those of joints with other zeros.
+    """Return all motors, with changed zeros for those of joints.
 
     Args:
         motors: motors of the arm.
@@ -68,7 +68,7 @@ def with_offsets(motors: Mapping[str, Motor], offsets: Mapping[str, float], file
         file: file of the motors, for messages.
 
     Raises:
-        OutputError: a joint has no motor or no zero in the file, or see `with_offset`.
+        OutputError: a joint has no motor or no zero in the file, or a range would become empty.
     """
     if any(DAMIAO.fullmatch(name) for name in offsets):
         raise OutputError(
@@ -97,7 +97,7 @@ def _check_rows(model: CalibratedModel, motors: Mapping[str, Motor], file: Path)
     """Check that the joint values of the calibration are possible with this calibration file.
 
     Raises:
-        OutputError: they are not, so that the zeros of the model are those of another file.
+        OutputError: the joint values are impossible, so the zeros of the model are those of another file.
     """
     names = [axis.name for axis in model.robot.axes]
     recorded = model.starts.numpy() / np.array([radians_per_unit("degrees", name, None) for name in names])

@@ -1,4 +1,4 @@
-"""Correct the joint values of LeRobot's observations and actions, of a policy or a data set."""
+"""Correct the joint values in LeRobot's observations and actions, from a policy or a data set."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -23,27 +23,27 @@ if TYPE_CHECKING:
     from pisigma.model.calibrated_model import CalibratedModel
 
 CHUNK = 10_000
-"""Frames whose poses are computed at a time."""
+"""Number of frames whose poses are computed at a time."""
 
 
 @dataclass(frozen=True, eq=False)
 class LeRobotCorrection:
     """Correction of frames of joint values in LeRobot's units.
 
-    The real arm commanded to q is where the nominal arm is at q + offset. The offsets are those of
-    `fit_joint_offsets`: errors of lengths and angles between the axes cannot be expressed in joint values, and
-    remain; `poses` contains them. Values that are not joints of the robot, such as the gripper's, are not changed.
+    The real arm commanded to q is where the nominal arm is at q + offset. The offsets are those of `fit_joint_offsets`.
+    Errors of lengths and of angles between the axes cannot be expressed in joint values and remain; `poses` takes them
+    into account. Values that are not joints of the robot, such as the gripper's, are not changed.
 
     Attributes:
         model: calibrated model.
         units: units of the values.
         names: names of the values of a frame, in their order.
-        joints: for every joint of the robot, the index of its value in a frame.
+        joints: index of the value of every joint of the robot in a frame.
         scale: rotation [rad] per unit of the value, for every joint.
-        offset: offset of every value of a frame [its unit], 0 for values that are not joints.
-        lost: the joint offsets with what they leave out.
+        offset: offset of every value of a frame [in its unit], 0 for values that are not joints.
+        lost: the joint offsets, with the deviation that they leave.
         prefix: start of the names of this arm, such as "left_".
-        motors: the arm's calibration file, by name of the motor; None if it is not known.
+        motors: motors in the arm's calibration file, by name; None if it is not known.
         version: name, SHA-256 and offsets of the model, as written to the metadata of data sets.
     """
 
@@ -71,14 +71,14 @@ class LeRobotCorrection:
         Args:
             model: model folder, whose robot has LeRobot's names of joints.
             names: names of the values of a frame, such as "shoulder_pan.pos" or "shoulder_pan".
-            units: "degrees" (LeRobot's `use_degrees=true`) or "normalized" (-100 to 100); they cannot be
-                distinguished by the values.
+            units: "degrees" (LeRobot's `use_degrees=true`) or "normalized" (-100 to 100); the values do not show which
+                applies.
             calibration: LeRobot's calibration file of this arm, needed for normalized values.
-            prefix: start of the names of this arm, such as "left_" of a pair.
+            prefix: start of the names of this arm, such as "left_" for one arm of a pair.
 
         Raises:
             ModelError: the folder is not a model.
-            MeasurementError: the values are not those of the robot's joints, or their scale is not known.
+            MeasurementError: the values are not those of the robot's joints, or their scale is unknown.
         """
         calibrated = load_model(model)
         robot = calibrated.robot
@@ -102,7 +102,7 @@ class LeRobotCorrection:
         )
 
     def true_values(self, frames: Any) -> Any:
-        """Compute the joint values at which the nominal arm is where the real arm was.
+        """Compute the joint values at which the nominal arm has the pose that the real arm had.
 
         Args:
             frames: joint values as recorded or commanded: an array or tensor `(*batch, values)`, or a dictionary by
@@ -117,9 +117,9 @@ class LeRobotCorrection:
         return self._moved(frames, self.offset)
 
     def commands(self, frames: Any) -> Any:
-        """Compute the joint values to command for true ones; the inverse of `true_values`.
+        """Compute the joint values to command for true joint values; the inverse of `true_values`.
 
-        LeRobot limits normalized values to -100 to 100 when it sends them, so that an arm stops there.
+        LeRobot limits normalized values to -100 to 100 when it sends them, so an arm stops there.
         """
         return self._moved(frames, -self.offset)
 
@@ -148,7 +148,7 @@ class LeRobotCorrection:
     def _moved_by_name(
         self, frame: Mapping[str, Any], offset: Float64[np.ndarray, " values"]
     ) -> dict[str, Any]:
-        """Return a dictionary with the values moved, all entries in their order."""
+        """Return a dictionary with the offsets added to the values; all entries keep their order."""
         if missing := [self.names[index] for index in self.joints if self.names[index] not in frame]:
             raise MeasurementError(
                 expected=f"the values {', '.join(self.names[index] for index in self.joints)}",
@@ -166,7 +166,7 @@ class LeRobotCorrection:
         """Return frames of numbers with one value per name.
 
         Raises:
-            MeasurementError: they have another number of values, or are integers.
+            MeasurementError: the frames have a different number of values, or are integers.
         """
         if not frames.ndim or frames.shape[-1] != len(self.names):
             raise MeasurementError(
@@ -178,17 +178,17 @@ class LeRobotCorrection:
 
 
 def _sum(values: Any, offset: Any) -> Any:
-    """Return values plus an offset, computed with 64 bits, of the type of the values."""
+    """Return values plus an offset, computed with 64 bits, in the type of the values."""
     if isinstance(values, torch.Tensor):
         return (values.double() + torch.as_tensor(offset, device=values.device)).to(values.dtype)
     return float(values + offset) if type(values) is float else (values + offset).astype(values.dtype)
 
 
 def _checked_type(values: Any, what: str) -> Any:
-    """Return values that are a float, or an array or a tensor of them.
+    """Return values after checking that they are a float, or an array or a tensor of floats.
 
     Raises:
-        MeasurementError: they are not; an offset would be cut off in integers.
+        MeasurementError: the values have another type; integers would truncate an offset.
     """
     dtype = getattr(values, "dtype", type(values))
     if not (dtype.is_floating_point if isinstance(dtype, torch.dtype) else np.issubdtype(dtype, np.floating)):
@@ -219,7 +219,7 @@ def joints_of_values(robot: Robot, names: Sequence[str], prefix: str) -> tuple[i
 def _version(
     folder: Path, robot: Robot, units: LeRobotUnits, lost: JointOffsets, motors: Mapping[str, Motor] | None
 ) -> dict[str, Any]:
-    """Return what identifies the model and the correction, for metadata."""
+    """Return the data that identify the model and the correction, for metadata."""
     sha256 = content_hash(read_model_file(folder, DESCRIPTION), read_model_file(folder, WEIGHTS))
     degrees = np.rad2deg(lost.values).tolist()
     return {

@@ -23,9 +23,9 @@ if TYPE_CHECKING:
     import pyarrow
 
 RECORD = Path("meta", "pisigma.json")
-"""File of a corrected data set: the version of the model by prefix of the arm and feature."""
+"""File in a corrected data set with the version of the model, by prefix of the arm and by feature."""
 STATISTICS = ("mean", "min", "max", "q01", "q10", "q50", "q90", "q99")
-"""Statistics of a feature that move with its values; the standard deviation and the count do not."""
+"""Statistics of a feature that shift with its values, unlike the standard deviation and the count."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,8 +34,8 @@ class CorrectedDataset:
 
     Attributes:
         folder: the new data set.
-        frames: number of its frames.
-        corrections: the correction of every feature that was changed, by its name.
+        frames: number of frames.
+        corrections: the correction of every changed feature, by name.
     """
 
     folder: Path
@@ -53,9 +53,9 @@ def correct_lerobot_dataset(
 ) -> CorrectedDataset:
     """Write a copy of a data set with true joint values in `observation.state` and `action`.
 
-    Frames keep their shape, type and order; statistics of these features move with them. All other files are copied
-    unchanged. `meta/pisigma.json` has the version of the model. A data set of two arms is corrected arm by arm: the
-    second call takes the output of the first one, and the other prefix.
+    Frames keep their shape, type and order; the statistics of these features are shifted accordingly. All other files
+    are copied unchanged. `meta/pisigma.json` states the version of the model. A data set of two arms is corrected arm
+    by arm: the second call takes the output of the first, with the other prefix.
 
     Args:
         dataset: folder of a data set of layout v2.1 or v3.0.
@@ -66,8 +66,8 @@ def correct_lerobot_dataset(
         prefix: start of the names of this arm.
 
     Raises:
-        MeasurementError: the data set cannot be read, this arm was corrected already, its values are not those of the
-            robot, or they are not possible in these units.
+        MeasurementError: the data set cannot be read, this arm has already been corrected, its values are not those of
+            the robot, or they are impossible in these units.
         ModelError: the folder is not a model.
         OutputError: the new folder exists or cannot be written.
         ImportError: pyarrow is not installed.
@@ -98,10 +98,11 @@ def correct_lerobot_dataset(
 
 
 def _record(source: LeRobotDataset, prefix: str) -> dict[str, Any]:
-    """Return the arms of a data set that were corrected already, by prefix.
+    """Return the arms of a data set that have already been corrected, by prefix.
 
     Raises:
-        MeasurementError: this arm is one of them; a prefix that continues another one selects the same values.
+        MeasurementError: this arm has already been corrected; a prefix that extends another prefix selects the same
+            values.
     """
     path = source.folder / RECORD
     if not path.exists():
@@ -118,10 +119,10 @@ def _record(source: LeRobotDataset, prefix: str) -> dict[str, Any]:
 
 
 def _json(path: Path, text: str, line: int | None = None) -> dict[str, Any]:
-    """Return a JSON object of a file.
+    """Parse the text of a file as a JSON object.
 
     Raises:
-        MeasurementError: the text is not one.
+        MeasurementError: the text is not a JSON object.
     """
     try:
         document = json.loads(text)
@@ -163,12 +164,12 @@ def _write_copy(source: LeRobotDataset, corrections: dict[str, LeRobotCorrection
 
 
 def _episode_files(source: LeRobotDataset) -> list[Path]:
-    """Return the files of v3.0 with the statistics of every episode."""
+    """Return the files of layout v3.0 with the statistics of every episode."""
     return sorted((source.folder / "meta" / "episodes").glob("chunk-*/*.parquet"))
 
 
 def _with_column(table: "pyarrow.Table", name: str, flat: Float[np.ndarray, " numbers"]) -> "pyarrow.Table":
-    """Return a table with other numbers in a column of lists, of the same type and lengths."""
+    """Return a table with new numbers, of the same type and lengths, in a column of lists."""
     import pyarrow
 
     index, field = table.column_names.index(name), table.schema.field(name)
@@ -182,7 +183,7 @@ def _with_column(table: "pyarrow.Table", name: str, flat: Float[np.ndarray, " nu
 
 
 def _with_statistics(table: "pyarrow.Table", corrections: dict[str, LeRobotCorrection]) -> "pyarrow.Table":
-    """Move the statistics of the corrected features in a table of episodes."""
+    """Shift the statistics of the corrected features in a table of episodes."""
     for key, correction in corrections.items():
         for name in (f"stats/{key}/{kind}" for kind in STATISTICS):
             if name in table.column_names:
@@ -194,7 +195,7 @@ def _with_statistics(table: "pyarrow.Table", corrections: dict[str, LeRobotCorre
 
 
 def _write_json_statistics(source: Path, corrections: dict[str, LeRobotCorrection], folder: Path) -> None:
-    """Move the statistics in `stats.json` (of all frames) and `episodes_stats.jsonl` (of every episode, v2.1)."""
+    """Shift the statistics in `stats.json` (of all frames) and `episodes_stats.jsonl` (of every episode, v2.1)."""
     whole, episodes = Path("meta", "stats.json"), Path("meta", "episodes_stats.jsonl")
     if (source / whole).exists():
         document = _json(source / whole, read_text(source / whole, MeasurementError, "JSON"))
@@ -209,7 +210,7 @@ def _write_json_statistics(source: Path, corrections: dict[str, LeRobotCorrectio
 
 
 def _move(statistics: dict[str, Any], corrections: dict[str, LeRobotCorrection]) -> None:
-    """Move statistics by feature in place."""
+    """Shift statistics, by feature, in place."""
     for key, correction in corrections.items():
         entry = statistics.get(key, {})
         for kind in set(STATISTICS) & set(entry):

@@ -12,20 +12,21 @@ from pisigma.files.errors import RequestError
 
 MAGIC = b"PSI1"
 JOINTS = 8
-"""Joint values in every frame, regardless of the robot."""
+"""Number of joint values in every frame, regardless of the robot."""
 HEAD = struct.Struct("<4sIQII")
-"""Magic, length of the whole frame, id; then model index and flags, or status and number of joints."""
+"""Format of the header: magic, length of the whole frame, id; then model index and flags, or status and number of
+joints."""
 REQUEST = struct.Struct(f"<4sIQII16d{JOINTS}d")
-"""Format of requests: the pose T_base_tool row by row [m], and joint values near which the solution should be [rad
-or m] (NaN: none)."""
+"""Format of requests: the pose T_base_tool row by row [m], and joint values near which the solution should be [rad or
+m] (NaN for none)."""
 _POSE, _NEAR = HEAD.size, HEAD.size + 128
 ANSWER = struct.Struct(f"<4sIQII{JOINTS}d2d8s")
-"""Joint values [rad or m], NaN after the last joint, the residuals of position [m] and rotation [rad], and the first
-bytes of the SHA-256 of the model, 0 if no model answered."""
+"""Format of answers: joint values [rad or m], NaN after the last joint, the residuals of position [m] and rotation
+[rad], and the first bytes of the SHA-256 of the model, 0 if no model answered."""
 _MAX_TOKEN_BYTES = 1024
 
 TOKEN = 1
-"""Flag of a first frame that has a token after its head."""
+"""Flag of a first frame that has a token after its header."""
 
 
 class Refusal(enum.IntEnum):
@@ -87,7 +88,7 @@ class BinaryFrames(AbstractProtocol):
         return _refusal(0, Refusal.BROKEN_FRAME)
 
     def token_of(self, message: bytes) -> bytes | None:
-        """Return the bytes after the head of a frame with the flag `TOKEN`."""
+        """Return the bytes after the header of a frame with the flag `TOKEN`."""
         return message[HEAD.size :] if HEAD.unpack_from(message)[4] == TOKEN else None
 
     def admission_answer(self, admitted: bool) -> bytes:

@@ -8,9 +8,9 @@ from collections.abc import Callable
 from pisigma.deployment.serve.protocol import AbstractProtocol, BrokenStreamError, tokens_match
 
 CHUNK = 4096
-"""Largest number of bytes that is read at a time, so that no client delays other clients by long messages."""
+"""Largest number of bytes that are read at a time, so that no client delays others with long messages."""
 MAX_DRAIN_BYTES = 2**22
-"""Largest number of bytes that is read from a client when the server stops, so that no client can delay the stop."""
+"""Largest number of bytes that are read from a client when the server stops, so that no client can delay the stop."""
 _MESSAGES_PER_TURN = 100
 """Number of messages of a client that are answered in one turn when the server stops."""
 
@@ -18,16 +18,16 @@ Submit = Callable[["Connection", Callable[[], bytes]], None]
 
 
 class Connection:
-    """Connection to a client, whose messages are answered one after the other, in order.
+    """Connection to a client, whose messages are answered one at a time, in order.
 
-    It is not read while an answer is computed or waits to be received by the client, so that the memory for a client is
-    limited by one message, one answer and a chunk.
+    It is not read while an answer is computed or waits to be received by the client, so the memory per client is
+    limited to one message, one answer and a chunk.
 
     Attributes:
         closed: whether the connection is closed.
         waits_since: `time.monotonic()` since which the remainder of a message, the token, or space for an answer has
             been awaited; None if nothing is awaited from the client.
-        busy: whether another thread computes an answer.
+        busy: whether another thread is computing an answer.
     """
 
     def __init__(
@@ -44,7 +44,7 @@ class Connection:
             stream: socket of the client.
             protocol: protocol of the client.
             selector: selector that reports when the socket can be read or written.
-            submit: function that has another thread compute an answer and pass it to `send_answer`.
+            submit: function that makes another thread compute an answer and pass it to `send_answer`.
             token: token that the first message must have; None if no token is required.
         """
         stream.setblocking(False)
@@ -98,7 +98,7 @@ class Connection:
             self.close()
 
     def answer_remaining(self) -> bool:
-        """Answer some of the complete messages, close after the last message, and return whether there are more."""
+        """Answer some complete messages, close the connection after the last one, and return whether there are more."""
         try:
             if not self.closed:
                 self.answer_messages()
@@ -115,7 +115,7 @@ class Connection:
             self._stream.close()
 
     def answer_messages(self) -> None:
-        """Answer the complete messages as far as answers can be sent; when the server stops, only some at a time."""
+        """Answer the complete messages as far as answers can be sent; when the server stops, only a few at a time."""
         answered = 0
         try:
             while not self.busy and not self._unsent:

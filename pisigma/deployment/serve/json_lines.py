@@ -30,7 +30,7 @@ from pisigma.robot.kernels.array_kinematics import xyzrpy_of
 from pisigma.robot.kinematics.status import Status
 
 MAX_LINE_BYTES = 2**20
-"""Largest length of a line, which is sufficient for a path of about 8,000 poses [bytes]."""
+"""Largest length of a line [bytes], which is sufficient for a path of about 8,000 poses."""
 _MAX_ID_CHARACTERS = 200
 
 _TASKS = ("pose", "path", "q_deg", "q", "ask")
@@ -44,7 +44,7 @@ _KEYS = {
     "q": {"id", "model", "approach", "accuracy"},
     "ask": {"id", "model"},
 }
-"""Further keys that a request of each task may have."""
+"""Other keys that a request of each task may have."""
 _QUESTIONS = ("health", "models", "reload", "status", "urdf")
 
 _PLAIN = {"id", "model", "pose", *_NEAR, "brief"}
@@ -74,11 +74,11 @@ _decode_strictly = json.JSONDecoder(object_pairs_hook=_object, parse_constant=_r
 def _decode(message: bytes) -> Any:
     """Read JSON in which no key appears twice.
 
-    Every key needs a colon, so an object with as many keys as there are colons has no repeated key.
+    Every key needs a colon, so no key of an object is repeated if there are as many keys as colons.
 
     Raises:
-        ValueError: it is not valid JSON, or a key appears twice.
-        RecursionError: it is nested too deeply.
+        ValueError: the message is not valid JSON, or a key appears twice.
+        RecursionError: the message is nested too deeply.
     """
     try:
         values = from_json(message, allow_inf_nan=False, cache_strings="keys")
@@ -202,7 +202,7 @@ class JsonLines(AbstractProtocol):
         return reply
 
     def _refuse(self, request: dict[str, Any], problem: Exception, begun: int) -> bytes:
-        """Return the answer to an invalid request, with its id if that could be read."""
+        """Return the answer to an invalid request, with the id of the request if it could be read."""
         if isinstance(problem, PisigmaError | ValueError):
             sentence = make_printable(str(problem))
         elif isinstance(problem, RecursionError):
@@ -221,10 +221,10 @@ def _line(values: dict[str, Any]) -> bytes:
 
 
 def _read(message: bytes) -> dict[str, Any]:
-    """Read a request and check its id only.
+    """Read a request, checking only its id.
 
     Raises:
-        RequestError: it is not a JSON object, or its id is neither an integer nor a short string.
+        RequestError: the message is not a JSON object, or its id is neither an integer nor a short string.
     """
     try:
         request = _decode(message)
@@ -280,7 +280,7 @@ def _record(model: ServedModel, row: list[float], ignored_axes: tuple[str, ...])
 
 
 def _brief(model: ServedModel, values: dict[str, Any]) -> dict[str, Any]:
-    """Reduce an answer to the status and joint values to 1e-6 deg or mm, for controllers with short strings."""
+    """Reduce an answer to status and joint values, rounded to 1e-6 deg or mm, for controllers with short strings."""
     q = values[model.joints_key]
     return {model.joints_key: q and [round(value, 6) for value in q], "status": values["status"]}
 
@@ -338,7 +338,7 @@ def _near(model: ServedModel, request: dict[str, Any]) -> list[float] | None:
 
 
 def _joints(model: ServedModel, request: dict[str, Any], in_degrees: str, mixed: str) -> list[float]:
-    """Return joint values [rad or m] from the key `in_degrees` if all joints are revolute, otherwise from `mixed`.
+    """Return joint values [rad or m] from the key `in_degrees` if all joints are revolute, or else from `mixed`.
 
     Raises:
         RequestError: the request has the other key, or the values are invalid.

@@ -17,8 +17,8 @@ class MetricsSummary:
         uptime_s: time since the start of the server [s].
         calls: number of answered requests.
         p50_us: median of the last `KEPT_DURATIONS` durations from reading a request to its answer [µs]; None before the
-            first.
-        p99_us: their 99 % quantile [µs].
+            first request.
+        p99_us: 99 % quantile of these durations [µs].
         statuses: number of requests by status, including "forward", "path" and "refused".
         connections: number of open connections.
         cut_off: number of connections that were closed because they were slow or broken.

@@ -31,7 +31,7 @@ class ServedModel:
 
     Attributes:
         folder: folder from which the model was read.
-        ik: its corrected inverse kinematics.
+        ik: corrected inverse kinematics of the model.
         sha256: SHA-256 of its `model.yaml`.
     """
 
@@ -46,7 +46,7 @@ class ServedModel:
         Raises:
             ModelError: the folder is not a complete model.
         """
-        # before loading, because the folder may be written again meanwhile
+        # read before loading, because the folder may be rewritten in the meantime
         sha256 = model_hash(folder) if is_model(folder) else ""
         ik = load(folder)
         ik(np.eye(4), near=np.zeros(len(ik.joints)), throw=False)
@@ -74,7 +74,7 @@ class ServedModel:
 
     @cached_property
     def file_units_per_si(self) -> list[float]:
-        """For every joint, degrees per radian or millimetres per metre."""
+        """Degrees per radian, or millimetres per metre, for every joint."""
         return [180 / math.pi if is_revolute else 1e3 for is_revolute in self.ik.revolute]
 
     @cached_property
@@ -84,7 +84,7 @@ class ServedModel:
 
     @cached_property
     def is_fast(self) -> bool:
-        """Whether compiled kernels solve its poses in microseconds, for coupled joints in DH values."""
+        """Whether compiled kernels solve poses in microseconds; for coupled joints, they do so in DH values."""
         controller = self.ik.controller
         if controller is None:
             return self.ik.compiled is not None
@@ -119,7 +119,7 @@ class ServedModel:
 
         Args:
             T_base_tool: 16 doubles, row by row [m].
-            near: one double for every joint [rad or m]; all NaN without desired joint values.
+            near: one double for every joint [rad or m]; all NaN if no joint values are preferred.
 
         Returns:
             The row of `CompiledIK.solve_packed`.
@@ -144,10 +144,10 @@ class ModelStatus:
         model: name of the model.
         sha256: SHA-256 of its `model.yaml`.
         day: day of the newest rows to which the model was fitted (ISO 8601); empty if no cell states it.
-        age_days: days since then; None if unknown.
+        age_days: days since this day; None if unknown.
         state: state of the cell, as printed by `pisigma status`; "not_in_cell" for a model outside of a cell,
             "not_in_use" if the cell uses another model, "unreadable" if the state cannot be determined.
-        reason: why it is in this state, as a sentence.
+        reason: sentence that states the reason for this state.
     """
 
     model: str
@@ -189,7 +189,7 @@ def model_folders(folder: Path) -> list[Path]:
     """Return the model folders in a folder by name, including damaged folders, so that loading reports the damage.
 
     Raises:
-        ModelError: there are none.
+        ModelError: the folder contains no model folder.
     """
     inside = sorted(path for path in folder.iterdir() if path.is_dir()) if folder.is_dir() else []
     folders = [path for path in inside if is_model(path) or any(path.glob("*.safetensors"))]
@@ -217,8 +217,7 @@ class ServedModels:
     """Models by index and by name; the index of a model does not change while the server runs.
 
     Attributes:
-        problems: with `within`, sentences on folders that could not be loaded and are not served; of a cell,
-            warnings.
+        problems: with `within`, sentences on folders that could not be loaded and are not served; for a cell, warnings.
     """
 
     def __init__(
@@ -228,8 +227,8 @@ class ServedModels:
 
         Args:
             folders: model folders.
-            within: folder that is searched for further models on reload; damaged models in it are left out.
-            cell: cell whose model in use is served instead, also after a change; see `follow_changes`.
+            within: folder that is searched for other models on reload; damaged models in it are left out.
+            cell: cell whose model in use is served instead, also after it changes; see `follow_changes`.
 
         Raises:
             ModelError: a folder is not a complete model; with `within`, no folder is a complete model.
@@ -267,7 +266,7 @@ class ServedModels:
         return self._in_use is not None and bool(self._in_use.findings.refusal)
 
     def find_model(self, name: object) -> ServedModel:
-        """Return the model with a name or an index; None stands for the only model.
+        """Return the model with a given name or index; None stands for the only model.
 
         Raises:
             RequestError: there is no such model, None is given and there are several, or the model must not be used
@@ -324,7 +323,7 @@ class ServedModels:
             self._in_use.stop()
 
     def _replace(self, folder: Path) -> None:
-        """Answer all further requests with the model in a folder, if it is a new model."""
+        """Answer all later requests with the model in a folder, if it is a new model."""
         if not (
             self._models and (folder, model_hash(folder)) == (self._models[0].folder, self._models[0].sha256)
         ):

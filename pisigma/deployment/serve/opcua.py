@@ -31,21 +31,21 @@ NAMESPACE = "urn:pisigma:server"
 USER = "pisigma"
 """Name of the user whose password is the token of the server."""
 _POLL_INTERVAL = 0.5
-"""Time between two checks which models are served [s]."""
+"""Time between two checks of which models are served [s]."""
 _STATUS_INTERVAL = 10.0
-"""Time after which age and state of a model are determined again [s]."""
+"""Time after which the age and state of a model are determined again [s]."""
 _CERTIFICATE, _KEY, _TRUSTED = "server_certificate.der", "server_key.pem", "trusted"
 _CERTIFICATE_DAYS = 3650
 _TEXTS = ("Name", "Sha256", "Day", "State", "Reason", "Joints", "Units")
-"""Text variables of every model; AgeDays is a number."""
+"""Text variables of every model; AgeDays is a number instead."""
 
 
 class OpcUa:
     """An OPC UA server in a separate thread.
 
-    Without a token, only programs on this machine can connect, and they need no user. With a token, every client needs
-    the user `USER`, whose password is the token, or a certificate in the folder `trusted`. If other machines can reach
-    the server, all connections are signed and encrypted.
+    Without a token, only programs on this machine can connect, and no user name is needed. With a token, every client
+    needs the user `USER`, whose password is the token, or a certificate in the folder `trusted`. If other machines can
+    reach the server, all connections are signed and encrypted.
 
     Attributes:
         port: port of the server.
@@ -70,7 +70,7 @@ class OpcUa:
                 option="--opcua-certificates",
                 remedy="give a folder for the certificates, or serve at 127.0.0.1",
             )
-        logging.getLogger("asyncua").setLevel(logging.CRITICAL)  # it reports every client that is refused
+        logging.getLogger("asyncua").setLevel(logging.CRITICAL)  # asyncua would report every refused client
         self._models, self._json, self._settings = models, JsonLines(models, metrics), settings
         self._uri, self._trusted = f"{NAMESPACE}:{socket.gethostname()}", frozenset[bytes]()
         if settings.opcua_certificates is not None:
@@ -120,11 +120,11 @@ class OpcUa:
             await self._look(server, index, robots)
         listener = server.bserver and server.bserver._server
         if listener is not None:
-            listener.close()  # before the connections, because clients that connect again at once would prevent the end
+            listener.close()  # before the connections, because clients that reconnect at once would prevent the stop
         await server.stop()
 
     async def _server(self) -> "asyncua.Server":
-        """Return a server that is not started, with its certificates and the clients that it admits."""
+        """Return a server that has not been started, with its certificates and the clients that it admits."""
         from asyncua import Server, ua
 
         folder = self._settings.opcua_certificates
@@ -272,10 +272,10 @@ def _argument(name: str, kind: int, meaning: str, length: int | None = None) -> 
 
 
 class _Admission:
-    """Decides which clients are admitted."""
+    """Rule that decides which clients are admitted."""
 
     def __init__(self, is_open: bool, token: bytes | None, trusted: frozenset[bytes]) -> None:
-        """Store who is admitted: everybody, a user with a token, and owners of certificates (DER)."""
+        """Store who is admitted: everybody, users with a token, and owners of certificates (DER)."""
         self._is_open, self._token, self._trusted = is_open, token, trusted
 
     def get_user(
@@ -285,7 +285,7 @@ class _Admission:
         password: Any = None,
         certificate: bytes | None = None,
     ) -> "User | None":
-        """Return the user of a client; None if it is not admitted."""
+        """Return the user of a client; None if the client is not admitted."""
         from asyncua.crypto.permission_rules import User, UserRole
 
         if username is not None and self._token is not None:
@@ -324,7 +324,7 @@ def _make_own_certificate(folder: Path, uri: str) -> None:
     """Write a key and a self-signed certificate of the server, unless the folder already has them.
 
     Raises:
-        OutputError: the folder has only one of both files, or they cannot be written.
+        OutputError: the folder has only one of the two files, or they cannot be written.
     """
     from asyncua.crypto import cert_gen
     from cryptography import x509

@@ -9,13 +9,13 @@ POLL_DURATION = 2.5e-3
 MAX_GAP = 5e-4
 """Gap between two polls above which other programs or threads used the processor [s]."""
 REST_FACTOR = 100.0
-"""Duration of a pause of polling as a multiple of the gap, so that gaps delay at most one request in a hundred."""
+"""Duration of a pause in polling, as a multiple of the gap, so that gaps delay at most one request in a hundred."""
 
 
 class Polling:
-    """Polls for requests without sleeping after two of them followed each other within a stated time.
+    """Polling for requests without sleeping, after two of them have followed each other within a stated time.
 
-    It pauses when others need the processor, because the scheduler delays a program that never sleeps.
+    It pauses when other programs need the processor, because the scheduler delays a program that never sleeps.
     """
 
     def __init__(self, selector: selectors.BaseSelector, duration: float) -> None:
@@ -24,7 +24,7 @@ class Polling:
         self._last, self._often, self._resting_until = -math.inf, False, -math.inf
 
     def wait_for_connections(self) -> list[tuple[selectors.SelectorKey, int]]:
-        """Return ready connections as soon as there are some; an empty list when it is time to sleep."""
+        """Return ready connections as soon as there are some, or an empty list when it is time to sleep."""
         now = time.monotonic()
         while self._often and self._resting_until < now < self._last + self._duration:
             if ready := self._selector.select(0):
@@ -35,6 +35,6 @@ class Polling:
         return []
 
     def record_activity(self) -> None:
-        """Record that a request was handled now."""
+        """Record that a request has just been handled."""
         before, self._last = self._last, time.monotonic()
         self._often = self._last - before < self._duration

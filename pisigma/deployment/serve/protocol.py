@@ -1,4 +1,4 @@
-"""Interface of a server's protocols, which cut a stream into messages and answer them, and the values of requests."""
+"""Interface of a server's protocols, which split a stream into messages and answer them, and values of requests."""
 
 import hmac
 import math
@@ -17,7 +17,7 @@ Reply = bytes | Callable[[], bytes]
 
 
 class BrokenStreamError(Exception):
-    """The received bytes cannot become a message, so later bytes cannot be interpreted either.
+    """Error for received bytes that cannot become a message, so that later bytes cannot be interpreted either.
 
     Attributes:
         final_answer: answer to send before the connection is closed.
@@ -57,7 +57,7 @@ class AbstractProtocol(ABC):
 
 
 def tokens_match(given: bytes | None, wanted: bytes) -> bool:
-    """Return whether tokens are equal, in a time that does not depend on their first difference."""
+    """Return whether tokens are equal, in a time that does not depend on where they first differ."""
     return given is not None and hmac.compare_digest(given, wanted)
 
 
@@ -75,7 +75,7 @@ def read_numbers(request: dict[str, Any], key: str, count: int) -> list[float]:
     """Return a list of `count` finite numbers from the key of a request.
 
     Raises:
-        RequestError: the value is not a list of this length, or contains another value.
+        RequestError: the value is not a list of this length, or an entry is not a finite number.
     """
     values = request[key]
     if not isinstance(values, list) or len(values) != count:
@@ -92,7 +92,7 @@ def read_numbers(request: dict[str, Any], key: str, count: int) -> list[float]:
 
 
 def read_tolerance(request: dict[str, Any], key: str) -> list[float] | None:
-    """Return the tolerances of three axes, given as a list or one number for all; None if not given."""
+    """Return the tolerances of three axes, given as a list or as one number for all; None if not given."""
     if key not in request:
         return None
     stated = request[key]

@@ -1,9 +1,9 @@
 """Joint corrections for a KUKA controller over RSI: one answer in every interpolation cycle.
 
-The controller computes the commanded joint values q (`ASPos`) with its nominal kinematics. The pose that it means is
+The controller computes the commanded joint values q (`ASPos`) with its nominal kinematics. The intended pose is
 FK_nominal(q), and the answer is the absolute correction IK_corrected(FK_nominal(q)) - q. Whether `ASPos` contains the
-correction of the last cycle makes a difference of second order only, the correction times its slope (about 1e-3 each),
-because corrections are absolute and do not add up. What is wrong ends the stream: without answers, the controller stops
+correction of the last cycle makes only a second-order difference, the correction times its slope (about 1e-3 each),
+because corrections are absolute and do not accumulate. Any fault ends the stream: without answers, the controller stops
 RSI, and with it the robot, after `Timeout` cycles.
 """
 
@@ -32,16 +32,16 @@ from pisigma.robot.kernels import arrays
 from pisigma.robot.kinematics.status import Status
 
 _CYCLE_MS = 4
-"""[ms] Interpolation cycle of a controller, or a third of it (12 ms); the time stamp counts milliseconds."""
+"""Interpolation cycle of a controller, or a third of it (12 ms) [ms]; the time stamp counts milliseconds."""
 _MAX_CYCLE_MS = 3 * _CYCLE_MS
 _MAX_GAP = 10
-"""Largest number of cycles from one answer to the next; those between were lost or late."""
+"""Largest number of cycles from one answer to the next; packets in between were lost or late."""
 _MAX_STEP_DEG = 0.05
-"""[deg] Largest change of a correction per cycle: 12.5 deg/s at 4 ms, far above what moving along a path needs."""
+"""Largest change of a correction per cycle [deg]: 12.5 deg/s at 4 ms, far more than motion along a path requires."""
 RAMP_MS = 2000
-"""[ms] Time in which the corrections rise from 0 at the start of a stream, and fall to 0 at its end."""
+"""Time in which the corrections rise from 0 at the start of a stream, and fall to 0 at its end [ms]."""
 _SILENCE = 0.5
-"""[s] Without packets for this time, the controller has ended the stream (RSI_OFF)."""
+"""Time without packets after which the controller has ended the stream (RSI_OFF) [s]."""
 _MAX_PACKET = 65535
 _IPOC = re.compile(rb"<IPOC>\s*(\d+)\s*</IPOC>")
 _SETPOINT = re.compile(rb"<ASPos\s([^>]*)>")
@@ -52,16 +52,16 @@ _SUCCESS = (Status.REACHED, Status.OUTSIDE_DOMAIN)
 
 @dataclass
 class RsiCounts:
-    """What happened in a stream.
+    """Statistics of a stream.
 
     Attributes:
-        answered: cycles with an answer.
-        unanswered: cycles without one, lost or late.
-        ignored: packets of other senders.
-        outside_domain: answers outside the domain of the model, where the correction is extrapolated.
+        answered: number of cycles with an answer.
+        unanswered: number of cycles without an answer, because packets were lost or late.
+        ignored: number of packets from other senders.
+        outside_domain: number of answers outside the domain of the model, where the correction is extrapolated.
         largest_deg: largest absolute correction [deg].
-        seconds: times from packet to answer of the last cycles [s].
-        slowest: the longest of all [s].
+        seconds: times from packet to answer in the last cycles [s].
+        slowest: longest time from packet to answer [s].
     """
 
     answered: int = 0
@@ -88,7 +88,7 @@ class RsiAnswers:
     """Answers of one stream.
 
     Attributes:
-        counts: what happened so far.
+        counts: statistics so far.
         finished: whether the corrections have fallen to 0 after `leave`.
     """
 
@@ -110,7 +110,7 @@ class RsiAnswers:
         self._weight, self._sent = 0.0, (0.0,) * len(AXES)
 
     def leave(self) -> None:
-        """Let the corrections fall to 0, after which `finished` is set."""
+        """Let the corrections fall to 0; `finished` is set when they have."""
         self._leaving = True
         self.finished = self.finished or self._first is None
 
@@ -119,7 +119,7 @@ class RsiAnswers:
 
         Raises:
             RequestError: the packet is damaged, its time stamp does not follow the last one, its pose cannot be
-                reached, or a correction or its change is above the limit. Nothing must be sent then or later.
+                reached, or a correction or its change is above the limit. Nothing must be sent from then on.
         """
         stamp, setpoint = _read(packet)
         cycles = self._cycles_since_last(stamp)
@@ -163,7 +163,7 @@ class RsiAnswers:
         return cycles
 
     def _correction(self, setpoint: list[float]) -> tuple[float, ...]:
-        """Return the whole correction [deg] at commanded joint values [deg]."""
+        """Return the full correction [deg] at commanded joint values [deg]."""
         q = [math.radians(value) for value in setpoint]
         T = self._kernels.forward([q], arm=arrays.NOMINAL)[0]
         row = self._kernels.solve_packed(T.tobytes(), _SIX.pack(*q))
@@ -183,7 +183,7 @@ class RsiAnswers:
 
 
 def _kernels(ik: CorrectedIK) -> CompiledIK:
-    """Return the kernels of a model, after the first solution, which compiles what is missing."""
+    """Return the kernels of a model after a first solution, which compiles whatever is missing."""
     if ik.compiled is None or ik.controller is not None:
         raise ModelError(
             f"model '{ik.name}' has no compiled form, so it cannot answer within a cycle",
@@ -222,7 +222,7 @@ def _read(packet: bytes) -> tuple[int, list[float]]:
 
 
 class RsiServer:
-    """Answers streams, one after the other, until it is stopped.
+    """Server that answers streams, one after the other, until it is stopped.
 
     Attributes:
         port: UDP port at which it receives.
@@ -251,7 +251,7 @@ class RsiServer:
         self.port = int(self._socket.getsockname()[1])
 
     def stop(self) -> None:
-        """Let `run` end after the corrections have fallen to 0, or immediately at the second call."""
+        """Let `run` end after the corrections have fallen to 0, or immediately if called a second time."""
         self._stops += 1
         self._answers.leave()
 
@@ -300,11 +300,11 @@ class RsiServer:
     def _newest(
         self, controller: str | None, counts: RsiCounts
     ) -> tuple[bytes, tuple[str, int], float] | None:
-        """Wait for a packet of the controller; after a delay only the newest of several can be answered in time.
+        """Wait for a packet of the controller; after a delay, only the newest of several can be answered in time.
 
         Args:
-            controller: IP address of the controller, None for any.
-            counts: counts of the stream.
+            controller: IP address of the controller; None for any address.
+            counts: statistics of the stream.
 
         Returns:
             The packet, its sender, and the time at which it was noticed; None if the controller is silent.

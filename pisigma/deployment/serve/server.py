@@ -25,7 +25,7 @@ from pisigma.files.errors import OutputError
 
 _MAX_CONNECTIONS = 512
 _SWITCH_INTERVAL = 1e-4
-"""Longest time for which the thread of slow answers holds the interpreter while quick answers wait [s]."""
+"""Longest time for which the thread of slow answers holds the interpreter while fast answers wait [s]."""
 
 
 class Server:
@@ -100,9 +100,9 @@ class Server:
         gc.unfreeze()
 
     def stop(self) -> None:
-        """Let `run` end after all received requests are answered, or immediately at the second call.
+        """Let `run` end after all received requests have been answered, or immediately if called a second time.
 
-        May be called from any thread or a signal handler.
+        It may be called from any thread or from a signal handler.
         """
         self._stops += 1
         self._notify()
@@ -202,7 +202,7 @@ class Server:
         self.metrics.connections = len(self._connections)
 
     def _finish(self) -> None:
-        """Answer all complete requests, also of clients that are not accepted yet, then close all connections."""
+        """Answer all complete requests, also those of clients that are not yet accepted, then close all connections."""
         for listener in self._listeners:
             accept = self._selector.get_key(listener).data
             while accept(selectors.EVENT_READ):

@@ -1,4 +1,4 @@
-"""Requests over ZeroMQ: a message is a line of JSON with or without its end, or a binary frame."""
+"""Requests over ZeroMQ: a message is a line of JSON, with or without its line end, or a binary frame."""
 
 import threading
 
@@ -11,9 +11,9 @@ from pisigma.deployment.serve.protocol import AbstractProtocol, BrokenStreamErro
 from pisigma.files.errors import OutputError
 
 _SILENCE_MS = 500
-"""Time without a message after which all messages that were sent before the stop have arrived [ms]."""
+"""Time without a message after which all messages sent before the stop are regarded as received [ms]."""
 _SEND_TIMEOUT_MS = 2000
-"""Longest waiting time for a client that does not read its answers, before an answer is dropped [ms]."""
+"""Longest time to wait for a client that does not read its answers before an answer is dropped [ms]."""
 _MAX_QUEUED = 100
 """Largest number of messages of a client, and of answers to it, in a queue."""
 
@@ -103,7 +103,7 @@ class ZeroMq:
         self._close()
 
     def _send(self, client: bytes, parts: list[bytes]) -> None:
-        """Send parts, and wait only once for a client that does not read, so that other clients are not delayed."""
+        """Send parts, waiting only once for a client that does not read, so that other clients are not delayed."""
         try:
             self._socket.send_multipart(parts, self._no_wait if client in self._not_reading else 0)
             self._not_reading.discard(client)

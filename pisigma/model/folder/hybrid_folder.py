@@ -1,7 +1,7 @@
 """Hybrid calibrations in a model folder: sections of `model.yaml`, and tensors.
 
-The geometry is stored in `model.yaml` in mm and deg, for people, and again in the weights file in SI units, so that
-predictions are equal to the last bit after reading. `model.yaml` states the unknowns to which the rows of the
+The geometry is stored in `model.yaml` in mm and deg, for readers, and also in the weights file in SI units, so that
+predictions are the same to the last bit after reading. `model.yaml` states the unknowns to which the rows of the
 covariance root belong, in order.
 """
 
@@ -99,15 +99,15 @@ def hybrid_tensors(model: CalibratedModel) -> dict[str, Tensor]:
 
 
 def check_size(document: ModelDocument, robot: Robot, stored: int) -> None:
-    """Check that the file has enough numbers for the description, before weights are allocated.
+    """Check that the file has enough values for the description, before weights are allocated.
 
     Args:
         document: description of the model.
         robot: robot of the description.
-        stored: count of numbers in the weights file.
+        stored: number of values in the weights file.
 
     Raises:
-        MisfitError: the description requires more numbers.
+        MisfitError: the description requires more values.
     """
     required = sum(sum(group.orders) * len(group.inputs) * len(group.joints) for group in document.network)
     if (learned := document.learned) is not None:
@@ -155,7 +155,7 @@ def hybrid_shapes(document: ModelDocument, robot: Robot) -> dict[str, Shape]:
 def with_hybrid(
     model: CalibratedModel, document: ModelDocument, tensors: Mapping[str, Tensor]
 ) -> CalibratedModel:
-    """Return the model with the parts of a hybrid calibration and the exact geometry; other models are unchanged.
+    """Return the model with the parts of a hybrid calibration and the exact geometry; leave other models unchanged.
 
     Args:
         model: model made from the description and all other tensors.
@@ -163,7 +163,7 @@ def with_hybrid(
         tensors: tensors with the shapes of `hybrid_shapes`.
 
     Raises:
-        MisfitError: parts do not fit together.
+        MisfitError: the parts do not fit together.
     """
     learned, known = document.learned, document.uncertainty
     if learned is None and known is None:
@@ -191,7 +191,7 @@ def with_hybrid(
 
 
 def _limited(robot: Robot) -> np.ndarray:
-    """Return the mask of the joints with limits; a file states both limits of a joint or none."""
+    """Return the mask of the joints with limits; a file states both limits of a joint or neither."""
     result: np.ndarray = np.isfinite(robot.limits).all(1)
     return result
 
@@ -311,7 +311,7 @@ def _uncertainty(
 def _root(
     known: UncertaintySection, tensors: Mapping[str, Tensor], free: list[int], parameters: int
 ) -> CovarianceRoot:
-    """Make the covariance root of all unknowns, with rows of zeros for the parameters that were not free."""
+    """Make the covariance root of all unknowns, with rows of zeros for parameters that were not free."""
     rows = tensors["uncertainty.unit" if known.rounded else "uncertainty.root"]
     count = parameters + len(rows) - len(free)
     uncertain = [*free, *range(parameters, count)]

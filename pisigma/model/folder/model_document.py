@@ -28,7 +28,7 @@ _Feature = Annotated[FeatureSection, PlainValidator(feature_section)]
 
 
 class MisfitError(ValueError):
-    """Parts of a model folder do not fit together; `load_model` raises a `ModelError` with the same fields.
+    """Error for parts of a model folder that do not fit together; `load_model` raises a `ModelError` with its fields.
 
     Attributes:
         file: name of the faulty file.
@@ -155,7 +155,7 @@ def write_document(text: str, compiled_sha256: str | None, path: Path) -> None:
 
     Args:
         text: text from `document_text`.
-        compiled_sha256: hash of `compiled.npz`; None without this file.
+        compiled_sha256: hash of `compiled.npz`; None if there is no such file.
         path: file to write.
     """
     text = f"{text}compiled_sha256: {compiled_sha256 or 'null'}\n"
@@ -213,7 +213,7 @@ def read_signed_text(path: Path) -> str:
 
 
 def stated_format(text: str) -> int | None:
-    """Return the format number in the first line of a document; None if it states none."""
+    """Return the format number in the first line of a document; None if there is none."""
     stated = re.match(r"format: ([0-9]{1,9})\n", text)
     return int(stated[1]) if stated else None
 

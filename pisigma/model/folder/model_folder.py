@@ -51,8 +51,8 @@ _ROWS = ("rows.numbers", "rows.measured", "rows.steps")
 def save_model(model: CalibratedModel, folder: Path) -> None:
     """Write the files of a model into a folder, for example one from `staged_folder`.
 
-    In addition to `model.yaml` and `model.safetensors`, the arrays of the compiled kernels are written if these
-    support the model's kind of correction, and the URDF file of the robot if the robot was read from one.
+    The files are `model.yaml`, `model.safetensors`, the arrays of the compiled kernels if these support the model's
+    kind of correction, and the URDF file of the robot if the robot was read from one.
 
     Raises:
         ModelError: the model is evaluated at fixed conditions.
@@ -114,8 +114,8 @@ def load_model(folder: str | os.PathLike[str]) -> CalibratedModel:
     """Read and check a model folder.
 
     Raises:
-        ModelError: a file is missing, truncated, changed, from another model or in a newer format; nothing is loaded
-            in this case.
+        ModelError: a file is missing, truncated, changed, from another model or in a newer format; nothing is loaded in
+            these cases.
     """
     path = Path(folder)
     if not path.is_dir():
@@ -164,7 +164,8 @@ def read_weights(path: Path, sha256: str) -> dict[str, Tensor]:
     """Read the tensors of a weights file.
 
     Raises:
-        ModelError: the hash of the file differs, it is not a safetensors file, or it has numbers that are not finite.
+        ModelError: the hash of the file differs, it is not a safetensors file, or it contains values that are not
+            finite.
     """
     content = _read_whole(path, sha256)
     try:
@@ -211,7 +212,7 @@ def _build_model(
     """Build the model from its description and tensors.
 
     Raises:
-        ValueError: a tensor is missing, unknown or of another shape or type; or a name or count is wrong.
+        ValueError: a tensor is missing, unknown or of a wrong shape or type, or a name or count is wrong.
     """
     robot = Robot(*document.robot.to_fields()._replace(urdf=drawing))
     check_size(document, robot, sum(value.numel() for value in tensors.values()))
@@ -311,7 +312,7 @@ def _empty_network(document: ModelDocument, robot: Robot) -> CorrectionNetwork |
 
 
 def _check_tensors(tensors: dict[str, Tensor], expected: dict[str, Shape]) -> None:
-    """Check that the tensors are exactly the expected tensors; None in a shape stands for any length."""
+    """Check that the tensors are exactly the expected ones; None in a shape stands for any length."""
     for name in sorted(set(tensors) ^ set(expected)):
         problem = "unknown" if name in tensors else "missing"
         raise MisfitError(f"the tensor '{name}' is {problem}", file=WEIGHTS, value=name)
@@ -343,7 +344,7 @@ ModelSource = CalibratedModel | str | os.PathLike[str]
 
 @runtime_checkable
 class HasModel(Protocol):
-    """Object with a model: a `pisigma.CorrectedIK`, or a result of `pisigma.calibrate` or a similar function."""
+    """Object that has a model: a `pisigma.CorrectedIK`, or a result of `pisigma.calibrate` or a similar function."""
 
     @property
     def model(self) -> CalibratedModel:

@@ -1,4 +1,4 @@
-"""Convert model folders of earlier versions, whose keys of `model.yaml` have other names or forms."""
+"""Convert model folders of earlier versions, in which keys of `model.yaml` have other names or forms."""
 
 import hashlib
 import os
@@ -41,7 +41,7 @@ _RENAMED = {
     "variance_widening": "prior_scale",
     "widening": "prior_scale",
 }
-"""New name of every renamed key among the metrics and in the section of the uncertainty."""
+"""New name of every renamed key in the metrics and in the section of the uncertainty."""
 
 _LABELS = (
     (r"^identified; the data hardly .*$", "held by the prior"),
@@ -89,7 +89,7 @@ def upgrade_folder(folder: str | os.PathLike[str], check: Callable[[CalibratedMo
     """Convert a model folder of an earlier version to the format of this one, completely or not at all.
 
     Tensors, figures and all other files are unchanged, except for the type of a covariance root. The card is
-    unchanged except for statements that are no longer true. The file for the compiled kernels is written again.
+    unchanged except for statements that are no longer true. The file for the compiled kernels is rewritten.
 
     Args:
         folder: folder to upgrade.
@@ -97,7 +97,7 @@ def upgrade_folder(folder: str | os.PathLike[str], check: Callable[[CalibratedMo
             `pisigma.model.inverse.written_model.check_written`.
 
     Raises:
-        ModelError: the folder is not a model, it was truncated, was edited or has a newer format, or it is a hybrid
+        ModelError: the folder is not a model, was truncated or edited, or has a newer format, or the model is a hybrid
             with product units of an earlier version or with an uncertainty whose order cannot be determined.
         OutputError: the folder cannot be written.
     """
@@ -136,7 +136,7 @@ def upgrade_folder(folder: str | os.PathLike[str], check: Callable[[CalibratedMo
 def _with_new_kernels(
     path: Path, document: Mapping[str, Any], check: Callable[[CalibratedModel, Path], None]
 ) -> Upgrade:
-    """Write the arrays of the compiled kernels of a folder again if this version cannot read them."""
+    """Rewrite the arrays of the compiled kernels of a folder if this version cannot read them."""
     model, changes = load_model(path), tuple[str, ...]()
     try:
         if (path / COMPILED).is_file():
@@ -171,7 +171,7 @@ def _without_fade(document: dict[str, Any]) -> tuple[str, ...]:
 
 
 def _without_turns(uncertainty: dict[str, Any], path: Path) -> dict[str, Any]:
-    """Replace the list of product-unit factors of formats up to 3 by the statement that there are no input products.
+    """Replace the list of product-unit factors of formats up to 3 with the statement that there are no input products.
 
     Raises:
         ModelError: there are factors of product units; their uncertainty cannot be converted to an uncertainty of
@@ -190,9 +190,9 @@ def _without_turns(uncertainty: dict[str, Any], path: Path) -> dict[str, Any]:
 def _in_order(uncertainty: dict[str, Any], document: Mapping[str, Any], path: Path) -> dict[str, Any]:
     """Add the order of the root's rows, which folders up to format 4 do not state.
 
-    Their weights are in the order in which the calibration tried the features: products of inputs after all others,
-    except for gear lines, which were fitted last, to the residuals of all other features. Unknown sensor parameters
-    are in the order of their values.
+    The weights are in the order in which the calibration tried the features: products of inputs after all others,
+    except for gear lines, which were fitted last, to the residuals of all other features. Unknown sensor parameters are
+    in the order of their values.
 
     Raises:
         ModelError: rows were added to a model whose weights were read in another order.
@@ -232,10 +232,10 @@ def _in_order(uncertainty: dict[str, Any], document: Mapping[str, Any], path: Pa
 
 
 def _with_exact_root(path: Path, sha256: str) -> str:
-    """Convert the covariance root to float64, which is float32 up to format 4, and return the new hash of the file.
+    """Convert the covariance root (float32 up to format 4) to float64, and return the new hash of the file.
 
     Raises:
-        ModelError: the hash of the file is not the one in the description.
+        ModelError: the hash of the file differs from the one in the description.
     """
     tensors = read_weights(path, sha256)
     if ROOT in tensors:
@@ -278,7 +278,7 @@ def _metrics(kind: str, metrics: dict[str, Any]) -> dict[str, Any]:
         return metrics | {"joints": [_joint(joint) for joint in metrics.get("joints", ())]}
     if kind not in ("geometric_calibration", "hybrid_calibration"):
         return metrics
-    if "parameters" not in metrics:  # studies stored other figures, which are not read
+    if "parameters" not in metrics:  # studies stored different figures, which are not read
         return {}
     metrics = metrics | {"parameters": [_labelled(row) for row in metrics["parameters"]]}
     held_out = metrics.get("held_out")

@@ -1,4 +1,4 @@
-"""Compiled corrected inverse kinematics for control loops, which solves NumPy arrays in microseconds per pose."""
+"""Compiled corrected inverse kinematics for control loops, which takes microseconds per pose of a NumPy array."""
 
 import ctypes
 import os
@@ -30,14 +30,14 @@ MAX_SOLUTIONS = 8
 
 
 class CompiledIK:
-    """Compiled corrected inverse kinematics of one arm. It may be called from several threads at a time.
+    """Compiled corrected inverse kinematics of one arm, which may be called from several threads at a time.
 
     Attributes:
         description: the arm as arrays.
         name: name of the model.
         branches: names of the branches.
         joints: names of the joints.
-        belongs_to: SHA-256 of the model folder with the same model; "" without a folder.
+        belongs_to: SHA-256 of the folder of the same model; "" if there is none.
         warnings: see `CorrectedIK`.
         task_axes: axes of the tool that are constrained unless a task states others.
     """
@@ -105,14 +105,14 @@ class CompiledIK:
 
         Args:
             T_base_tool: `(4, 4)`: target pose of the tool in the base frame [m].
-            near: `(dof,)` joint values [rad or m], for example the robot's current joint values. Of the branches
+            near: `(dof,)` joint values [rad or m], for example the robot's current joint values. Among the branches
                 that reach the pose, the nearest is chosen, with revolute joints wrapped as near as their limits allow.
-            branch: name of the branch to use. Without `near` and `branch`, branches are tried in the order of their
-                number of training rows; the first branch that reaches the pose inside the joint limits is chosen,
-                otherwise the first that reaches it.
-            throw: whether an invalid pose, or a `near` that is not finite, raises an error; otherwise the status is
+            branch: name of the branch to use. Without `near` and `branch`, branches are tried in order of decreasing
+                numbers of training rows; the first branch that reaches the pose inside the joint limits is chosen, or
+                else the first that reaches it.
+            throw: whether an invalid pose, or a `near` that is not finite, raises an error; if not, the status is
                 INVALID_POSE.
-            approach: `(dof,)`: +1 or -1 for the direction in which every joint moves to the pose, 0 if it is not known.
+            approach: `(dof,)`: +1 or -1 for the direction in which every joint moves to the pose, 0 if it is unknown.
             owner: see `Solution`.
             axes: axes of the tool that are constrained; None for the arm's `task_axes`.
 
@@ -137,7 +137,7 @@ class CompiledIK:
         return Solution(*joints, position, rotation, measure, owner, task.ignored, approach)
 
     def solve_packed(self, T_base_tool: bytes, near: bytes) -> list[float]:
-        """Find corrected joint values for one pose given as bytes, for example received from a network socket.
+        """Find corrected joint values for one pose given as bytes, for example as received from a network socket.
 
         Args:
             T_base_tool: 16 doubles, row by row [m].
@@ -168,14 +168,14 @@ class CompiledIK:
         single: bool = False,
         axes: TaskAxes | None = None,
     ) -> Solution:
-        """Find corrected joint values for poses `(*batch, 4, 4)`, several threads at a time.
+        """Find corrected joint values for poses `(*batch, 4, 4)`, using several threads.
 
         Args:
             T_base_tool: `(*batch, 4, 4)`: target poses [m].
             near: `(*batch, dof)` or `(dof,)`: see `solve`.
             branch: see `solve`.
             threads: number of threads; None for one per processor that this process may use.
-            throw: see `solve`; with False, invalid rows get the status INVALID_POSE and other rows are solved.
+            throw: see `solve`; if False, invalid rows get the status INVALID_POSE and other rows are solved.
             approach: `(*batch, dof)` or `(dof,)`: see `solve`.
             single: whether the poses were rounded to float32, which widens the tolerances for rounding.
             axes: see `solve`.
@@ -205,8 +205,8 @@ class CompiledIK:
     ) -> Solution:
         """Find solutions `(*batch, branches)` of poses `(*batch, 4, 4)` on every branch; see `solve_batch`.
 
-        For an arm without a closed-form inverse these are up to `MAX_SOLUTIONS` distinct solutions; missing
-        solutions are UNREACHABLE.
+        For an arm without a closed-form inverse, these are up to `MAX_SOLUTIONS` distinct solutions; missing solutions
+        are UNREACHABLE.
         """
         task = self._checked(axes)
         T = self._poses(T_base_tool, throw)
@@ -307,7 +307,7 @@ class CompiledIK:
     ) -> tuple[int, ctypes.Array[ctypes.c_double]]:
         """Solve one pose with the kernels, and return their fault code and the row that they write.
 
-        ctypes passes the address of bytes in a fraction of the time that NumPy takes for the address of an array.
+        ctypes passes the address of bytes in a fraction of the time that NumPy needs for the address of an array.
         """
         said, out = Said(), self._row()
         arm = self._address, self._memory(), arrays.SOLVE, 1

@@ -1,4 +1,4 @@
-"""Corrected inverse kinematics of coupled joints: solutions in DH values are converted to the controller's values."""
+"""Corrected inverse kinematics of coupled joints, whose solutions in DH values become the controller's values."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -20,14 +20,14 @@ if TYPE_CHECKING:  # run-time type checkers resolve the full name without this i
     import pisigma.robot.coupling
 
 MAX_STARTS = 4
-"""Largest number of stored joint values with the nearest poses that are tried in sequence."""
+"""Largest number of stored joint values, those with the nearest poses, that are tried in sequence."""
 _IGNORED_WEIGHT = 1e-6
-"""Weight of rotations about the tool's x and y axes for arms with fewer than six axes, which cannot control them;
-they only determine the choice between joint values that reach the other axes. The tool may then be tilted by up to
+"""Weight of rotations about the tool's x and y axes for arms with fewer than six axes, which cannot control these
+rotations; they only decide between joint values that meet the other axes. The tool may then be tilted by up to
 `MAX_TILT`."""
 Values = Float64[np.ndarray, "rows axes"]
 Motion = Callable[[Values], tuple[Any, Any]]
-"""Pose `(rows, 4, 4)` and Jacobian `(rows, 6, axes)` of an arm as functions of the controller's values."""
+"""Function that returns the pose `(rows, 4, 4)` and Jacobian `(rows, 6, axes)` of an arm at the controller's values."""
 
 
 class ControllerValues:
@@ -49,7 +49,7 @@ class ControllerValues:
         """Return a copy in which other axes of the tool are constrained.
 
         Raises:
-            PoseError: the arm has passive joints, which are solved in the default axes only.
+            PoseError: the arm has passive joints, which are solved only in the default axes.
         """
         if self.coupling.passive:
             raise PoseError(
@@ -66,9 +66,9 @@ class ControllerValues:
         Args:
             T: target poses.
             near: checked values of the controller, or None.
-            owner: solver that the solutions name as their owner.
+            owner: solver that the solutions refer to as their owner.
             branch: name of the only branch that may be used, or None.
-            options: further options of `CorrectedIK.__call__`.
+            options: other options of `CorrectedIK.__call__`.
         """
         sides = options.get("approach")
         if self.coupling.passive:
@@ -115,7 +115,7 @@ class ControllerValues:
         return self.coupling.to_dh(q if is_tensor(q) else np.asarray(q, dtype=np.float64))
 
     def _solve_passive(self, T: Any, near: Any, owner: Any) -> Solution:
-        """Solve an arm with passive joints, from `near` or from the stored joint values with the nearest poses."""
+        """Solve an arm with passive joints, starting at `near` or at the stored joint values with the nearest poses."""
         poses, axes = pose_array(T)[0], len(self.coupling.axes)
         rows, batch = poses.reshape(-1, 4, 4), poses.shape[:-2]
         if near is None:
@@ -140,7 +140,7 @@ class ControllerValues:
             np.full(batch, np.nan),
             owner,
         )
-        # A solution outside the limits remains only if no start leads to a solution within them.
+        # A solution outside the limits is kept only if no start leads to a solution within them.
         outside = found.reached & ~self.coupling.is_within_limits(self.coupling.to_dh(found.q))
         beyond = int(Status.OUTSIDE_JOINT_LIMITS)
         solution = replace(solution, status=np.where(outside.reshape(batch), beyond, solution.status))
@@ -162,7 +162,7 @@ class ControllerValues:
         return turned.reshape(q.shape), (~inside & np.isfinite(rows).all(-1)).reshape(q.shape[:-1])
 
     def _other_branches(self, T: Any, q: Any, outside: Any, near: Any, options: dict[str, Any]) -> None:
-        """Replace joint values in `q` by the values of the best branch within the limits, if any."""
+        """Replace joint values in `q` with those of the best branch within the limits, if there is one."""
         poses = T[outside] if T.ndim > 2 else T[None]
         every, excluded = self._inside(
             np.asarray(self.ik.all_branches(poses, approach=_of_rows(options.get("approach"), outside)).q),
@@ -183,7 +183,7 @@ class ControllerValues:
         q[...] = rows.reshape(q.shape)
 
     def _answer(self, solution: Solution, owner: Any) -> Solution:
-        """Return a solution in the controller's values, with the status according to the controller's limits."""
+        """Return a solution in the controller's values, with a status that refers to the controller's limits."""
         status = np.asarray(as_array(solution.status))
         dh = np.asarray(as_array(solution.q))
         beyond = ~self.coupling.is_within_limits(dh) & np.isfinite(dh).all(-1)
@@ -216,7 +216,7 @@ class ReachedPoses:
         q: the controller's values [rad or m].
         reached: whether the pose is reached in all axes that the arm can control.
         position: distance from the target position [m].
-        rotation: angle to the target orientation [rad], which arms with fewer than six axes control only in part.
+        rotation: angle to the target orientation [rad], which arms with fewer than six axes control only partially.
     """
 
     q: Values
@@ -233,7 +233,7 @@ def solve(motion: Motion, T: Float64[np.ndarray, "rows 4 4"], start: Values) -> 
     """Find the controller's values that reach poses, by damped least squares from initial values.
 
     Args:
-        motion: function for pose and Jacobian of the arm.
+        motion: function that returns pose and Jacobian of the arm.
         T: target poses T_base_tool [m].
         start: initial values of the controller [rad or m].
     """
@@ -268,7 +268,7 @@ def solve_from(
     starts: Float64[np.ndarray, "rows tried axes"],
     is_inside: Callable[[Values], Bool[np.ndarray, " rows"]],
 ) -> ReachedPoses:
-    """Solve every pose from the first start that reaches it within the limits, otherwise from any that reaches it."""
+    """Solve every pose from the first start that reaches it within the limits, or else from any that reaches it."""
     result = solve(motion, T, starts[:, 0])
     for tried in starts[:, 1:].swapaxes(0, 1):
         left = ~(result.reached & is_inside(result.q))
@@ -283,14 +283,14 @@ def solve_from(
 def nearest_starts(
     motion: Motion, T: Float64[np.ndarray, "rows 4 4"], starts: Float64[np.ndarray, "starts axes"]
 ) -> Float64[np.ndarray, "rows tried axes"]:
-    """Return for every pose the stored values with the nearest poses, nearest first."""
+    """Return the stored values with the poses nearest to every pose, nearest first."""
     position = motion(starts)[0][:, :3, 3]
     off = np.linalg.norm(T[:, None, :3, 3] - position, axis=-1)
     return starts[np.argsort(off, axis=1)[:, :MAX_STARTS]]
 
 
 def _errors(motion: Motion, T: Any, q: Values) -> tuple[Any, Any]:
-    """Compute position error [m] and rotation vector [rad] in the tool's axes, and the Jacobian in these axes."""
+    """Compute the position error [m] and rotation vector [rad] in the tool's axes, and their Jacobian."""
     here, J = motion(q)
     R = here[:, :3, :3]
     shift = (R.mT @ (T[:, :3, 3] - here[:, :3, 3])[..., None])[..., 0]

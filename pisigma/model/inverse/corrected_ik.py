@@ -1,4 +1,4 @@
-"""Corrected inverse kinematics: joint values with which the real robot reaches a pose."""
+"""Corrected inverse kinematics: joint values at which the real robot reaches a pose."""
 
 import os
 from collections.abc import Callable, Sequence
@@ -30,20 +30,20 @@ if TYPE_CHECKING:  # run-time type checkers resolve the full names without these
 class CorrectedIK(AbstractInverse):
     """Corrected inverse kinematics of a model; call it with poses.
 
-    Poses are solved by compiled kernels on the CPU. For NumPy arrays and nested lists the solutions are NumPy arrays,
-    and torch is not imported; for tensors they are tensors on the same device, with gradients (see `pose_gradients`).
+    Poses are solved by compiled kernels on the CPU. For NumPy arrays and nested lists, the solutions are NumPy arrays,
+    and torch is not imported; for tensors, they are tensors on the same device, with gradients (see `pose_gradients`).
     Models without a compiled form, and all models on machines without kernels, are solved by `NumericIK` instead.
 
     Attributes:
         name: name of the model.
         branches: names of the branches.
         joints: names of the joints.
-        order: indices of the branches, in the order of decreasing numbers of training rows.
+        order: indices of the branches, in order of decreasing numbers of training rows.
         limits: `(dof, 2)` joint limits [rad or m].
         revolute: `(dof,)` mask of the revolute joints.
         closed_form: whether the nominal robot has a closed-form inverse, so that all branches are known.
-        warnings: warnings about conditions given to `under` outside the range of the calibration, and modelled torques.
-        controller: conversion to the controller's values for coupled joints; None without coupled joints.
+        warnings: warnings about conditions given to `under` outside the range of the calibration, or modelled torques.
+        controller: conversion to the controller's values for coupled joints; None if there are none.
     """
 
     controller: "pisigma.model.inverse.controller_values.ControllerValues | None"
@@ -107,7 +107,7 @@ class CorrectedIK(AbstractInverse):
 
     @cached_property
     def compiled(self) -> "pisigma.model.inverse.compiled_ik.CompiledIK | None":
-        """Kernels of the model; None if its correction has no compiled form, or there are none for this machine."""
+        """Kernels of the model; None if its correction has no compiled form, or this machine has no kernels."""
         from pisigma.model.inverse.compiled_ik import CompiledIK
 
         try:
@@ -117,7 +117,7 @@ class CorrectedIK(AbstractInverse):
 
     @cached_property
     def postures(self) -> Postures:
-        """Ranges of plausible joint values, which `near` has to meet."""
+        """Ranges of plausible joint values, in which `near` must lie."""
         return Postures(self.limits, self.revolute, self.joints)
 
     def __call__(
@@ -138,14 +138,14 @@ class CorrectedIK(AbstractInverse):
         Args:
             T_base_tool: `(*batch, 4, 4)` target poses of the tool in the base frame [m].
             near: joint values `(*batch, dof)` or `(dof,)` [rad or m], for example the robot's current joint values.
-                Of the branches that reach a pose, the nearest is chosen, and revolute joints are wrapped as near to
+                Among the branches that reach a pose, the nearest is chosen, and revolute joints are wrapped as near to
                 `near` as their limits allow. Distances add radians and metres with equal weight.
             branch: name of the branch to use; `near` then only affects how joint values are wrapped. The default is
                 the first branch in `order` that reaches the pose, preferably inside the joint limits.
-            throw: False for control loops: an invalid pose, or a `near` that is not finite or implausible for the
-                robot, then does not raise an error; its solution is NaN with the status INVALID_POSE.
+            throw: False for control loops: an invalid pose, or a `near` that is not finite or plausible for the robot,
+                then raises no error; its solution is NaN with the status INVALID_POSE.
             approach: `(*batch, dof)` or `(dof,)`: +1 or -1 for the direction in which every joint moves to the pose,
-                which affects joints with backlash; 0 for a joint, or None for all, if it is not known.
+                which affects joints with backlash; 0 for a joint, or None for all, if it is unknown.
             ignore_axes: see `for_task`.
             tolerance_mm: see `for_task`.
             tolerance_deg: see `for_task`.
@@ -199,7 +199,7 @@ class CorrectedIK(AbstractInverse):
         Args:
             T_base_tool: `(poses, 4, 4)` target poses in order [m], as a NumPy array or nested lists.
             near: `(dof,)` joint values [rad or m] of the robot before the path.
-            branch: name of the branch to start on, if that causes no jump.
+            branch: name of the branch to start on, if this causes no jump.
 
         Raises:
             PoseError: see `__call__`.
@@ -213,7 +213,7 @@ class CorrectedIK(AbstractInverse):
 
         Args:
             q: joint values [rad or m]; arrays are evaluated by kernels, tensors by torch with gradients.
-            approach: see `__call__`; accepted for arrays only.
+            approach: see `__call__`; accepted only for arrays.
 
         Raises:
             PoseError: q does not match the robot's joints, or `approach` is invalid or given where torch is used.
@@ -250,9 +250,9 @@ class CorrectedIK(AbstractInverse):
         return J.reshape(*values.shape[:-1], 6, values.shape[-1])
 
     def under(self, *, payload_kg: float | None = None, temperature_c: float | None = None) -> "CorrectedIK":
-        """Return the corrected inverse kinematics at a given payload or temperature instead of the calibration's mean.
+        """Return the corrected inverse kinematics at a given payload or temperature instead of their means.
 
-        Outside the measured range the correction is that of the nearest measured temperature, and the effect of the
+        Outside the measured range, the correction is that of the nearest measured temperature, and the effect of the
         payload is extrapolated linearly; `warnings` of the result then states this.
 
         Args:
@@ -260,7 +260,7 @@ class CorrectedIK(AbstractInverse):
             temperature_c: temperature of the robot [deg C]; None for the mean of the calibration rows.
 
         Raises:
-            ModelError: the model did not learn the effect of a given condition, or the value is not possible.
+            ModelError: the model did not learn the effect of a given condition, or the value is impossible.
         """
         from pisigma.model.stated_conditions import under_stated_conditions
 
@@ -306,18 +306,18 @@ class CorrectedIK(AbstractInverse):
     ) -> "CorrectedIK":
         """Return a copy for a task that leaves axes of the tool free, which applies to calls, branches and paths.
 
-        A robot with more joints than constrained axes gets joint values as near to `near` as possible; without
-        `near`, joint values away from joint limits and singularities.
+        For a robot with more joints than constrained axes, the joint values are as near to `near` as possible or,
+        without `near`, away from joint limits and singularities.
 
         Args:
-            ignore_axes: axes of the tool's frame that are not constrained, of "x", "y", "z" (translations along them)
-                and "roll", "pitch", "yaw" (rotations about x, y and z): ("yaw",) for a torch that may rotate about its
-                z axis. With None no axis is ignored for robots with six or more joints, "yaw" for five, "roll" and
-                "pitch" up to 10 deg for four, and all rotations for three.
-            tolerance_mm: accepted deviations along the tool's axes where the pose cannot be reached exactly [mm], one
+            ignore_axes: axes of the tool's frame that are not constrained, among "x", "y", "z" (translations along
+                them) and "roll", "pitch", "yaw" (rotations about x, y and z), such as ("yaw",) for a torch that may
+                rotate about its z axis. None ignores no axis for robots with six or more joints, "yaw" for five, "roll"
+                and "pitch" up to 10 deg for four, and all rotations for three.
+            tolerance_mm: accepted deviations along the tool's axes if the pose cannot be reached exactly [mm], one
                 number or three. The deviations, each divided by its tolerance, are then minimised.
-            tolerance_deg: accepted rotations about the tool's axes where the pose cannot be reached exactly [deg],
-                one number or three. Other axes are met exactly unless they are ignored.
+            tolerance_deg: accepted rotations about the tool's axes if the pose cannot be reached exactly [deg], one
+                number or three. Other axes are met exactly unless they are ignored.
             elbow_angle: elbow angle of an arm with seven revolute joints [rad], see `kinematics.task_axes.TaskAxes`.
 
         Raises:
@@ -340,7 +340,7 @@ class CorrectedIK(AbstractInverse):
         """Return a copy in which other axes of the tool are constrained.
 
         Raises:
-            PoseError: the robot has passive joints, which are solved in the default axes only.
+            PoseError: the robot has passive joints, which are solved only in the default axes.
         """
         ik = copy(self)
         ik.task_axes = axes
@@ -349,7 +349,7 @@ class CorrectedIK(AbstractInverse):
         return ik
 
     def _like(self, poses: Any, solution: Solution, axes: TaskAxes) -> Solution:
-        """Return solutions as tensors, with gradients if required, for poses that are tensors, otherwise as arrays."""
+        """Return solutions as tensors, with gradients if required, if the poses are tensors, otherwise as arrays."""
         if poses is None:
             return replace(solution.map(as_array), owner=self)
         from pisigma.model.inverse.pose_gradients import as_tensors

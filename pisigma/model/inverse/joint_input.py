@@ -13,7 +13,7 @@ from pisigma.robot.kernels.array_kinematics import is_tensor
 
 
 class _Fault(NamedTuple):
-    """Requirement on an argument that is not met, and a remedy."""
+    """Requirement that an argument does not meet, and a remedy."""
 
     option: str
     expected: str
@@ -53,10 +53,10 @@ def pose_array(values: Any) -> tuple[Any, bool, Any]:
     """Return matrices `(*batch, 4, 4)` as a float64 array.
 
     Returns:
-        The array, whether the matrices were float32 before, and the original tensor or None.
+        The array, whether the matrices were float32, and the original tensor or None.
 
     Raises:
-        PoseError: the matrices are not numbers, or have another type or shape.
+        PoseError: the matrices are not numbers, or have a wrong type or shape.
     """
     tensor = values if is_tensor(values) else None
     if tensor is not None and str(tensor.dtype) not in ("torch.float32", "torch.float64"):
@@ -83,7 +83,7 @@ def pose_array(values: Any) -> tuple[Any, bool, Any]:
 def as_float_array(values: Any, what: str, throw: bool) -> Any:
     """Return values as a contiguous float64 array, without a copy if possible.
 
-    Values that are not numbers become NaN with `throw` False.
+    Values that are not numbers become NaN if `throw` is False.
 
     Raises:
         PoseError: the values are ragged, or they are not numbers and `throw` is True.
@@ -132,7 +132,7 @@ def checked_approach(approach: Any) -> Any:
         approach: +1 or -1 for the direction in which a joint moves before it stops, 0 if not stated; or None.
 
     Raises:
-        PoseError: a value is another number, which would scale the learned backlash.
+        PoseError: a value is a different number, which would scale the learned backlash.
     """
     if approach is None:
         return None
@@ -153,8 +153,8 @@ def checked_approach(approach: Any) -> Any:
 class Postures:
     """Joint values that are plausible for a robot: at most one turn beyond the joint limits.
 
-    For prismatic joints the margin is the stroke, but at least 1 m. Solutions, and a real robot, may be somewhat
-    outside the joint limits; values farther outside are assumed to be in degrees or millimetres by mistake.
+    For prismatic joints, the margin is the stroke, but at least 1 m. Solutions, and a real robot, may be somewhat
+    outside the joint limits; values farther outside are presumably in degrees or millimetres by mistake.
     """
 
     def __init__(self, limits: np.ndarray, revolute: np.ndarray, joints: Sequence[str]) -> None:
@@ -170,13 +170,13 @@ class Postures:
         return clipped
 
     def contains(self, values: Sequence[float]) -> bool:
-        """Return whether joint values `(dof,)` are plausible; several times as fast as a comparison of arrays."""
+        """Return whether joint values `(dof,)` are plausible, several times as fast as a comparison of arrays."""
         return all(map(le, self._lows, values)) and all(map(le, values, self._highs))
 
     def check_near(self, near: Any, throw: bool = True) -> Any:
         """Return `near` as a float64 array with NaN for implausible values.
 
-        Values that are not numbers, or of another shape, are returned unchecked.
+        Values that are not numbers, or have a different shape, are returned unchecked.
 
         Args:
             near: joint values `(*batch, dof)` [rad or m]: a tensor, an array or nested lists.

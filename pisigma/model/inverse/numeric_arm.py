@@ -1,4 +1,4 @@
-"""Newton iterations of a calibrated arm towards poses, in torch and in the constrained axes of the tool."""
+"""Newton iterations of a calibrated arm towards poses, in torch, in the constrained axes of the tool."""
 
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -24,7 +24,7 @@ from pisigma.robot.kinematics.status import Status
 from pisigma.robot.kinematics.task_axes import TaskAxes
 
 _EXACT_ITERATIONS = 25
-"""Number of steps with the slope of the correction, after steps without it came near a pose but did not converge."""
+"""Number of steps with the slope of the correction, after steps without it have come near a pose without converging."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +32,7 @@ class NumericArm:
     """An arm with identified geometry and joint correction.
 
     Attributes:
-        nominal: nominal arm, which has the joint limits.
+        nominal: nominal arm, which states the joint limits.
         robot: arm with the identified geometry; for a hybrid, the geometry that belongs to the correction.
         hybrid: arm with joint correction, or None.
         axes: axes of the tool that are constrained.
@@ -55,7 +55,7 @@ class NumericArm:
 
     @cached_property
     def motion_functions(self) -> tuple[Motion, ...]:
-        """Functions for pose and Jacobian: without the slope of the correction, and for a hybrid also with it."""
+        """Functions for pose and Jacobian, without the slope of the correction and, for a hybrid, also with it."""
         if self.hybrid is None:
             return (partial(joint_jacobian, self.robot),)
         return tuple(partial(hybrid_motion, self.hybrid, exact=exact) for exact in (False, True))
@@ -70,7 +70,7 @@ class NumericArm:
     def reach(
         self, T: Float64[Tensor, "poses 4 4"], start: Float64[Tensor, "poses dof"]
     ) -> tuple[Float64[Tensor, "poses dof"], Bool[Tensor, " poses"]]:
-        """Iterate from the start of every pose, and return joint values [rad or m] and whether they reach the pose.
+        """Iterate from a start for every pose; return joint values [rad or m] and whether they reach the pose.
 
         The joint values are wrapped near the starts. Poses that cannot be reached exactly are solved within the
         tolerances of the axes.
@@ -111,7 +111,7 @@ class NumericArm:
         q: Float64[Tensor, "poses dof"],
         near: Float64[Tensor, "poses dof"] | None,
     ) -> Float64[Tensor, "poses dof"]:
-        """Move redundant joints at constant poses as near as possible to `near` or to the middle of their limits.
+        """Move redundant joints, at constant poses, as near as possible to `near` or to the middle of their limits.
 
         A joint without limits prefers its current value instead, with half a turn as its scale.
         """

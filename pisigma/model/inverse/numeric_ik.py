@@ -1,4 +1,4 @@
-"""Corrected inverse kinematics in torch, for models and machines without compiled kernels."""
+"""Corrected inverse kinematics in torch, for models or machines without compiled kernels."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -28,20 +28,20 @@ from pisigma.robot.se3 import check_transforms, pose_error, transform_faults
 NUMERIC = "numeric"
 """Name of the only branch of a robot without a closed-form inverse."""
 _OUTSIDE, _LOST = 1e9, 1e15
-"""Penalties in the rank of solutions outside the joint limits, and of starts that do not converge."""
+"""Penalties on the rank of solutions outside the joint limits and of starts that do not converge."""
 
 
 class NumericIK:
-    """Corrected inverse kinematics of a model by iteration; solutions are float64 tensors on the CPU.
+    """Iterative corrected inverse kinematics of a model; solutions are float64 tensors on the CPU.
 
-    Every pose is solved by damped Newton steps, a few milliseconds each, from several starts: the nominal arm's
-    branches (or their nearest joint values where they do not reach the pose), `near`, and stored joint values with the
+    Every pose is solved by damped Newton steps, which take a few milliseconds each, from several starts: the nominal
+    arm's branches (or the nearest joint values if they do not reach the pose), `near`, and stored joint values with the
     nearest poses. The best solution is returned.
 
     Attributes:
         model: calibrated model.
         branches: names of the branches.
-        order: indices of the branches: branches of training rows, most frequent first, then all others.
+        order: indices of the branches: those of training rows, most frequent first, then all others.
         task_axes: axes of the tool that are constrained.
     """
 
@@ -53,7 +53,7 @@ class NumericIK:
             axes: axes of the tool that are constrained; None for the default axes.
 
         Raises:
-            ModelError: the model states branches that its robot does not have, or has no initial values for the numeric
+            ModelError: the model states branches that its robot lacks, or has no initial values for the numeric
                 inverse.
             PoseError: an elbow angle is given, which only the kernels support.
         """
@@ -131,7 +131,7 @@ class NumericIK:
         single: bool | None = None,
         axes: TaskAxes | None = None,
     ) -> Solution:
-        """Find solutions on every branch, `(*batch, branches)`; a robot without closed form has one branch."""
+        """Find solutions on every branch, `(*batch, branches)`; a robot without a closed form has one branch."""
         poses = _Poses.from_values(T_base_tool, single, True)
 
         def solve(ik: "NumericIK", rows: Tensor) -> Solution:
@@ -188,7 +188,7 @@ class NumericIK:
             starts = torch.cat([starts, few], 1)
         unknown = branch.new_full((len(T), starts.shape[1] - branch.shape[1]), -1)
         every, rank = self._solved(T, starts, torch.cat([branch, unknown], 1), near)
-        # Only poses that no start solves are tried from further starts.
+        # Only poses that no start solves are tried from additional starts.
         lost = ((_among(every, rank, requested) >= _OUTSIDE).all(1) & plausible).nonzero()[:, 0]
         if not len(lost):
             return every, rank
@@ -199,20 +199,20 @@ class NumericIK:
         return every.map(lambda *values: torch.cat(values, 1), others), torch.cat([rank, ranks], 1)
 
     def _starts(self, T: Tensor, single: bool) -> tuple[Tensor, Tensor]:
-        """Return nominal joint values `(poses, branches, dof)`, and their branch or -1 if they do not reach the pose.
+        """Return nominal joint values `(poses, branches, dof)` and their branches, -1 if they do not reach the pose.
 
         Joint values that do not reach the pose are as near to it as possible, or NaN.
         """
         if self._solver is None:
             return T.new_zeros(len(T), 0, self.model.robot.dof), torch.zeros(len(T), 0, dtype=torch.int64)
-        # A SCARA cannot tilt its tool: where the tilt is ignored, its closed form gets the upright pose.
+        # A SCARA cannot tilt its tool, so its closed form gets the upright pose if the tilt is ignored.
         if len(self.model.robot.joints) == 4 and all(self.task_axes.tolerance[3:5]):
             T = self._solver.upright_poses(T)
         q, near_rows = self._solver.solve(T.float() if single else T).q.double(), self._solver.start_values(T)
         reached, robot = torch.isfinite(q).all(-1), self.model.identified
-        # The calibrated arm may reach poses that the nominal arm just misses: start at the nearest joint values,
-        # unless they miss the pose by far more than geometric errors explain. Divided by the reach, lengths add up
-        # with angles.
+        # The calibrated arm may reach poses that the nominal arm just misses, so iterations start at the nearest joint
+        # values, unless these miss the pose by far more than geometric errors explain. Lengths are divided by the reach
+        # to be added to angles.
         each = T[:, None].expand(*near_rows.shape[:-1], 4, 4).reshape(-1, 4, 4)
         off, _ = task_error(self.task_axes, each, forward_kinematics(robot, near_rows.reshape(-1, robot.dof)))
         off = off * off.new_tensor([*[1 / robot.reach] * 3, 1, 1, 1]) * off.new_tensor(self._arm.weights)
@@ -253,7 +253,7 @@ class NumericIK:
             q: `(rows, dof)` joint values of the identified arm, or nominal joint values that a network corrects.
             start: joint values from which the iteration started.
             branch: branch of the starts that reach the pose, otherwise -1.
-            near: joint values that the solutions should be near, or None.
+            near: joint values near which the solutions should be, or None.
         """
         robot, known = self.model.robot, branch >= 0
         if self._spare:
@@ -287,7 +287,7 @@ class NumericIK:
         return replace(solution, ignored_axes=self.task_axes.ignored), torch.where(reached, rank, _LOST)
 
     def _nominal(self, T: Tensor, q: Tensor, known: Tensor) -> Tensor:
-        """Return the nominal arm's joint values near q, or q where these are `known`; NaN without a solution."""
+        """Return the nominal arm's joint values near q, or q where these are `known`; NaN if there is no solution."""
         if self.model.calibrated is None:
             return q
         solved = solve_numeric(self.model.robot, T, q, axes=self.task_axes, weights=self._arm.weights)
@@ -384,7 +384,7 @@ def _best(every: Solution, rank: Tensor, branches: Sequence[int]) -> Solution:
 
 
 def _without(result: Solution, lost: Tensor, status: Status) -> Solution:
-    """Return solutions with NaN and another status where `lost`."""
+    """Return solutions with NaN and the given status where `lost`."""
 
     def kept(values: Tensor) -> Tensor:
         where = lost.reshape(-1, *[1] * (values.ndim - 1))

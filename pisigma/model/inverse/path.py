@@ -26,9 +26,9 @@ CHUNK = 8_192
 """Number of steps whose transitions between all pairs of branches are in memory at a time."""
 _TURN = 2 * math.pi
 _OTHER_BRANCH = 1e4
-"""Cost of a start on a branch other than the requested branch [rad²]; lower than the cost of a jump."""
+"""Cost of a start on a branch other than the requested one [rad²], which is lower than the cost of a jump."""
 _LATER = 1e-3
-"""Cost of a start on a later branch if no branch is requested [rad²], per place in the order of branches."""
+"""Cost of a start on a later branch if no branch is requested [rad²], per position in the order of branches."""
 _STILL = 1e-9
 """Motion of a joint below which it is treated as at rest [rad or m]."""
 
@@ -58,7 +58,7 @@ class JointPath:
 
     Attributes:
         solution: solutions of all poses; NaN where a pose is not reached.
-        switches: changes of the branch, discontinuities and gaps in order; empty for a continuous path on one branch.
+        switches: changes of the branch, discontinuities and gaps, in order; empty for a continuous path on one branch.
     """
 
     solution: Any
@@ -75,13 +75,13 @@ def follow_path(
 
     For arms with a closed-form inverse, dynamic programming chooses the branches of the whole path that have the
     fewest jumps and, among these, the smallest sum of squared joint motions. For other arms, and for redundant
-    tasks, every pose is solved from the solution of the previous one.
+    tasks, every pose is solved starting from the solution of the previous pose.
 
     Args:
         ik: corrected inverse kinematics.
         T_base_tool: `(poses, 4, 4)` target poses [m].
         near: `(dof,)` joint values [rad or m] of the robot before the path.
-        branch: name of the branch to start on, if that causes no jump; without `near` and `branch`, the branch with
+        branch: name of the branch to start on, if this causes no jump; without `near` and `branch`, the branch with the
             most training rows.
 
     Raises:
@@ -109,12 +109,12 @@ def _solve(
     near: Array | None,
     approach: Array | None = None,
 ) -> Any:
-    """Solve poses near joint values, which may be of a solution far outside the joint limits."""
+    """Solve poses near joint values, which may belong to a solution far outside the joint limits."""
     return ik(T, near=None if near is None else ik.postures.clip(near), approach=approach)
 
 
 def _approaches(q: Array, near: Array | None) -> Array:
-    """Return the direction in which every joint moves to its values `(poses, dof)`: +1 if they increase or -1.
+    """Return the direction in which every joint moves to its values, `(poses, dof)`: +1 if they increase, else -1.
 
     A joint that does not move keeps its last direction; the direction is 0 before the first motion.
     """
@@ -127,13 +127,14 @@ def _approaches(q: Array, near: Array | None) -> Array:
 
 
 def _guide(ik: AbstractInverse, T: Array, near: Array | None, branch: str | None) -> Array:
-    """Return joint values near which to solve all poses: wrapped values of the chosen branches."""
+    """Return the joint values near which all poses are solved: wrapped values of the chosen branches."""
     every = ik.all_branches(T)
     q, status = np.asarray(every.q), np.asarray(every.status)
     reached = np.flatnonzero(np.isfinite(q).all(-1).any(-1))
     if not len(reached):
         return np.tile(np.clip(0.0, ik.limits[:, 0], ik.limits[:, 1]) if near is None else near, (len(T), 1))
-    # Cost of starting on each branch: by the requested branch, the joint motion from `near`, or the usual order.
+    # The cost of starting on each branch follows from the requested branch, the joint motion from `near`, or the usual
+    # order.
     first = np.zeros(len(ik.branches))
     for place, index in enumerate(ik.order):
         first[index] = _LATER * place
@@ -144,7 +145,7 @@ def _guide(ik: AbstractInverse, T: Array, near: Array | None, branch: str | None
     q, status = q[reached], status[reached]
     chosen = choose_branches(q, status, _jumps(ik, T[reached], q), first, ik.revolute)
     rolled, _ = unwrap_path(q[np.arange(len(q)), chosen], ik.limits, ik.revolute, near)
-    # Poses without a solution are guided by the last reached pose before them, or by the first one.
+    # Poses without a solution are guided by the last pose reached before them, or by the first pose reached.
     before = np.maximum(np.searchsorted(reached, np.arange(len(T)), side="right") - 1, 0)
     return rolled[before]
 
@@ -245,11 +246,11 @@ def unwrap_path(
         q: `(poses, dof)` joint values [rad or m] with any wrapping, without NaN.
         limits: `(dof, 2)` joint limits [rad or m].
         revolute: `(dof,)` mask of the revolute joints.
-        near: `(dof,)` joint values near which the path should start, or None for 0.
+        near: `(dof,)` joint values near which the path should start; None for 0.
 
     Returns:
-        The joint values, and `(pose, joint)` where a joint must be rewound by full turns before the pose because it
-        reaches a limit. A value that cannot be wrapped into the limits remains outside.
+        The joint values, and `(pose, joint)` for every joint that must be rewound by full turns before the pose because
+        it reaches a limit. A value that cannot be wrapped into the limits remains outside.
     """
     rolled = q.copy()
     rolled[1:] = q[0] + np.cumsum(wrap_motion(np.diff(q, axis=0), revolute), axis=0)
@@ -262,7 +263,7 @@ def unwrap_path(
 
 
 def _within(values: Array, lower: float, upper: float, meant: float) -> tuple[Array, list[int]]:
-    """Return a joint's continuous values shifted by full turns into its limits, and where the shift changes."""
+    """Return a joint's continuous values, shifted by full turns into its limits, and where the shift changes."""
     result, breaks, start = values.copy(), [], 0
     lower, upper = lower - LIMIT_TOLERANCE, upper + LIMIT_TOLERANCE
     while start < len(values):
@@ -291,7 +292,7 @@ def wrap_motion(step: Array, revolute: Array) -> Array:
 
 
 def is_jump(before: Array, middle: Array, after: Array, revolute: Array) -> Array:
-    """Return whether two solutions `(..., dof)` are not connected through the solution of the halfway pose.
+    """Return whether two solutions `(..., dof)` are not connected via the solution of the halfway pose.
 
     A continuous motion passes near the middle of a step, so that both halves are shorter than three quarters of it. If
     the halfway pose has no solution (NaN), the solutions are not connected.
@@ -318,11 +319,11 @@ def poses_halfway(T: Array, U: Array) -> Array:
 def choose_branches(q: Array, status: Array, jumps: Array, first: Array, revolute: Array) -> Array:
     """Choose the branch of every pose by dynamic programming over all branches.
 
-    The sum of squared joint motions, plus `JUMP` for every jump, is minimised. A pose outside joint limits costs as
-    much as 100 jumps, and a pose without a solution as much as 10,000 poses outside joint limits.
+    The sum of squared joint motions, plus `JUMP` for every jump, is minimised. A pose outside the joint limits costs as
+    much as 100 jumps, and a pose without a solution as much as 10,000 poses outside the joint limits.
 
     Args:
-        q: `(poses, branches, dof)` solutions [rad or m], NaN where a pose has none.
+        q: `(poses, branches, dof)` solutions [rad or m]; NaN where a pose has none.
         status: `(poses, branches)`: `Status` of the solutions.
         jumps: `(poses - 1, branches)`: whether a step on the same branch is a jump.
         first: `(branches,)` cost of a start on each branch [rad²].

@@ -68,11 +68,11 @@ def with_pose_gradients(
     `dq_nominal = J_nominal⁺ ξ`.
 
     J⁺ is the pseudo-inverse of the dimensionless Jacobian, without singular values below `SINGULAR_TOLERANCE`. It is
-    the inverse if this exists; for a redundant arm it yields the smallest joint motion, and for fewer than six
-    joints or at a singular pose it follows the part of ξ that the tool can follow. Changes of T that are not motions
-    (shear, scale) do not contribute. The gradient of a solution that is NaN is 0, so that it can be masked. Only
-    first derivatives are available. If some axes of the tool are not constrained, ξ and J are restricted to the
-    constrained axes.
+    the inverse if this exists; for a redundant arm, it yields the smallest joint motion, and for fewer than six joints
+    or at a singular pose, the joints follow the part of ξ that the tool can follow. Changes of T that are not motions
+    (shear, scale) do not contribute. The gradient of a solution that is NaN is 0, so it can be masked. Only first
+    derivatives are available. If some axes of the tool are not constrained, ξ and J are restricted to the constrained
+    axes.
 
     Args:
         model: calibrated model.
@@ -100,7 +100,7 @@ def with_pose_gradients(
 
 
 def _twist(T: Float64[Tensor, "*batch 4 4"]) -> Float64[Tensor, "*batch 6"]:
-    """Return the twist of poses relative to themselves [m, rad]: 0, with its derivatives."""
+    """Return the twist of poses relative to themselves [m, rad], which is 0, with its derivatives."""
     still = T.detach()
     turn = T[..., :3, :3] @ still[..., :3, :3].mT
     turned = [turn[..., k, j] - turn[..., j, k] for j, k in ((1, 2), (2, 0), (0, 1))]

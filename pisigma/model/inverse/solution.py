@@ -45,7 +45,7 @@ class AbstractInverse(ABC):
     @property
     @abstractmethod
     def postures(self) -> Postures:
-        """Ranges of plausible joint values, which `near` has to meet."""
+        """Ranges of plausible joint values, in which `near` must lie."""
 
     @abstractmethod
     def __call__(
@@ -82,7 +82,7 @@ class AbstractInverse(ABC):
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """Joint values to command so that the robot reaches poses, and measures of their validity.
+    """Joint values to command in order to reach poses, and measures of their validity.
 
     All values are NumPy arrays (scalars for a single pose) if the poses were arrays or lists, and tensors on the device
     of the poses if these were tensors: joint values and `domain_measure` in the dtype of the poses, residuals in
@@ -91,25 +91,25 @@ class Solution:
     Attributes:
         q: `(*batch, dof)`: corrected joint values [rad or m]; NaN if and only if the status is UNREACHABLE or
             INVALID_POSE.
-        q_nominal: `(*batch, dof)`: joint values of the nominal robot, wrapped near `q`; NaN also where the
-            identified geometry reaches the pose but the nominal geometry does not.
+        q_nominal: `(*batch, dof)`: joint values of the nominal robot, wrapped near `q`; also NaN where the identified
+            geometry reaches the pose but the nominal geometry does not.
         branch: `(*batch,)`: index into `branches`.
         branches: names of the branches.
         status: `(*batch,)`: a `Status` as a number. The most serious status is reported, in the order unreachable,
-            outside joint limits, singular, outside domain, reached. Joint limits apply to the corrected values,
-            which are commanded.
+            outside joint limits, singular, outside domain, reached. Joint limits apply to the corrected values, because
+            these are commanded.
         position_residual: `(*batch,)`: distance of the tool from the target position [m] as predicted by the model,
-            before joint values are rounded to float32, and without the ignored axes; NaN without a solution.
+            before joint values are rounded to float32, and without the ignored axes; NaN if there is no solution.
         rotation_residual: `(*batch,)`: angle between the tool and the target orientation [rad], computed in the same
             way.
-        domain_measure: `(*batch,)`: distance to the training rows divided by their spacing; above 1 the correction
-            is extrapolated, regardless of the status. For a hybrid it is 1 plus the largest angle [rad] by which a
-            joint is outside its measured values. NaN without a learned correction or without a solution.
+        domain_measure: `(*batch,)`: distance to the training rows divided by their spacing; above 1, the correction is
+            extrapolated, regardless of the status. For a hybrid, it is 1 plus the largest angle [rad] by which a joint
+            is outside its measured values. NaN if there is no learned correction or no solution.
         owner: solver that found the solution and predicts its accuracy.
-        ignored_axes: axes of the tool that affect neither the status nor the residuals: those that the task ignores or
-            that an arm with fewer than six joints cannot control; see `kinematics.task_axes.TaskAxes`.
-        approach: `(*batch, dof)`: direction of approach that the call stated for every joint, as an array; None if it
-            stated none.
+        ignored_axes: axes of the tool that affect neither the status nor the residuals, because the task ignores them
+            or an arm with fewer than six joints cannot control them; see `kinematics.task_axes.TaskAxes`.
+        approach: `(*batch, dof)`: direction of approach that the call stated for every joint, as an array; None if the
+            call stated none.
     """
 
     q: Any
@@ -131,14 +131,14 @@ class Solution:
 
     @property
     def model(self) -> str:
-        """Name of the model that was used; empty if it is not known."""
+        """Name of the model that was used; empty if unknown."""
         return "" if self.owner is None else self.owner.name
 
     @cached_property
     def accuracy(self) -> Any:
         """Predicted standard deviation of the tool's position [m], `(*batch,)`; NaN if the model has no uncertainty.
 
-        It is computed with torch in float64 at the first access.
+        It is computed with torch in float64 on first access.
         """
         if self.owner is None:
             return np.full(np.shape(self.status), np.nan)
@@ -146,7 +146,7 @@ class Solution:
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """Sentence about the meaning of every status and what to do, with flattened batch axes."""
+        """Sentence on the meaning of every status and on what to do, with flattened batch axes."""
         return tuple(Status(status).sentence for status in np.ravel(self.status).tolist())
 
     def select(self, index: Any) -> "Solution":
@@ -171,7 +171,7 @@ class Solution:
 
         Args:
             change: function of the values of this solution and of every other solution.
-            others: further solutions, with the same branches.
+            others: other solutions, with the same branches.
         """
         changed = {
             name: change(*(getattr(solution, name) for solution in (self, *others))) for name in _VALUES

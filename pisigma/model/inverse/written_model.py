@@ -1,4 +1,4 @@
-"""Check written models: the folder is read and compared with the model in memory before it gets its name."""
+"""Check written models: a folder is read and compared with the model in memory before it gets its final name."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +18,7 @@ _PROBES = 20
 _PROBE_RADIUS = 0.1
 """Largest distance [rad or m] of the compared joint values from the joint values of training rows."""
 TOLERANCE, _JOINT_TOLERANCE = 1e-12, 1e-9
-"""Largest difference of predictions [m or rad], and of joint values, which result from an iteration."""
+"""Largest difference of predictions [m or rad], and of joint values, which are results of an iteration."""
 
 
 def write_model(model: CalibratedModel, folder: Path) -> None:
@@ -33,7 +33,7 @@ def write_model(model: CalibratedModel, folder: Path) -> None:
 
 
 def check_written(model: CalibratedModel, folder: Path) -> None:
-    """Compare a model with its folder: poses, corrected IK, predicted deviations and prior sizes of weights.
+    """Compare a model with its folder in poses, corrected IK, predicted deviations and prior sizes of weights.
 
     Raises:
         AssertionError: the model and its folder differ.

@@ -1,1 +1,1 @@
-"""Several arms that measured the same things: their models, and their bases relative to each other."""
+"""Several arms that measured the same objects: their models, and their bases relative to each other."""

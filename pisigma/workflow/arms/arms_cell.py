@@ -39,7 +39,7 @@ class ArmsDocument(Section):
     """The content of a `cell.yaml` of several arms.
 
     Attributes:
-        arms: the arms by name; the first is the one in whose base the others are.
+        arms: the arms by name; the bases of the others are relative to that of the first.
         calibrate: settings of `pisigma calibrate` of every arm.
     """
 
@@ -55,8 +55,8 @@ def arms_of_cell(folder: str | os.PathLike[str], **changed: Any) -> tuple[Arm, .
         **changed: settings of the calibration that override the file, by its keys.
 
     Raises:
-        PlanningError: `cell.yaml` is not valid, a file is outside of the cell, or two arms of one URDF file share a
-            joint, such as that of a torso.
+        PlanningError: `cell.yaml` is not valid, a file is outside the cell, or two arms of one URDF file share a joint,
+            such as that of a torso.
         PisigmaError: a robot cannot be loaded, or a setting is not valid.
     """
     path = Path(folder) / CELL_FILE
@@ -76,10 +76,10 @@ def arms_of_cell(folder: str | os.PathLike[str], **changed: Any) -> tuple[Arm, .
 
 
 def _check_joints(path: Path, first: Arm, second: Arm, document: ArmsDocument) -> None:
-    """Refuse two arms of one tree with a common joint, which would be calibrated twice.
+    """Refuse two arms of one URDF file with a common joint, which would be calibrated twice.
 
     Raises:
-        PlanningError: see above.
+        PlanningError: two arms have a common joint.
     """
     one, other = document.arms[first.name], document.arms[second.name]
     assert isinstance(first.robot, Robot)
@@ -107,11 +107,12 @@ def calibrate_arms_of_cell(
     Args:
         folder: folder of the cell.
         progress: called with the current step.
-        accept_implausible: also store a result that must not be trusted.
+        accept_implausible: whether to also store a result that must not be trusted.
         **changed: settings that override the file, by its keys.
 
     Returns:
-        The calibration, and the folder with the models; None if it must not be trusted and was not stored.
+        The calibration, and the folder with the models, which is None if the result must not be trusted and was not
+        stored.
 
     Raises:
         PisigmaError: see `arms_of_cell` and `calibrate_arms`.

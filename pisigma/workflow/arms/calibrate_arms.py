@@ -1,4 +1,4 @@
-"""Calibrate several arms that measured the same things, and find their bases relative to each other."""
+"""Calibrate several arms that measured the same objects, and find their bases relative to each other."""
 
 import os
 import re
@@ -31,7 +31,7 @@ from pisigma.workflow.settings.calibration import CalibrationSettings
 FRAMES_FILE = "frames.yaml"
 """File with the bases of the arms relative to each other, next to the folders of their models."""
 _MAX_POSTURES = 200
-"""Number of postures of every arm at which the distances between tools are judged."""
+"""Number of postures of every arm at which the distances between tools are evaluated."""
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
 
 
@@ -42,9 +42,9 @@ class Arm:
     Attributes:
         name: name of the arm: letters, digits, "_" and "-".
         robot: the nominal robot, or its catalogue name or robot file.
-        data: measurements, or CSV files of them. What other arms measured too has the same name in their rows: a board,
-            jig or instrument in the column `frame`, sockets in `socket`, anchors in `anchor`.
-        settings: settings of its calibration.
+        data: measurements, or CSV files of them. Objects that other arms also measured have the same name in all rows:
+            a board, jig or instrument in the column `frame`, sockets in `socket`, anchors in `anchor`.
+        settings: settings of the calibration of the arm.
     """
 
     name: str
@@ -58,7 +58,7 @@ class ArmsCalibration:
     """Result of `calibrate_arms`.
 
     Attributes:
-        calibrations: calibration of every arm, by its name.
+        calibrations: calibration of every arm, by name of the arm.
         bases: bases of the arms, with covariances in SI units.
         summary: figures of the bases.
         seconds: computing time [s].
@@ -71,14 +71,14 @@ class ArmsCalibration:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Sums of bases and tools, and warnings of the arms after their names, one sentence each."""
+        """Sums of bases and tools, and warnings of the arms preceded by their names, one sentence each."""
         return self.summary.sums + tuple(
             f"{name}: {sentence}" for name, one in self.calibrations.items() for sentence in one.warnings
         )
 
     @property
     def trusted(self) -> bool:
-        """Whether no check found an arm implausible, and the arms agree on what they share."""
+        """Whether no check found an arm implausible and the arms agree on shared objects."""
         return not self.summary.diagnostics and all(one.trusted for one in self.calibrations.values())
 
     def to_json(self) -> dict[str, Any]:
@@ -97,7 +97,8 @@ class ArmsCalibration:
         Args:
             folder: folder to write; it must not exist, or must be empty.
             command: command that made the models, for their cards. None: the Python calls.
-            accept_implausible: also write a result that must not be trusted; `frames.yaml` and the cards say why.
+            accept_implausible: whether to also write a result that must not be trusted; `frames.yaml` and the cards
+                state the reason.
 
         Returns:
             The figures as written, with the hashes of the models.
@@ -159,8 +160,8 @@ def postures_of(calibration: Calibration) -> Postures:
 def calibrate_arms(arms: Sequence[Arm], progress: Progress = lambda what: None) -> ArmsCalibration:
     """Calibrate every arm with its own rows, and find the bases of the arms relative to each other.
 
-    Every arm is calibrated as by `calibrate`. The bases then follow from what the arms share, see `fit_arm_bases`.
-    The models are those of the arms' own rows: what an arm could learn from another one is used for the bases only.
+    Every arm is calibrated as by `calibrate`. The bases then follow from the shared objects, see `fit_arm_bases`. The
+    models are those of the arms' own rows; information that one arm has about another is used only for the bases.
 
     Args:
         arms: two or more arms.
@@ -171,9 +172,9 @@ def calibrate_arms(arms: Sequence[Arm], progress: Progress = lambda what: None) 
 
     Raises:
         RobotError: a robot is unknown.
-        MeasurementError: rows cannot be read, or cannot be split as the settings say.
-        IdentificationError: rows do not determine the free parameters, or the arms do not share enough; or a name is
-            not valid.
+        MeasurementError: rows cannot be read, or cannot be split as the settings require.
+        IdentificationError: rows do not determine the free parameters, the arms do not share enough objects, or a name
+            is not valid.
     """
     started = time.perf_counter()
     _check_names([arm.name for arm in arms])
@@ -196,10 +197,10 @@ def calibrate_arms(arms: Sequence[Arm], progress: Progress = lambda what: None) 
 
 
 def _check_names(names: Sequence[str]) -> None:
-    """Refuse fewer than two arms, and names that are not valid or appear twice.
+    """Refuse fewer than two arms, and names that are invalid or appear twice.
 
     Raises:
-        IdentificationError: see above.
+        IdentificationError: there are fewer than two arms, or a name is invalid or appears twice.
     """
     if len(names) < 2:
         raise IdentificationError(

@@ -1,4 +1,4 @@
-"""Find which base of calibrated arms, or which frame that they share, was moved, from a few new rows."""
+"""Find the base of calibrated arms, or the shared frame, that was moved, from a few new rows."""
 
 import math
 import os
@@ -35,12 +35,13 @@ class MovedFigures(Section):
 
     Attributes:
         kind: "arm" (its base) or "frame".
-        name: its name.
-        is_named: whether its motion explains the rows best; if several are named, the rows cannot distinguish them.
-        shift_mm: shift of its origin along x, y, z of the first arm's base [mm], if it alone moved.
+        name: name of the arm or frame.
+        is_named: whether its motion explains the rows best; if this is true of several, the rows cannot distinguish
+            them.
+        shift_mm: shift of its origin along x, y, z of the first arm's base [mm], if only it moved.
         rotation_deg: rotation about these axes [deg], as a rotation vector.
-        standard_errors: standard errors of both [mm and deg].
-        log_likelihood: log likelihood if it alone moved, relative to none having moved [nats].
+        standard_errors: standard errors of shift and rotation [mm and deg].
+        log_likelihood: log likelihood if only it moved, relative to no motion [nats].
     """
 
     kind: str
@@ -53,7 +54,7 @@ class MovedFigures(Section):
 
     @property
     def sentence(self) -> str:
-        """The motion in one sentence."""
+        """Sentence that states the motion."""
         error = math.hypot(*self.standard_errors[:3])
         what = "base of arm" if self.kind == "arm" else "frame"
         turned = math.hypot(*self.rotation_deg)
@@ -69,7 +70,7 @@ class ArmsMovement:
 
     Attributes:
         found: what moved, in SI units.
-        bodies: figures of all arms and frames, the best explanation first.
+        bodies: figures of all arms and frames, best explanation first.
         seconds: computing time [s].
     """
 
@@ -79,7 +80,7 @@ class ArmsMovement:
 
     @property
     def sentence(self) -> str:
-        """What moved, in one sentence."""
+        """Sentence that states what moved."""
         named = [one.sentence for one in self.bodies if one.is_named]
         if not named:
             return "Nothing moved."
@@ -107,19 +108,19 @@ def find_moved_arms(
     data: Mapping[str, Measurements | MeasurementFiles],
     cameras: Mapping[str, CameraFiles] | None = None,
 ) -> ArmsMovement:
-    """Find the base or the shared frame that was bumped since arms were calibrated, see `find_moved_bases`.
+    """Find the base or shared frame that was moved since the arms were calibrated, see `find_moved_bases`.
 
     Args:
         folder: folder with `frames.yaml` and the models of the arms, as `calibrate_arms` wrote it.
-        data: 6 or more new rows of every arm that is compared, by its name, in frames of its calibration.
+        data: six or more new rows of every compared arm, by name of the arm, in frames of its calibration.
         cameras: cameras and boards of arms whose rows are detected corners.
 
     Returns:
         What moved, with its shift and uncertainty.
 
     Raises:
-        ModelError: an arm is unknown, its model was changed, or it has no posterior of its parameters (a geometric
-            calibration that was stored).
+        ModelError: an arm is unknown, its model was changed, or its model has no posterior of its parameters, as a
+            stored geometric calibration.
         MeasurementError: rows cannot be read.
         IdentificationError: there are too few rows, or none in a frame of the calibration.
     """
@@ -138,7 +139,7 @@ def find_moved_arms(
 
 
 def _poses_in_first(summary: ArmsSummary) -> dict[str, Float64[Tensor, "4 4"]]:
-    """Return the base of every arm in that of the first one."""
+    """Return the base of every arm relative to that of the first arm."""
     first = summary.arms[0].name
     poses = {first: torch.eye(4, dtype=torch.float64)}
     for one in summary.bases:

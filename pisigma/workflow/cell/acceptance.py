@@ -1,4 +1,4 @@
-"""Collect the statements by which the robot of a cell is accepted."""
+"""Collect the statements on which the acceptance of a cell's robot is based."""
 
 from jaxtyping import Float64
 from torch import Tensor
@@ -17,7 +17,7 @@ from pisigma.workflow.cell.setup_names import ModelRows
 from pisigma.workflow.evaluate import evaluate
 
 _JUDGED = frozenset(("position", "rotation", "pose", "corner"))
-"""Kinds of readings that give positions."""
+"""Kinds of readings that yield positions."""
 _NO_SESSION = "no independent session has been measured since the calibration of the model."
 
 
@@ -25,14 +25,14 @@ def acceptance_of(cell: Cell) -> Acceptance:
     """Collect instrument, uncertainty budget, measured figures and acceptances of the model in use.
 
     Measured figures and poses of the budget are from the newest valid session to which the model was not fitted;
-    without such a session, the budget is for the poses of the calibration.
+    if there is none, the budget is for the poses of the calibration.
 
     Args:
         cell: cell to read; nothing is added to it.
 
     Raises:
         ModelError: no model is in use.
-        MeasurementError: the file of a session was changed, or there is no session with which the model was used.
+        MeasurementError: the file of a session was changed, or there is no session of the model.
     """
     model = load_model(folder := cell.model_folder())
     entry = cell.history.model(folder.name)
@@ -40,7 +40,7 @@ def acceptance_of(cell: Cell) -> Acceptance:
     facts, made_of = cell.status().facts, entry.made_of
     sessions, later = facts.valid_sessions, facts.new_sessions(entry)
     known = later or [one for one in cell.history.sessions() if one.name in made_of[-1:]]
-    if not known:  # the model was made outside of the cell
+    if not known:  # the model was made outside the cell
         remedy = "import rows that were measured with it"
         raise MeasurementError(
             f"the cell has no session of model '{entry.name}'", at=Place(cell.folder), remedy=remedy
@@ -86,7 +86,7 @@ def acceptance_of(cell: Cell) -> Acceptance:
 def _measured(
     cell: Cell, entry: ModelEntry, session: SessionEntry, seen: ModelRows
 ) -> tuple[MeasuredAccuracy | None, str]:
-    """Evaluate the model on a session; return a reason if that is not possible."""
+    """Evaluate the model on a session; return the reason if this is not possible."""
     if others := seen.rows.kinds - _JUDGED:
         return None, f"session {session.name} has readings without a position ({', '.join(sorted(others))})."
     settings = seen.settings_to_fit(cell.file.settings_of_step("evaluate"))

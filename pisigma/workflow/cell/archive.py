@@ -50,7 +50,7 @@ def pack(cell: Cell, path: str | os.PathLike[str]) -> int:
     try:
         with scratch_beside(target, FILE) as scratch, scratch_beside(target, FILE) as history:
             if cell.history.path in files:
-                cell.history.database.copy(history)  # completely, even if another process writes
+                cell.history.database.copy(history)  # copied completely, even if another process writes
             with zipfile.ZipFile(scratch, "w", zipfile.ZIP_DEFLATED) as archive:
                 for one in files:
                     source = history if one == cell.history.path else one

@@ -54,8 +54,8 @@ class Cell:
 
     Attributes:
         folder: folder of the cell.
-        file: its `cell.yaml`.
-        history: history of its sessions, events, models and checks.
+        file: the `cell.yaml` of the cell.
+        history: history of the sessions, events, models and checks.
     """
 
     def __init__(self, folder: Path, file: CellFile) -> None:
@@ -92,8 +92,8 @@ class Cell:
             robot: catalogue name, or a robot file (YAML or URDF), which is copied into the cell.
             sensor: "tracker", "camera", "sockets", "draw-wire" or "touch".
             limit_mm: limit on the 95 % quantile of the position errors [mm]; None for no limit.
-            base: base link of the URDF file; poses are in its frame. None for its root.
-            tip: tool link of the URDF file; None for its only end.
+            base: base link of the URDF file; poses are in its frame. None for the root link.
+            tip: tool link of the URDF file; None for the only end link.
             cameras: cameras and boards, whose files are copied into the cell.
 
         Raises:
@@ -112,7 +112,7 @@ class Cell:
 
     @property
     def cameras(self) -> CameraFiles | None:
-        """Cameras and boards that measure; None without cameras."""
+        """Cameras and boards that measure the robot; None if there are none."""
         settings: CalibrationSettings = self.file.settings_of_step("calibrate")
         return settings.cameras
 
@@ -126,7 +126,7 @@ class Cell:
         """Return the folder of a model.
 
         Args:
-            name: name of the model. None: the model in use.
+            name: name of the model; None for the model in use.
 
         Raises:
             ModelError: there is no model with this name, or no model is in use.
@@ -140,13 +140,13 @@ class Cell:
     def plan(
         self, progress: Progress = lambda what: None, programs: Sequence[Path] = (), **changed: Any
     ) -> tuple[Plan, Path]:
-        """Plan which poses to measure; every plan of a cell has different poses.
+        """Plan the poses to measure; every plan of a cell has different poses.
 
         Without a model, the poses are for a calibration; with a model, they verify, monitor or improve the model.
 
         Args:
             progress: called with the name of each step.
-            programs: files of robot programs to write as well.
+            programs: files of robot programs that are also written.
             **changed: options of `pisigma plan` that override `cell.yaml`, by its keys.
 
         Returns:
@@ -156,7 +156,7 @@ class Cell:
         entry, settings = facts.in_use or facts.newest_model, self.file.plan_settings(facts, **changed)
         subject = self.model_folder(entry.name) if entry is not None and entry.has_posterior else self.robot
         planned = plan(subject, settings, self.file.document.surroundings, progress)
-        with self.history.database.transaction():  # so that no other process chooses the same name
+        with self.history.database.transaction():  # reserved, so that no other process chooses the same name
             path = free_path(self.folder / PLANS, datetime.date.today().isoformat(), ".csv")
             planned.save(path, programs)
         made = f"plan '{path.stem}' of {planned.poses + planned.check_poses} poses"
@@ -191,7 +191,7 @@ class Cell:
         Args:
             progress: called with the name of each step.
             accept_implausible: store the model even if it must not be trusted; such a model is not put into use.
-            prior: model folder of `pisigma fleet prior` to start from. None: calibrate from scratch.
+            prior: model folder of `pisigma fleet prior` to start from; None for none.
             **changed: options of `pisigma calibrate` that override `cell.yaml`, by its keys.
 
         Returns:
@@ -226,11 +226,11 @@ class Cell:
     def verify(
         self, session: str | None = None, model: str | None = None, **changed: Any
     ) -> tuple[Verification, ModelEntry]:
-        """Verify a model with a session to which it was not fitted; use it from now on if it passes and is newer.
+        """Verify a model with a session to which it was not fitted; put it into use if it passes and is newer.
 
         Args:
-            session: name of the session. None: the newest to which the model was not fitted.
-            model: name of the model. None: the model in use or, if there is none, the newest.
+            session: name of the session; None for the newest session to which the model was not fitted.
+            model: name of the model; None for the model in use or, if there is none, the newest.
             **changed: options of `pisigma verify` that override `cell.yaml`, by its keys.
 
         Returns:
@@ -252,7 +252,7 @@ class Cell:
         return found, entry
 
     def monitor(self, progress: Progress = lambda what: None, **changed: Any) -> MonitoringResult:
-        """Compare every session that is newer than the model in use with this model, to detect moved parts.
+        """Compare every session newer than the model in use with this model, to detect moved parts.
 
         Args:
             progress: called with the name of each step.
@@ -303,10 +303,10 @@ class Cell:
     ) -> tuple[Recalibration, ModelEntry | None]:
         """Recalibrate the model in use with the newest session; put the result into use if it can be trusted.
 
-        A move of the instrument or the tool that was found and not recorded becomes an event on the day of the session.
+        An unrecorded move of the instrument or the tool that is found becomes an event on the day of the session.
 
         Args:
-            session: name of the session. None: the newest to which the model was not fitted.
+            session: name of the session; None for the newest session to which the model was not fitted.
             progress: called with the name of each step.
             accept_implausible: store the model even if it must not be trusted; such a model is not put into use.
             **changed: options of `pisigma recalibrate` that override `cell.yaml`, by its keys.
@@ -344,7 +344,7 @@ class Cell:
         """Put a model into use by hand, or undo the last change of the model in use; no model is deleted.
 
         Args:
-            model: name of the model. None: the model before the last change; repeated calls go further back.
+            model: name of the model; None for the one before the last change (repeated calls go further back).
             reason: reason to record in the history.
 
         Returns:
@@ -376,7 +376,7 @@ class Cell:
         )
 
     def _candidate(self, model: str | None) -> ModelEntry:
-        """Return the named model; without a name, the model in use or the newest model."""
+        """Return the named model or, without a name, the model in use or the newest model."""
         if model is not None:
             return self.history.model(model)
         if (entry := self.history.in_use) is not None:

@@ -15,7 +15,7 @@ from pisigma.lifetime.cell.history import now
 from pisigma.workflow.cell.cell import Cell
 
 NONE = "none"
-"""Word that is stated instead of a file if no export is active on the controller."""
+"""Word that stands for no file if no export is active on the controller."""
 
 
 def export_from_cell(cell: Cell, form: str, request: ExportRequest) -> Exported:
@@ -27,7 +27,7 @@ def export_from_cell(cell: Cell, form: str, request: ExportRequest) -> Exported:
         request: file and options; its model is ignored.
 
     Raises:
-        ModelError: no model is in use, or an export that is active on the controller would be applied in addition.
+        ModelError: no model is in use, or an export that is already active on the controller would be applied as well.
         PisigmaError: see `export_model`.
     """
     contains = export_format(form).contents_for(request)

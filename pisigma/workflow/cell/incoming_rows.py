@@ -1,4 +1,4 @@
-"""Files of an instrument that are added to a cell: how they are read, their faults, and repairs."""
+"""Files of an instrument that are added to a cell: reading, faults and repairs."""
 
 import shlex
 from collections.abc import Mapping, Sequence
@@ -32,18 +32,18 @@ _SIZES = {
     "rad": 1.0,
     "gon": np.pi / 200,
 }
-"""Sizes of the units that are confused [m or rad]."""
+"""Sizes of units that are often confused [m or rad]."""
 _MISNAMED = {"mm_named_m": 1e-3, "m_named_mm": 1e3}
-"""Ratio of correct to stated values by the cause of a finding that has no other figures."""
+"""Ratio of correct to stated values, by the cause of a finding that states no figures."""
 
 
 @dataclass(frozen=True)
 class Repair:
-    """Settings of the import that correct a finding of the check.
+    """Settings of the import that correct a finding of a check.
 
     Attributes:
         text: effect of the settings, such as "read x_mm, y_mm, z_mm as x_in!, y_in!, z_in!".
-        settings: all settings of the import with the correction.
+        settings: all settings of the import, including the correction.
         options: the settings as options of a command line.
     """
 
@@ -57,7 +57,7 @@ class Repair:
 
 
 def stated_options(settings: ImportSettings) -> str:
-    """Return stated meanings of columns and new frames as options of `pisigma import`; "" without statements."""
+    """Return stated meanings of columns and new frames as options of `pisigma import`; "" if none are stated."""
     pairs = ",".join(f"{key}={text}" for one in settings.maps for key, text in one.items())
     words = ["--map", pairs] if pairs else []
     for line in settings.new_frame_at:
@@ -174,7 +174,7 @@ class IncomingRows:
 
 
 def _corrected(mapping: FileMapping, finding: Diagnostic) -> Mapping[str, str]:
-    """Return the meanings of the columns of a file that correct a finding, by heading; empty without a repair."""
+    """Return the meanings of a file's columns that correct a finding, by heading; empty if there is no repair."""
     kinds, values = set(finding.cause.split("+")) - {"frame", "tool"}, finding.values
     columns, ratio = values.get("columns"), values.get("ratio", _MISNAMED.get(finding.cause))
     targets: list[tuple[MappedColumn, Target]] = []

@@ -1,4 +1,4 @@
-"""Models of a cell: entries in the history, the model in use, and comparison of a new model on new rows."""
+"""Models of a cell: entries in the history, changes of the model in use, and comparison on new rows."""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
@@ -47,7 +47,7 @@ def is_better(
     Args:
         stored: the sessions of the cell.
         in_use: the model in use.
-        sessions: sessions to which the new calibration was fitted, by their days.
+        sessions: sessions to which the new calibration was fitted, in the order of their days.
         settings: settings of the calibration.
         progress: called with the name of each step.
     """
@@ -148,7 +148,7 @@ def unrecorded_changes(
 ) -> list[Event]:
     """Return the unrecorded changes of instrument and tool that a recalibration found.
 
-    None is returned if another session was measured on the same day, maybe before the change.
+    None is returned if another session was measured on the same day, possibly before the change.
 
     Args:
         result: the recalibration.
@@ -171,9 +171,9 @@ def unrecorded_changes(
 def calibrate_rows(
     robot: Robot, rows: Measurements, settings: CalibrationSettings, prior: Path | None, progress: Progress
 ) -> Calibration | Recalibration:
-    """Calibrate a robot with rows that were read, from scratch or from the prior of a fleet.
+    """Calibrate a robot with given rows, from scratch or from the prior of a fleet.
 
-    A calibration from scratch without a validation is stored without figures, which take longer than itself.
+    A calibration from scratch without a validation is stored without figures, which take longer than the calibration.
     """
     if prior is None:
         result = calibrate(robot, rows, replace(settings, cameras=None), progress)
@@ -183,9 +183,9 @@ def calibrate_rows(
 
 
 def errors_of(result: Calibration | Recalibration | FrameCalibration) -> tuple[float | None, float | None]:
-    """Return the 95 % quantile and the RMS of the position errors [mm]; None if they are unknown.
+    """Return the 95 % quantile and the RMS of the position errors [mm]; None if unknown.
 
-    Both are of held-out rows; without a validation, the RMS is that of the rows of the calibration.
+    Both refer to held-out rows; without a validation, the RMS refers to the rows of the calibration.
     """
     if isinstance(result, FrameCalibration):
         return None, result.summary.rms_mm
@@ -212,11 +212,11 @@ def model_entry(
 
     Args:
         events: events that were recorded when the rows were read; a recalibrated model has the names of its parent.
-        made: time at which they were read (ISO 8601, UTC).
+        made: time at which the rows were read (ISO 8601, UTC).
         path: folder of the model.
         sessions: sessions to which the model was fitted.
-        remark: why it is or is not in use.
-        result: calibration or recalibration that made it.
+        remark: reason why the model is or is not in use.
+        result: calibration or recalibration that made the model.
         parent: model that was recalibrated; None for a calibration.
     """
     day = max(one.day for one in sessions)
@@ -264,7 +264,7 @@ def put_into_use(history: History, model: str, reason: str, undo: bool = False) 
 
 
 def with_warnings(result: Result, warnings: tuple[str, ...]) -> Result:
-    """Return a calibration or a recalibration with further warnings, which its card also states."""
+    """Return a calibration or a recalibration with additional warnings, which its card also states."""
     if not warnings:
         return result
     summary = result.summary.model_copy(update={"warnings": (*warnings, *result.summary.warnings)})

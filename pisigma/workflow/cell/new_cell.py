@@ -36,9 +36,9 @@ class NewCell:
         base: base link of the URDF file; poses are in its frame. None for its root.
         tip: tool link of the URDF file; None for its only end.
         cameras: cameras and boards, whose files are copied into the cell.
-        calibrate: settings of `pisigma calibrate` by their keys, for a short `cell.yaml`. None: a `cell.yaml` that
-            lists all settings of all steps as comments.
-        sessions: files of rows by their names in `sessions/`.
+        calibrate: settings of `pisigma calibrate`, by key, for a short `cell.yaml`; None for a `cell.yaml` that lists
+            all settings of all steps as comments.
+        sessions: files of rows, by their names in `sessions/`.
         model: a model folder, which is copied into the cell.
     """
 
@@ -159,7 +159,7 @@ def _copied(cameras: CameraFiles, folder: Path) -> dict[str, Any]:
     """Copy the files of cameras and boards into the cell; return the section `camera`.
 
     Raises:
-        OutputError: two files have the same name, or that of another file of the cell.
+        OutputError: two files have the same name, or a file has the name of another file of the cell.
     """
     for path in cameras.files:
         if (folder / Path(path).name).exists() or Path(path).name == CELL_FILE:

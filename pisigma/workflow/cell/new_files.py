@@ -9,7 +9,7 @@ from pisigma.files.errors import OutputError, Place
 from pisigma.files.scratch import FILE, scratch_beside
 
 _MAX_NAMES = 10_000
-"""Largest number of files with the date of one day in a folder."""
+"""Largest number of files with the same date in a folder."""
 
 
 def free_path(folder: Path, name: str, suffix: str, taken: Collection[str] = ()) -> Path:
@@ -48,12 +48,12 @@ def output_path(cell: str | os.PathLike[str], part: str, suffix: str) -> Path:
 
 
 def save_new(folder: Path, save: Callable[[Path], object], taken: Collection[str]) -> Path:
-    """Save a model under a new name, the date of today, even if other processes save models in the same folder.
+    """Save a model under a new name, today's date, even if other processes save models in the same folder.
 
     Args:
         folder: folder of the models.
         save: function that writes the folder of the model, and refuses an existing folder.
-        taken: further names that are taken, such as names of models whose folders were removed.
+        taken: other names that are taken, such as names of models whose folders were removed.
 
     Raises:
         OutputError: the model cannot be written.
@@ -75,7 +75,7 @@ def write_new(folder: Path, name: str, content: bytes, taken: Collection[str]) -
         folder: folder of the sessions.
         name: name of the file without ".csv"; see `free_path`.
         content: content of the file.
-        taken: further names that are taken.
+        taken: other names that are taken.
 
     Raises:
         OutputError: the file cannot be written.
@@ -89,7 +89,9 @@ def write_new(folder: Path, name: str, content: bytes, taken: Collection[str]) -
                     file.flush()
                     os.fsync(file.fileno())
                 scratch.chmod(0o644)
-                os.link(scratch, path)  # unlike a rename, it never replaces what another process wrote
+                os.link(
+                    scratch, path
+                )  # unlike a rename, this never replaces a file that another process wrote
             return path
         except FileExistsError:
             continue

@@ -1,4 +1,4 @@
-"""Sessions of a cell: they are checked and stored as measured, and read with the names of a model."""
+"""Sessions of a cell, which are checked, stored as measured, and read with the names of a model."""
 
 import datetime
 import hashlib
@@ -44,9 +44,9 @@ class Sessions:
     Attributes:
         folder: folder of the sessions.
         robot: the nominal robot.
-        cameras: cameras and boards that measure; None without cameras.
+        cameras: cameras and boards that measure the robot; None if there are none.
         history: history of the cell.
-        one_by_one: whether files in the folder are added by `add_next_file` only, and not by every step.
+        one_by_one: whether files in the folder are added only by `add_next_file`, not by every step.
     """
 
     def __init__(self, cell: Path, robot: Robot, cameras: CameraFiles | None, history: History) -> None:
@@ -78,14 +78,14 @@ class Sessions:
     ) -> SessionEntry:
         """Check the rows of a session and store them; they are never changed afterwards.
 
-        Rows to which the model in use was fitted outside of the cell become a session of this model.
+        Rows to which the model in use was fitted outside the cell become a session of this model.
 
         Args:
             file: measurements (CSV), or rows in memory.
-            accept_implausible: add them even if the check finds that they must not be trusted.
-            day: day on which the rows were measured (ISO 8601). If empty: from the column `date`, otherwise from the
-                name of the file, otherwise today.
-            remark: how the rows were imported, which the entry records before the findings.
+            accept_implausible: whether to add the rows even if the check finds that they must not be trusted.
+            day: day on which the rows were measured (ISO 8601). If empty, it is taken from the column `date`, or else
+                from the name of the file, or else it is today.
+            remark: description of the import of the rows, which the entry records before the findings.
 
         Returns:
             The entry of the session.
@@ -139,11 +139,11 @@ class Sessions:
         return self._verdict(rows, _checked_day(rows, day))[0]
 
     def _read(self, file: str | os.PathLike[str] | Measurements) -> Measurements:
-        """Read rows; if values exceed the limits of their joints, name the setup fault that explains it.
+        """Read rows; if values exceed the joint limits, name the setup fault that explains this.
 
         Raises:
             MeasurementError: the rows cannot be read.
-            AcceptanceError: a setup fault explains why.
+            AcceptanceError: a setup fault explains why values exceed the limits.
         """
         try:
             return read_rows(file, self.robot, self.cameras)
@@ -229,16 +229,16 @@ class Sessions:
         self.history.add(replace(sessions[session], set_aside=reason.strip()))
 
     def set_imported_aside(self, files: Sequence[Path], session: SessionEntry) -> None:
-        """Set files in the folder aside whose rows were imported as a session, so that they are not read again."""
+        """Set aside files in the folder whose rows were imported as a session, so that they are not read again."""
         for file in files:
             if file.parent.resolve() == self.folder.resolve():
                 self.set_aside(file.name.removesuffix(".csv"), f"imported as session '{session.name}'")
 
     def valid_sessions(self) -> list[SessionEntry]:
-        """Return the sessions that describe the current arm by their days, after adding new files in the folder.
+        """Return the sessions that describe the current arm, in order of day, after adding new files in the folder.
 
         Raises:
-            MeasurementError: there is none.
+            MeasurementError: there is no such session.
         """
         return list(self._facts().valid_sessions)
 
@@ -259,7 +259,7 @@ class Sessions:
         """Return the valid sessions to which a model was not fitted, measured on its newest day or later.
 
         Raises:
-            MeasurementError: there is none.
+            MeasurementError: there is no such session.
         """
         if not (found := self._facts().new_sessions(model)):
             raise MeasurementError(
@@ -270,7 +270,7 @@ class Sessions:
         return found
 
     def choose(self, model: ModelEntry, name: str | None) -> SessionEntry:
-        """Return a session that is new to a model (see `new_to`) by its name; None: the newest.
+        """Return a session that is new to a model (see `new_to`), by name; None for the newest.
 
         Raises:
             MeasurementError: there is no session with this name.
@@ -287,7 +287,7 @@ class Sessions:
 
         Args:
             sessions: the sessions.
-            events: events that count; None: all that have been recorded.
+            events: events to use; None for all that have been recorded.
 
         Raises:
             MeasurementError: a file was changed or removed after it was added.
@@ -322,12 +322,12 @@ class Sessions:
         return rows
 
     def rows_with_model_names(self, model: ModelEntry, rows: Measurements, day: str) -> ModelRows:
-        """Return rows with the names of frame and target of a model, and what was moved since the model was made.
+        """Return rows with a model's names of frame and target, and the parts that were moved since it was made.
 
         Args:
             model: the model.
             rows: rows with the frame and target names of their file.
-            day: day on which they were measured (ISO 8601).
+            day: day on which the rows were measured (ISO 8601).
         """
         events = self.history.events()
         changed = {"base": "instrument", "tool": "tool"}
@@ -391,7 +391,7 @@ def _check_new(rows: Measurements, known: Bool[Tensor, " rows"]) -> None:
 
 
 def _day_of(rows: Measurements) -> str:
-    """Return the first day of rows: from the column `date`, the name of the file, or today, in this order."""
+    """Return the first day of rows: from the column `date`, or else from the name of the file, or else today."""
     if dates := [one for one in rows.date or () if one]:
         return min(dates)
     return date_in_name(Path(rows.source).name) or datetime.date.today().isoformat()

@@ -1,4 +1,4 @@
-"""Rows with the names of a model: frames and targets are named after the days of their setup."""
+"""Rows with the names of a model, in which frames and targets are named after the days of their setup."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -15,14 +15,14 @@ class ModelRows:
 
     Attributes:
         rows: the rows, with the names of the newest frame and target of the model.
-        moved: "base" or "tool" or both, if events since the model record that they were changed.
+        moved: "base" or "tool" or both, if events since the model was made record that these were changed.
     """
 
     rows: Measurements
     moved: tuple[str, ...]
 
     def settings_to_fit(self, settings: Any) -> Any:
-        """Return settings that also fit a changed frame and tool; cameras are removed, because the rows are read."""
+        """Return settings that also fit a changed frame and tool, without cameras, because rows are already read."""
         fit_frame, fit_tool = settings.fit_frame or self.fit_frame, settings.fit_tool or self.fit_tool
         return replace(settings, cameras=None, fit_frame=fit_frame, fit_tool=fit_tool)
 
@@ -43,7 +43,7 @@ class ModelRows:
 
 
 def with_setup_names(rows: Measurements, frame_day: str, target_day: str) -> Measurements:
-    """Return rows whose frame and target names state the day of their setup; "": the names of the file."""
+    """Return rows whose frame and target names state the day of their setup; day "" keeps the names of the file."""
     frame = tuple(setup_name(name, frame_day) for name in rows.frame)
     target = tuple(setup_name(name, target_day) for name in rows.target)
     return replace(rows, frame=frame, target=target)
@@ -55,5 +55,5 @@ def setup_name(name: str, day: str) -> str:
 
 
 def newest_day(events: Sequence[Event], kind: str, day: str) -> str:
-    """Return the day of the newest event of a kind until a day; "" if there is none."""
+    """Return the day of the newest event of a kind up to a given day; "" if there is none."""
     return max((one.day for one in events if one.kind == kind and one.day <= day), default="")

@@ -17,8 +17,8 @@ class UpgradeResult:
 
     Attributes:
         models: results of the models.
-        before: previous version of the schema of the history; equal to `after` if there was no history.
-        after: version of the schema of the history now.
+        before: version of the history's schema before the upgrade; equal to `after` if there was no history.
+        after: version of the history's schema after the upgrade.
     """
 
     models: tuple[Upgrade, ...]
@@ -30,7 +30,7 @@ def upgrade(path: str | os.PathLike[str]) -> UpgradeResult:
     """Convert a model folder or a cell to the current formats; the history then names the upgraded models.
 
     Args:
-        path: a model folder, whose history is also upgraded, or a cell, of which all models are upgraded.
+        path: a model folder, whose history is also upgraded, or a cell, whose models are all upgraded.
 
     Raises:
         ModelError: a folder is not a model, or cannot be upgraded; see `upgrade_folder`.

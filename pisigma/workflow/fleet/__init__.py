@@ -1,1 +1,1 @@
-"""Calibration of a fleet: every robot by itself, and the prior of all robots."""
+"""Calibration of a fleet: of every robot individually, and of the prior of all robots."""

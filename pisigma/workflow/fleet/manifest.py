@@ -24,7 +24,7 @@ COLUMNS = ("id", "robot", "data", "date", "model", "options", "camera", "board")
 _ROBOT_FILES = ("robot.yaml", "robot.yml", "robot.urdf")
 """Names of the robot description in a folder with the rows of a robot."""
 _NO_VALIDATION = {"folds": 0}
-"""Settings of calibrations unless the manifest states others: many robots are calibrated without a cross-validation."""
+"""Settings of calibrations unless the manifest states others; many robots are calibrated without a cross-validation."""
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 _EXPECTED_NAME = "1 to 100 letters, digits, '.', '_' or '-', starting with a letter or digit"
 _Row = tuple[Place, Mapping[str, str]]
@@ -38,7 +38,7 @@ class NewCells:
         cells: folders of all cells of the manifest, sorted by name.
         created: number of cells that did not exist before.
         sessions: number of files of rows that were copied into cells.
-        refused: by id, why a robot has no cell, or its cell lacks some of its rows.
+        refused: reasons, by id, why a robot has no cell, or why its cell lacks some of its rows.
     """
 
     cells: tuple[Path, ...]
@@ -54,21 +54,21 @@ class NewCells:
 
 
 def new_cells(source: Path, out: Path, common: NewCell) -> NewCells:
-    """Create a cell for every robot of a manifest or a folder; add only new sessions to existing cells.
+    """Create a cell for every robot in a manifest or folder, and add new sessions to existing cells.
 
     A manifest has the columns `id` and `data`, and optionally `robot`, `date`, `model`, `options` (settings of
     `pisigma calibrate`, such as `free=joint_offsets; model=geometric`), `camera` and `board` (several as `a.yaml;
-    b.yaml`). Several rows of one id are several sessions. Paths are relative to the folder of the manifest. In a
+    b.yaml`). Several rows with the same id are several sessions. Paths are relative to the folder of the manifest. In a
     folder, every subfolder with `*.csv` is a robot with its description (`robot.yaml` or `robot.urdf`), and every
     `*.csv` is a robot that was measured once.
 
     Args:
         source: manifest or folder.
         out: folder of the cells.
-        common: settings that all cells have in common; its robot is that of the rows that state none, "" for none.
+        common: settings that all cells have in common; its robot applies to rows that state none ("" for none).
 
     Raises:
-        FleetError: there is no robot, an id is not valid or appears twice, or no robot can be used.
+        FleetError: there is no robot, an id is invalid or appears twice, or no robot can be used.
         MeasurementError: the manifest is not a CSV file with commas between its fields.
     """
     robots: dict[str, list[_Row]] = {}
@@ -93,7 +93,7 @@ def new_cells(source: Path, out: Path, common: NewCell) -> NewCells:
 
 
 def _check_names(robots: Mapping[str, list[_Row]], source: Path) -> None:
-    """Refuse ids that cannot be names of folders, or that some file systems do not distinguish."""
+    """Refuse ids that cannot be names of folders, or that some file systems cannot distinguish."""
     if not robots:
         raise FleetError(
             expected="a manifest (CSV) with the columns id, robot and data, a model folder, or a folder with one "
@@ -209,7 +209,7 @@ def _sessions(rows: list[_Row]) -> Iterator[tuple[str, Path]]:
     """Yield names and files of the sessions of a robot.
 
     Raises:
-        FleetError: a session is missing, cannot be named, appears twice, or has no date although there are others.
+        FleetError: a session is missing, cannot be named, appears twice, or has no date although there are several.
     """
     known: dict[str, Place] = {}
     for at, fields in rows:
@@ -237,7 +237,7 @@ def _sessions(rows: list[_Row]) -> Iterator[tuple[str, Path]]:
 
 
 def _add_sessions(cell: NewCell, folder: Path) -> int:
-    """Copy the sessions that a cell does not have yet; return their number."""
+    """Copy the sessions that a cell does not yet have; return their number."""
     present = {sha256_of(path) for path in (folder / SESSIONS).glob("*.csv")}
     new = [(name, file) for name, file in cell.sessions if sha256_of(file) not in present]
     for name, file in new:

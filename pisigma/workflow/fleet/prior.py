@@ -1,4 +1,4 @@
-"""Estimate the prior of a fleet of robots, as a model from which calibrations with few rows start."""
+"""Estimate the prior of a fleet of robots, a model from which calibrations with few rows start."""
 
 import os
 import time
@@ -48,7 +48,7 @@ class FleetPriorResult(AbstractModelResult):
 def estimate_fleet_prior(
     folder: str | os.PathLike[str], progress: Progress = lambda what: None
 ) -> FleetPriorResult:
-    """Estimate means and covariances of the errors of robots of one type from the first valid session of each cell.
+    """Estimate means and covariances of the errors of one type of robot from the first valid session of each cell.
 
     Args:
         folder: folder of cells; files in their `sessions/` that have not been added yet are added.
@@ -56,8 +56,8 @@ def estimate_fleet_prior(
 
     Raises:
         PlanningError: the folder contains no cell.
-        FleetError: the robots are of several types, or too few have rows. Single cells without rows are listed in the
-            figures.
+        FleetError: the robots are of several types, or too few of them have rows. Single cells without rows are listed
+            in the figures.
         IdentificationError: the rows of a robot do not determine its base.
     """
     started = time.perf_counter()
@@ -98,7 +98,7 @@ def _common_robot(robots: Mapping[str, Robot]) -> Robot:
     """Return the nominal robot that all robots share.
 
     Raises:
-        FleetError: there are several.
+        FleetError: there are several nominal robots.
     """
     (name, first), *others = robots.items()
     for other_name, other in others:

@@ -1,4 +1,4 @@
-"""Steps that are due in the cells of a folder, run in processes or on Ray, with one table of results."""
+"""Run the steps that are due in the cells of a folder, in processes or on Ray, and write a table of results."""
 
 import functools
 import io
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from pisigma.workflow.cell.cell import Cell
 
 _CELLS_PER_CHUNK = 4
-"""Number of cells that a worker processes at once, which takes some seconds."""
+"""Number of cells that a worker processes at a time, which takes a few seconds."""
 _LOST = (
     "the process that worked on this cell ended unexpectedly twice; check the free memory and the files of the "
     "cell."
@@ -41,7 +41,7 @@ RESULTS = "results.parquet"
 def advance_cell(
     cell: "Cell", prior: Path | None = None, progress: Progress = lambda what: None
 ) -> CellStatus:
-    """Calibrate, verify, monitor and recalibrate a cell as its status says, for every new session in turn.
+    """Calibrate, verify, monitor and recalibrate a cell as its status requires, for one new session after the other.
 
     New files in `sessions/` are added one by one in the order of their dates, each after all steps that earlier
     files make possible: a model of the first session is verified with the second, and monitored with the third. A
@@ -49,7 +49,7 @@ def advance_cell(
 
     Args:
         cell: the cell.
-        prior: model folder of `pisigma fleet prior` to start calibrations from; None: calibrate from scratch.
+        prior: model folder of `pisigma fleet prior` from which calibrations start; None to calibrate from scratch.
         progress: called with the name of each step.
 
     Returns:
@@ -89,7 +89,7 @@ class ParameterValue:
     """An estimated geometric parameter.
 
     Attributes:
-        name: name such as "theta_1".
+        name: name of the parameter, such as "theta_1".
         unit: "mm" or "deg", of the three figures.
         value: identified value.
         change: difference from the nominal value.
@@ -104,7 +104,7 @@ class ParameterValue:
 
 
 Parameters = Mapping[str, Sequence[ParameterValue]]
-"""Estimated parameters of models by the SHA-256 of their `model.yaml`."""
+"""Estimated parameters of models, by the SHA-256 of their `model.yaml`."""
 
 
 def read_parameters(path: Path) -> Parameters:
@@ -185,7 +185,7 @@ class FleetRun:
     Attributes:
         cells: number of cells.
         unchanged: number of cells without due steps.
-        refused: names of the cells that need attention, and reasons.
+        refused: names of the cells that need attention, with the reasons.
         results: file of the table of all checks.
         seconds: computing time [s].
     """
@@ -237,7 +237,7 @@ def run_fleet(
     """
     started, path = time.perf_counter(), Path(folder) / RESULTS
     for extra in ("pyarrow", *(("ray",) if settings.engine == "ray" else ())):
-        import_module(extra)  # at once, before any step and any writing
+        import_module(extra)  # checked first, before any step and any writing
     cells = cells_in(folder)
     if settings.prior is not None:
         from pisigma.model.folder.model_folder import load_model
@@ -296,7 +296,7 @@ def _advance(folder: Path, prior: Path | None) -> tuple[str, dict[str, list[Para
 
 
 def _parameters(facts: CellFacts, known: Iterable[str] = ()) -> dict[str, list[ParameterValue]]:
-    """Return the estimated parameters of models of a cell that are not known yet, by the SHA-256 of the models."""
+    """Return the estimated parameters of a cell's models that are not yet known, by the SHA-256 of the models."""
     new = {one.sha256: Path(facts.folder) / MODELS / one.name for one in facts.models}
     there = {sha256: folder for sha256, folder in new.items() if sha256 not in known and folder.is_dir()}
     if not there:

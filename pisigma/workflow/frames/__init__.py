@@ -1,1 +1,1 @@
-"""Base, tool and hand-eye as small jobs: with the arm of a robot, model or cell as given."""
+"""Small calibrations of a base, tool or hand-eye transform, with the arm of a robot, model or cell held fixed."""

@@ -1,4 +1,4 @@
-"""Calibrate a base, a tool or a hand-eye transform from few rows, with the arm of a robot or model as given."""
+"""Calibrate a base, tool or hand-eye transform from few rows, with the arm of a robot or model held fixed."""
 
 import os
 import time
@@ -57,17 +57,17 @@ def calibrate_frame(
     only: FrameChoice,
     cameras: CameraFiles | None = None,
 ) -> FrameCalibration:
-    """Calibrate base, tool or both with the arm as given, from 4 to 12 touches, positions, poses or images.
+    """Calibrate base, tool or both, with the arm held fixed, from 4 to 12 touches, positions, poses or images.
 
-    The fit is least squares. Standard errors are those of the residuals' noise and, with a model that has a posterior,
-    of its arm. Rows that all others contradict are left out and named, and the others are checked, see
-    `pisigma.validation.gate.check_rows_of_frames`; `diagnostics` has the findings.
+    The fit is by least squares. Standard errors include the noise of the residuals and, for a model that has a
+    posterior, the uncertainty of its arm. Rows that all others contradict are left out and named, and the others are
+    checked, see `pisigma.validation.gate.check_rows_of_frames`; `diagnostics` contains the findings.
 
     Args:
-        robot: robot as drawn (a `Robot`, catalogue name or robot file), or a calibrated model (an object that has one,
+        robot: nominal robot (a `Robot`, catalogue name or robot file), or a calibrated model (an object that has one,
             or its folder).
-        data: measurements, or CSV files of them, without those of the set "test". For a tool, rows of one socket are
-            touches of one unknown point.
+        data: measurements, or CSV files of them; rows of the set "test" are not used. For a tool, rows of one socket
+            are touches of one unknown point.
         only: "tool" (with the base of the robot or model), "base" (with its tool) or "hand-eye" (both).
         cameras: cameras and boards, for files of detected board corners.
 
@@ -107,7 +107,7 @@ Source = Robot | CalibratedModel | HasModel | str | os.PathLike[str]
 
 
 def _drawn(robot: Source) -> Robot:
-    """Return a robot as drawn."""
+    """Return a nominal robot."""
     assert isinstance(robot, Robot | str | os.PathLike)
     return robot if isinstance(robot, Robot) else Robot.load(os.fspath(robot))
 

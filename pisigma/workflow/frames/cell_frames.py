@@ -16,8 +16,8 @@ def calibrate_frame_of_cell(
 ) -> tuple[FrameCalibration, ModelEntry | None]:
     """Calibrate base, tool or both with the newest session and the arm of the model in use, and store the model.
 
-    Without a model in use, the newest model of the cell is taken, and without any its robot as drawn. `verify` puts the
-    new model into use.
+    If no model is in use, the newest model of the cell is used, or if there is none, its nominal robot. `verify` puts
+    the new model into use.
 
     Args:
         cell: the cell.

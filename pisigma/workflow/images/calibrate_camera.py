@@ -25,7 +25,8 @@ from pisigma.reporting.result_text import Table
 from pisigma.workflow.settings.images import IntrinsicsSettings
 
 _OBLIQUE = np.deg2rad(15.0)
-"""Angle [rad] that a third of the images have to exceed, as frontal views do not separate focal length and distance."""
+"""Angle [rad] that a third of the images must exceed, because frontal views do not separate focal length and
+distance."""
 _MIN_IMAGES = 10
 """Number of images below which a warning is given."""
 _CORNER = 2
@@ -44,7 +45,7 @@ class CameraCalibration:
 
     Attributes:
         calibration: intrinsics, and coverage and tilts of the images.
-        detection: the boards in the images, with the corners that the calibrated camera predicts.
+        detection: boards in the images, with the corners that the calibrated camera predicts.
     """
 
     calibration: IntrinsicCalibration
@@ -60,7 +61,7 @@ class CameraCalibration:
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """Detected boards, and coverage and tilts of the images, in sentences."""
+        """Sentences about detected boards, and about coverage and tilts of the images."""
         tilts = np.rad2deg(self.calibration.tilts)
         return (
             *self.detection.sentences,
@@ -124,7 +125,7 @@ class CameraCalibration:
         """Write the camera to a file.
 
         Raises:
-            OutputError: it cannot be written.
+            OutputError: the file cannot be written.
         """
         write_atomically(Path(path), self.calibration.camera.to_yaml())
 
@@ -134,7 +135,7 @@ class CameraCalibration:
         Raises:
             OutputError: the page is not an .html file, or cannot be written.
         """
-        from pisigma.reporting.page.images import images_page  # matplotlib takes a second
+        from pisigma.reporting.page.images import images_page  # importing matplotlib takes a second
 
         check_page(Path(page))
         title = f"Intrinsics of {self.calibration.camera.name}"
@@ -151,7 +152,7 @@ def calibrate_camera(
     """Calibrate the intrinsics of a camera with images of a board, including standard deviations.
 
     Args:
-        images: image files of one size, folders of image files, or videos in which the board rests at every pose.
+        images: image files of the same size, folders of image files, or videos in which the board rests at every pose.
         board: file of the board; see `Board.load`.
         settings: see `IntrinsicsSettings`.
         progress: called with the name of every image.

@@ -25,7 +25,7 @@ class DetectedCorners:
 
     Attributes:
         detection: the boards in the images.
-        joints: joint values of the images; None without a file of joint values.
+        joints: joint values of the images; None if there is no file of joint values.
         names: names of the camera and of the board, for every row.
     """
 
@@ -50,7 +50,7 @@ class DetectedCorners:
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """Detected boards, and which images are left out and why, in sentences."""
+        """Sentences about detected boards, and about images that are left out, with the reasons."""
         return self.detection.sentences
 
     @property
@@ -60,7 +60,7 @@ class DetectedCorners:
 
     @property
     def tables(self) -> tuple[tuple[str, Table], ...]:
-        """No tables, because there is one row per corner."""
+        """No tables, because a table would have one row per corner."""
         return ()
 
     def to_json(self) -> dict[str, object]:
@@ -76,7 +76,7 @@ class DetectedCorners:
         """Write the detected corners to a file.
 
         Raises:
-            OutputError: it cannot be written.
+            OutputError: the file cannot be written.
         """
         text = io.StringIO()
         csv.writer(text, lineterminator="\n").writerows(self.rows)
@@ -88,7 +88,7 @@ class DetectedCorners:
         Raises:
             OutputError: the page is not an .html file, or cannot be written.
         """
-        from pisigma.reporting.page.images import images_page  # matplotlib takes a second
+        from pisigma.reporting.page.images import images_page  # importing matplotlib takes a second
 
         check_page(Path(page))
         says = self.sentences, self.warnings
@@ -109,7 +109,7 @@ def detect(
         images: image files, folders of them, or videos of an arm that stops at every pose.
         board: file of the board; see `Board.load`.
         camera: file of the camera; see `Camera.load`.
-        joints: CSV file of the joint values of the images; see `join_joint_values`. None: added later.
+        joints: CSV file of the joint values of the images, see `join_joint_values`; None to add them later.
         settings: see `DetectionSettings`.
         progress: called with the name of every image.
 

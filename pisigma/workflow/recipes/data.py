@@ -25,12 +25,12 @@ Seeded = TypeVar("Seeded", bound=Section)
 
 @dataclass(frozen=True, eq=False)
 class RecipeData:
-    """Data that a recipe is trained and validated on.
+    """Data on which a recipe is trained and validated.
 
     Attributes:
         robot: the nominal robot.
-        training: rows to train on.
-        test: rows of the set "test" of measured data; None without such rows.
+        training: rows for training.
+        test: rows of the set "test" of measured data; None if there are none.
         simulations: training and held-out rows of every repeat of a simulation, beginning with rows of the model;
             empty for measured data.
         folds: how measured rows are split for a cross-validation; None for simulated data.
@@ -69,7 +69,7 @@ def load_data(recipe: Recipe, data: Measurements | str | os.PathLike[str] | None
         data: measurements or their CSV file, for a recipe that uses measured data.
 
     Raises:
-        RecipeError: `data` is given for a recipe that simulates its data, or missing for another recipe.
+        RecipeError: `data` is given for a recipe that simulates its data, or missing for one that does not.
         RobotError: the robot of the recipe cannot be used.
         MeasurementError: the file cannot be used.
     """
@@ -97,7 +97,7 @@ def simulate(recipe: Recipe, repeats: int = 1) -> RecipeData:
 
     Args:
         recipe: a recipe for simulated data.
-        repeats: number of repeats, each with other seeds.
+        repeats: number of repeats, each with different seeds.
 
     Raises:
         RecipeError: the recipe is for measured data.
@@ -112,7 +112,7 @@ def simulate(recipe: Recipe, repeats: int = 1) -> RecipeData:
 
 
 def simulate_at(recipe: Recipe, poses: str | os.PathLike[str]) -> tuple[Robot, Measurements]:
-    """Return simulated rows of the tracker of a recipe at other joint values; equal calls give equal rows.
+    """Return simulated rows of a recipe's tracker at other joint values; equal calls return equal rows.
 
     Args:
         recipe: a recipe with a simulated tracker.
@@ -132,13 +132,13 @@ def simulate_at(recipe: Recipe, poses: str | os.PathLike[str]) -> tuple[Robot, M
             expected="a recipe that simulates a tracker", value=recipe.name, option="--at", remedy="omit it"
         )
     q, noise = read_joints(poses, robot), tracker.noise
-    if noise is not None:  # other poses have other noise
+    if noise is not None:  # other poses have different noise
         noise = noise.model_copy(update={"seed": noise.seed + zlib.crc32(q.numpy().tobytes())})
     return robot, measure(TrueRobot(robot, data.errors), q, tracker.sensor, noise)
 
 
 def write_recipe_images(recipe: Recipe, folder: str | os.PathLike[str]) -> int:
-    """Render the images that a recipe calibrates with; see `write_images`.
+    """Render the images with which a recipe calibrates; see `write_images`.
 
     Raises:
         RecipeError: the recipe simulates no images.
@@ -174,7 +174,7 @@ def simulated_data(recipe: Recipe) -> SimulatedData:
 
 
 def with_other_seeds(data: SimulatedData, repeat: int) -> SimulatedData:
-    """Return a simulation with other random numbers: all of its seeds plus the number of the repeat."""
+    """Return a simulation with other random numbers, by adding the number of the repeat to all of its seeds."""
     return data.model_copy(
         update={
             "errors": tuple(_reseeded(source, repeat) for source in data.errors),

@@ -45,8 +45,8 @@ def read_recipe(path: str | os.PathLike[str]) -> Recipe:
     """Read a recipe of any kind, and check it against its robot.
 
     Raises:
-        RecipeError: the file cannot be read, or a value is not valid; it names file, line and key.
-        RobotError: its robot cannot be used; it also names file, line and key.
+        RecipeError: the file cannot be read, or a value is invalid; the message names file, line and key.
+        RobotError: the robot of the recipe cannot be used; the message also names file, line and key.
     """
     kinds: dict[str, tuple[type[Recipe], Callable[[Any, Robot], Iterator[Check]]]] = {
         "inverse_calibration": (InverseRecipe, _network_checks),

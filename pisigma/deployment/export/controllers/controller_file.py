@@ -1,4 +1,4 @@
-"""Files of robot controllers: which parameters they have, how they are written and read, and their loss of accuracy."""
+"""Files of robot controllers: parameters, writing and reading, and loss of accuracy."""
 
 import re
 from collections.abc import Callable, Sequence
@@ -42,7 +42,7 @@ class Frames:
     """Frames of a controller relative to the frames of a robot description.
 
     Attributes:
-        sentence: a sentence that states them.
+        sentence: sentence that states the frames.
         base: the controller's base frame in the frame of the description's poses, as `FRAME_COLUMNS`.
         tool: the description's tool relative to the controller's flange.
     """
@@ -64,8 +64,8 @@ class Convention:
     Attributes:
         nominal: robot of the controller without the file, in its frames and parameters.
         frames: frames of the controller relative to frames of the robot description; None if they are equal.
-        published: values published by the maker or a user that the file was tested against, with their source; None
-            without such values.
+        published: values published by the manufacturer or a user with which the file was tested, and their source; None
+            if there are none.
     """
 
     nominal: Robot
@@ -74,7 +74,7 @@ class Convention:
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """Return sentences on how the file was tested, and on the frames of its poses."""
+        """Return sentences on the tests of the file and the frames of its poses."""
         tried = (
             f"Reading and writing were tested against {self.published}."
             if self.published
@@ -92,14 +92,15 @@ class ControllerFile:
         name: name of the `--format`.
         contents: contents of a file, with an article.
         suffixes: suffixes of its files.
-        source: sentence on the source of the format and on how it was tested; see `untested_on_controller`.
-        convention: function for the controller's description of a robot; raises a `PisigmaError` if there is none.
-        relies: sentences on requirements of the file on the controller.
+        source: sentence on the source of the format and its tests; see `untested_on_controller`.
+        convention: function that returns the controller's description of a robot, or raises a `PisigmaError` if there
+            is none.
+        relies: sentences on what the file requires of the controller.
         text: function that returns the text of a file.
-        read: function from text, file name and nominal robot to the robot of a file. None if the file includes base and
-            tool and is loaded as a robot file.
+        read: function of text, file name and nominal robot that returns the robot of a file; None if the file includes
+            base and tool and is loaded as a robot file.
         check: function that raises a `PisigmaError` for robots that the file cannot describe.
-        parameters: function for the indices into the flattened `Robot.dh` that the file includes.
+        parameters: function that returns the indices into the flattened `Robot.dh` of the parameters in the file.
         options: options of `OPTIONS` that the format accepts.
         refuse: function that raises a `PisigmaError` for invalid requests before anything is loaded.
         contains: contents of a file of this format.
@@ -132,7 +133,7 @@ class ControllerFile:
         )
 
     def write(self, request: ExportRequest) -> Exported:
-        """Project the model on the parameters of the file, and evaluate the loss of accuracy by reading the file back.
+        """Project the model onto the parameters of the file, and evaluate the loss of accuracy by rereading the file.
 
         Raises:
             PisigmaError: the model cannot be loaded or projected, or the file cannot describe its robot.
@@ -171,12 +172,12 @@ class ControllerFile:
 
 
 def untested_on_controller(source: str) -> str:
-    """Return the sentence on a file that was not tested on a controller."""
+    """Return the sentence about a file that was not tested on a controller."""
     return f"Written from the published description ({source}), not tested on a controller."
 
 
 def frame_sentences(robot: Robot) -> tuple[str, ...]:
-    """Return base and tool as comments for files without them; `with_frames` reads them back."""
+    """Return base and tool as comments for files that cannot contain them; `with_frames` reads them back."""
     sentences = []
     for part in ("base", "tool"):
         values = in_file_units(FRAME_COLUMNS, getattr(robot, part)).items()
@@ -202,7 +203,7 @@ def check_plain_joints(robot: Robot, kind: str, count: int | None = None) -> Non
     Args:
         robot: robot to check.
         kind: name of the file for messages.
-        count: expected number of joints, all revolute and not reversed; None for any.
+        count: expected number of joints, which must all be revolute and not reversed; None for any number and type.
 
     Raises:
         RobotError: the robot does not comply.

@@ -1,4 +1,4 @@
-"""Joint offsets in encoder counts: Epson's home offsets, FANUC's mastering counts."""
+"""Joint offsets in encoder counts, such as Epson's home offsets and FANUC's mastering counts."""
 
 from dataclasses import dataclass
 
@@ -30,7 +30,7 @@ class EncoderCounts:
     joint value is subtracted from the count.
 
     Attributes:
-        per_turn: encoder counts per turn of the joint, including its gear, or per 1 mm of a prismatic joint; negative
+        per_turn: encoder counts per turn of the joint, including the gear, or per 1 mm of a prismatic joint; negative
             if the encoder counts in the opposite direction.
         present: current counts of the controller.
         new: counts to enter.

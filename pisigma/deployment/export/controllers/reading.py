@@ -1,4 +1,4 @@
-"""Reading of controllers' files as robots."""
+"""Reading of controller files as robots."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,10 +18,10 @@ from pisigma.robot.description import Robot
 
 MAX_CHANGE = 5.0
 """Largest plausible mean distance [mm] between the tools of a calibrated and the nominal robot on the same base; the
-largest of five published calibrations of Universal Robots is 4.2 mm."""
+largest in five published calibrations of Universal Robots arms is 4.2 mm."""
 
 _LEVER = 0.1
-"""Distance from the flange of points to which the limit also applies, so that rotations of the flange count [m]."""
+"""Distance from the flange [m] of points to which the limit also applies, so that rotations of the flange count."""
 
 _READERS: dict[str, ControllerFile | None] = {
     ".conf": universal_robots.FILE,
@@ -30,7 +30,7 @@ _READERS: dict[str, ControllerFile | None] = {
     ".yaml": None,
     ".yml": None,
 }
-"""Kinds of files of makers by suffix; None for tables of pisigma. The kinematics of a ROS driver are also YAML."""
+"""Kinds of manufacturers' files by suffix; None for tables of pisigma. The kinematics of a ROS driver are also YAML."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +39,7 @@ class ControllerReading:
 
     Attributes:
         robot: nominal robot with the parameters of the file; its `source` names the file and the frames of its poses.
-        change: distance of its tool from that of the nominal robot, in the same frame.
+        change: distance between its tool and that of the nominal robot, in the same frame.
         frames: frames of the controller relative to frames of the nominal robot; None if they are equal.
         remarks: sentences on the description of the format, its tests, and the frames of poses.
     """
@@ -53,14 +53,14 @@ class ControllerReading:
 def read_controller_file(path: Path, nominal: Robot, max_change: float = MAX_CHANGE) -> ControllerReading:
     """Read a controller's file as a robot.
 
-    Supported files are calibration.conf of Universal Robots and the kinematics YAML of their ROS driver, Staubli's
-    arm.cfx, and tables of joint offsets or counts that pisigma wrote. Load xacro and URDF files, which need no nominal
-    robot, with `Robot.load`.
+    Supported files are Universal Robots' calibration.conf, the kinematics YAML of their ROS driver, Staubli's arm.cfx,
+    and tables of joint offsets or counts written by pisigma. Xacro and URDF files need no nominal robot; load them with
+    `Robot.load`.
 
     Args:
         path: file to read.
-        nominal: robot of the controller without the file, for names and limits, and for base and tool if the file has
-            none.
+        nominal: robot of the controller without the file, which provides names and limits, and base and tool if the
+            file has none.
         max_change: largest accepted mean distance [mm] between the two tools in the same frame, and between points at
             `_LEVER` from them due to their rotations.
 

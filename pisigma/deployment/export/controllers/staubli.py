@@ -20,12 +20,12 @@ from pisigma.robot.writing import comment_text
 
 ARRAY, ELEMENT, NAME = "DhArray", "DH", "dhOffset"
 ATTRIBUTES = ("theta", "d", "a", "b", "alpha", "beta")
-"""Keys in the order of the maker, in degrees and millimetres. b is a shift along y, which is 0 here."""
+"""Keys in the order of the manufacturer, in degrees and millimetres. b is a shift along y, which is 0 here."""
 _FACTORS = np.array([np.pi / 180 if name in ("theta", "alpha", "beta") else 1e-3 for name in DH_COLUMNS])
 
 
 def write_arm(content: FileContent) -> str:
-    """Return the element `dhOffset`, inside the file of the controller if it is given."""
+    """Return the element `dhOffset`, inside the controller's file if one is given."""
     from lxml import etree
 
     difference = (content.robot.dh - content.nominal.dh) / _FACTORS
@@ -51,7 +51,7 @@ def write_arm(content: FileContent) -> str:
 def read_arm(text: str, source: str, nominal: Robot) -> Robot:
     """Apply an `arm.cfx` to the nominal robot.
 
-    Base and tool come from the comments that pisigma writes, otherwise from the nominal robot.
+    Base and tool come from the comments that pisigma writes, or else from the nominal robot.
 
     Raises:
         RobotError: the file is not XML or has no `dhOffset` for the robot's joints, or b is not 0.

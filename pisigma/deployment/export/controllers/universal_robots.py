@@ -29,22 +29,22 @@ KEYS = {"delta_theta": 0, "delta_a": 2, "delta_d": 1, "delta_alpha": 3}
 """Column of `DH_COLUMNS` for every key of the file; radians and metres."""
 
 _TILTED = 1e-6
-"""Sine of the angle between two axes below which they are treated as parallel: otherwise their common normal would be
+"""Sine of the angle between two axes below which they are treated as parallel; otherwise their common normal could be
 1,000 km away, and rounding of such large numbers would move the tool."""
 
 _LINE = r"(?m)^[ \t]*{key}[ \t]*=[ \t]*\[([^\]\n]*)\]"
 
 
 def without_beta(origins: list[Frame], own: Robot) -> Robot:
-    """Convert a robot to the maker's rows, in which beta is 0 and the last row has neither a nor alpha.
+    """Convert a robot to the manufacturer's rows, in which beta is 0 and the last row has neither a nor alpha.
 
-    Two lines have one common normal. If the lines are nearly parallel, the normal is far away, so d of that row and
-    of the next are large and nearly cancel, as in files of the maker. Of the two directions of a normal, the one
+    Two lines have one common normal. If the lines are nearly parallel, the normal is far away, so d of this row and of
+    the next are large and nearly cancel, as in the manufacturer's files. Of the two directions of a normal, the one
     that changes theta by less than 90 deg is used.
 
     Args:
         origins: frames of the joints, see `ControllerGeometry.origins`.
-        own: nominal robot with the base and tool that belong to them.
+        own: nominal robot with the base and tool that belong to these frames.
     """
     plain = robot_of_origins(own, origins, np.eye(4), _TILTED)
     dh = plain.dh.copy()
@@ -62,7 +62,7 @@ def without_beta(origins: list[Frame], own: Robot) -> Robot:
 
 
 def write_calibration(content: FileContent) -> str:
-    """Return `calibration.conf`, with other lines of the file of the controller if it is given."""
+    """Return `calibration.conf`, with the other lines of the controller's file if one is given."""
     own = controller_geometry(content.nominal)
     robot = without_beta(*own.origins(content.robot))
     difference = robot.dh - own.robot.dh
@@ -88,9 +88,9 @@ def write_calibration(content: FileContent) -> str:
 
 
 def read_calibration(text: str, source: str, nominal: Robot) -> Robot:
-    """Apply a `calibration.conf` to the maker's nominal robot, in rows without large lengths.
+    """Apply a `calibration.conf` to the manufacturer's nominal robot, in rows without large lengths.
 
-    Poses are those of the flange in the controller's frame `base`, or with the base and tool of the comments that
+    Poses are those of the flange in the controller's frame `base`, or use the base and tool from the comments that
     pisigma writes.
 
     Raises:

@@ -33,11 +33,12 @@ The UR30 is from UniversalRobots/Universal_Robots_ROS2_Description, config/ur30/
 _ALPHA = np.array([1.0, 0.0, 0.0, 1.0, -1.0, 0.0]) * np.pi / 2
 
 _FARTHEST = 5e-3
-"""[m] Largest mean distance of the tool up to which a description belongs to a model: factory calibrations move it by 1
-to 4 mm, and the models differ by 10 mm and more."""
+"""Largest mean distance between tools [m] at which a description belongs to a model: factory calibrations move the tool
+by 1 to 4 mm, and the models differ by 10 mm and more."""
 _EXACT = 1e-9
 _NEAR_ANGLE, _NEAR_LENGTH = np.deg2rad(0.5), 0.01
-"""Frames of a calibrated robot this close to right angles [rad] and to the origin [m] are rounded to these."""
+"""Distances of a calibrated robot's frames from right angles [rad] and from the origin [m] up to which the frames are
+rounded to these."""
 _POSES = 200
 
 
@@ -51,7 +52,7 @@ _USERS = {
     "UR10": "two calibrations and two positions of the driver's tests (ur_calibration/test/calibration_test.cpp)",
     "UR10e": "the calibration of the driver's documentation (ur_calibration/doc/algorithm.rst)",
 }
-"""Published values by model that the files were tested against, in addition to `_DEFAULTS` of `_WITH_DEFAULTS`."""
+"""Published values, by model, with which the files were tested, in addition to `_DEFAULTS` of `_WITH_DEFAULTS`."""
 _WITH_DEFAULTS = frozenset(("UR3", "UR3e", "UR5", "UR5e", "UR10", "UR10e"))
 
 
@@ -60,7 +61,8 @@ class ControllerGeometry:
     """Geometry in the controller's convention, `Π RotZ(theta + q) Trans(a, 0, d) RotX(alpha)` from `base` to flange.
 
     Attributes:
-            model: the maker's name, for example "UR5e", or the robot's name if it is not in the table.
+            model: the manufacturer's name of the model, for example "UR5e", or the robot's name if it is not in the
+                table.
             robot: nominal parameters, with the names and limits of the description.
             T_poses_base: maps the controller's frame `base` into the frame of the description's poses.
             T_flange_tool: maps the description's tool into the controller's flange.
@@ -74,7 +76,7 @@ class ControllerGeometry:
     described: Robot
 
     def origins(self, calibrated: Robot) -> tuple[list[Frame], Robot]:
-        """Return the frames of a calibrated robot's joints as the controller defines them, each in the previous.
+        """Return the frames of a calibrated robot's joints as the controller defines them, each in the previous frame.
 
         Shifting the frame of a joint along and about its axis does not change the motion or the tool.
 
@@ -82,7 +84,7 @@ class ControllerGeometry:
             calibrated: the description with other parameters, base and tool.
 
         Returns:
-            The frames, the first in `base`, and the nominal robot with the base and tool that belong to them.
+            The frames, the first one in `base`, and the nominal robot with the base and tool that belong to them.
         """
         T_rows_base = inverse(frame_of(self.described.base)) @ self.T_poses_base
         before, moved = T_rows_base, []
@@ -138,10 +140,10 @@ def _frame_words(T: Frame) -> str:
 
 
 def controller_geometry(described: Robot) -> ControllerGeometry:
-    """Return the model of Universal Robots to which a nominal or calibrated robot belongs, and their relative frames.
+    """Return the Universal Robots model to which a nominal or calibrated robot belongs, and its relative frames.
 
     Raises:
-        RobotError: it is not a known model.
+        RobotError: the robot is not a known model.
     """
     check_robot(described)
     candidates = [_placed(model, _robot(described, model), described) for model in _D_AND_A]
@@ -164,7 +166,7 @@ def controller_geometry(described: Robot) -> ControllerGeometry:
 
 
 def convention(described: Robot) -> Convention:
-    """Return the controller's description of an arm, and the values that its files were tested against."""
+    """Return the controller's description of an arm, and the values with which its files were tested."""
     own = controller_geometry(described)
     values = [_USERS[own.model]] if own.model in _USERS else []
     if own.model in _WITH_DEFAULTS:
@@ -173,7 +175,7 @@ def convention(described: Robot) -> Convention:
 
 
 def check_robot(robot: Robot) -> None:
-    """Raise an error for robots that the maker's files cannot describe.
+    """Raise an error for robots that the manufacturer's files cannot describe.
 
     Raises:
         RobotError: the robot does not have exactly six joints, all revolute.
@@ -190,7 +192,7 @@ def _robot(described: Robot, model: str) -> Robot:
 
 
 def _has_own_convention(robot: Robot) -> bool:
-    """Return whether a robot is described in the maker's convention, with any lengths."""
+    """Return whether a robot is described in the manufacturer's convention, with any lengths."""
     theta, _, a, alpha, beta = robot.dh.T
     return not (theta.any() or beta.any() or a[[0, 3, 4, 5]].any()) and bool(
         (a[[1, 2]] < 0).all() and np.allclose(alpha, _ALPHA, atol=1e-8)
@@ -198,7 +200,7 @@ def _has_own_convention(robot: Robot) -> bool:
 
 
 def _placed(model: str, own: Robot, described: Robot) -> tuple[float, ControllerGeometry]:
-    """Align a model with a description, and return the mean distance [m] of their tools."""
+    """Align a model with a description, and return the mean distance [m] between their tools."""
     base, tool = _by_first_axes(own, described)
     q = torch.rand((_POSES, JOINTS), generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 6 - 3
     T = forward_kinematics(described, q)
@@ -248,7 +250,7 @@ def _clean(T: Frame) -> Frame:
 
 
 def _right(T: Frame) -> Frame:
-    """Return the frame before calibration, if it had right angles at the origin, otherwise the given frame."""
+    """Return the frame before calibration if it had right angles at the origin, otherwise the given frame."""
     values = xyzrpy_of(T)
     rounded = _rounded(values, _NEAR_ANGLE, _NEAR_LENGTH)
     quarters = rounded[3:] / (np.pi / 2)

@@ -26,7 +26,7 @@ from pisigma.robot.row import BoundedFloat
 from pisigma.robot.urdf_frames import Frame, frame_of, rotation, translation, xyzrpy_of
 
 COLUMNS = ("x", "y", "z", "yaw", "pitch", "roll")
-"""Keys in the order of `frame_of`: the driver's roll is about x, that of pisigma about z."""
+"""Keys in the order of `frame_of`; the driver's roll is about x, that of pisigma about z."""
 
 
 class LinkSection(Section):
@@ -79,7 +79,7 @@ _LINKS = tuple(KinematicsSection.model_fields)[:JOINTS]
 
 
 ORDER = "Rotations are RotZ(yaw) RotY(pitch) RotX(roll), as URDF reads them."
-"""Sentence in the comments that identifies files of pisigma."""
+"""Sentence in the comments that identifies files written by pisigma."""
 
 
 def write_kinematics(content: FileContent) -> str:
@@ -96,12 +96,12 @@ def write_kinematics(content: FileContent) -> str:
 def read_kinematics(text: str, source: str, nominal: Robot) -> Robot:
     """Return the robot of a kinematics YAML, with names and limits of the nominal robot.
 
-    The driver extracts angles in one order and URDF reads them in the other (ur_calibration/src/calibration.cpp,
-    `eulerAngles(0, 1, 2)`), which moves the tool by about 0.1 mm. The order that yields the hash of the file is used;
-    if neither does, the convention of URDF if pisigma wrote the file, otherwise the convention of the driver.
+    The driver extracts angles in one order, and URDF reads them in the other order (ur_calibration/src/calibration.cpp,
+    `eulerAngles(0, 1, 2)`), which moves the tool by about 0.1 mm. The order that yields the hash of the file is used.
+    If neither does, the convention is that of URDF if pisigma wrote the file, otherwise that of the driver.
 
-    Poses are those of the link `tool0` in the controller's frame `base` (the driver's `base_link_inertia`), or with the
-    base and tool of the comments that pisigma writes.
+    Poses are those of the link `tool0` in the controller's frame `base` (the driver's `base_link_inertia`), or use the
+    base and tool from the comments that pisigma writes.
 
     Raises:
         RobotError: the file is not a kinematics file of the driver, or the robot has different joints.
@@ -118,8 +118,8 @@ def read_kinematics(text: str, source: str, nominal: Robot) -> Robot:
 def calibration_hash(robot: Robot) -> str:
     """Return the hash of DH parameters that the driver compares with the hash of the connected robot.
 
-    It is `calib_` and the GNU C++ library's `std::hash` of theta, d, a and alpha of all joints as printed by C++
-    streams, with 6 digits and no separators.
+    It is `calib_` followed by the GNU C++ library's `std::hash` of theta, d, a and alpha of all joints as printed by
+    C++ streams, with 6 digits and no separators.
     """
     text = "".join(
         f"{value + 0.0:g}" for theta, d, a, alpha, _ in robot.dh.tolist() for value in (theta, d, a, alpha)

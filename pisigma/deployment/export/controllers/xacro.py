@@ -29,10 +29,10 @@ def urdf_to_xacro(urdf: str) -> str:
 
 
 def write_xacro(content: FileContent) -> str:
-    """Return the xacro file, made from the URDF file from which the nominal robot was loaded.
+    """Return the xacro file, made from the URDF file that describes the nominal robot.
 
     Raises:
-        OutputError: there is no such file.
+        OutputError: the robot was not loaded from a URDF file.
     """
     urdf = updated_urdf_text(content.request, content.robot, content.nominal, content.comments)
     if urdf is None:

@@ -32,7 +32,7 @@ _OPTIONS = ("-std=c11", "-O2", "-Wall", "-Wextra", "-Werror", "-fPIC", "-shared"
 _HEAD = struct.Struct(f"=8s7Qq{2 * DOF}dQ8d")
 _WORD = 8
 _GAP = 16
-"""Runs of at most this many zero words are written instead of starting a new segment."""
+"""Largest number of successive zero words that are written instead of starting a new segment."""
 
 
 def _compiler() -> str:
@@ -53,7 +53,7 @@ def _compiler() -> str:
 
 
 def _link(code: bytes, compiler: str) -> bytes:
-    """Link the kernels' object code to a library.
+    """Link the kernels' object code into a library.
 
     Raises:
         OutputError: the compiler fails; the message includes its output.
@@ -102,8 +102,8 @@ def library_key() -> int:
 def model_file(model: CalibratedModel) -> bytes:
     """Return the model file of the library, in the byte order of this machine.
 
-    It consists of a head, the names of the branches, the parts of the struct that are not zero, and a checksum (CRC-32)
-    of all these; see `pisigma_ik.c`.
+    It consists of a header, the names of the branches, the nonzero parts of the struct, and a checksum (CRC-32) of all
+    these; see `pisigma_ik.c`.
 
     Raises:
         ModelError: the correction of the model has no compiled form.

@@ -1,4 +1,4 @@
-"""Languages of controllers: names and limits of programs, and writing them."""
+"""Languages of controllers: names and limits of programs, and writing of programs."""
 
 import functools
 import re
@@ -47,7 +47,7 @@ class Program:
         robot: nominal robot.
         heading: sentences on the purpose and the requirements of the program.
         q: joint values of every stop [rad].
-        labels: comment before the move to every stop.
+        labels: comment that precedes the move to every stop.
         waits: waiting time at every stop [s]; 0 for none.
         cartesian: targets, if the program has poses instead of joint values; otherwise None.
         config: configuration of the arm in all poses, if the language requires a configuration; otherwise "".
@@ -114,7 +114,7 @@ class Language:
     cartesian_cautions: tuple[str, ...] = ()
 
     def program_name(self, path: Path) -> str:
-        """Return the program's name, which is that of its file.
+        """Return the name of a program, which is that of its file.
 
         Raises:
             OutputError: the name is not valid in the language; the message proposes a valid name.
@@ -140,7 +140,7 @@ class Language:
         """Return the text of a program.
 
         Raises:
-            OutputError: it has more lines than the language allows.
+            OutputError: the program has more lines than the language allows.
         """
         sentences = [*self.cautions, *(self.cartesian_cautions if program.cartesian else ())]
         content = {"program": program, "targets": program.cartesian, "cautions": sentences}
@@ -326,7 +326,7 @@ def program_text(targets: Targets, path: Path, cartesian: bool, config: str | No
 
 
 def _check_turns(targets: Targets) -> None:
-    """Check that all joint values have the same number of turns, which one configuration states for all."""
+    """Check that all joint values have the same number of turns, because one configuration states it for all."""
     turns = torch.floor(targets.q / (2 * torch.pi) + 0.5)
     if len(turns) and bool((turns != turns[0]).any()):
         row = int((turns != turns[0]).any(-1).nonzero()[0, 0])

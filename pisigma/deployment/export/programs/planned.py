@@ -1,4 +1,4 @@
-"""Planned poses as programs that stop at every pose for its measurement and use waypoints around obstacles."""
+"""Programs that move to planned poses, via waypoints around obstacles, and stop at every pose for a measurement."""
 
 from pathlib import Path
 

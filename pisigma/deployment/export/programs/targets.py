@@ -1,4 +1,4 @@
-"""Corrected targets: joint values for every requested pose, and the nominal robot's poses at these."""
+"""Corrected targets: joint values for every requested pose, and the nominal robot's poses at these joint values."""
 
 from dataclasses import dataclass
 
@@ -74,7 +74,7 @@ class Targets:
 
     @property
     def failure_sentence(self) -> str | None:
-        """Return a sentence on poses without a target, and the reasons; None if all poses have targets."""
+        """Return a sentence on poses without a target, with the reasons; None if all poses have targets."""
         failed = [(n, s) for n, s in zip(self.line, self.status, strict=True) if s not in WITH_TARGET]
         if not failed:
             return None
@@ -86,7 +86,7 @@ class Targets:
 
     @property
     def domain_warning(self) -> str | None:
-        """Sentence on targets outside the domain; None without such targets."""
+        """Sentence on targets outside the domain; None if there are no such targets."""
         lines = self.lines_with_status(Status.OUTSIDE_DOMAIN)
         if not lines:
             return None

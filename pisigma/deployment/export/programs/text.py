@@ -1,4 +1,4 @@
-"""Formatting of numbers, frames and comments of a program for templates."""
+"""Formatting of numbers, frames and comments in the templates of programs."""
 
 import math
 import textwrap
@@ -11,8 +11,8 @@ from torch import Tensor
 from pisigma.robot.se3 import rotation_vector, rpy_from_rotation
 
 DIGITS = 6
-"""Decimals of degrees and millimetres: joints are rounded by 1e-8 rad, which moves no tool by a micrometre. Radians,
-metres and quaternions have 9."""
+"""Number of decimals of degrees and millimetres, which rounds joints by 1e-8 rad and moves no tool by a micrometre.
+Radians, metres and quaternions have 9."""
 
 
 def numbers(values: Iterable[float], digits: int = DIGITS) -> str:
@@ -33,7 +33,7 @@ def labelled(values: Iterable[float], labels: Iterable[str], unit: str = "") -> 
 
 
 def comments(sentences: Iterable[str], mark: str, width: int = 100) -> str:
-    """Wrap sentences to lines of printable ASCII with a comment mark; other characters are written as `?`."""
+    """Wrap sentences into lines of printable ASCII with a comment mark; other characters are written as `?`."""
     lines = []
     for sentence in sentences:
         plain = " ".join(sentence.split()).encode("ascii", "replace").decode()

@@ -1,1 +1,1 @@
-"""Rewriting of pose targets in existing programs of controllers; other parts of the programs do not change."""
+"""Rewriting of pose targets in existing controller programs; other parts of the programs do not change."""

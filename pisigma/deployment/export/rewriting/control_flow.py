@@ -1,4 +1,4 @@
-"""Frames and tools in force at a statement of a program, as far as control flow determines them."""
+"""Frames and tools that are active at a statement of a program, as far as control flow determines them."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -15,9 +15,9 @@ class Step(NamedTuple):
     """One statement that affects control flow, frames or tools.
 
     Attributes:
-        kind: "routine", "loop" and "branch" start a block, and "end" ends the innermost one; "else" starts another part
-            of a branch; "jump" is a label or a jump; "set" sets a frame or a tool; "call" calls a routine; "other" is
-            anything else.
+        kind: "routine", "loop" and "branch" start a block, and "end" ends the innermost one; "else" starts another
+            alternative of a branch; "jump" is a label or a jump; "set" sets a frame or a tool; "call" calls a routine;
+            "other" is anything else.
         name: name of the routine that starts or is called, or of the frame or tool that is set.
     """
 
@@ -26,12 +26,12 @@ class Step(NamedTuple):
 
 
 class ActiveFrames:
-    """Frame or tool of every name, or the reason why it is not certain, while a reader advances through the steps.
+    """Frame or tool of every name, or the reason why it is uncertain, while a reader advances through the steps.
 
-    A value is certain if all paths through the program lead to the same value. A value that is set in a loop or a
-    branch is certain after its statement in that block, but neither after the block nor earlier in the same loop.
-    Values that a called routine sets are not certain, nor are values at the start of a routine, if the program sets
-    them in several places. A routine of another file may set all of them.
+    A value is certain if all paths through the program lead to it. A value that is set in a loop or a branch is certain
+    after its statement in that block, but neither after the block nor earlier in the same loop. Values that a called
+    routine sets are uncertain, as are values at the start of a routine if the program sets them in several places. A
+    routine of another file may set all values.
     """
 
     def __init__(self, steps: Sequence[Step], before: dict[str, Frame | str]) -> None:
@@ -68,12 +68,12 @@ class ActiveFrames:
         }
         self._called = {step.name for step in steps if step.kind == "call"}
         self._certain_before = {name for name, value in before.items() if not isinstance(value, str)}
-        for _ in acting:  # the longest path of a name passes every routine once
+        for _ in acting:  # the longest path of a name passes through every routine once
             for first, inside in acting.items():
                 self._set_by[steps[first].name].update(*map(self._set_at, inside))
 
     def __getitem__(self, name: str) -> Frame | str:
-        """Return the value of a name, or the reason why it is not certain."""
+        """Return the value of a name, or the reason why it is uncertain."""
         return self._values[name]
 
     def advance(self, number: int, value: Frame | str = "") -> None:
@@ -81,7 +81,7 @@ class ActiveFrames:
 
         Args:
             number: index of the step.
-            value: value of a "set", or the reason why it is not known.
+            value: value of a "set", or the reason why it is unknown.
         """
         step = self._steps[number]
         if step.kind == "set":
@@ -128,7 +128,7 @@ class ActiveFrames:
         return several | {name for name in self._certain_before if foreign or self._places[name]}
 
     def _set_in(self, begin: int, kinds: Sequence[str] = ("set", "call")) -> set[str]:
-        """Return the names that steps of some kinds set in a block."""
+        """Return the names that steps of the given kinds set in a block."""
         inside = takewhile(lambda step: begin in self._open[step], range(begin + 1, len(self._steps)))
         return {name for step in inside if self._steps[step].kind in kinds for name in self._set_at(step)}
 
@@ -142,13 +142,13 @@ class ActiveFrames:
         return next((k for k in reversed(self._open[number]) if self._steps[k].kind == "routine"), -1)
 
     def _is_reached_twice(self, number: int) -> bool:
-        """Return whether jumps may skip a statement that sets a value after another one set it."""
+        """Return whether jumps may skip a statement that sets a value that another statement has already set."""
         inside = self._of_routine[self._routine(number)]
         jumps = any(self._steps[other].kind == "jump" for other in inside)
         return jumps and sum(self._steps[number].name in self._set_at(other) for other in inside) > 1
 
     def _set_at(self, number: int) -> set[str]:
-        """Return the names that a step sets, directly or by a call; a routine of another file may set all."""
+        """Return the names that a step sets, directly or by a call; a routine of another file may set all names."""
         step = self._steps[number]
         if step.kind == "set":
             return {step.name}

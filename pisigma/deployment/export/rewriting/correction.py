@@ -1,4 +1,4 @@
-"""Correction of the targets of a program, with waypoints on moves that would leave their line or arc."""
+"""Correction of the targets of a program, adding waypoints to moves that would leave their line or arc."""
 
 import difflib
 import math
@@ -20,10 +20,10 @@ from pisigma.robot.se3 import invert, rotation_from_vector, rotation_vector, tra
 _SPACING = 0.01
 """Largest distance between points at which a path is evaluated [m]."""
 _STEP_ANGLE = 0.035
-"""Largest rotation between points at which a path is evaluated, two degrees [rad]."""
+"""Largest rotation between points at which a path is evaluated [rad], two degrees."""
 MAX_STEPS = 512
 _LEVER = 0.1
-"""Distance from the tool at which a rotational deviation from the path is converted to a length [m]."""
+"""Distance from the tool [m] at which a rotational deviation from the path is converted to a length."""
 
 
 _LINE_NUMBER = re.compile(r"(?m)^ *\d+:")
@@ -46,7 +46,7 @@ class CorrectedProgram:
         text: text of the program.
         statuses: line and status of every target.
         waypoints: number of inserted waypoints.
-        left: line and reason of every target that was not changed.
+        left: line of every target that was not changed, and the reason.
         largest_shift: largest shift of a target [m].
         branches: names of the branches of the corrected targets.
     """
@@ -64,7 +64,7 @@ class CorrectedProgram:
         return tuple((line, status) for line, status in self.statuses if status not in WITH_TARGET)
 
     def diff(self, before: str, names: tuple[str, str]) -> str:
-        """Return the changes as a unified diff that ignores line numbers of the language."""
+        """Return the changes as a unified diff that ignores the line numbers of the language."""
         old, new = (_LINE_NUMBER.sub(":", text).splitlines() for text in (before, self.text))
         lines = difflib.unified_diff(old, new, *names, lineterm="", n=0)
         return "\n".join(lines)
@@ -77,7 +77,7 @@ class CommandedPoses:
     Attributes:
         T: poses of the nominal robot, in the frame of the target poses.
         status: status of every pose.
-        branches: indices of their branches.
+        branches: indices of the branches of the poses.
     """
 
     T: Float64[Tensor, "poses 4 4"]
@@ -105,11 +105,11 @@ class ProgramCorrection:
     tolerance: float
 
     def correct_program(self, program: ScannedProgram) -> CorrectedProgram:
-        """Rewrite all targets that are understood and reached; other text does not change.
+        """Rewrite all targets that are understood and reached, and leave other text unchanged.
 
-        A target is the pose for the real tool. It is replaced by the nominal robot's pose at the corrected joint
-        values. A straight move is split where the line between two of these poses deviates from the corrected line by
-        more than the tolerance; an arc is split into arcs in the same way.
+        A target is the intended pose of the real tool. It is replaced by the nominal robot's pose at the corrected
+        joint values. A straight move is split where the line between two of these poses deviates from the corrected
+        line by more than the tolerance; an arc is split into arcs in the same way.
         """
         targets, ways = program.targets, {move: self.path(move) for move in program.moves}
         paths = {move: way for move, way in ways.items() if isinstance(way, Tensor)}
@@ -139,7 +139,7 @@ class ProgramCorrection:
     def commanded_poses(
         self, targets: Sequence[Target], poses: Sequence[Float64[Tensor, "_poses 4 4"]]
     ) -> list[CommandedPoses]:
-        """Compute the poses to command for target poses of each target's tool in its frame."""
+        """Compute the poses to command for poses of each target's tool in the target's frame."""
         robot, counts = self.solver.model.robot, torch.tensor([len(T) for T in poses])
         base, tool = (
             transform_from_xyzrpy(torch.from_numpy(frame.copy())) for frame in (robot.base, robot.tool)
@@ -157,7 +157,7 @@ class ProgramCorrection:
         ]
 
     def path(self, move: PathMove) -> Float64[Tensor, "points 4 4"] | str:
-        """Return the path of the end's tool in the end's frame, or the reason why it is not known."""
+        """Return the path of the end's tool in the end's frame, or the reason why it is unknown."""
         if move.start is None or (move.circular and move.via is None):
             what = "start or via point" if move.circular else "start"
             return f"the {what} of the {_kind(move)} is not stated, so only its end is corrected"
@@ -175,7 +175,7 @@ class ProgramCorrection:
         return _round(start, via, end, _steps(start, end, length))[0]
 
     def waypoints(self, move: PathMove, there: CommandedPoses) -> list[Frame] | str:
-        """Return the waypoints of a move, see `PathMove.waypoints`, or the reason why it is not split."""
+        """Return the waypoints of a move (see `PathMove.waypoints`), or the reason why it is not split."""
         if not there.all_reached:
             return f"the {_kind(move)} has poses that are not reached, so it has no waypoints"
         if len(there.branches) > 1:
@@ -213,7 +213,7 @@ def _seen_from(end: Target, target: Target) -> Float64[Tensor, "1 4 4"]:
 
 
 def _off(T: Float64[Tensor, "points 4 4"], stride: int, circular: bool) -> float:
-    """Compute the largest deviation of poses from the lines or arcs between every `stride`-th of them [m]."""
+    """Compute the largest deviation of poses from the lines or arcs between every `stride`-th pose [m]."""
     start, end = T[:-1:stride], T[stride::stride]
     interpolated = (
         _round(start, T[stride // 2 :: stride], end, stride) if circular else _between(start, end, stride)
@@ -224,7 +224,7 @@ def _off(T: Float64[Tensor, "points 4 4"], stride: int, circular: bool) -> float
 
 
 def _steps(start: Float64[Tensor, "1 4 4"], end: Float64[Tensor, "1 4 4"], length: float) -> int:
-    """Return a power of two as the number of steps of a path, short enough to resolve the correction."""
+    """Return the number of steps of a path, a power of two that is large enough to resolve the correction."""
     angle = float(_turn(start, end).norm())
     steps = 8
     while steps < MAX_STEPS and steps < max(length / _SPACING, angle / _STEP_ANGLE):
@@ -278,8 +278,8 @@ class CircularArcs:
         centre: centres of the circles [m].
         radius: vectors from the centres to the first points [m].
         axis: axes of counter-clockwise motion.
-        passing: angle from the first to the second points [rad].
-        angle: at the third points [rad], below a full turn.
+        passing: angles from the first to the second points [rad].
+        angle: angles from the first to the third points [rad], below a full turn.
     """
 
     centre: Points

@@ -1,4 +1,4 @@
-"""`--format targets --program`: an existing program with corrected targets, and a report of the changes."""
+"""Export with `--format targets --program`: an existing program with corrected targets, and a report of changes."""
 
 from collections import Counter
 from collections.abc import Callable
@@ -41,7 +41,7 @@ def check_rewriting(request: ExportRequest) -> None:
     """Check the options for a program.
 
     Raises:
-        OutputError: the program's language is not known or not that of the output file, or an option is invalid.
+        OutputError: the program's language is unknown or differs from that of the output file, or an option is invalid.
     """
     assert request.program is not None
     suffix = request.program.suffix.lower()
@@ -65,13 +65,13 @@ def check_rewriting(request: ExportRequest) -> None:
 
 
 def rewrite_program(request: ExportRequest) -> Exported:
-    """Return a program with corrected targets where these are understood, and a report of the changes.
+    """Return a program with corrected targets, where the targets are understood, and a report of the changes.
 
     Raises:
         OutputError: the program cannot be read, or has no target whose frame and tool are stated.
     """
     assert request.program is not None
-    # Characters beyond ASCII occur in comments only; this encoding preserves every byte.
+    # Characters beyond ASCII occur only in comments; this encoding preserves every byte.
     text = read_input(request.program, OutputError, MAX_BYTES).decode("latin-1")
     scanned = SCANNERS[request.program.suffix.lower()](text, FrameFile.read(request.frames))
     if not scanned.targets:
@@ -146,7 +146,7 @@ def _exported(
 
 
 def _warnings(corrected: CorrectedProgram, source: str) -> tuple[str, ...]:
-    """Return warnings on branches of targets, and on targets that were not changed."""
+    """Return warnings about branches of targets, and about targets that were not changed."""
     sentences = [
         f"Targets are corrected for the branch {' and '.join(corrected.branches) or 'of the model'}. The program's "
         "configuration was not checked: if the arm is in another configuration, use --branch."

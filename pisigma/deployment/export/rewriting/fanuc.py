@@ -47,7 +47,7 @@ _MODIFIED = re.compile(r"\b(Offset|Tool_Offset|INC|VOFFSET|TOOL_OFFSET|Skip|OFFS
 
 
 def scan_fanuc(text: str, stated: FrameFile) -> ScannedProgram:
-    """Scan a program; a position is that of tool `UT` in frame `UF`, where 0 is the flange or the world, respectively.
+    """Scan a program; a position is that of tool `UT` (0 is the flange) in frame `UF` (0 is the world).
 
     Args:
         text: text of the program.
@@ -183,7 +183,7 @@ def _written(text: str, T: Frame) -> str:
 
 
 def _numbered(text: str) -> str:
-    """Renumber the lines from 1, and update their count in the head."""
+    """Renumber the lines from 1, and update the number of lines in the header."""
     numbers = count(1)
 
     def numbered(line: re.Match[str]) -> str:

@@ -1,4 +1,4 @@
-"""YAML file of frames and tools that a program names without stating them."""
+"""YAML file of frames and tools that a program names but does not define."""
 
 from pathlib import Path
 
@@ -16,9 +16,9 @@ from pisigma.robot.se3 import transform_from_xyzrpy
 class FrameFile(Section):
     """Frames relative to the origin of the robot description, and tools relative to its flange (the last row).
 
-    The file uses the names of the program, such as `UFRAME 1`, `BASE_DATA[3]` or `wobj_table`; `tcp` is the tool that a
-    URScript program does not set. `routines` are routines of other files that set neither frame nor tool: after a call
-    of any other routine, poses are not changed until the program sets frame and tool again.
+    The file uses the names of the program, such as `UFRAME 1`, `BASE_DATA[3]` or `wobj_table`; `tcp` is the tool of a
+    URScript program that does not set one. `routines` are routines of other files that set neither frame nor tool;
+    after a call of any other routine, poses are not changed until the program sets frame and tool again.
     """
 
     frames: dict[str, FrameSection] = Field(default_factory=dict)
@@ -35,7 +35,7 @@ class FrameFile(Section):
         return FrameFile() if path is None else read_yaml(path, FrameFile, OutputError)
 
     def frame(self, name: str) -> Float64[Tensor, "4 4"] | str:
-        """Return a frame by name, or the reason why it is not known."""
+        """Return a frame by name, or the reason why it is unknown."""
         return _lookup(self.frames, name, "frame")
 
     def sets_no_frame(self, routine: str) -> bool:
@@ -43,7 +43,7 @@ class FrameFile(Section):
         return routine.upper() in map(str.upper, self.routines)
 
     def tool(self, name: str) -> Float64[Tensor, "4 4"] | str:
-        """Return a tool by name, or the reason why it is not known."""
+        """Return a tool by name, or the reason why it is unknown."""
         return _lookup(self.tools, name, "tool")
 
 

@@ -1,4 +1,4 @@
-"""Functions of the controllers' languages that set neither frame nor tool; other routines may set both."""
+"""Functions of the controllers' languages that set neither frame nor tool, unlike other routines, which may."""
 
 _URSCRIPT = """
 movej movel movep movec servoj servoc speedj speedl stopj stopl freedrive_mode end_freedrive_mode

@@ -82,9 +82,9 @@ _FRAMES = re.compile(
 
 
 def scan_krl_data(text: str, stated: FrameFile) -> ScannedProgram:
-    """Scan a data list (`.dat`): points of inline forms, whose frame and tool are in the `FDAT` of their name.
+    """Scan a data list (`.dat`) for points of inline forms, whose frame and tool are in the `FDAT` of the same name.
 
-    The moves are in the program that belongs to it, so they have no waypoints.
+    The moves are in the program that belongs to the list, so they get no waypoints.
 
     Args:
         text: text of the data list.
@@ -150,7 +150,7 @@ class _Reader:
         ]
 
     def _value(self, match: re.Match[str], step: Step) -> Frame | str:
-        """Return the frame or tool that a statement sets, or the reason why it is not known."""
+        """Return the frame or tool that a statement sets, or the reason why it is unknown."""
         if match["form"]:
             return f"{step.name} is that of FDAT_ACT"
         look_up = self.stated.frame if step.name == "$BASE" else self.stated.tool
@@ -182,7 +182,7 @@ class _Reader:
             self.scan.add_move(match.start(), pose, *self._frames(match["target"]), cut, circular)
 
     def _frames(self, target: str) -> tuple[Frame | str, Frame | str]:
-        """Return frame and tool of a move, which the move may state after WITH."""
+        """Return the frame and tool of a move, which may be stated after WITH."""
         own = {f"${match[1].upper()}" for match in _WITH.finditer(target)}
         base, tool = (
             f"the move states {name}" if name in own else self.frames[name] for name in _FRAMES_OF_MOVES

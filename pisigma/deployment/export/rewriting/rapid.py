@@ -99,7 +99,7 @@ class _Reader:
     frames: dict[str, Frame | str] = field(default_factory=dict)
     axes_in_use: dict[str, int] = field(default_factory=dict)
     foreign: str = ""
-    """Reason why no frame and no tool is certain; "" without such a reason."""
+    """Reason why no frame and no tool is certain; "" if there is none."""
 
     def __post_init__(self) -> None:
         self.names = NamedPoses(self.text, _SET, str.upper)
@@ -129,7 +129,7 @@ class _Reader:
         return self.scan.program(self.names)
 
     def _foreign(self) -> str:
-        """Return why a call of another module's routine makes frames and tools uncertain; "" without such a call.
+        """Return the reason why a call of another module's routine makes frames and tools uncertain; "" without one.
 
         The data persist and a module may run again, so the position of the call does not matter.
         """
@@ -148,7 +148,7 @@ class _Reader:
         return ""
 
     def _placed(self, read: _Read | str, match: re.Match[str]) -> _Read | str:
-        """Return the value of a declaration, or the reason why there is none with its line."""
+        """Return the value of a declaration, or the reason, with its line, why there is none."""
         return f"{read} (line {self.scan.line_number(match.start())})" if isinstance(read, str) else read
 
     def _move(self, match: re.Match[str]) -> None:
@@ -255,7 +255,7 @@ def _product(literal: re.Match[str]) -> Frame | str:
 
 
 def _not_normalised(text: str) -> str:
-    """Return the reason why position and quaternion do not form a frame; "" if they form a frame."""
+    """Return the reason why position and quaternion do not form a frame; "" if they do."""
     quaternion = numbers_in(text)[3:]
     norm = math.hypot(*quaternion)
     if abs(norm - 1) <= ORTHONORMALITY_TOLERANCE:

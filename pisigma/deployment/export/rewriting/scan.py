@@ -1,4 +1,4 @@
-"""Poses in the text of a program, their frames and tools, and the moves to them."""
+"""Poses in the text of a program, their frames and tools, and the moves to these poses."""
 
 import bisect
 import re
@@ -25,7 +25,7 @@ class Pose:
     """A pose in a text.
 
     Attributes:
-        span: span of its numbers.
+        span: span of the numbers of the pose.
         T: pose of the tool in the frame [m].
         write: function that formats another pose in the same way.
     """
@@ -45,13 +45,13 @@ class Edit:
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """A pose that the robot moves to.
+    """A pose to which the robot moves.
 
     Attributes:
         line: line of the pose.
         pose: the pose.
         T_root_frame: frame of the pose, relative to the origin of the robot description.
-        T_flange_tool: tool, relative to the last row of the robot description.
+        T_flange_tool: frame of the tool, relative to the last row of the robot description.
     """
 
     line: int
@@ -62,14 +62,14 @@ class Target:
 
 @dataclass(frozen=True, eq=False)
 class PathMove:
-    """Straight move to a target, or arc through another target.
+    """Straight move to a target, or arc to a target through another.
 
     Attributes:
         line: line of the move.
         start: previous target; None if the program does not determine it.
         via: via point of an arc; None for a straight move, or if the program does not state it.
         end: target of the move.
-        circular: whether it is an arc.
+        circular: whether the move is an arc.
         waypoints: function that returns the edits for waypoints, which are poses of the end's tool in the end's
             frame. An arc is split into arcs: the poses alternate between via and end points, and the last one is the
             new via point of the move itself.
@@ -90,8 +90,8 @@ class ScannedProgram:
     Attributes:
         text: text of the program.
         targets: targets whose frame and tool are known, in the order of the text.
-        moves: straight moves and arcs to these.
-        left: line and reason of every target that is not changed.
+        moves: straight moves and arcs to these targets.
+        left: line of every target that is not changed, and the reason.
         joint_lines: lines of moves to joint values, which are not changed.
         finish: function that is applied to the text after the edits, for example to number its lines.
     """
@@ -105,7 +105,7 @@ class ScannedProgram:
 
 
 class NamedPoses:
-    """Named poses that a program sets once, and whether they are used in moves only."""
+    """Named poses that a program sets once, and whether they are used only in moves."""
 
     def __init__(self, text: str, assignment: re.Pattern[str], fold: Callable[[str], str]) -> None:
         """Count the names of a text.
@@ -134,7 +134,7 @@ class NamedPoses:
             self._poses[self._fold(name)] = pose
 
     def target(self, name: str) -> Pose | str:
-        """Return the pose of a name as the target of a move, or the reason why it is not known."""
+        """Return the pose of a name as the target of a move, or the reason why it is unknown."""
         return self.get(name) or self._reasons.get(self._fold(name), COMPUTED)
 
     def get(self, name: str, target: bool = True) -> Pose | None:
@@ -205,7 +205,7 @@ class Scan:
             frame: frame of the pose, relative to the origin of the robot description.
             tool: tool, relative to the last row of the robot description.
             waypoints: function for the waypoints of a straight move or an arc, see `PathMove`.
-            circular: whether it is the end of an arc, whose via point is the previous target.
+            circular: whether the pose is the end of an arc whose via point is the previous target.
         """
         start, via = self._last_two if circular else (self._last_two[1], None)
         self._last_two = (self._last_two[1], None)
@@ -285,12 +285,12 @@ def _stripped(text: str, start: int, end: int) -> tuple[int, int]:
 
 
 def waypoint_groups(poses: Sequence[_Item], count: int) -> list[Sequence[_Item]]:
-    """Return waypoints, or their names, in groups by inserted move: one each, or two for arcs; see `PathMove`."""
+    """Return waypoints, or their names, grouped by inserted move: one per move, or two for arcs; see `PathMove`."""
     return [poses[first : first + count] for first in range(0, len(poses) - count + 1, count)]
 
 
 def axes_in_use(values: Mapping[str, str]) -> dict[str, str]:
-    """Return the external axes whose value is not 0 or not known.
+    """Return the external axes whose value is nonzero or unknown.
 
     Args:
         values: texts by name of the axis; 9E9 means that the axis does not exist or does not move.
@@ -301,12 +301,12 @@ def axes_in_use(values: Mapping[str, str]) -> dict[str, str]:
 def external_axes(values: Mapping[str, str], in_use: Mapping[str, int]) -> str:
     """Return the reason why a pose with external axes is not changed; "" if no external axis is in use.
 
-    The robot description has no external axes: it describes the robot with all of them at 0. A pose that does not state
-    an axis leaves it where the program has moved it before.
+    The robot description has no external axes; it describes the robot with all of them at 0. A pose that does not state
+    an axis leaves the axis where the program has moved it before.
 
     Args:
         values: texts by name of the axis, see `axes_in_use`.
-        in_use: line in which the program moves each of them.
+        in_use: line in which the program moves each axis.
     """
     if used := axes_in_use(values):
         names = ", ".join(f"{name} = {_plain(text)}" for name, text in used.items())

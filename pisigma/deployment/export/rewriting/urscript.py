@@ -43,7 +43,7 @@ _TURNING = re.compile(r"mode\s*=\s*(?!0$)")
 _Span = tuple[int, int]
 
 _BLEND = 1e-3
-"""Blend radius at waypoints, which is smaller if they are close together [m]."""
+"""Blend radius at waypoints [m], which is reduced if they are close together."""
 
 
 def scan_urscript(text: str, stated: FrameFile) -> ScannedProgram:
@@ -51,7 +51,7 @@ def scan_urscript(text: str, stated: FrameFile) -> ScannedProgram:
 
     Args:
         text: text of the program.
-        stated: frames that the program does not state; its tool `tcp` applies until a `set_tcp` with numbers.
+        stated: frames that the program does not state; their tool `tcp` applies until a `set_tcp` with numbers.
     """
     return _Reader(Scan(text), mask_comments(text, _HIDDEN), stated).read()
 
