@@ -19,7 +19,14 @@ from pisigma.files.yaml_file import read_yaml
 from pisigma.lifetime.cell.controller import Controller, valid_sessions
 from pisigma.lifetime.cell.events import CHANGING_EVENTS, Event
 from pisigma.lifetime.cell.history import HISTORY, Check, History, ModelEntry, SessionEntry
-from pisigma.lifetime.cell.layout import CELL_FILE, MODELS, PLANS, SESSIONS, newest_plan
+from pisigma.lifetime.cell.layout import (
+    CELL_FILE,
+    MODELS,
+    PLANS,
+    SESSIONS,
+    is_cell_of_arms,
+    newest_plan,
+)
 from pisigma.measurement.dates import date_in_name
 
 _BEFORE_FIT = ("plan", "import")
@@ -54,6 +61,7 @@ class CellFacts:
             were made.
         incomplete: number of measured poses of the newest plan as a text, if there are too few; otherwise "".
         controller: exports that were active on the controller, with the times.
+        has_several_arms: whether `cell.yaml` lists several arms, for which no steps are kept.
     """
 
     folder: str
@@ -73,6 +81,7 @@ class CellFacts:
     changed_models: tuple[str, ...] = ()
     incomplete: str = ""
     controller: Controller = field(default_factory=Controller)
+    has_several_arms: bool = False
 
     @cached_property
     def valid_sessions(self) -> tuple[SessionEntry, ...]:
@@ -219,6 +228,7 @@ def _facts(folder: Path, history: History) -> CellFacts:
         ),
         incomplete=_incomplete(folder, sessions, checks),
         controller=Controller.from_history(history),
+        has_several_arms=is_cell_of_arms(folder),
     )
 
 

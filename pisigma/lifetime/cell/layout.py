@@ -24,7 +24,7 @@ def is_cell_of_arms(path: str | os.PathLike[str]) -> bool:
     """Return whether a folder is a cell whose file lists several arms."""
     file = Path(path) / CELL_FILE
     return file.is_file() and any(
-        line.startswith("arms:") for line in file.read_text("utf-8", errors="replace").splitlines()
+        line.startswith("arms:") for line in file.read_text("utf-8-sig", errors="replace").splitlines()
     )
 
 

@@ -136,6 +136,11 @@ def _to_measure(facts: CellFacts, plan: str) -> Step:
     return Step("not_measured", why, facts.import_command())
 
 
+def _several_arms(facts: CellFacts) -> Step | None:
+    why = f"its arms are calibrated with `{facts.command('calibrate')}`; use the models of one arm then"
+    return Step("several_arms", why) if facts.has_several_arms else None
+
+
 def _model_changed(facts: CellFacts) -> Step | None:
     if facts.in_use is None or facts.in_use.name not in facts.changed_models:
         return None
@@ -301,10 +306,9 @@ def _better_model(facts: CellFacts, model: ModelEntry) -> Step | None:
     newest = facts.newest_model
     if newest is None or newest.made <= model.made or _wrongly_fitted(facts, newest):
         return None
-    if not (new := _not_judged(facts, newest, "verify")):
-        return None
-    why = f"model '{newest.name}' {_CAN_VERIFY.format(new[-1])}"
-    return Step("better_model", why, facts.command("verify", "--model", newest.name))
+    new = _not_judged(facts, newest, "verify")
+    why = f"model '{newest.name}' {_CAN_VERIFY.format(new[-1])}" if new else ""
+    return Step("better_model", why, facts.command("verify", "--model", newest.name)) if new else None
 
 
 def _replaced(facts: CellFacts, model: ModelEntry) -> Step | None:
@@ -349,11 +353,8 @@ def _outside_limit(facts: CellFacts, model: ModelEntry) -> Step | None:
             f"{missed}; the scatter of the sensor and of the robot alone accounts for {scatter:.3f} mm, which more "
             "poses cannot reduce; use a more accurate sensor, or raise limit_mm",
         )
-    return Step(
-        "outside_limit",
-        f"{missed}; more poses reduce it until the repeatability of the robot is reached",
-        facts.command("plan"),
-    )
+    why = f"{missed}; more poses reduce it until the repeatability of the robot is reached"
+    return Step("outside_limit", why, facts.command("plan"))
 
 
 def _verification_due(facts: CellFacts, model: ModelEntry) -> Step | None:
@@ -377,6 +378,7 @@ def _up_to_date(facts: CellFacts, model: ModelEntry) -> Step:
 
 
 RULES: tuple[Callable[[CellFacts], Step | None], ...] = (
+    _several_arms,
     _model_changed,
     _edited_session,
     _file_to_take_in,

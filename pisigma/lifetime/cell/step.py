@@ -7,6 +7,7 @@ COMPUTED = ("calibrate", "verify", "monitor", "recalibrate")
 """Commands that need neither new rows nor a decision by a person."""
 
 State = Literal[
+    "several_arms",
     "model_changed",
     "edited_session",
     "not_taken_in",

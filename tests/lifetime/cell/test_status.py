@@ -57,6 +57,7 @@ CASES = {
     "no_plan": (EMPTY, "plan"),
     "not_measured": (PLANNED, "import"),
     "session_incomplete": (replace(MEASURED, incomplete="3 of 50 poses"), "import"),
+    "several_arms": (replace(PLANNED, not_taken_in=("a.csv",), has_several_arms=True), ""),
     "not_taken_in": (replace(PLANNED, not_taken_in=("2026-01-10.csv",)), "import"),
     "file_refused": (
         replace(
