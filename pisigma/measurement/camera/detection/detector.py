@@ -102,9 +102,18 @@ def image_files(
             that clock; None to name them by the numbers of the stops, from 1.
 
     Raises:
-        MeasurementError: there are no images, two images have the same name, or a video has no frame at rest.
+        MeasurementError: there are no images, two images have the same name, a video has no frame at rest, or several
+            videos are named by time.
     """
-    files = list[Path]()
+    files, videos = list[Path](), [path for path in map(Path, paths) if is_video(path)]
+    if video_start is not None and len(videos) > 1:
+        raise MeasurementError(
+            "several videos cannot start at the same time",
+            expected="one video, because joint values are joined by time",
+            value=len(videos),
+            at=Place(videos[1]),
+            remedy="detect the boards of every video separately, each with its start (video_start)",
+        )
     for path in map(Path, paths):
         if is_video(path):
             files += _frames(path, video_start)

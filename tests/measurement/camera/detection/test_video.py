@@ -61,6 +61,13 @@ def test_frames_are_read_like_image_files(video):
     assert [file.stem for file in image_files([video], 100.0)] == ["100.450", "101.550", "102.650"]
 
 
+def test_frames_of_several_videos_are_not_named_by_one_start(video, tmp_path):
+    second = tmp_path / "second.avi"
+    second.write_bytes(video.read_bytes())
+    with refused(MeasurementError, file=str(second), value=2):
+        image_files([video, second], 100.0)
+
+
 def test_stops_are_paired_only_if_every_row_is_one(video, tmp_path):
     log = tmp_path / "joints.csv"
     log.write_text("image,q1_deg\n1,10\n2,20\n3,30\n")
