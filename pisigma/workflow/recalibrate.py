@@ -251,7 +251,7 @@ def _summary(
     return RecalibrationSummary(
         command=f"pisigma.recalibrate({parent.name!r}, {rows.file_names!r})",
         parent=ParentFigures(name=parent.name, kind=parent.kind, sha256=""),
-        date=datetime.datetime.now(datetime.UTC).date().isoformat(),
+        date=datetime.date.today().isoformat(),
         rows=rows.rows,
         kept=choice.kept,
         verdict=choice.sentence,

@@ -14,7 +14,7 @@ from typing import Literal, get_args
 from pisigma.files.errors import MeasurementError, ModelError, Place
 from pisigma.lifetime.cell.events import ARM_EVENTS, Event
 from pisigma.lifetime.cell.exports import ON_CONTROLLER, Contents, ControllerEntry, ExportEntry
-from pisigma.lifetime.cell.history import HISTORY, History, ModelEntry, SessionEntry, now
+from pisigma.lifetime.cell.history import HISTORY, History, ModelEntry, SessionEntry, day_of, now
 from pisigma.lifetime.cell.layout import is_cell, model_folder
 from pisigma.measurement.dates import EXPECTED_DATE, is_date
 
@@ -156,7 +156,9 @@ class Controller:
         """Return the exports that were active when the newest rows of a model were measured."""
         newest = [one for one in sessions if one.name == model.sessions.split(",")[-1]]
         return (
-            self.active_during(newest[0]) if newest else self.active(model.day or model.made[:10], model.made)
+            self.active_during(newest[0])
+            if newest
+            else self.active(model.day or day_of(model.made), model.made)
         )
 
     def fits(self, model: ModelEntry, sessions: tuple[SessionEntry, ...]) -> bool:
@@ -313,7 +315,7 @@ def record_controller(history: History, sha256: str, day: str, note: str) -> Con
             option="--export",
             remedy="record only what the controller computes with, not what programs use",
         )
-    first = min((one.exported[:10] for one in history.exports() if one.sha256 == sha256), default="")
+    first = min((day_of(one.exported) for one in history.exports() if one.sha256 == sha256), default="")
     if day < first:
         expected = f"a day since {first}, when the file was exported"
         raise MeasurementError(expected=expected, value=day, option="--date")

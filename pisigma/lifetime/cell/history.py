@@ -209,6 +209,11 @@ def now() -> str:
     return datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="milliseconds")
 
 
+def day_of(time: str) -> str:
+    """Return the day (ISO 8601) of a stored time in the time zone of this machine, in which people state days."""
+    return datetime.datetime.fromisoformat(time).astimezone().date().isoformat()
+
+
 class History:
     """The history of a cell, or of a model outside a cell.
 
@@ -336,8 +341,8 @@ class History:
         if kind == "accepted":
             if (entry := self.in_use) is None:
                 raise ModelError("no model of the cell is in use", at=Place(self.path.parent))
-            if day < entry.made[:10]:
-                expected = f"a day since {entry.made[:10]}, when model '{entry.name}' was made"
+            if day < (made := day_of(entry.made)):
+                expected = f"a day since {made}, when model '{entry.name}' was made"
                 raise MeasurementError(expected=expected, value=day, option="--date")
             model = entry.name
         event = Event(day, kind, note, now(), person.strip(), model)  # type: ignore[arg-type]  # checked above

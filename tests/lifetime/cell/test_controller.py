@@ -1,5 +1,6 @@
 """What is active on the controller: every rule of the table, and which zeros sessions and models were measured with."""
 
+import time
 from dataclasses import replace
 from typing import get_args
 
@@ -10,7 +11,7 @@ from pisigma.files.errors import MeasurementError, ModelError
 from pisigma.lifetime.cell.controller import RULES, Controller, Situation, record_controller
 from pisigma.lifetime.cell.exports import Contents, ControllerEntry, ExportEntry
 from pisigma.lifetime.cell.facts import CellFacts
-from pisigma.lifetime.cell.history import HISTORY, History, ModelEntry, SessionEntry
+from pisigma.lifetime.cell.history import HISTORY, History, ModelEntry, SessionEntry, Use
 from pisigma.lifetime.cell.status import next_step
 
 DH = ExportEntry("dh.csv", "dh", "dh", "kinematics", "a", "2026-01-12T08:00:00+00:00")
@@ -146,3 +147,23 @@ def test_what_cannot_be_active_is_refused(tmp_path, sha256, day, option):
     assert history.controller() == ()
     record_controller(history, "dh", "2026-01-20", "at low speed")
     assert Controller.from_history(history).active()["kinematics"].since == "2026-01-20"
+
+
+@pytest.mark.parametrize(
+    ("zone", "utc", "day"),
+    [("UTC+8", "2026-01-13T03:00", "2026-01-12"), ("UTC-9", "2026-01-12T20:00", "2026-01-13")],
+)
+def test_days_are_those_of_the_time_zone_of_the_machine(tmp_path, monkeypatch, zone, utc, day):
+    at, history = f"{utc}:00.000+00:00", History(tmp_path / HISTORY)
+    made = replace(MODEL, made=at, sessions="", day="")
+    history.add(replace(OFFSETS, exported=at), made, Use("a", at, ""))
+    monkeypatch.setenv("TZ", zone)
+    time.tzset()
+    try:
+        assert history.record("accepted", day, "", "A. Auditor").day == day
+        record_controller(history, "offsets", day, "")
+        since = ControllerEntry(day, "offsets", "", f"{utc[:14]}00:00.000+00:00")
+        assert Controller((since,), history.exports()).fits(made, ())
+    finally:
+        monkeypatch.undo()
+        time.tzset()
