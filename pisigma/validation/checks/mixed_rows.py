@@ -16,6 +16,7 @@ from pisigma.robot.frame_fits import best_base, best_tool
 from pisigma.validation.checks.check import CheckedCalibration, RowsUnderModel
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.setup_faults.cause import join_words, length_text
+from pisigma.validation.setup_faults.ordered_rows import SENSORS as POSE_SENSORS
 from pisigma.validation.setup_faults.ordered_rows import OrderedRows
 from pisigma.validation.setup_faults.populations import MIN_ROWS as MIN_ROWS_OF_TWO
 from pisigma.validation.setup_faults.populations import (
@@ -176,16 +177,30 @@ def check_two_populations(checked: CheckedCalibration) -> Iterator[Diagnostic]:
 
     If at most a tenth of the rows are wrong, they are outliers, to which the robust loss gives no weight; more wrong
     rows need not be outliers. A hybrid has smaller residuals, so smaller differences are visible, but it absorbs part
-    of large differences, so both calibrations are tested.
+    of large differences, so both calibrations are tested. Populations of the geometric calibration do not count if
+    the hybrid explains its errors better, because errors of gears look like two populations, too.
     """
     learned = checked.hybrid if checked.hybrid is not None and checked.hybrid.learned is not None else None
     for result in (checked.geometric, learned):
         ordered = None if result is None else OrderedRows.from_result(result)
         found = None if ordered is None else find_populations(ordered, checked.rows.rows)
-        if found is not None and _differ(found):
+        if found is None or not _differ(found):
+            continue
+        if result is learned or learned is None or found.factor > _factor_of_hybrid(checked):
             yield _two_populations(checked.rows, found)
             return
     yield from _two_sizes(checked)
+
+
+def _factor_of_hybrid(checked: CheckedCalibration) -> float:
+    """Return the ratio of the errors without and with the joint correction, all sensors counting alike."""
+    before, after = (checked.errors[name] for name in ("geometric", "hybrid"))
+    shares = [
+        float(after[sensor].square().nanmean() / before[sensor].square().nanmean())
+        for sensor in POSE_SENSORS
+        if sensor in before
+    ]
+    return float(np.mean(shares)) ** -0.5
 
 
 def _two_sizes(checked: CheckedCalibration) -> Iterator[Diagnostic]:

@@ -11,6 +11,7 @@ from testing.outside_arm import ARMS, OutsideArm, either
 from testing.simulated_arm import simulate
 
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
+from pisigma.calibration.hybrid.calibrator import HybridCalibrator
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import Robot
 from pisigma.validation.checks.mixed_rows import check_two_populations
@@ -103,3 +104,16 @@ def test_poses_in_two_named_frames_are_one_population(seed):
     arm = simulate("ur5", seed, 30, noise=3e-5, turn_noise=1e-4, length=3e-4, angle=5e-4)
     frame = tuple(["before"] * 15 + ["after"] * 15)
     assert populations(arm.nominal, replace(arm.measurements, frame=frame)) == []
+
+
+def test_gears_that_a_hybrid_explains_are_one_population():
+    arm = OutsideArm("scara", 3, 35, 2)
+    arm.q = np.repeat(arm.q, 2, 0)
+    rows, geometric = arm.measured(), GeometricCalibrator(arm.robot)
+    assert populations(arm.robot, rows) != []
+    hybrid = HybridCalibrator(geometric)
+    assert list(check_two_populations(checked(hybrid, rows))) == []
+    other = OutsideArm("scara", 103, 35, 2)
+    other.q = arm.q
+    (found,) = check_two_populations(checked(hybrid, either(rows, other.measured(), np.arange(70) % 2 == 1)))
+    assert (found.severity, found.cause) == ("implausible", "arm")
