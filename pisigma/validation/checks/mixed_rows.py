@@ -206,8 +206,11 @@ def _factor_of_hybrid(checked: CheckedCalibration) -> float:
 def _two_sizes(checked: CheckedCalibration) -> Iterator[Diagnostic]:
     """Report sensors whose residuals come from two normal populations."""
     for sensor, errors in checked.final_errors.items():
-        residuals = np.asarray(errors)
-        residuals = residuals[np.isfinite(residuals).all(1)]
+        sigma = checked.rows.sigma_position if SENSORS[sensor].unit == "m" else checked.rows.sigma_rotation
+        measured = torch.isfinite(errors).all(1)
+        residuals = errors[measured].numpy()
+        if sigma is not None and bool(torch.isfinite(sigma[measured]).all()):
+            residuals = residuals * (sigma[measured].median() / sigma[measured])[:, None].numpy()
         if len(residuals) < MIN_ROWS_OF_TWO or not (fit := two_populations(residuals)).are_distinct:
             continue
         unit = "mm" if SENSORS[sensor].unit == "m" else "mrad"

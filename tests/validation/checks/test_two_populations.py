@@ -117,3 +117,12 @@ def test_gears_that_a_hybrid_explains_are_one_population():
     other.q = arm.q
     (found,) = check_two_populations(checked(hybrid, either(rows, other.measured(), np.arange(70) % 2 == 1)))
     assert (found.severity, found.cause) == ("implausible", "arm")
+
+
+@pytest.mark.parametrize("is_stated", [True, False])
+def test_rows_with_a_larger_stated_noise_are_no_second_population(is_stated):
+    arm, rng = OutsideArm("irb120", 3), np.random.default_rng(0)
+    sigma = torch.from_numpy(np.where(np.arange(100) % 5 == 0, 2e-3, 2e-4))
+    position = arm.measured().position + sigma[:, None] * torch.from_numpy(rng.normal(size=(100, 3)))
+    rows = replace(arm.measured(), position=position, sigma_position=sigma if is_stated else None)
+    assert [one.cause for one in populations(arm.robot, rows)] == ([] if is_stated else ["sizes"])
