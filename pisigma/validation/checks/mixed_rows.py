@@ -200,7 +200,7 @@ def _factor_of_hybrid(checked: CheckedCalibration) -> float:
         for sensor in POSE_SENSORS
         if sensor in before
     ]
-    return float(np.mean(shares)) ** -0.5
+    return 1 / math.sqrt(np.nanmean(shares))
 
 
 def _two_sizes(checked: CheckedCalibration) -> Iterator[Diagnostic]:
