@@ -2,13 +2,13 @@
 
 from pathlib import Path
 
-from shared_benchmark.comparison import extrapolation_table, losses_text, ranking_table
+from shared_benchmark.comparison import below_geometric_text, extrapolation_table, losses_text, ranking_table
 from shared_benchmark.cost import cost_table, failures_table, total_text, versions_text
 from shared_benchmark.coverage import coverage_table, pooled_table
 from shared_benchmark.fits import LIMIT_S
 from shared_benchmark.methods import NAMES as METHODS
 from shared_benchmark.methods import method_of
-from shared_benchmark.pictures import draw_coverage, draw_learning_curves
+from shared_benchmark.pictures import draw_accuracy, draw_coverage, draw_learning_curves
 from shared_benchmark.reported import reported_table
 from shared_benchmark.results import Results, table
 from shared_benchmark.scores import DRAWS, rms_interval
@@ -27,6 +27,7 @@ def write_page(folder: Path) -> None:
     """Write the page and its pictures."""
     results = Results(*read(folder))
     PAGE.write_text(page_of(results), encoding="utf-8")
+    draw_accuracy(results.errors, FIGURES / "benchmark_accuracy.png")
     draw_learning_curves(results.errors, results.fits, FIGURES / "benchmark_rows.png")
     draw_coverage(results.errors, FIGURES / "benchmark_coverage.png")
 
@@ -43,6 +44,7 @@ def page_of(results: Results) -> str:
         "accuracy": "\n\n".join(_accuracy(results, name) for name in names),
         "ranking": ranking_table(results),
         "losses": losses_text(results),
+        "below_geometric": below_geometric_text(results),
         "reported": reported_table(results),
         "extrapolation": extrapolation_table(results),
         "pooled": pooled_table(results),

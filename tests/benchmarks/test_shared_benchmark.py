@@ -209,3 +209,4 @@ def test_the_page_is_made_from_the_stored_results_and_explains_every_loss(module
     results = module("results").Results(*store.read(store.RESULTS))
     assert page.PAGE.read_text(encoding="utf-8") == page.page_of(results)
     assert set(comparison.losses(results)) <= set(comparison.LOSSES)
+    assert set(comparison.below_geometric(results)) <= set(comparison.BELOW_GEOMETRIC)
