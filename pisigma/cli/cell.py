@@ -110,14 +110,14 @@ def cell_at(path: str | Path) -> "Cell | None":
 
 
 def report_overrides(cell: "Cell", step: str, settings: StatedSettings[Any]) -> Mapping[str, Any]:
-    """Print to stderr which settings of a step the command line overrides; return the stated ones by key."""
+    """Print to stderr which settings of a step the command line overrides; return the stated settings by key."""
     for key in sorted(settings.values.keys() & cell.file.stated_values(step).keys()):
         print_line(f"The command line overrides {key} of {cell.file.path}.", to_stderr=True)
     return settings.values
 
 
 def settings_at(path: str | Path, step: str, settings: StatedSettings[Group]) -> Group:
-    """Return the settings of the command line; for a cell, in addition to the settings in its file."""
+    """Return the settings of the command line; for a cell, together with the settings in its file."""
     cell = cell_at(path)
     if cell is None:
         return settings.build()

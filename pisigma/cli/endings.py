@@ -1,4 +1,4 @@
-"""Endings of a command: its exit status, and a message on stderr for a problem."""
+"""How a command ends: its exit status, and a message on stderr if there is a problem."""
 
 import contextlib
 import errno
@@ -33,11 +33,11 @@ NOT_ACCEPTED = 3
 DEFECT = 1
 """Exit status of a defect of pisigma."""
 TRACEBACK = "PISIGMA_TRACEBACK"
-"""Environment variable: if it is set, a defect ends with Python's traceback."""
+"""Environment variable; if it is set, Python's traceback is printed after a defect."""
 
 _INTERRUPTED = 130
 _NO_READER = 141
-"""Status that shells report for a program ended by SIGPIPE, such as `pisigma robots | head -1`."""
+"""Status that shells report for a program that SIGPIPE has ended, as in `pisigma robots | head -1`."""
 
 
 PluginFiles = Annotated[
@@ -83,7 +83,7 @@ def exit_with_problem(problem: BaseException, as_json: bool = False) -> None:
     """Print the error, and end the command with an exit status.
 
     The status is 2 if the user's input is invalid, 3 if a model does not meet its limits, 130 after an interruption,
-    141 if the reader of the output has gone, and 1 for everything else.
+    141 if the reader of the output has ended, and 1 for everything else.
 
     Args:
         problem: the exception that ended the command.

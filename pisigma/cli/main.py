@@ -97,14 +97,17 @@ def run() -> None:
     Exits with status 0 on success, 2 if the input is at fault, 3 if limits are not met, and 1 for a defect of pisigma.
     """
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):  # characters that a terminal lacks must not fail
+        if isinstance(
+            stream, io.TextIOWrapper
+        ):  # characters that the terminal cannot show must not cause an error
             stream.reconfigure(errors="backslashreplace")
-    # Waiting threads sleep soon: while they spin, other processes make both many times slower.
+    # Waiting threads are put to sleep soon: if they keep spinning while other processes run, both become many times
+    # slower.
     os.environ.setdefault("GOMP_SPINCOUNT", "2000")
     try:
         try:
             app()
-        except Exception as problem:  # of the command line itself, or of its help
+        except Exception as problem:  # ended by the command line itself, or by its help
             exit_with_problem(problem)
     except typer.Exit as end:
         sys.exit(end.exit_code)

@@ -124,7 +124,7 @@ def screen_width() -> int:
 
 
 def command_line(context: typer.Context, files: Collection[str] = ("out",)) -> str:
-    """Return the running command for cards, without folders of files and without options at their defaults.
+    """Return the running command for cards; folders of files, and options with their defaults, are left out.
 
     Args:
         context: context of the command.

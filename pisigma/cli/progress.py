@@ -53,7 +53,7 @@ class _Shown:
             from rich.text import Text
 
             self.status.update(Text(self._line(what)))
-            self.status.start()  # started at the first step, because another progress bar may be drawn before
+            self.status.start()  # started at the first step, because another progress bar may be drawn before that
             return
         self._stop_timer()
         now = time.monotonic()

@@ -1,4 +1,4 @@
-"""Compare alternative causes of residuals by their evidence, and the share of the residuals that each explains."""
+"""Compare alternative causes of residuals by their evidence and by the share of the residuals that each explains."""
 
 import math
 from collections.abc import Mapping
@@ -17,7 +17,7 @@ _SIZES = torch.logspace(-3, 1.5, 28, dtype=torch.float64)
 _NOISE = torch.logspace(-2, 2, 41, dtype=torch.float64)
 """Factors on the noise that are tried."""
 _STATED_SPREAD = 0.3
-"""Prior standard deviation of the logarithm of the factor, where the noise is stated."""
+"""Prior standard deviation of the logarithm of the factor if the noise is stated."""
 CLEAR = 5.0
 """Log Bayes factor [nats] above which residuals have a cause: odds of 150 to 1."""
 _MAX_CAUSES = 3
@@ -31,8 +31,9 @@ class Cause:
         name: name of the cause.
         log_bayes_factor: log evidence with this cause alone, minus that with noise alone [nats].
         size: most probable size relative to the scale of the cause.
-        share: share of the squared residuals, in units of the noise, that it explains alone at this size.
-        named: whether the evidence names it: it is the clearest one, or clear in addition to the clearer ones.
+        share: share of the squared residuals, in units of the noise, that the cause alone explains at this size.
+        named: whether the evidence supports the cause, because it is the clearest one, or clear in addition to clearer
+            ones.
     """
 
     name: str
@@ -46,15 +47,15 @@ class Cause:
 class FitResiduals:
     """Residuals of a linear fit without priors, and their possible causes.
 
-    The residuals are normal with the covariance `A A^T + s² Z Z^T + (f σ)²`, with A the derivatives along what is known
-    with a stated uncertainty, and Z those with respect to the unknowns of a cause. What was fitted is projected out,
-    which is the restricted likelihood (Harville 1974, Biometrika 61(2), 383-385). The evidence of a cause is the mean
-    over its sizes s and noise factors f; the difference of two log evidences is a log Bayes factor (Kass and Raftery
-    1995, J. Am. Stat. Assoc. 90(430), 773-795).
+    The residuals are normal with the covariance `A A^T + s² Z Z^T + (f σ)²`, where A contains the derivatives along
+    quantities known with a stated uncertainty, and Z those with respect to the unknowns of a cause. Fitted unknowns are
+    projected out, which yields the restricted likelihood (Harville 1974, Biometrika 61(2), 383-385). The evidence of a
+    cause is the mean over its sizes s and noise factors f; the difference of two log evidences is a log Bayes factor
+    (Kass and Raftery 1995, J. Am. Stat. Assoc. 90(430), 773-795).
 
     Attributes:
         y: projected residuals in units of the stated noise.
-        covariance: projected covariance by what is known with a stated uncertainty, and by included causes.
+        covariance: projected covariance due to quantities known with a stated uncertainty and due to included causes.
         exact: projected unit vectors of the values whose noise is exactly as stated, such as that of a prior.
         is_stated: whether the noise of the other values is stated.
         causes: projected derivatives with respect to the unknowns of every cause at size 1.
@@ -79,8 +80,8 @@ class FitResiduals:
 
         Args:
             y: residuals in units of the stated noise.
-            fitted: derivatives with respect to what was fitted.
-            known: root of their covariance by what is known with a stated uncertainty.
+            fitted: derivatives with respect to the fitted unknowns.
+            known: root of the covariance of the residuals due to quantities known with a stated uncertainty.
             exact: values whose noise is exactly as stated.
             is_stated: whether the noise of the other values is stated.
             causes: derivatives with respect to the unknowns of every cause at size 1.
@@ -92,7 +93,7 @@ class FitResiduals:
         return FitResiduals(N @ y, A @ A.t(), N[:, exact], is_stated, columns)
 
     def compare(self) -> tuple[Cause, ...]:
-        """Return all causes, where `named` marks the clear causes; named causes come first, then by Bayes factor."""
+        """Return all causes: first those that are `named` because they are clear, then the others by Bayes factor."""
         alone = self._compared()
         named, here = set[str](), self
         while len(named) < _MAX_CAUSES:

@@ -89,7 +89,7 @@ def return_free_memory(unknowns: int) -> None:
     """Return free memory to the system after fits of many unknowns, if the C library can (`malloc_trim` of glibc).
 
     After a fit of thousands of unknowns, more than 100 MB of free memory is fragmented, and the matrices of the next
-    fit would be allocated in addition to it.
+    fit would be allocated in addition to this memory.
     """
     if unknowns > _MANY_UNKNOWNS and sys.platform == "linux":
         trim = getattr(ctypes.CDLL(None), "malloc_trim", None)

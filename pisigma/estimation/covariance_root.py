@@ -63,12 +63,12 @@ def multiply_updated_root(
 
 @dataclass(frozen=True, eq=False)
 class CovarianceRoot:
-    """Covariance root R: columns for all unknowns, and optionally columns in factors that concern the weights only.
+    """Covariance root R, with columns for all unknowns and optionally columns, in factors, for the weights only.
 
     Attributes:
         directions: columns of R for all unknowns.
-        weights: further columns, which are 0 for the parameters; None if there are none.
-        rounded: form of R that a model folder stores instead of R, and of which R was made; None if R is stored.
+        weights: additional columns, which are 0 for the parameters; None if there are none.
+        rounded: form of R that a model folder stores instead of R and from which R was made; None if R is stored.
     """
 
     directions: Float64[Tensor, "unknowns directions"]
@@ -77,7 +77,7 @@ class CovarianceRoot:
 
     @staticmethod
     def from_rounded(rounded: RoundedRoot) -> "CovarianceRoot":
-        """Make R of its rounded form."""
+        """Make R from its rounded form."""
         return CovarianceRoot(rounded.as_matrix, rounded=rounded)
 
     @cached_property

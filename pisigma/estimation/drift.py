@@ -1,4 +1,4 @@
-"""Estimate the drift of groups of unknowns since a calibration by the evidence of new rows."""
+"""Estimate the drift of groups of unknowns since a calibration, from the evidence of new rows."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -12,7 +12,7 @@ from pisigma.estimation.cholesky import covariance_factor, scaled_cholesky
 from pisigma.estimation.regression import SensorCount
 
 SIZES = torch.logspace(-6, -0.5, 56, dtype=torch.float64)
-"""Drift sizes that are tried: 1 µm to 0.3 m, 0.0001 to 18 deg; for corrections, shares of ten times their usual
+"""Drift sizes that are tried: 1 µm to 0.3 m, 0.0001 to 18 deg and, for corrections, shares of ten times the usual
 size."""
 LOG_PRIOR_PENALTY = 4.0
 """Increase of the log evidence that a drift requires [nats]: prior odds of about 1 to 50 for a group of the arm."""
@@ -31,10 +31,10 @@ class DriftGroup:
 
     Attributes:
         what: name of the group, such as "joint 3", "base" or "correction".
-        index: indices of its unknowns.
+        index: indices of the unknowns of the group.
         scale: standard deviation of every unknown at size 1 [m or rad].
         size: size of the drift; 0 if the group has not drifted.
-        fixed_size: whether the size is given rather than estimated, as for a base that was relocated.
+        fixed_size: whether the size is stated rather than estimated, as for a base that was relocated.
         log_prior_penalty: increase of the log evidence that a drift of the group requires [nats].
         single: whether the group is one motion rather than a set of many independent changes.
     """
@@ -116,12 +116,12 @@ class Drift:
 class DriftSearch:
     """Search for the drift sizes that maximise the evidence of new rows under a model's posterior.
 
-    With A the derivatives along the columns of the posterior's root, Z_g the derivatives with respect to the
-    unknowns of group g times their scale, and u ~ N(0, R R^T + Σ_g drift), the values are normal with the covariance
-    `V = A A^T + Σ_g size_g² Z_g Z_g^T + noise²`. Sizes are optimised one at a time with all others fixed: for the
-    eigenvalues λ and coordinates b of a group in the metric of the other terms, a size s raises the log evidence by
-    `Σ (s² λ b² / (1 + s² λ) - log(1 + s² λ)) / 2` (Tipping and Faul 2003, Fast marginal likelihood maximisation for
-    sparse Bayesian models, eq. 18, for groups instead of single columns).
+    With the derivatives A along the columns of the posterior's root, the derivatives Z_g with respect to the unknowns
+    of group g times their scale, and u ~ N(0, R R^T + Σ_g drift), the values are normal with the covariance `V = A A^T
+    + Σ_g size_g² Z_g Z_g^T + noise²`. Sizes are optimised one at a time with all others fixed: for the eigenvalues λ
+    and coordinates b of a group in the metric of the other terms, a size s raises the log evidence by `Σ (s² λ b² / (1
+    + s² λ) - log(1 + s² λ)) / 2` (Tipping and Faul 2003, Fast marginal likelihood maximisation for sparse Bayesian
+    models, eq. 18, for groups instead of single columns).
     """
 
     def __init__(
@@ -183,7 +183,7 @@ class DriftSearch:
 
         Args:
             number: index of the group.
-            held: whether to use the prior of the group; otherwise its unknowns are unconstrained.
+            held: whether to use the prior of the group; if not, its unknowns are unconstrained.
 
         Returns:
             The shifts [m or rad] and their covariance.
@@ -220,7 +220,7 @@ class DriftSearch:
         self._groups[number] = replace(group, size=size)
 
     def _update_noise(self, sensor: int, least: float) -> None:
-        """Update the noise of a sensor by the factor of highest evidence on its usual noise (log-normal prior)."""
+        """Update the noise of a sensor with the factor of highest evidence on its usual noise (log-normal prior)."""
         variance, now = (
             self.values.deviation(torch.ones_like(self._noise)).square(),
             float(self._noise[sensor]),
@@ -305,7 +305,7 @@ class PosteriorUpdate:
         # Old uncertainty and drift are independent, so their roots are joined as columns.
         A = torch.cat([values.X @ root, values.X[:, index] * deviation], 1) / noise[:, None]
         y = values.y / noise
-        # Work in the smaller of both spaces: values (A A^T) or directions (A^T A).
+        # Work in the smaller of the two spaces: values (A A^T) or directions (A^T A).
         self._few = 2 * len(y) <= A.shape[1]
         if self._few:
             self._eigenvalues, U = torch.linalg.eigh(A @ A.t())
@@ -320,7 +320,7 @@ class PosteriorUpdate:
             z = torch.cholesky_solve((A.t() @ y)[:, None], self._L)[:, 0]
             self.effective = len(M) - float(torch.cholesky_inverse(self._L).trace())
         directions = root.shape[1]
-        # z is in units of the roots: the first part moves old unknowns, the second drifted ones.
+        # z is in units of the roots: the first part moves the old unknowns, the second part those that drifted.
         self.shift = root @ z[:directions]
         self.shift.index_add_(0, index, deviation * z[directions:])
 
@@ -336,7 +336,7 @@ class PosteriorUpdate:
             t = 1 + self._eigenvalues
             shrink = -1 / (t.sqrt() * (1 + t.sqrt()))
             root = R.addmm_((R @ self._along) * shrink, self._along.t())
-        # Every update adds columns; many of them are compressed to a triangle with the same product.
+        # Every update adds columns; if there are many, they are compressed to a triangle with the same product.
         if root.shape[1] <= MAX_DIRECTIONS * len(root):
             return root
         scale, factor = scaled_cholesky(lambda: root @ root.t())

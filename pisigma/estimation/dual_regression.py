@@ -1,4 +1,4 @@
-"""Bayesian linear regression in dual form for few values, by the covariance of the values as in Gaussian processes."""
+"""Bayesian linear regression in dual form, for few values: with their covariance, as in Gaussian processes."""
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -23,13 +23,13 @@ _MAX_VARIANCE_RATIO = 1e6
 class DualRegression(AbstractRegression):
     """Regression by the values' covariance `V = Σ_g size_g² K_g + noise²` under the prior of the weights.
 
-    With G the columns of the parameters and Z those of the weights, `K_g = Σ_i Z_i Z_i^T / base_i` over the
-    weights of group g, and `P = V^-1 - V^-1 G (G^T V^-1 G + Λ)^-1 G^T V^-1`::
+    With the columns G of the parameters and Z of the weights, `K_g = Σ_i Z_i Z_i^T / base_i` over the weights of group
+    g, and `P = V^-1 - V^-1 G (G^T V^-1 G + Λ)^-1 G^T V^-1`::
 
         parameters = (G^T V^-1 G + Λ)^-1 G^T V^-1 y        weights_i = size² / base_i · Z_i^T P y
         determined_g = size_g² tr(P K_g)                    y - X x = noise² P y
 
-    By Woodbury's identity posterior and evidence are those of `PrimalRegression`. Source: Rasmussen and Williams,
+    By Woodbury's identity, posterior and evidence are those of `PrimalRegression`. Source: Rasmussen and Williams,
     Gaussian Processes for Machine Learning, 2006, sections 2.2, 2.7 and 5.4.
 
     Attributes:
@@ -57,21 +57,21 @@ class DualRegression(AbstractRegression):
         P, parameters, covariance, log_det = self.projection(prior, noise)
         active, precision = self.active, prior.precision
         variance = self.y.new_tensor(noise).square()[self.sensor]
-        # alpha = V^-1 (y - G parameters): weights and residuals both are products with it.
+        # alpha = V^-1 (y - G parameters); both weights and residuals are products with alpha.
         alpha = P @ self.y
         x = torch.cat([parameters, (self.X.t() @ alpha)[active:] / precision[active:]])
         square = prior.sum_by_group(x.square() * prior.base)
-        # A parameter is determined by the data as far as its posterior variance is below the prior variance.
+        # A parameter is determined by the data to the extent that its posterior variance is below the prior variance.
         held = torch.zeros_like(x)
         held[:active] = 1 - precision[:active] * covariance.diagonal()
         determined = prior.sum_by_group(held)
-        # Both matrices are symmetric, so the trace of their product requires one triangle only.
+        # Both matrices are symmetric, so the trace of their product requires only one triangle.
         traces = self.K @ (P.flatten().index_select(0, self._pairs) * self._counts)
         determined[prior.classes :] = prior.sizes[prior.classes :].square() * traces
         # Parameters without a prior have precision 0; their constant term is left out.
         stated = precision[:active]
         evidence = float(self.y @ alpha) + log_det - float(stated[stated > 0].log().sum())
-        # |V| contains the noise of all values; repeated poses are treated as fewer independent ones (`SensorCount`).
+        # |V| contains the noise of all values; repeated poses are treated as fewer independent poses (`SensorCount`).
         evidence += log_noise(self.sensors, noise) - float(variance.log().sum())
         # Residuals are variance · alpha; the leverage of a value is 1 - variance · P_ii.
         misfit = self._by_sensor((variance * alpha).square())

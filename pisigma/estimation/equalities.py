@@ -1,4 +1,4 @@
-"""Values that are equal: independent normal distributions conditioned on linear equations between their unknowns."""
+"""Independent normal distributions conditioned on linear equations between their unknowns."""
 
 from dataclasses import dataclass
 
@@ -17,7 +17,7 @@ class ConditionedUnknowns:
         z_root: root of the covariance of z, in the directions (z, e) of the prior.
         x_root: root of the covariance of x, in the same directions.
         misfit: `|z|² + |e|²` at the solution, which has a chi-squared distribution.
-        redundancy: its degrees of freedom, the number of equations that x does not absorb.
+        redundancy: degrees of freedom of the misfit, the number of equations that x does not absorb.
     """
 
     z: Float64[Tensor, " directions"]
@@ -44,7 +44,7 @@ def condition_on_equalities(
         B: derivatives of the equations with respect to z.
         G: derivatives with respect to x, of full column rank.
         r: misclosure of the equations at z = 0 and x = 0.
-        closure: standard deviation of e > 0, to which the equations hold. It also keeps C positive definite where the
+        closure: standard deviation > 0 of e, with which the equations hold. It also keeps C positive definite if the
             prior of the values on both sides is exact.
     """
     E = closure.diag()

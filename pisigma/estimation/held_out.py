@@ -39,8 +39,8 @@ class HeldOutErrors:
     ) -> "HeldOutErrors":
         """Compute the errors of the values of a fold from a fit to all values: `M^-1 r` with the covariance `M^-1`.
 
-        If only these values determine an unknown, such as the position of a socket, M is singular. That unknown
-        counts as fitted to them, and the errors are scaled by the lost degrees of freedom (Cook and Weisberg 1982,
+        If only these values determine an unknown, such as the position of a socket, M is singular. This unknown is
+        treated as fitted to them, and the errors are scaled for the lost degrees of freedom (Cook and Weisberg 1982,
         section 2.2).
 
         Args:
@@ -92,7 +92,7 @@ def held_out_scale(errors: HeldOutErrors) -> float:
     """Return the factor >= 1 on the covariance of the unknowns for which held-out errors are as large as predicted.
 
     With errors e and predicted standard deviations s in units of the noise, it solves
-    `mean(e² / (1 + f (s² - 1))) = 1`. Effects that the model cannot express make it larger than 1.
+    `mean(e² / (1 + f (s² - 1))) = 1`. Effects that the model cannot express make the factor larger than 1.
     """
     square, extra = errors.error.square(), errors.spread.square() - 1
     low, high = 0.0, math.log(MAX_SCALE)

@@ -1,4 +1,4 @@
-"""Determine what moved before a session from the evidence of its rows, with one hypothesis per independent motion."""
+"""Determine what moved before a session, from the evidence of its rows, with one hypothesis per independent motion."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -51,7 +51,7 @@ class Explanation:
 
     Attributes:
         motions: motions that certainly happened, most probable first.
-        candidates: all hypotheses, most probable first, if something moved but it is not clear what; otherwise empty.
+        candidates: all hypotheses, most probable first, if something moved but it is unclear what; otherwise empty.
         unchanged: probability that no part moved.
         noise_factor: most probable factor on the usual noise.
         log_evidence: log evidence of the rows given the motions, averaged over all other hypotheses, minus the prior
@@ -150,11 +150,11 @@ class SessionEvidence:
     def influence(
         self, groups: Sequence[DriftGroup], noise_factor: float
     ) -> tuple[Float64[Tensor, "members directions"], Float64[Tensor, "members members"]]:
-        """Return the sources of error of an estimate by `estimate_shift` if nothing has moved.
+        """Return the sources of error of an estimate of `estimate_shift` if nothing has moved.
 
         Returns:
-            The derivative of the estimate along the columns of the posterior's root, an error that sessions have in
-            common, and the covariance of the other errors, which are independent between sessions.
+            The derivative of the estimate along the columns of the posterior's root, which describes an error that
+            sessions have in common, and the covariance of the other errors, which are independent between sessions.
         """
         gain, _ = self._gain(groups, noise_factor)
         own = self._K - self.known @ self.known.t() + self._noise(noise_factor).square().diag()
@@ -191,16 +191,16 @@ class SessionEvidence:
             raised[row] = self._raised(whitened[:, 0], whitened[:, 1:])
         joint = evidence[:, None, None] + raised
         nothing = evidence.logsumexp(0)
-        # Average over noise factors and sizes: a hypothesis must not win by a size chosen afterwards.
+        # Average over noise factors and sizes, because a hypothesis must not win by a size chosen afterwards.
         log_odds = joint.logsumexp((0, 2)) - math.log(len(_TRIED)) - nothing
         log_odds -= torch.tensor([group.log_prior_penalty for group in self._groups], dtype=torch.float64)
-        # What is known to have moved is not a further hypothesis.
+        # Groups that are known to have moved are no longer hypotheses.
         log_odds[[self._groups.index(one.group) for one in motions]] = -math.inf
         log_odds = torch.cat([log_odds, log_odds.new_zeros(1)])
         *probability, unchanged = log_odds.softmax(0).tolist()
         sizes = _TRIED[joint.logsumexp(0).argmax(1)].tolist()
         compared = [Motion(*one) for one in zip(self._groups, sizes, probability, strict=True)]
-        # The noise factor of the explanation: without further motion if none is needed, else with all of them.
+        # noise factor of the explanation: without further motion if none is needed, otherwise with all of them
         likely = evidence if unchanged >= _CERTAIN else joint.logsumexp((1, 2))
         return Explanation(
             motions=tuple(motions),
@@ -216,7 +216,7 @@ class SessionEvidence:
         """Return the gain of log evidence for every group and size."""
         raised = torch.empty(len(self._groups), len(_TRIED), dtype=torch.float64)
         widths = torch.tensor([Z.shape[1] for Z in self._Z])
-        # Groups of one unknown are all evaluated in one product; the others need an eigendecomposition each.
+        # Groups of one unknown are all evaluated in one product; the others need one eigendecomposition each.
         single = widths == 1
         columns = W[:, single.repeat_interleave(widths)]
         eigenvalues = columns.square().sum(0)
@@ -233,7 +233,7 @@ class SessionEvidence:
 
     def _gain(self, groups: Sequence[DriftGroup], noise_factor: float) -> tuple[Tensor, Tensor]:
         """Return the gain matrix from values to an estimate of the groups' unknowns, and its covariance."""
-        # Groups of fixed size are part of K, but those to be estimated must not be treated as noise too.
+        # Groups of fixed size are part of K, but those to be estimated must not also be treated as noise.
         V = self._K + self._noise(noise_factor).square().diag()
         for B in (self.values.X[:, one.index] * one.deviation for one in groups if one.fixed_size):
             V = V - B @ B.t()

@@ -10,7 +10,7 @@ from pisigma.estimation.held_out import SINGULAR
 from pisigma.estimation.orthonormal_columns import orthonormal_columns
 
 _LEVEL = 1e-3
-"""Probability, over all rows of a data set, of calling a row wrong although none is."""
+"""Probability, over all rows of a data set, of calling a row wrong although none is wrong."""
 
 
 @dataclass(frozen=True)
@@ -18,8 +18,8 @@ class RowTest:
     """The row with the least probable error under the fit to all other rows.
 
     Attributes:
-        row: number of the row.
-        probability: probability that the error of any row is this improbable if none is wrong (Bonferroni).
+        row: index of the row.
+        probability: probability that the error of any row is at least this improbable if none is wrong (Bonferroni).
     """
 
     row: int
@@ -39,21 +39,21 @@ def most_deviating_row(
 ) -> RowTest | None:
     """Find the row whose values the fit to all other rows predicts worst.
 
-    With `M = I - X (X^T X)^-1 X^T` and its block M_k of the m values of a row, leaving the row out lowers the sum of
-    squared residuals S by `T = r_k^T M_k^-1 r_k`. Without wrong rows `(T / m) / ((S - T) / (f - m))`, with f degrees of
-    freedom, has the distribution F(m, f - m), whatever the noise is (Cook and Weisberg 1982, Residuals and Influence in
-    Regression, sections 2.2 and 5.1, for several values).
+    With `M = I - X (X^T X)^-1 X^T` and its block M_k of the m values of a row, leaving out the row lowers the sum of
+    squared residuals S by `T = r_k^T M_k^-1 r_k`. Without wrong rows, `(T / m) / ((S - T) / (f - m))`, with f degrees
+    of freedom, has the distribution F(m, f - m), regardless of the noise (Cook and Weisberg 1982, Residuals and
+    Influence in Regression, sections 2.2 and 5.1, for several values).
 
     Args:
         X: derivatives, in units of the noise.
         y: residuals of the fit, in units of the noise.
-        row: number of every value's row.
-        exact: values that are not measured, such as priors; their rows are judged without them.
+        row: index of every value's row.
+        exact: values that are not measured, such as priors; rows are tested without these values.
 
     Returns:
         The row; None if no row leaves degrees of freedom for the test.
     """
-    from scipy.stats import f as f_distribution  # here: imports half a second of scipy
+    from scipy.stats import f as f_distribution  # imported here, because importing scipy takes half a second
 
     U = orthonormal_columns(X)
     total, freedom = float(y.square().sum()), len(y) - U.shape[1]

@@ -1,4 +1,4 @@
-"""Losses, which weight a row in least squares by its distance from the prediction in standard deviations."""
+"""Losses, which weight a row in least squares according to its distance from the prediction in standard deviations."""
 
 import math
 from abc import ABC, abstractmethod
@@ -84,7 +84,7 @@ class HampelLoss(AbstractLoss):
 
     Hampel's three-part function (Hampel et al. 1986, section 2.6) with corners at 1, 1.5 and 3 times the quantile:
     good rows have the weight 1, so normal noise is treated as in least squares; gross outliers have the weight 0.
-    The scale is the median of the distances, so it needs no threshold in metres and tolerates almost half of the rows
+    The scale is the median of the distances, so it needs no threshold in metres and tolerates nearly half of the rows
     being wrong.
     """
 

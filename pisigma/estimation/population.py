@@ -12,12 +12,12 @@ MIN_ROBOTS = 5
 """Minimum number of robots of a fleet; with fewer, their scatter cannot be distinguished from their uncertainties."""
 _EM_STEPS = 60
 _SEARCH_STEPS = 25
-"""Expectation-maximisation steps while outliers are searched for; these need not converge."""
+"""Number of expectation-maximisation steps during the search for outliers, in which they need not converge."""
 _CLASS_ROBOTS = 0.02
-"""Weight of the robot class in the variances of the fleet, as a number of robots: small, because robots of one type
-are more alike, but large enough that unknowns that no rows determine are as uncertain as in the class."""
+"""Weight of the robot class in the variances of the fleet, as a number of robots. It is small, because robots of one
+type are more alike, but large enough for unknowns that no rows determine to be as uncertain as in the class."""
 _SEARCH_CLASS_ROBOTS = 0.2
-"""Weight of the robot class, as a number of robots, while outliers are searched for; it is larger, because all other
+"""Weight of the robot class, as a number of robots, during the search for outliers. It is larger, because all other
 robots would be outliers if a few robots made the fleet too narrow."""
 _ROBOTS_PER_CHUNK = 100
 """Number of robots whose inverse matrices are kept at a time (40 MB)."""
@@ -32,7 +32,8 @@ class Information:
 
     Attributes:
         normal: information matrix (normal matrix) of the unknowns.
-        descent: product of the information matrix and the most likely values, the right side of the normal equations.
+        descent: product of the information matrix and the most likely values, the right-hand side of the normal
+            equations.
     """
 
     normal: Float64[Tensor, "unknowns unknowns"]
@@ -56,19 +57,19 @@ class Population:
     def predictive_distribution(self, robots: int) -> "Population":
         """Return the predictive distribution of a robot that was not used for the estimate.
 
-        With n robots the mean has the covariance `Σ / n`, and the estimate of Σ is biased by `(n - 1) / n`: together
-        a factor `(n + 1) / (n - 1)`.
+        With n robots, the mean has the covariance `Σ / n`, and the estimate of Σ is biased by `(n - 1) / n`; together,
+        they give a factor of `(n + 1) / (n - 1)`.
 
         Args:
-            robots: number of robots that the population was estimated from.
+            robots: number of robots from which the population was estimated.
         """
         return replace(self, covariance=(robots + 1) / (robots - 1) * self.covariance)
 
     def squared_distance(self, robot: Information) -> tuple[float, int]:
-        """Return a robot's squared distance from the fleet, chi-squared for its robots, and the degrees of freedom.
+        """Return a robot's squared distance from the fleet, chi-squared for robots of the fleet, and its freedom.
 
         In coordinates in which the covariance is the identity and the information is diagonal with entries λ, the
-        right side of the normal equations minus its expectation for the mean has the variance `λ + λ²`.
+        right-hand side of the normal equations minus its expectation for the mean has the variance `λ + λ²`.
         """
         root = torch.linalg.cholesky(self.covariance)
         information, axes = torch.linalg.eigh(root.t() @ robot.normal @ root)
@@ -79,7 +80,7 @@ class Population:
         return float(squares[identified].sum()), int(identified.sum())
 
     def log_evidence(self, robot: Information) -> float:
-        """Return the log probability of a robot's rows, up to a constant that depends on the robot only."""
+        """Return the log probability of a robot's rows, up to a constant that depends only on the robot."""
         root = torch.linalg.cholesky(self.covariance)
         # In units of the population, prior and information add up without inverting the covariance.
         factor = torch.linalg.cholesky(torch.eye(len(root)).to(root) + root.t() @ robot.normal @ root)
@@ -133,7 +134,7 @@ def _nearest_to_median(evidence: Sequence[Information], start: Population) -> li
     inverses = torch.linalg.inv(torch.stack([one.normal for one in evidence]) + precision)
     x = torch.einsum("rij,rj->ri", inverses, torch.stack([one.descent for one in evidence]))
     median = x.median(0).values
-    # Scatter by the median deviation, which outliers do not change, plus the uncertainty that the rows leave.
+    # The scatter is the median deviation, which outliers do not change, plus the uncertainty that the rows leave.
     scatter = (x - median).abs().median(0).values.square() + inverses.diagonal(dim1=1, dim2=2).mean(0)
     population = Population(median, scatter.diag(), start.geometric)
     distances = [square / max(count, 1) for square, count in map(population.squared_distance, evidence)]

@@ -83,7 +83,7 @@ class PrimalRegression(AbstractRegression):
         x, held = solved.x, precision * solved.variance
         pairs = zip(self.normal[1:], noise[1:], strict=True)
         used = [solved.trace(N) / sigma**2 for N, sigma in pairs]
-        # All sensors together determine what the prior does not determine, which saves the trace of the first sensor.
+        # All sensors together determine what the prior does not, which saves computing the trace of the first sensor.
         used.insert(0, float((1 - held).sum()) - sum(used))
         misfit = self._misfits(x)
         log_prior = float(precision[precision > 0].log().sum())

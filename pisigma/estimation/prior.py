@@ -22,9 +22,9 @@ class GaussianPrior:
         base: 1 / variance at size 1; 0 without a prior.
         group: index in `sizes` of every unknown.
         sizes: standard deviation of every group at base 1.
-        classes: number of leading groups that are classes of geometric parameters. Their sizes, factors on the
-            stated sizes, remain as the geometric calibration estimated them: over a narrow joint range low harmonics
-            resemble geometry, and if they could replace it the arm would be wrong beyond that range.
+        classes: number of leading groups that are classes of geometric parameters. Their sizes, which are factors on
+            the stated sizes, remain as estimated by the geometric calibration: over a narrow joint range, low harmonics
+            resemble geometry, and if they could replace it, the arm would be wrong beyond this range.
     """
 
     base: Float64[Tensor, " unknowns"]
@@ -46,7 +46,7 @@ class GaussianPrior:
     ) -> "GaussianPrior":
         """Update the sizes by MacKay's rule (1992, Neural Computation 4(3), eq. 4.7): size² = Σ x² base / Σ determined.
 
-        The rule approaches its fixed point from one side in ever shorter steps, so it is over-relaxed.
+        The rule approaches its fixed point from one side in ever shorter steps and is therefore over-relaxed.
         """
         sizes = (square.clamp(min=0.0) / determined.clamp(min=1e-12)).sqrt()
         sizes = (self.sizes * (sizes / self.sizes) ** _RELAXATION).clamp(min=SMALLEST_SIZE)

@@ -14,7 +14,7 @@ from pisigma.estimation.prior import GaussianPrior
 SMALLEST_NOISE = 1e-8
 """Lower bound of the estimated noise [m or rad], far below the resolution of instruments."""
 MIN_EFFECTIVE = 0.5
-"""Number of unknowns of a group that the data have to determine for its prior size to matter."""
+"""Number of unknowns of a group that the data must determine for its prior size to matter."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,7 +23,7 @@ class Posterior:
 
     Attributes:
         x: most probable values.
-        log_evidence: log evidence of the data under the prior, up to a constant that depends on the data only.
+        log_evidence: log evidence of the data under the prior, up to a constant that depends only on the data.
         prior: prior with estimated sizes.
         noise: standard deviation of the noise of every sensor [m or rad], or a factor on the stated noise.
         square: `Σ base x²` over the unknowns of every group.

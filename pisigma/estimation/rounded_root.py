@@ -1,4 +1,4 @@
-"""Square root of a covariance of many unknowns in whole numbers, of which model folders store few bytes."""
+"""Square root of a covariance of many unknowns in whole numbers, for which model folders need few bytes."""
 
 import bz2
 from collections.abc import Iterator
@@ -11,11 +11,11 @@ from jaxtyping import Float64, Int16
 from torch import Tensor
 
 STEPS = (1 / 256, 1 / 512, 1 / 1024)
-"""Units to try, as shares of an unknown's standard deviation given all unknowns before it."""
+"""Units to try, as shares of an unknown's standard deviation given all previous unknowns."""
 _SMALLEST_UNIT = 2.0**-14
 """Smallest unit as a share of an unknown's standard deviation: multiples of it by whole numbers fit into 16 bits."""
 _BLOCK = 64
-"""Rows that are rounded with one matrix product."""
+"""Number of rows that are rounded with one matrix product."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +40,7 @@ class RoundedRoot:
         return RoundedRoot(self.unit[rows], self.numbers[rows])
 
     def among(self, rows: list[int], count: int) -> "RoundedRoot":
-        """Return the root of `count` unknowns of which these are the given ones, and the others are known exactly."""
+        """Return the root of `count` unknowns: `rows` are the unknowns of this root, the others are exact."""
         unit, numbers = self.unit.new_zeros(count), self.numbers.new_zeros(count, self.numbers.shape[1])
         unit[rows], numbers[rows] = self.unit, self.numbers
         return RoundedRoot(unit, numbers)
@@ -57,7 +57,7 @@ class RoundedRoot:
         """Reverse `packed`; no more is decompressed than the root needs.
 
         Raises:
-            ValueError: the content is not compressed by bz2, or has another count of numbers.
+            ValueError: the content is not compressed with bz2, or has a wrong number of values.
         """
         result = RoundedRoot(unit, torch.zeros(len(unit), len(unit), dtype=torch.int16))
         cells = np.tril_indices(len(unit))
@@ -84,7 +84,7 @@ def round_root(
         tolerance: largest relative change of the standard deviation of a combination.
 
     Returns:
-        None if even the smallest unit changes one by more.
+        The rounded root; None if even the smallest unit changes a standard deviation by more.
     """
     exact = torch.linalg.vector_norm(probes @ root, dim=1)
     # R^T = Q U gives R R^T = U^T U without forming it, which would lose half of the digits of small directions
@@ -99,12 +99,12 @@ def round_root(
 
 
 def _rounded(lower: Float64[Tensor, "unknowns unknowns"], step: float) -> RoundedRoot:
-    """Round a lower triangular root L row by row, with every row made up for what the rows before lost.
+    """Round a lower triangular root L row by row, compensating in every row for the rounding of previous rows.
 
-    The rounded root is `L Z` with Z the identity but for errors. Combinations of correlated unknowns are much better
-    known than each of them, so that errors of independently rounded rows would dominate. Row i is therefore rounded
-    from `L_i Z` with the Z of the rows before: its own error is then all that is new, and has a standard deviation of
-    `0.29 step` whatever the combination. Rows that those before determine are rounded to their smallest unit.
+    The rounded root is `L Z`, where Z is the identity except for errors. Combinations of correlated unknowns are known
+    much better than the individual unknowns, so errors of independently rounded rows would dominate. Row i is therefore
+    rounded from `L_i Z` with the Z of the previous rows. Only its own error is then new, with a standard deviation of
+    `0.29 step` for any combination. Rows that are determined by previous rows are rounded to their smallest unit.
 
     Args:
         lower: L.

@@ -28,8 +28,8 @@ class ExplainedRows(Generic[What]):
     """The best explanation of measured values.
 
     Attributes:
-        what: what explains the values.
-        values: the measured values; values of wrong configurations have a larger noise.
+        what: the explanation of the values.
+        values: the measured values; those of wrong configurations have larger noise.
         log_evidence: log evidence of the values, including the prior odds of the explanation.
         covariance: covariance of the values.
         deviation: standard deviation of the noise of every value.
@@ -47,10 +47,9 @@ def mark_wrong_rows(
 ) -> ExplainedRows[What]:
     """Mark configurations as wrong as long as this raises the log evidence by more than the prior penalty.
 
-    If a drift of many unknowns is estimated from all rows, a wrong row is hard to detect. Therefore the most
-    suspicious configurations get a larger noise one at a time, and the drift is estimated again for each; compare
-    the externally studentised residuals of Cook and Weisberg 1982, Residuals and Influence in Regression, section
-    2.2.
+    If a drift of many unknowns is estimated from all rows, a wrong row is hard to detect. Therefore the most suspicious
+    configurations get larger noise one at a time, and the drift is re-estimated for each of them; compare the
+    externally studentised residuals of Cook and Weisberg 1982, Residuals and Influence in Regression, section 2.2.
 
     Args:
         explained: explanation of the values, with the wrong configurations found so far.

@@ -1,1 +1,1 @@
-"""Read and write files: inputs of limited size, outputs that are complete or absent, errors with file and line."""
+"""Read and write files, with inputs of limited size, outputs that are complete or absent, and located errors."""

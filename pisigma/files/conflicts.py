@@ -12,7 +12,7 @@ Input = str | os.PathLike[str] | None
 
 
 def check_conflicts(output: str | os.PathLike[str], inputs: Iterable[Input], option: str = "--out") -> None:
-    """Check that an output neither is, contains nor is inside an input or a model folder; links are resolved.
+    """Check that an output is not, does not contain and is not inside an input or a model folder; resolve links.
 
     Args:
         output: file or folder to write.

@@ -78,10 +78,10 @@ class PisigmaError(Exception):
         line: line number in the file, counted from 1; None for the whole file.
         column: name or number of the column, or the YAML key; None for the whole line.
         option: the option or argument that caused the error, for example ``"--camera"``; empty if none did.
-        value: the value that was given; None if it is not known.
-        expected: what was expected; empty if `problem` says what is wrong.
-        problem: a clause that states what is wrong; empty if the message says what was expected.
-        remedy: how to correct the input; empty if the message does not say.
+        value: the value that was given; None if it is unknown.
+        expected: what was expected; empty if `problem` states what is wrong.
+        problem: a clause that states what is wrong; empty if the message states what was expected.
+        remedy: how to correct the input; empty if the message does not state it.
     """
 
     def __init__(
@@ -152,10 +152,10 @@ class PisigmaError(Exception):
         return type(self)(self.problem.rstrip("."), option=option, **fields)
 
     def with_place(self, at: Place, error: "type[PisigmaError] | None" = None) -> "PisigmaError":
-        """Return a copy of the error with a place in a file, for code that knows the file when the cause does not.
+        """Return a copy of the error with a place in a file, for code that knows the file although the cause does not.
 
         Args:
-            at: the place in a file. If the error has a place already, the new message begins with `at` instead.
+            at: the place in a file. If the error already has a place, the new message begins with `at` instead.
             error: class of the copy; None for the class of this error.
         """
         make = error or type(self)
@@ -295,7 +295,7 @@ def system_fault(problem: BaseException) -> str:
 
 
 def missing_extra(problem: ImportError) -> MissingExtraError | None:
-    """Return an error that names what installs a package that could not be imported; None if it is not of pisigma."""
+    """Return an error that states how to install a package that could not be imported; None for other packages."""
     module = (problem.name or "").split(".")[0]
     if module in _NOT_IN_IK:
         return MissingExtraError(

@@ -7,7 +7,8 @@ import stat
 from pisigma.files.errors import PisigmaError, Place
 
 MAX_BYTES = 2**26
-"""Largest size of an input file [bytes]; files that people or instruments write are smaller (half a million rows)."""
+"""Largest size of an input file [bytes], about half a million rows; files written by people or instruments are
+smaller."""
 MAX_WAIT_S = 4.0
 """Longest time that a pipe or a terminal may stay silent [s]."""
 _CHUNK_BYTES = 2**20
@@ -48,7 +49,7 @@ def read_input(path: str | os.PathLike[str], error: type[PisigmaError], max_byte
 
 
 def open_input(path: str, flags: int) -> int:
-    """Open a file without blocking, as the opener of `open`, which otherwise waits forever for a pipe without a writer.
+    """Open a file without blocking, as an opener for `open`, which would wait forever for a pipe without a writer.
 
     Raises:
         TimeoutError: the file is a pipe or a device that delivers nothing for `MAX_WAIT_S`.

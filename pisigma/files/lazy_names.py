@@ -10,7 +10,7 @@ def lazy_getattr(package: str, names: Mapping[str, str]) -> Callable[[str], Any]
 
     Args:
         package: name of the package.
-        names: exported names, separated by spaces, by the submodule that defines them.
+        names: exported names, separated by spaces, keyed by the submodule that defines them.
     """
 
     def getattribute(name: str) -> Any:

@@ -35,7 +35,7 @@ SPREAD_PNG = "predicted_spread.png"
 MODEL_FILES = frozenset(
     value for name, value in list(globals().items()) if name.isupper() and isinstance(value, str)
 )
-"""All files that pisigma writes into a model folder; any other file belongs to the user."""
+"""All files that pisigma writes into a model folder; all other files belong to the user."""
 
 
 _MAX_BYTES = {DESCRIPTION: 2**21, WEIGHTS: 2**28, HELD_OUT_CSV: 2**28}
@@ -86,7 +86,7 @@ def check_model_hash(folder: str | os.PathLike[str], sha256: str) -> None:
         sha256: the expected `model_hash`, as `sha256sum` prints it.
 
     Raises:
-        ModelError: the model is a different one, was changed, or cannot be read.
+        ModelError: the model is a different one, has been changed, or cannot be read.
     """
     if (actual := model_hash(folder)) != sha256.strip().lower():
         raise ModelError(

@@ -1,4 +1,4 @@
-"""Write a file completely or not at all, and never replace an input or a part of a model."""
+"""Write a file completely or not at all, and never replace an input or part of a model."""
 
 import errno
 import os
@@ -24,8 +24,8 @@ def check_output(
         inputs: files and folders that the same call reads.
 
     Raises:
-        OutputError: the path has another extension, is an input, a part of a model or not a regular file, or its
-            folder is missing or read-only.
+        OutputError: the path has a wrong extension, is an input, part of a model or not a regular file, or its folder
+            is missing or read-only.
     """
     if suffixes and path.suffix.lower() not in suffixes:
         endings = " or ".join(suffixes)

@@ -104,7 +104,7 @@ def staged_folder(
 ) -> Iterator[Path]:
     """Yield a scratch folder that becomes `folder` if the block succeeds, and is removed otherwise.
 
-    A killed process leaves the old or the new model, never a part of a model. If it is killed between the two
+    A killed process leaves the old or the new model, never part of a model. If it is killed between the two
     renames, the old model is kept next to `folder`, and the next call restores it.
 
     Args:

@@ -1,8 +1,8 @@
 """Load plug-ins: modules outside the package that register sensors, features, exports, error sources or closed forms.
 
-A plug-in is a program that runs with the user's permissions. So only installed packages (entry points of the group
-`pisigma.plugins`) and the command line (`--plugin FILE`) can name one: never a model, a recipe, a manifest or a cell,
-which may come from someone else.
+A plug-in is a program that runs with the user's permissions. Therefore only installed packages (entry points of the
+group `pisigma.plugins`) and the command line (`--plugin FILE`) can name one, never a model, a recipe, a manifest or a
+cell, which may come from someone else.
 """
 
 import contextlib
@@ -24,7 +24,7 @@ _ENTRY_POINTS = "pisigma.plugins"
 
 @dataclass(frozen=True)
 class Plugins:
-    """The plug-ins that a process has loaded and that its workers load too.
+    """The plug-ins that a process has loaded and that its workers also load.
 
     Attributes:
         files: absolute paths in the order of loading.
@@ -97,7 +97,7 @@ def _run(path: Path) -> None:
     spec = spec_from_file_location(name, path, loader=SourceFileLoader(name, str(path)))
     assert spec is not None
     assert spec.loader is not None
-    # registered before it runs, because dataclasses look their module up
+    # registered before it runs, because dataclasses look up their module
     sys.modules[name] = module_from_spec(spec)
     try:
         spec.loader.exec_module(sys.modules[name])

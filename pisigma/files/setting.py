@@ -26,16 +26,16 @@ class Option:
     """Command-line form of a setting, as far as it does not follow from its name and type.
 
     Attributes:
-        name: name of the option, such as "--camera"; None: made from the name of the setting.
+        name: name of the option, such as "--camera"; None to make it from the name of the setting.
         kind: type of the command-line value if it differs from that of the setting.
         read: function that converts the command-line value to the setting.
-        unit: unit of the command-line value, one of `_UNITS`; `read`, if given, has to convert it.
+        unit: unit of the command-line value, one of `_UNITS`; `read`, if given, must convert the value.
         min: smallest value that is accepted.
         max: largest value that is accepted.
         metavar: placeholder of the value in the help.
         default: default that the help shows, if the setting's default has another type.
-        is_key: whether the setting has no option of its own and is set by its key: in `cell.yaml`, and with `--set`.
-        hidden: whether the setting can be set in Python only.
+        is_key: whether the setting has no option of its own and is set by its key, in `cell.yaml` and with `--set`.
+        hidden: whether the setting can be set only in Python.
     """
 
     name: str | None = None
@@ -51,11 +51,11 @@ class Option:
 
 
 HIDDEN = Option(hidden=True)
-"""Annotation of settings that can be set in Python only."""
+"""Annotation of settings that can be set only in Python."""
 KEY = Option(is_key=True)
 """Annotation of settings that have a key in `cell.yaml` but no option."""
 FILE = Option(kind=Path, read=str)
-"""Annotation of settings that are a path, stored as text."""
+"""Annotation of settings that are paths, stored as text."""
 
 
 def as_texts(stated: Iterable[object]) -> tuple[str, ...]:
@@ -69,7 +69,7 @@ def split_names(stated: str) -> tuple[str, ...]:
 
 
 NAMES = Option(kind=str, read=split_names)
-"""Annotation of settings that are several names, separated by commas on the command line."""
+"""Annotation of settings that consist of several names, separated by commas on the command line."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ class Setting:
 
     @property
     def name(self) -> str:
-        """Name of the option, such as "--limit-mm", even if the setting can be set by its key only."""
+        """Name of the option, such as "--limit-mm", even if the setting can only be set by its key."""
         return self.option.name or f"--{self.field.replace('_', '-')}"
 
     @property
@@ -123,7 +123,7 @@ class Setting:
 def settings_of(group: type) -> tuple[Setting, ...]:
     """Return the settings of a class that have command-line options or keys.
 
-    A setting whose type cannot be resolved, because it is imported for type checkers only, is read as text.
+    A setting whose type cannot be resolved, because it is imported only for type checkers, is read as text.
     """
     meanings, found = attributes_of(group), []
     for one in fields(group):

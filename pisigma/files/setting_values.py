@@ -22,7 +22,7 @@ def read_assignments(
         option: option that states the texts, for messages; empty for a file.
 
     Raises:
-        SettingError: a text has another form, a key is unknown, or a value has the wrong type or is out of range.
+        SettingError: a text has a wrong form, a key is unknown, or a value has the wrong type or is out of range.
     """
     stated: dict[str, list[str]] = {}
     for one in assignments:
@@ -72,7 +72,7 @@ def checked_values(
 
 
 def _listed(value: Any, kind: Any) -> Any:
-    """Convert a value to a list if the setting may be repeated, otherwise a list of one value to that value."""
+    """Convert a value to a list if the setting may be repeated, or else a list of one value to that value."""
     is_list, is_repeated = isinstance(value, list | tuple), get_origin(kind) is list
     if is_list and not is_repeated and len(value) == 1:
         return value[0]

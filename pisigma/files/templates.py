@@ -1,4 +1,4 @@
-"""Render texts from templates, which define layout and wording of results that Python computes."""
+"""Render texts from templates, which define the layout and wording of results that Python computes."""
 
 from collections.abc import Callable
 from typing import Any

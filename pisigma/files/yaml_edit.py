@@ -1,4 +1,4 @@
-"""Change single values in the text of a YAML file, and keep its comments and its order."""
+"""Change single values in the text of a YAML file while keeping its comments and order."""
 
 import re
 from collections.abc import Sequence
@@ -19,8 +19,8 @@ _COMMENTS = re.compile(r"[^\n]*\n(?:[ \t]*(?:#[^\n]*)?\n)*")
 def with_value(text: str, keys: Keys, value: Any, source: str) -> str:
     """Return the text of a YAML file after a change of one value.
 
-    A missing key is added before the comment that states its default ("# folds: 5"), otherwise at the end of its
-    section. Only a collection in braces loses the comments inside it.
+    A missing key is added before the comment that states its default ("# folds: 5"), or else at the end of its section.
+    Only a collection in braces loses the comments inside it.
 
     Args:
         text: a valid YAML document.
@@ -30,7 +30,7 @@ def with_value(text: str, keys: Keys, value: Any, source: str) -> str:
         source: name of the file in errors.
 
     Raises:
-        PisigmaError: the text is written in a way in which this value cannot be changed alone.
+        PisigmaError: the text is written in such a way that this value cannot be changed alone.
     """
     text = text if text.endswith("\n") else f"{text}\n"
     before = plain_content(text, PisigmaError, source)
@@ -88,7 +88,7 @@ def _has(content: Any, key: str | int) -> bool:
 
 
 def _entry(node: yaml.Node, key: str | int) -> tuple[int, yaml.Node] | None:
-    """Return the start of a collection's entry with a key, and its value; None without such an entry."""
+    """Return the start of a collection's entry with a key, and its value; None if there is no such entry."""
     if isinstance(node, yaml.MappingNode):
         return next(((k.start_mark.index, v) for k, v in node.value if k.value == key), None)
     if isinstance(node, yaml.SequenceNode) and isinstance(key, int) and key < len(node.value):
@@ -105,10 +105,10 @@ def _end(node: yaml.Node) -> int:
 
 
 def _with_replaced(text: str, node: yaml.Node, value: Any) -> str:
-    """Return the text with a value replaced by another one, written in one line."""
+    """Return the text with a value replaced by another, which is written in one line."""
     start, is_block = node.start_mark.index, isinstance(node, yaml.CollectionNode) and not node.flow_style
     is_apart = text[start - 1 : start].isspace() or text[start - 1 : start] in ("[", "{")
-    # a block may begin in the column of its key, a value in one line may not
+    # a block may begin in the column of its key, but a value in one line may not
     gap = "" if is_apart and not is_block else " "
     return f"{text[:start]}{gap}{yaml_text(value, in_one_line=True)}{text[_end(node) :]}"
 
@@ -120,7 +120,7 @@ def _with_added(
 
     Args:
         text: the text.
-        start: where the entry of the collection in its parent starts.
+        start: start of the collection's entry in its parent.
         parent: collection that contains the collection.
         node: the collection, or an empty value in its place.
         key: key of the new entry.

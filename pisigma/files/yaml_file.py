@@ -1,4 +1,4 @@
-"""Read YAML files as validated, typed documents; every error carries file, line and key."""
+"""Read YAML files as validated, typed documents; every error states file, line and key."""
 
 import functools
 import json
@@ -167,7 +167,7 @@ def yaml_text(content: Any, in_one_line: bool = False) -> str:
 
 
 def plain_content(text: str, error: type[PisigmaError], source: str) -> Any:
-    """Parse YAML text as plain values, for documents whose format has to be determined first.
+    """Parse YAML text as plain values, for documents whose format must first be determined.
 
     Raises:
         error: the text is not valid YAML, or has too many values.
@@ -185,7 +185,7 @@ def read_yaml(path: str | os.PathLike[str], document: type[Document], error: typ
 
     Raises:
         error: the file is missing, is not valid YAML, or does not fit the model; its `file`, `line` and `column` (the
-            key, such as "rows.2.a_mm") say where.
+            key, such as "rows.2.a_mm") locate the fault.
     """
     return parse_yaml(read_text(path, error, "YAML", MAX_BYTES), document, error, source=str(path))
 

@@ -60,7 +60,7 @@ class Backlash(AbstractFeature):
     def unstated_root(
         self, state: JointState, weight: Float64[Tensor, "dof columns"]
     ) -> Float[Tensor, "*batch dof sources"]:
-        """Return half the backlash where the side is not stated: the joint stops on one of the sides."""
+        """Return half the backlash where the direction is not stated: the joint stops on one of the two sides."""
         return torch.diag_embed(weight[:, 0] * (1 - self.columns(state)[..., 0].abs()))
 
     def add_onnx(self, graph: OnnxGraph, weight: Float64[np.ndarray, "dof columns"], q: str) -> str:

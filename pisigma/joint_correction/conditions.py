@@ -1,4 +1,4 @@
-"""Feature for effects of payload and temperature on the joints, and corrections under fixed conditions."""
+"""Feature for the effects of payload and temperature on the joints, and corrections under fixed conditions."""
 
 from collections.abc import Callable, Sequence
 from typing import Annotated, Literal
@@ -41,9 +41,9 @@ class ConditionFeatures(AbstractFeature):
 
     A condition is expressed in standard deviations from its mean over the measured rows, so that missing
     conditions are treated as their means. The payload also multiplies the gravity torques of a mass in the last row's
-    frame; its effect is proportional, also beyond the measured values. Beyond the lowest and highest measured
-    temperature the correction is constant, because thermal expansion of an arm is not linear and extrapolating it would
-    soon increase the errors.
+    frame; its effect is proportional, even beyond the measured values. Beyond the lowest and highest measured
+    temperature, the correction is constant, because the thermal expansion of an arm is not linear and its extrapolation
+    would soon increase the errors.
 
     Attributes:
         names: names of the conditions.
@@ -147,9 +147,9 @@ def learned_conditions(correction: JointCorrection) -> ConditionFeatures | None:
 def at_conditions(
     correction: JointCorrection, scaled: Float64[Tensor, " conditions"]
 ) -> tuple[JointCorrection, Float64[Tensor, " dof"]]:
-    """Convert a correction at fixed conditions to a correction that depends on the joint values only.
+    """Convert a correction at fixed conditions to a correction that depends only on the joint values.
 
-    At fixed conditions `ConditionFeatures` are offsets of the joints, first harmonics, and gravity torques of the last
+    At fixed conditions, `ConditionFeatures` are offsets of the joints, first harmonics, and gravity torques of the last
     row; these are added to the weights of the other features.
 
     Args:
@@ -182,7 +182,7 @@ def at_conditions(
 
 
 def with_modelled_torques(correction: JointCorrection) -> JointCorrection:
-    """Reduce a correction to one without `JointTorques`, which is the same where no torques are stated."""
+    """Convert a correction to one without `JointTorques` that is the same where no torques are stated."""
     kept, torques = _without(correction, JointTorques)
     if torques is not None:
         feature, values = torques
@@ -195,7 +195,7 @@ def with_modelled_torques(correction: JointCorrection) -> JointCorrection:
 def at_torques(
     correction: JointCorrection, torques: Float64[np.ndarray, " dof"]
 ) -> tuple[JointCorrection, Float64[Tensor, " dof"]]:
-    """Reduce a correction with `JointTorques` at fixed torques [Nm or N] to one without.
+    """Convert a correction with `JointTorques` at fixed torques [Nm or N] to one without them.
 
     Returns:
         The correction, and the remaining offset of every joint [rad or m].
@@ -218,7 +218,7 @@ _Kept = list[tuple[AbstractFeature, Tensor]]
 def _without(
     correction: JointCorrection, kind: type[Feature]
 ) -> tuple[_Kept, tuple[Feature, Float64[Tensor, "dof columns"]] | None]:
-    """Return copies of all weights, those of the feature of a class apart."""
+    """Return copies of all weights, with those of the feature of a given class separate."""
     kept: _Kept = []
     learned = None
     for feature, values in zip(correction.features, correction.linear, strict=True):

@@ -1,4 +1,4 @@
-"""Feature for errors of the drives of coupled joints: factors, gears before the coupling, and curved guides."""
+"""Feature for errors in the drives of coupled joints: factors, gears before the coupling, and curved guides."""
 
 from typing import Any
 
@@ -19,14 +19,14 @@ errors in low harmonics, gears also in higher ones."""
 class CoupledSeries(AbstractFeature):
     """Scaled value, and first sines and cosines, of every axis that drives a coupled joint.
 
-    For joint i and an axis j that its coupling names, with q_j the controller's value::
+    For joint i and an axis j named in its coupling, with the controller's value q_j::
 
         Δ_i = δC_ij · q_j + Σ_k (a_k sin k φ_j + b_k cos k φ_j) + Σ_l (∂f_i/∂ln l) δl/l
 
-    δC_ij is the error of the factor. φ_j is the angle of the axis; for a prismatic axis an angle with a period of twice
-    its travel, so low harmonics describe the straightness and yaw of a rail (a joint that follows it with the
-    factor 0). The last sum is over the lengths l of the bars of a four-bar linkage. Errors of gears before the coupling
-    depend on φ_j (Judd and Knasinski 1990, IEEE Transactions on Robotics and Automation 6(1), 20-30).
+    δC_ij is the error of the factor. φ_j is the angle of the axis or, for a prismatic axis, an angle with a period of
+    twice its travel, so that low harmonics describe the straightness and yaw of a rail (in a joint that follows it with
+    the factor 0). The last sum is over the lengths l of the bars of a four-bar linkage. Errors of gears before the
+    coupling depend on φ_j (Judd and Knasinski 1990, IEEE Transactions on Robotics and Automation 6(1), 20-30).
     """
 
     name = "coupling"
@@ -98,7 +98,7 @@ class CoupledSeries(AbstractFeature):
         return torch.cat([columns, lengths], -1)
 
     def is_periodic(self, weight: Float64[np.ndarray, "dof columns"]) -> bool:
-        """Return False if a factor has an error: a full turn of an axis then moves the joint differently."""
+        """Return False if a factor has an error, because a full turn of an axis then moves the joint differently."""
         return not weight[:, : len(self.robot.axes)].any()
 
     def factor_errors(self, weight: Float64[np.ndarray, "dof columns"]) -> Float64[np.ndarray, "dof axes"]:

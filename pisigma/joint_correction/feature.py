@@ -54,7 +54,7 @@ class AbstractFeature(ABC):
         robot: the nominal robot.
         name: name of the feature in recipes and models.
         section: class of the feature's section in the description of a model.
-        compiled: compiled form for the kernels, which get the numbers of `pack`; None if the feature has no compiled
+        compiled: compiled form for the kernels, which read the numbers of `pack`; None if the feature has no compiled
             form.
         usually_zero: whether the correction is 0 if only joint values are stated, so that kernels and graphs may
             omit the feature.
@@ -99,7 +99,7 @@ class AbstractFeature(ABC):
     def unstated_root(
         self, state: JointState, weight: Float64[Tensor, "dof columns"]
     ) -> Float[Tensor, "*batch dof sources"]:
-        """Return a root R of the covariance R R^T of the corrections [rad or m] by row data that are not stated.
+        """Return a root R of the covariance R R^T of the corrections [rad or m] due to unstated conditions of rows.
 
         Args:
             state: joint states; see `columns`.
@@ -111,7 +111,7 @@ class AbstractFeature(ABC):
     def candidates(
         cls: type[Feature], robot: Robot, options: FeatureOptions, state: JointState
     ) -> tuple[Feature, ...]:
-        """Return the features that a calibrator tries: one, several of increasing size, or none if data is missing.
+        """Return the features that a calibrator tries: one, several of increasing size, or none if data are missing.
 
         Args:
             robot: the nominal robot.
@@ -177,7 +177,7 @@ class AbstractFeature(ABC):
 def angle_per_joint_value(robot: Robot) -> Float[np.ndarray, " dof"]:
     """Return the angle of a joint's periodic functions per joint value: 1 for a revolute joint [rad/rad].
 
-    The period of a prismatic joint is twice its travel [rad/m], or twice the reach if it has no limits.
+    For a prismatic joint [rad/m], the period is twice its travel, or twice the reach if it has no limits.
     """
     travel = np.diff(robot.limits)[:, 0]
     travel = np.where(np.isfinite(travel) & (travel > 0), travel, max(robot.reach, 1e-3))
@@ -185,7 +185,7 @@ def angle_per_joint_value(robot: Robot) -> Float[np.ndarray, " dof"]:
 
 
 def scaled_joints(robot: Robot, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch dof"]:
-    """Scale joint values to 0 in the middle of the limits and ±1 at them; without limits divide by pi or the reach."""
+    """Scale joint values to ±1 at the limits and 0 midway; without limits, divide by pi or the reach."""
     limited = np.isfinite(robot.limits).all(1)
     bounds = np.where(limited[:, None], robot.limits, 0.0)
     middle, half = bounds.mean(1), (bounds[:, 1] - bounds[:, 0]) / 2

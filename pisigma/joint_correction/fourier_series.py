@@ -23,11 +23,10 @@ BAND_STARTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256)
 """First harmonic of every band for few configurations: about two bands per octave."""
 FINE_BAND_STARTS = (*range(1, 10), 11, 13, 15, 18, 21, 25, 30, 35, 41, 49, 58, 69, 82, 97, 115, 137, 163)
 """First harmonic of every band for many configurations: one harmonic per band up to 8, then about four bands per
-octave.
-
-The log evidence of all 29 subsets of the measured UR5 and UR10 that were tested (random folds, boxes and halves) is
-higher than with `BAND_STARTS`, by 12 on average for 11 additional prior sizes. Eight bands per octave raise it by
-another 17 for 18 sizes, which is less than their number (Akaike 1974, IEEE Transactions on Automatic Control 19(6))."""
+octave. In all 29 subsets of the measured UR5 and UR10 that were tested (random folds, boxes and halves), the log
+evidence is higher than with `BAND_STARTS`, by 12 on average for 11 additional prior sizes. Eight bands per octave raise
+it by another 17 for 18 sizes, which is less than one per size (Akaike 1974, IEEE Transactions on Automatic Control
+19(6))."""
 MANY_CONFIGURATIONS = 200
 """Smallest number of configurations with which fine bands are used; fewer do not determine the size of every band."""
 BAND_SIZES = (
@@ -50,10 +49,11 @@ BAND_SIZES = (
 )
 """Initial standard deviations of the weights of every band of `BAND_STARTS` [rad] for fits of few rows.
 
-They are between the sizes that maximise the evidence of hybrid calibrations of the measured UR5, UR10 and FANUC
-R-2000iC and of simulated arms with gear errors of 0.26 mrad at harmonics 1, 2 and 7."""
+They lie between the sizes that maximise the evidence of hybrid calibrations of the measured UR5, UR10 and FANUC
+R-2000iC and those of simulated arms with gear errors of 0.26 mrad at harmonics 1, 2 and 7."""
 USUAL_HARMONICS = 56
-"""Number of harmonics up to which series are tried for any number of rows, because few rows start with `BAND_SIZES`."""
+"""Number of harmonics up to which series are tried for any number of rows, because fits of few rows start with
+`BAND_SIZES`."""
 
 
 class SeriesSection(FeatureSection):
@@ -130,7 +130,7 @@ def add_series_slope(arms: Any, correction: Any, first: int, memory: Any, q: Any
 
 
 class FourierSeries(AbstractFeature):
-    """Columns sin(k q_j) and cos(k q_j) of the value q_j of a joint, with k = 1 … K.
+    """Columns sin(k q_j) and cos(k q_j) of the value q_j of a joint for k = 1 … K.
 
     Weights of neighbouring harmonics share a prior size (see `BAND_STARTS`), so that the data determine how the
     spectrum of the error decreases with k; fine bands (see `FINE_BAND_STARTS`) contain fewer harmonics. Source of the
@@ -170,7 +170,7 @@ class FourierSeries(AbstractFeature):
     def candidates(
         cls, robot: Robot, options: FeatureOptions, state: JointState
     ) -> tuple["FourierSeries", ...]:
-        """Return series of increasing size; above `USUAL_HARMONICS` up to twice the number of configurations."""
+        """Return series of increasing size; above `USUAL_HARMONICS`, up to twice the number of configurations."""
         most = max(2 * options.configurations, min(options.harmonics), USUAL_HARMONICS)
         fine = options.configurations >= MANY_CONFIGURATIONS
         return tuple(FourierSeries(robot, k, fine) for k in options.harmonics if k <= most)

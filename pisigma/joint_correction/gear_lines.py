@@ -55,15 +55,15 @@ def add_lines_slope(arms: Any, correction: Any, first: int, memory: Any, q: Any)
 class GearLines(AbstractFeature):
     """Columns sin(k q_j) and cos(k q_j) of the value q_j of a joint for a few orders k, which may be in the thousands.
 
-    The error of a strain wave gear of ratio N has 2N and 4N cycles per turn, the cogging of a motor with p pole pairs
-    multiples of pN. Between these lines the spectrum is empty, and a series up to them would have thousands of weights.
-    `hybrid.spectrum` finds the significant orders. All lines of a joint share a prior size.
+    The error of a strain wave gear of ratio N has 2N and 4N cycles per turn, and the cogging of a motor with p pole
+    pairs has multiples of pN. Between these lines, the spectrum is empty, and a series up to them would have thousands
+    of weights. `hybrid.spectrum` finds the significant orders. All lines of a joint share a prior size.
 
-    Source: Tuttle and Seering, IEEE Transactions on Robotics and Automation 12(3), 1996, 368-374, of the transmission
-    errors of strain wave gears.
+    Source: Tuttle and Seering, IEEE Transactions on Robotics and Automation 12(3), 1996, 368-374, on the transmission
+        errors of strain wave gears.
 
     Attributes:
-        orders: orders of the lines of every joint [cycles per turn; for a prismatic joint per twice its travel].
+        orders: orders of the lines of every joint [cycles per turn; for a prismatic joint, per twice its travel].
     """
 
     name = "lines"

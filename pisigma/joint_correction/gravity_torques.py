@@ -61,14 +61,14 @@ def add_gravity(arms: Any, correction: Any, first: int, memory: Any, q: Any) -> 
 class GravityTorques(AbstractFeature):
     """Deflection of joints by gravity torques.
 
-    The torque on joint j is linear in the masses that it carries. For every moved row k from joint j to the tool
-    there are four columns: a mass at the origin p_k of the row's frame, and first moments along the axes u of the
-    frame [1/m, scaled by `ARM` as a typical distance]::
+    The torque on joint j is linear in the masses that it carries. For every moved row k from joint j to the tool, there
+    are four columns: a mass at the origin p_k of the row's frame, and first moments along the axes u of the frame [1/m,
+    scaled by `ARM` as a typical distance]::
 
         z_j · ((p_k - p_j) × g) / reach        z_j · (u_k × g) · ARM
 
-    with g the direction of gravity; a weight is then compliance times mass. For a prismatic joint the first column
-    is the force `z_j · g`. The nominal geometry is used.
+    with the direction of gravity g; a weight is then compliance times mass. For a prismatic joint, the first column is
+    the force `z_j · g`. The nominal geometry is used.
 
     Source: Whitney, Lozinski and Rourke, ASME Journal of Dynamic Systems, Measurement, and Control 108(1),
     1986, 1-8; regressors linear in the masses as in Khalil and Dombre, "Modeling, Identification and Control
@@ -96,7 +96,7 @@ class GravityTorques(AbstractFeature):
         norm = float(np.linalg.norm(gravity))
         if not norm > 0 or not np.isfinite(norm):
             raise ValueError(f"expected a finite, non-zero direction of gravity, got {gravity}.")
-        # A unit vector is not normalised again, so that restored features are identical to the last bit.
+        # A unit vector is not renormalised, so that restored features are identical to the last bit.
         scale = 1.0 if abs(norm - 1) < 1e-12 else norm
         x, y, z = (float(value / scale) for value in gravity)
         self.gravity: Direction = (x, y, z)
@@ -145,7 +145,7 @@ class GravityTorques(AbstractFeature):
         return np.concatenate([self.gravity, (masses * scale[:, None]).ravel()])
 
     def add_onnx(self, graph: OnnxGraph, weight: Float64[np.ndarray, "dof columns"], q: str) -> str:
-        """Add the deflections by gravity torques to an ONNX graph; see `AbstractFeature.add_onnx`."""
+        """Add the deflections due to gravity torques to an ONNX graph; see `AbstractFeature.add_onnx`."""
         node, dof, g = graph.add_node, self.robot.dof, np.array(self.gravity)
         axes, origins, carried = add_joint_frames(graph, self.robot, q)
         z = node("Mul", axes, self.robot.directions[:, None])

@@ -64,7 +64,7 @@ class JointCorrection(nn.Module):
         return all(feature.is_periodic(weight.detach().cpu().numpy()) for feature, weight in pairs)
 
     def for_rows(self, measurements: Measurements) -> Float[Tensor, "rows dof"]:
-        """Compute the corrections of measured rows [rad or m]; data that a row does not state has its usual value."""
+        """Compute the corrections of measured rows [rad or m], with usual values where a row states none."""
         delta: Tensor = self(JointState.from_measurements(measurements))
         return delta
 
@@ -76,8 +76,8 @@ class JointCorrection(nn.Module):
         """Compute the corrections to add to joint values [rad or m].
 
         Args:
-            q: joint values [rad or m], for usual conditions and the middle of all backlash, or joint states with
-                further data.
+            q: joint values [rad or m], for usual conditions and the middle of all backlash, or joint states that
+                include conditions.
             approach: approach direction of every joint for plain joint values: +1 if its value increases, -1 if it
                 decreases, 0 if not stated.
         """
@@ -91,7 +91,7 @@ class JointCorrection(nn.Module):
         return total + sum_of_products(self.factors(state.q), self.orders)
 
     def unstated_root(self, state: JointState) -> Float[Tensor, "*batch dof sources"]:
-        """Compute a root R of the covariance R R^T of the corrections [rad or m] by row data that are not stated."""
+        """Compute a root R of the covariance R R^T of the corrections [rad or m] due to unstated conditions of rows."""
         roots = [
             feature.unstated_root(state, weight.detach().to(state.q))
             for feature, weight in zip(self.features, self.linear, strict=True)

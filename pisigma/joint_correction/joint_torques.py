@@ -16,13 +16,13 @@ from pisigma.measurement.groups import groups_of_equal_joints
 from pisigma.robot.description import Robot
 
 _MIN_POSES = 30
-"""Distinct joint values with a torque of a joint that its model of gravity torques needs: about twice the number of
-masses and centres of mass that the torque of a joint of a six-axis arm depends on."""
+"""Number of distinct joint values with a torque of a joint that the model of its gravity torques needs: about twice the
+number of masses and centres of mass on which the torque of a joint of a six-axis arm depends."""
 _MIN_TORQUE = 1e-6
-"""[Nm or N] A joint whose torque varies less has no deflection that could be identified."""
+"""Variation of a joint's torque below which its deflection cannot be identified [Nm or N]."""
 _RIDGES = (1e-6, 1e-4, 1e-2, 1.0)
 """Shares of the mean square of the columns that are added to the normal equations of the modelled torques, because some
-masses cannot be distinguished; the one with the smallest left-out errors is used."""
+masses cannot be distinguished; the share with the smallest held-out errors is used."""
 
 
 class TorqueSection(FeatureSection):
@@ -39,17 +39,17 @@ class JointTorques(AbstractFeature):
     """`Δ_j = w_j τ_j / s_j`: the deflection of a joint by its torque; `c_j = -w_j / s_j` is its compliance [rad/Nm].
 
     τ_j is the torque that the drive exerts on the joint in the direction in which its value increases [Nm; N for
-    prismatic joints]; it holds the arm, and an elastic gear yields against it, so that c_j is positive. s_j is the
-    standard deviation of the measured torques.
+    prismatic joints]; it holds the arm, and an elastic gear yields in the opposite direction, so c_j is positive. s_j
+    is the standard deviation of the measured torques.
 
     Where no torque is stated, τ_j is the modelled gravity torque `Σ_m g_jm m_jm`, with the columns g of
-    `GravityTorques`, and m fitted to the measured torques of the calibration (ridge regression). A payload that differs
-    from the mean of the calibration is not a part of it; `unstated_root` contains the differences of measured torques
-    from modelled ones, each modelled without the rows of its joint values. They are correlated,
+    `GravityTorques`, and m fitted to the measured torques of the calibration (ridge regression). It does not include a
+    payload that differs from the mean of the calibration; `unstated_root` therefore contains the differences between
+    measured and modelled torques, each modelled without the rows of its joint values. These differences are correlated,
     because a payload loads several joints.
 
     Source: Dumas, Caro, Garnier and Furet, Robotics and Computer-Integrated Manufacturing 27(4), 2011, 881-888: joint
-    stiffness from torques; measured torques instead of modelled ones are our choice.
+        stiffness from torques; using measured instead of modelled torques is our choice.
 
     Attributes:
         gravity: direction of gravity in the frame of the robot's first row.
@@ -97,7 +97,7 @@ class JointTorques(AbstractFeature):
     def candidates(
         cls, robot: Robot, options: FeatureOptions, state: JointState
     ) -> tuple["JointTorques", ...]:
-        """Return the feature, with modelled torques fitted to the measured ones, if the torque of a joint varies."""
+        """Return the feature, with modelled torques fitted to measured torques, if the torque of a joint varies."""
         torque = state.stated.get(TORQUE)
         if torque is None:
             return ()
@@ -119,7 +119,7 @@ class JointTorques(AbstractFeature):
         return (JointTorques(robot, options.gravity, scale, model.tolist(), covariance),)
 
     def columns(self, state: JointState) -> Float[Tensor, "*batch dof columns"]:
-        """Return the torques, stated or modelled, over their scale."""
+        """Return the torques, stated or modelled, divided by their scale."""
         q, modelled = state.q, self.modelled(state)
         stated = state.stated.get(TORQUE)
         torque = modelled
@@ -135,7 +135,7 @@ class JointTorques(AbstractFeature):
     def unstated_root(
         self, state: JointState, weight: Float64[Tensor, "dof columns"]
     ) -> Float[Tensor, "*batch dof sources"]:
-        """Return the deflections by the differences of measured and modelled torques where none are stated."""
+        """Return the deflections due to the differences between measured and modelled torques where none are stated."""
         q = state.q
         variance, directions = torch.linalg.eigh(q.new_tensor(self.covariance))
         compliance = weight[:, 0].to(q) * self._per_scale(q)
@@ -148,13 +148,13 @@ class JointTorques(AbstractFeature):
     def gravity_weights(
         self, weight: Float64[Tensor, "dof columns"]
     ) -> Float64[Tensor, "dof gravity_columns"]:
-        """Return the weights with which `GravityTorques` gives the deflections by modelled torques."""
+        """Return the weights with which `GravityTorques` yields the deflections due to modelled torques."""
         return weight * self._per_scale(weight)[:, None] * weight.new_tensor(self.model)
 
     def deflections(
         self, weight: Float64[Tensor, "dof columns"], torques: Float64[np.ndarray, " dof"]
     ) -> Float64[Tensor, " dof"]:
-        """Return the deflections of the joints [rad or m] by torques [Nm or N]."""
+        """Return the deflections of the joints [rad or m] due to torques [Nm or N]."""
         return -self.compliances(weight) * weight.new_tensor(torques)
 
     def compliances(self, weight: Float64[Tensor, "dof columns"]) -> Float64[Tensor, " dof"]:
@@ -172,7 +172,7 @@ def _fit(
     pose: Int64[Tensor, " rows"],
     ridge: float,
 ) -> tuple[Float64[Tensor, " columns"], Float64[Tensor, " rows"]]:
-    """Return the masses of a ridge regression, and the differences of rows from a fit without their pose."""
+    """Return the masses from a ridge regression, and the differences of rows from a fit without their pose."""
     penalty = ridge * X.square().sum(0).mean().clamp(min=1e-12)
     solved = torch.linalg.solve(X.T @ X + penalty * torch.eye(X.shape[1]).to(X), X.T)
     masses = solved @ y

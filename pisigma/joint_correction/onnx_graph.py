@@ -106,9 +106,9 @@ class OnnxGraph:
     def angle(self, sine: str, cosine: str) -> str:
         """Add `atan2(sine, cosine)` in full double precision, for values of any length.
 
-        Runtimes have no inverse trigonometric functions in double. The function in float returns an angle a; the
-        exact angle is `a + asin(u)` with `u = (sine cos a - cosine sin a) / length`, about 1e-7, so two terms of
-        asin suffice.
+        Runtimes have no inverse trigonometric functions in double precision. The function in single precision returns
+        an angle a; the exact angle is `a + asin(u)` with `u = (sine cos a - cosine sin a) / length`, about 1e-7, so two
+        terms of asin suffice.
         """
         node, doubles, floats = self.add_node, self._onnx.TensorProto.DOUBLE, self._onnx.TensorProto.FLOAT
         high, wide = node("Abs", sine), node("Abs", cosine)

@@ -22,8 +22,8 @@ FEATURES: dict[str, type[AbstractFeature]] = {}
 def register_feature(feature: type[AbstractFeature]) -> type[AbstractFeature]:
     """Register a feature, so that calibrators and recipes can use it and models with it can be loaded.
 
-    May be used as a class decorator. A feature with a compiled form makes the kernels recompile at its first use, which
-    requires numba (`pip install 'pisigma[compile]'`).
+    May be used as a class decorator. The kernels are recompiled at the first use of a feature with a compiled form,
+    which requires numba (`pip install 'pisigma[compile]'`).
 
     Raises:
         ValueError: another feature has the name.

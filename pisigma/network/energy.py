@@ -1,4 +1,4 @@
-"""Energy of a Pi-Sigma network: its value, its derivatives in closed form, and its history during a training."""
+"""Energy of a Pi-Sigma network: value, derivatives in closed form, and history during training."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -86,7 +86,7 @@ def output_jacobian(
 
 @dataclass(frozen=True, eq=False)
 class TrainingHistory:
-    """Energies of a training by epoch.
+    """Energies of a training run, by epoch.
 
     Attributes:
         joints: names of the corrected joints.

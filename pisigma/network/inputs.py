@@ -44,8 +44,8 @@ class Inputs:
         """Return the inputs with the given names for a robot.
 
         Raises:
-            RecipeError: a name is not valid (the message lists the valid ones), two inputs are the same, or one is a
-                sine or cosine of a length.
+            RecipeError: a name is invalid (the message lists the valid ones), two inputs are the same, or one is a sine
+                or cosine of a length.
         """
         joints = tuple(joint.name for joint in robot.joints)
         chosen = Inputs(tuple(names), joints, np.eye(3) if reference is None else reference)
@@ -92,7 +92,7 @@ class Inputs:
         return torch.stack(columns, -1)
 
     def combination(self, name: str) -> tuple[str, list[float]]:
-        """Return the function of an input ("" for none), and its integer factors by joint; empty for a coordinate.
+        """Return the function of an input ("" for none) and its integer factors by joint (none for a coordinate).
 
         Raises:
             RecipeError: the name is not valid.
@@ -112,7 +112,7 @@ class Inputs:
         return function, factors
 
     def _terms(self, argument: str, name: str) -> list[tuple[float, str]]:
-        """Return factor and joint of every term of a sum, which has to be parsed completely."""
+        """Return the factor and joint of every term of a sum, which must be parsed completely."""
         joints = "|".join(re.escape(joint) for joint in sorted(self.joint_names, key=len, reverse=True))
         rest = argument
         terms: list[tuple[float, str]] = []

@@ -19,11 +19,11 @@ _WINDOW = 5
 CONVERGED_SHARE = 0.02
 """Relative decrease of the cost within a window below which a problem has converged."""
 CONVERGED_COST_DECREASE = 1e-11
-"""Decrease of the cost within a window below which a problem has converged: an RMS of 4e-6 of the range of the
-targets, in the scaling of `build_network`."""
+"""Decrease of the cost within a window below which a problem has converged: an RMS of 4e-6 of the range of the targets,
+in the scaling of `build_network`."""
 
 _PROBE = 0.1
-"""Share of a step for the finite difference of the curvature along it."""
+"""Share of a step used for the finite difference of the curvature along the step."""
 _BEND = 0.75
 """Largest ratio of twice the second-order correction to the step at which the correction is used (Transtrum and
 Sethna 2012)."""
@@ -201,7 +201,7 @@ class LevenbergMarquardt(nn.Module):
         floor = diagonal.amax(-1, keepdim=True) * 1e-12 + torch.finfo(A.dtype).tiny
         damping = self.damping[..., None] * diagonal.clamp_min(floor) + floor * 1e-3
         factor, info = torch.linalg.cholesky_ex(A + torch.diag_embed(damping))
-        # A matrix that is indefinite by rounding results in no step: the candidate is not better, so λ increases.
+        # A matrix that is indefinite due to rounding results in no step; the candidate is not better, so λ increases.
         return torch.where((info == 0)[..., None, None], factor, torch.inf)
 
     def _solve(self, factor: Tensor, right: Tensor) -> Tensor:
@@ -218,7 +218,7 @@ class LevenbergMarquardt(nn.Module):
             self.window_cost = self.cost.clone()
 
     def _remember(self, patterns: Patterns, residual: Tensor, changed: Tensor) -> None:
-        """Keep the parameters with the lowest error on the validation patterns, or without any on all patterns."""
+        """Keep the parameters with the lowest error on the validation patterns (on all patterns if none)."""
         chosen = patterns.validation if patterns.validation.any() else torch.ones_like(patterns.validation)
         error = (residual.square() * chosen[:, None, None]).sum(0)
         better = changed & (error < self.best_error)

@@ -81,7 +81,7 @@ class WholeBatches:
     """A loader that repeats the batch of all patterns; a DataLoader would double the time of a step."""
 
     def __init__(self, batch: list[Tensor], count: int) -> None:
-        """Store the batch of all patterns, and how often an epoch repeats it."""
+        """Store the batch of all patterns and the number of times that an epoch repeats it."""
         self._batch, self._count = batch, count
 
     def __iter__(self) -> Iterator[list[Tensor]]:
@@ -95,7 +95,7 @@ class WholeBatches:
 
 
 class ShuffledBatches(Sampler[Tensor]):
-    """Rows of mini-batches in an order that depends on seed and epoch only, so that a training resumes exactly."""
+    """Rows of mini-batches in an order that depends only on seed and epoch, so that a training resumes exactly."""
 
     def __init__(self, rows: int, batch_rows: int, seed: int) -> None:
         """Store the total number of rows, the rows per batch, and the seed of their order."""
@@ -157,8 +157,8 @@ class NetworkTraining(lightning.LightningModule):
     def configure_optimizers(self) -> Any:
         """Return the optimiser of the training method."""
         if not isinstance(self.fit, MiniBatchSection):
-            # `_descend` writes gradients times rates. Solvers write none, but Lightning needs an optimiser to count
-            # steps and save checkpoints.
+            # `_descend` writes gradients times rates. Solvers write no gradients, but Lightning needs an optimiser to
+            # count steps and save checkpoints.
             return torch.optim.SGD(self.networks.parameters(), lr=1.0)
         optimiser, steps = self.fit.build(self.networks.parameters()), self.trainer.estimated_stepping_batches
         falling = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, int(steps))

@@ -1,4 +1,4 @@
-"""Training pairs of inverse calibration: measured poses, and the joint corrections that explain them."""
+"""Training pairs of an inverse calibration: measured poses, and the joint corrections that explain them."""
 
 from dataclasses import dataclass
 
@@ -18,7 +18,7 @@ from pisigma.robot.kinematics.status import Status
 
 @dataclass(frozen=True, eq=False)
 class TrainingPairs:
-    """Poses with the joint corrections that a network has to learn.
+    """Poses with the joint corrections that a network must learn.
 
     Attributes:
         T: measured poses T_base_tool.

@@ -18,7 +18,8 @@ from pisigma.robot.description import Robot
 
 TARGET_RANGE = 1.25
 """Range to which targets are scaled. It contains 1, near which products start, and no negative values, so no product
-has to change its sign. With [-1, 1] some starts end in poor minima; with [0, 2] the paper's learning rates diverge."""
+has to change its sign. With [-1, 1], some starts end in poor minima; with [0, 2], the paper's learning rates
+diverge."""
 
 _MIN_INPUT_RANGE = 1e-9
 """Range of an input [m, rad or 1] below which it is treated as constant."""
@@ -32,10 +33,10 @@ def build_network(
     """Build the network of a recipe, scaled by the rows that are used for training.
 
     Inputs are scaled from their range in the data to [-1, 1] and targets to [0, 1.25] / sqrt(n) for n patterns; the
-    product of the fixed weights of a unit is 1 / sqrt(n) too. The energy of eq. (3) is then half the mean square of the
-    error in units of the scaled range, so a learning rate has the same effect for 100 rows as for 1000.
+    product of the fixed weights of a unit is also 1 / sqrt(n). The energy of eq. (3) is then half the mean square of
+    the error in units of the scaled range, so a learning rate has the same effect for 100 rows as for 1000.
 
-    A constant target is scaled as if it varied by 1e-12: the correction is then that constant.
+    A constant target is scaled as if it varied by 1e-12, so that the correction is this constant.
 
     Raises:
         RecipeError: an input is unknown; the message lists the valid ones.
@@ -78,7 +79,7 @@ def build_patterns(
         generator: generator for the choice of validation rows.
 
     Raises:
-        IdentificationError: there are fewer rows to fit than the network has free parameters per joint.
+        IdentificationError: there are fewer fitted rows than free parameters of the network per joint.
     """
     validation = _draw_validation(pairs.used, groups_of_rows, validation_share, generator)[pairs.used]
     patterns = []
@@ -102,7 +103,7 @@ def _check_varying(names: Sequence[str], width: Float64[Tensor, " inputs"], rows
 
 
 def _check_count(group: JointGroup, network: PiSigma, fitted: int) -> None:
-    """Check that there are as many rows as free parameters, without those that scale factors against each other."""
+    """Check that there are at least as many rows as free parameters, without those that only rescale factors."""
     free = sum(network.orders) * (network.inputs + 1) - sum(order - 1 for order in network.orders)
     if fitted < free:
         raise IdentificationError(

@@ -91,7 +91,7 @@ class PiSigma(nn.Module):
     def initialise(self, spread: float, generator: torch.Generator) -> None:
         """Draw the weights uniformly from ±spread and the biases from 1 ± spread.
 
-        Every product then starts near the product of its fixed weights. Near 0 training would stall, because the
+        Every product then starts near the product of its fixed weights. Near 0, training would stall, because the
         gradient of a product with respect to one factor is the product of the others.
         """
         for parameter, centre in ((self.weight, 0.0), (self.bias, 1.0)):
@@ -150,7 +150,7 @@ def sum_of_products(
 def products_of_others(
     weighted: Float[Tensor, "*batch units"], orders: Sequence[int]
 ) -> Float[Tensor, "*batch units"]:
-    """Return for every summing unit the product of the others in its product unit, exact even for zero factors.
+    """Return the product of the other summing units in each one's product unit, exact even for zero factors.
 
     This is `Π_{i≠j} W_ki h_i` in the derivative of eq. (4).
     """

@@ -93,7 +93,7 @@ class Checkpoints:
 
 
 class _Fingerprint(lightning.Callback):
-    """Writes the fingerprint of settings and data into every checkpoint."""
+    """Callback that writes the fingerprint of settings and data into every checkpoint."""
 
     def __init__(self, fingerprint: str) -> None:
         self._fingerprint = fingerprint
@@ -121,7 +121,7 @@ def train(
         epochs: largest number of epochs; about `SAVED` checkpoints are written, and one at the end.
         checkpoints: folder and settings of checkpoints; None writes no checkpoints.
         show_progress: whether to draw Lightning's progress bar on stderr if it is a terminal.
-        logs: folder for Lightning's logs: `metrics.csv`, and TensorBoard events if that is installed.
+        logs: folder for Lightning's logs: `metrics.csv`, and TensorBoard events if TensorBoard is installed.
 
     Raises:
         TrainingError: there is no checkpoint with these settings and data to resume from.
@@ -176,7 +176,7 @@ def _loggers(folder: Path | None) -> list[Logger]:
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """Compute on one thread in the block; for a hundred patterns, a second thread costs more than it saves."""
+    """Compute on one thread within the block; for a hundred patterns, a second thread costs more than it saves."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -187,7 +187,7 @@ def _one_thread() -> Iterator[None]:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Suppress Lightning's hints and warnings about choices that are made on purpose."""
+    """Suppress Lightning's hints and warnings about choices that were made on purpose."""
     loggers = [logging.getLogger(name) for name in ("lightning.pytorch", "lightning.fabric")]
     levels = [logger.level for logger in loggers]
     for logger in loggers:

@@ -48,7 +48,7 @@ def acceptance_sentences(acceptance: Acceptance) -> tuple[str, ...]:
 
 
 def contradiction(acceptance: Acceptance) -> str:
-    """Return a sentence that the measured errors are larger than the budget explains."""
+    """Return a sentence if the measured errors are larger than the budget explains; "" otherwise."""
     session = "" if acceptance.measured is None else f" of session {acceptance.measured.session}"
     return (
         f"The measured errors{session} are larger than the budget explains: the budget lacks a component, or the "

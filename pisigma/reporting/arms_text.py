@@ -52,8 +52,8 @@ def arms_text(
         summary: figures of the bases.
         calibrations: figures of every arm, by its name.
         warnings: warnings of the arms.
-        folder: where the models were written; None if they were not.
-        seconds: time it took [s].
+        folder: folder to which the models were written; None if they were not written.
+        seconds: duration of the calibration [s].
     """
     warnings = (*(one.sentence for one in summary.diagnostics), *warnings)
     rows = [row for one in summary.bases for row in base_rows(one)]

@@ -21,7 +21,7 @@ _PAPERS = {
     "A1": (594.0, 841.0),
     "A0": (841.0, 1189.0),
 }
-"""Width and height of paper [mm]; the first is the part that A4 and Letter have in common."""
+"""Widths and heights of papers [mm]; the first entry is the area that A4 and Letter have in common."""
 _MARGIN = 8.0
 """Margin that printers leave blank along the edges of a sheet [mm]."""
 _FOOT = 22.0

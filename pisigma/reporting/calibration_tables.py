@@ -88,7 +88,7 @@ def warning_lines(summary: CalibrationSummary) -> list[str]:
 
 
 def implausible_lines(summary: CalibrationSummary) -> list[str]:
-    """Return sentences on why the calibration is implausible."""
+    """Return sentences on the reasons why the calibration is implausible."""
     return [one.sentence for one in summary.diagnostics if one.severity == "implausible"]
 
 

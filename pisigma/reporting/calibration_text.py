@@ -13,11 +13,12 @@ from pisigma.validation.held_out.calibration_summary import CalibrationSummary, 
 from pisigma.validation.held_out.validation_figures import ValidationFigures
 
 _LIKELY_SCALE, _POSSIBLE_SCALE = 1.0, 0.1
-"""Odds above which a common factor on all lengths is a warning, or a remark, if the error that would follow matters."""
+"""Odds above which a common factor on all lengths leads to a warning or a remark, if the resulting error matters."""
 _MIN_SCALE_SHARE = 0.5
-"""Share of the held-out RMS error above which the error that would follow from a wrong scale matters."""
+"""Share of the held-out RMS error above which the error that results from a wrong scale matters."""
 _MIN_COVERAGE = 0.9
-"""Share of held-out coordinates within their predicted 95 % intervals below which these are called too narrow."""
+"""Share of held-out coordinates within their predicted 95 % intervals below which the intervals are called too
+narrow."""
 _SHOWN = {"rms": "RMS", "p95": "95 %", "max": "largest"}
 
 
@@ -60,10 +61,10 @@ def error_quantity(summary: CalibrationSummary) -> str:
 
 
 def calibration_verdict(summary: CalibrationSummary, folder: Path | None, warnings: int) -> Verdict:
-    """Judge a calibration.
+    """Return the verdict on a calibration.
 
     Args:
-        summary: its figures.
+        summary: figures of the calibration.
         folder: folder of the model; None if no folder was written.
         warnings: number of warnings.
     """
@@ -159,9 +160,9 @@ def calibration_text(
     """Lay out a calibration: the verdict, warnings, and errors of held-out rows; on demand all tables and parameters.
 
     Args:
-        summary: its figures.
+        summary: figures of the calibration.
         folder: folder to which the model was written; None if it was not written.
-        seconds: time it took [s].
+        seconds: duration of the calibration [s].
         also: blocks that are shown first.
     """
     warnings = [*tables.implausible_lines(summary)[1:], *tables.warning_lines(summary)]

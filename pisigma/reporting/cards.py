@@ -67,7 +67,9 @@ def _draw_calibration(
     folder: Path,
 ) -> None:
     """Draw the figures of `write_calibration_card`."""
-    from pisigma.reporting import calibration_figures as figures  # late, as matplotlib takes 30 MB
+    from pisigma.reporting import (
+        calibration_figures as figures,
+    )  # imported late because matplotlib takes 30 MB
 
     geometric = geometric_result(result)
     correlations = (geometric.pairwise.lengths, geometric.pairwise.angles)

@@ -55,7 +55,7 @@ def model_rms(figures: ModelFigures, rows: int) -> str:
 def comparison_blocks(
     comparison: ModelComparison, data: str, width: int, verbose: bool
 ) -> tuple[list[Block], list[Block]]:
-    """Return the errors of models on rows as text; without `verbose`, with remarks on omitted figures."""
+    """Return the errors of models on rows as text; unless `verbose`, remarks state which figures are omitted."""
 
     def blocks(whole: bool) -> list[Block]:
         tables = comparison_tables(comparison, Path(data).name, width, whole)

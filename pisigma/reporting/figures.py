@@ -12,7 +12,7 @@ from PIL import Image
 from torch import Tensor
 
 _MIN_ENERGY = 1e-32
-"""Value that 0 is drawn as on a logarithmic axis."""
+"""Value at which 0 is drawn on a logarithmic axis."""
 
 
 def write_energy_csv(joints: Sequence[str], energies: Float64[Tensor, "epochs joints"], path: Path) -> None:
@@ -53,8 +53,8 @@ def draw_errors_over_workspace(
         joints: names of the corrected joints.
         units: unit of each joint's errors, "deg" or "mm".
         position: tool positions [m].
-        before: joint errors without correction, in these units.
-        after: joint errors with correction, in these units.
+        before: joint errors without correction, in the units of `units`.
+        after: joint errors with correction, in the units of `units`.
         path: PNG file to write.
     """
     x, y = (position[:, axis].numpy() * 1e3 for axis in (0, 1))
@@ -87,7 +87,7 @@ def _row_height(x: Float64[np.ndarray, " rows"], y: Float64[np.ndarray, " rows"]
 
 
 def save_figure(figure: Figure, path: Path) -> None:
-    """Write a figure as PNG of 64 colours, which is small, without changing matplotlib's global state."""
+    """Write a figure as a small PNG of 64 colours, without changing matplotlib's global state."""
     canvas = FigureCanvasAgg(figure)
     figure.set_dpi(120)
     canvas.draw()  # type: ignore[no-untyped-call]

@@ -1,4 +1,4 @@
-"""Tables and verdict of the cells of a fleet, without torch, so that `pisigma status FOLDER` starts quickly."""
+"""Tables and verdict of the cells of a fleet; torch is not imported, so `pisigma status FOLDER` starts quickly."""
 
 from collections.abc import Iterable
 
@@ -43,7 +43,7 @@ def _row(one: CellStatus) -> tuple[str, ...]:
 
 
 def fleet_verdict(status: FleetStatus) -> Verdict:
-    """Judge a fleet by its largest error and by the cells that need attention."""
+    """Return the verdict on a fleet: its largest error, and the cells that need attention."""
     worst = next(iter(status.by_error), None)
     serious = [state for state in status.states if state in (UNREADABLE, *ATTENTION)]
     count = len(status.cells) + len(status.unreadable)

@@ -16,17 +16,17 @@ _REMEDIES = {
     "camera": "calibrate the camera again with `pisigma camera`",
     "board": "measure the squares of the board and correct `square_mm`",
 }
-"""What to do about every cause."""
+"""What to do about a cause, by the name of the cause."""
 COLUMNS = ("coordinate", "unit", "before", "estimated", "standard error")
 
 
 MAX_DIRECTIONS = 3
-"""Weak directions that are shown, the weakest; JSON has all."""
+"""Number of weak directions that are shown, weakest first; JSON contains all of them."""
 CAUSE_TITLE = "possible causes of the residuals, each alone compared with noise alone"
 
 
 def coordinate_table(summary: FrameSummary) -> Table:
-    """Make a table of the coordinates in mm and deg, rounded according to their standard errors."""
+    """Return a table of the coordinates in mm and deg, rounded according to their standard errors."""
     return Table(COLUMNS, tuple(map(_coordinate_row, summary.coordinates)))
 
 
@@ -44,7 +44,7 @@ def _coordinate_row(one: CoordinateFigures) -> tuple[str, ...]:
 
 
 def cause_table(summary: FrameSummary) -> Table:
-    """Make a table of the possible causes of the residuals."""
+    """Return a table of the possible causes of the residuals."""
     columns = ("cause", "log Bayes factor", "explains alone [%]", "most probable size", "named")
     rows = (
         (
@@ -60,7 +60,7 @@ def cause_table(summary: FrameSummary) -> Table:
 
 
 def cause_sentence(summary: FrameSummary) -> tuple[str, ...]:
-    """Return what causes the residuals and what to do; empty if nothing does beyond their noise."""
+    """Return what causes the residuals and what to do; "" if the residuals are only noise."""
     named = [one for one in summary.causes if one.named]
     if not named:
         return ()
@@ -79,14 +79,14 @@ def cause_sentence(summary: FrameSummary) -> tuple[str, ...]:
 
 
 def coordinate_title(summary: FrameSummary) -> str:
-    """Name the frames that the coordinates belong to."""
+    """Return the names of the frames to which the coordinates belong."""
     bases = "base of the robot in the measuring frame"
     tools = "tool in the flange of the robot"
     return {"tool": tools, "base": bases, "hand-eye": f"{bases}, and {tools}"}[summary.only]
 
 
 def fit_lines(summary: FrameSummary) -> list[str]:
-    """Return sentences on the residuals, and on what the rows hardly determine."""
+    """Return sentences on the residuals, and on directions that the rows hardly determine."""
     sizes = [
         f"{rounded(value, summary.rows)} {unit}"
         for value, unit in ((summary.rms_mm, "mm"), (summary.rms_deg, "deg"))
@@ -100,9 +100,9 @@ def frame_text(summary: FrameSummary, folder: Path | None, seconds: float) -> Re
     """Lay out calibrated frames.
 
     Args:
-        summary: the figures.
-        folder: where the model was written; None if it was not.
-        seconds: time it took [s].
+        summary: figures of the frames.
+        folder: folder to which the model was written; None if it was not written.
+        seconds: duration of the calibration [s].
     """
     warnings = (*cause_sentence(summary), *(one.sentence for one in summary.outliers), *summary.warnings)
     written = () if folder is None else (f"Model written to {folder} in {seconds:.1f} s.",)

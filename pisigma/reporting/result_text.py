@@ -34,11 +34,11 @@ class Block:
     """Sentences or a table that are shown together or not at all.
 
     Attributes:
-        what: short name.
-        sentences: sentences; that before a table is its title.
+        what: short name of the block.
+        sentences: sentences; the one before a table is its title.
         columns: headings of the table; () without a table.
         rows: cells of the table.
-        indent: before further lines of a sentence on a screen.
+        indent: indentation of the further lines of a sentence on a screen.
     """
 
     what: str
@@ -49,12 +49,12 @@ class Block:
 
 
 def table_block(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], what: str = "") -> Block:
-    """Return a table with its title; `what` is a shorter name of it."""
+    """Return a table with its title; `what` is its short name."""
     return Block(what or title, (title,), tuple(columns), tuple(map(tuple, rows)))
 
 
 def sentences(what: str, lines: Iterable[str], indent: str = "") -> Block:
-    """Return sentences."""
+    """Return sentences as a block."""
     return Block(what, tuple(lines), indent=indent)
 
 
@@ -63,9 +63,9 @@ class ResultText:
     """A result for people.
 
     Attributes:
-        verdict: verdict in three sentences.
-        warnings: sentences; all are shown.
-        blocks: the most important first.
+        verdict: verdict on the result, in three sentences.
+        warnings: warnings as sentences; all are shown.
+        blocks: blocks, most important first.
         details: blocks that are shown on demand.
         closing: sentence on the written files.
     """

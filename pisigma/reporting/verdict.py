@@ -9,9 +9,9 @@ if TYPE_CHECKING:
     from pisigma.validation.held_out.validation_figures import ErrorFigures
 
 _MANY_ROWS = 100
-"""Number of rows from which errors deserve three digits, because their RMS is known to a few percent."""
+"""Number of rows from which errors are stated with three digits, because their RMS is known to a few percent."""
 _SMALLEST = 1e-4
-"""Errors below which their size does not matter [mm or deg]."""
+"""Size below which errors do not matter [mm or deg]."""
 
 
 @dataclass(frozen=True)
@@ -19,8 +19,8 @@ class Verdict:
     """The essentials of a result for a user.
 
     Attributes:
-        accuracy: how accurate it is, with the kind of the figures.
-        trust: whether to trust it, and why not.
+        accuracy: how accurate the result is, with the kind of the figures.
+        trust: whether to trust the result, and if not, why.
         next_step: recommended next step.
         heading: subject of the first sentence.
     """
@@ -32,7 +32,7 @@ class Verdict:
 
     @property
     def short(self) -> str:
-        """The accuracy and whether to trust it, on one line."""
+        """The accuracy, and whether to trust the result, on one line."""
         accuracy = self.accuracy.partition("; ")[0].partition(". ")[0].rstrip(".")
         trust = re.split(r"[:,;.] ?", self.trust)[0]
         return f"Verdict: {accuracy}. Trust: {trust}."
@@ -44,7 +44,7 @@ class Verdict:
 
 
 def rounded(value: float, rows: int = _MANY_ROWS) -> str:
-    """Return an error with three digits, or two if few rows were judged."""
+    """Return an error with three digits, or two if few rows were evaluated."""
     digits = 3 if rows >= _MANY_ROWS else 2
     if value == 0 or not math.isfinite(value):
         return f"{value:g}"

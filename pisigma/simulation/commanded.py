@@ -1,4 +1,4 @@
-"""Commanded joint values, either random or such that the true robot reaches desired poses."""
+"""Commanded joint values, either random or those with which the true robot reaches desired poses."""
 
 import torch
 from jaxtyping import Bool, Float64
@@ -23,7 +23,7 @@ class BranchSection(Section):
     Attributes:
         name: name of a branch of the nominal robot's closed form, instead of joint values.
         near_deg: joint values by name of a revolute joint [deg], 0 by default. With a closed form, the nearest
-            reachable solution is used; without one, they are the start of the numeric solution.
+            reachable solution is used; without one, the numeric solution starts here.
         near_mm: joint values by name of a prismatic joint [mm], 0 by default.
     """
 
@@ -105,7 +105,7 @@ class BranchSection(Section):
     def _solutions(
         self, solver: AbstractClosedForm | None, robot: Robot, T: Float64[Tensor, "poses 4 4"]
     ) -> InverseSolutions:
-        """Return the solutions of all branches, or of the named branch only."""
+        """Return the solutions of all branches, or only of the named branch."""
         if solver is None:
             raise RecipeError(
                 f"robot '{robot.name}' has no closed form and therefore no branch '{self.name}'",
@@ -168,7 +168,7 @@ def joints_for_poses(
 ) -> Float64[Tensor, "poses dof"]:
     """Return the commanded joint values [rad or m] with which the true robot reaches desired poses.
 
-    Encoder steps are ignored: the joint values would reach the poses exactly without an encoder. With an encoder,
+    Encoder steps are ignored; without an encoder, the joint values would reach the poses exactly. With an encoder,
     the robot stops at the nearest pulse, so measured poses differ slightly from desired poses.
 
     Args:

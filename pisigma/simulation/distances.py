@@ -1,4 +1,4 @@
-"""Simulated distances and sockets: a draw wire from an anchor, a ball bar between two poses, and a ball in sockets."""
+"""Simulated distances (draw wire from an anchor, ball bar between two poses), and a simulated ball in sockets."""
 
 from typing import Literal
 

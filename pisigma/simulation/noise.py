@@ -14,9 +14,9 @@ from pisigma.robot.se3 import rotation_from_vector, transform
 class MeasurementNoise(Section):
     """Normal noise of every measured coordinate and about every axis.
 
-    `p_measured = p + s_p · n_p` and `R_measured = Exp(s_r · n_r) · R` with n_p and n_r three standard normal
-    numbers each and Exp the rotation of a rotation vector, in the frame of measurement. From one generator
-    with `seed`, (rows, 3) numbers are drawn for the positions, then as many for the orientations.
+    `p_measured = p + s_p · n_p` and `R_measured = Exp(s_r · n_r) · R` where n_p and n_r are three standard normal
+    numbers each and Exp is the rotation of a rotation vector, in the frame of measurement. From one generator with
+    `seed`, (rows, 3) numbers are drawn for the positions, then the same number for the orientations.
 
     Source: Hollerbach, Khalil and Gautier, "Model Identification", Springer Handbook of Robotics, chapter
     6 (independent, zero-mean measurement noise).
@@ -59,7 +59,7 @@ class NoiseDraws:
     """Random deviations of sensor and robot, one row per measurement.
 
     Attributes:
-        sensor: deviations of the sensor [m]; sensors of one value use the first column.
+        sensor: deviations of the sensor [m]; sensors with a single value use the first column.
         robot: deviations of the tool point from the commanded point, in the base frame [m].
     """
 
@@ -70,8 +70,8 @@ class NoiseDraws:
 class SensorNoise(Section):
     """Normal deviations, independent from row to row and axis to axis.
 
-    From one generator with `seed`, (rows, 3) standard normal numbers are drawn for the sensor, where a sensor of one
-    value uses the first column, then (rows, 3) for the robot.
+    From one generator with `seed`, (rows, 3) standard normal numbers are drawn for the sensor, where a sensor with a
+    single value uses the first column, then (rows, 3) for the robot.
 
     Attributes:
         sensor_mm: standard deviation of a measured length, or of every axis of a ball in its socket [mm].
@@ -96,11 +96,11 @@ class SensorNoise(Section):
 
 
 def draw_noise(noise: SensorNoise | None, rows: int) -> NoiseDraws:
-    """Return random deviations of the given number of rows; 0 without noise."""
+    """Return random deviations of the given number of rows; 0 if there is no noise."""
     return (noise or SensorNoise(seed=0)).draw(rows)
 
 
 def row_sigma(noise: SensorNoise | None, rows: int, points: int = 1) -> Float64[Tensor, " rows"] | None:
-    """Return the standard deviation of the noise of every row [m]; None without noise."""
+    """Return the standard deviation of the noise of every row [m]; None if there is no noise."""
     sigma = 0.0 if noise is None else noise.sigma(points)
     return torch.full((rows,), sigma, dtype=torch.float64) if sigma else None

@@ -27,7 +27,7 @@ class OrientationSection(Section):
     Attributes:
         home_rpy_deg: R_home as roll, pitch, yaw [deg].
         home_rotation: R_home as the three rows of a rotation matrix, instead of `home_rpy_deg`.
-        spread_deg: half the range of roll, pitch and yaw [deg]; with 0 all poses have the home orientation.
+        spread_deg: half the range of roll, pitch and yaw [deg]; if 0, all poses have the home orientation.
     """
 
     home_rpy_deg: Triple | None = None

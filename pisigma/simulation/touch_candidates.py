@@ -31,7 +31,7 @@ class JigPlacement(Section):
         name: name of the placement, and of the frame of its touches.
         jig: name of a jig that comes with pisigma, or a YAML file.
         base: nominal T_jig_base.
-        true_base: true T_jig_base; equal to the nominal one by default.
+        true_base: true T_jig_base; by default equal to the nominal pose.
     """
 
     name: str = Field(min_length=1)
@@ -138,7 +138,7 @@ class TouchCandidates:
         return TouchCandidates(parts[0].placements, **arrays)
 
     def as_measurements(self) -> Measurements:
-        """Return the measurements that the nominal robot would give at the nominal placements, for planning."""
+        """Return the measurements that the nominal robot would yield at the nominal placements, for planning."""
         return Measurements(
             q=self.q,
             frame=self.frame,
@@ -154,9 +154,9 @@ _ARRAYS = ("placement", "face", "axis", "sign", "coordinate", "T_jig_tool", "q")
 class TouchCandidatesSection(Section):
     """Section of random candidates of touches, with the same number for each of the axes x, y and z.
 
-    For every axis a face and a point on it are drawn uniformly. The tool's z axis, along which the wire leaves the
-    torch, points down the jig's z axis except for a tilt; tilt and azimuth are drawn uniformly over the cone, and
-    the rotation about the wire uniformly. Candidates that the nominal robot cannot reach are drawn again.
+    For every axis, a face and a point on it are drawn uniformly. The tool's z axis, along which the wire leaves the
+    torch, points down the jig's z axis except for a tilt; tilt and azimuth are drawn uniformly over the cone, as is the
+    rotation about the wire. Candidates that the nominal robot cannot reach are drawn again.
 
     Attributes:
         count: number of candidates per placement.
@@ -164,8 +164,8 @@ class TouchCandidatesSection(Section):
         tilt_deg: largest tilt of the torch from vertical [deg].
         least_lean_deg: smallest angle between the torch and the face [deg], so that its tip touches first.
         margin_mm: smallest distance of the point from edges of the face and from blocks on it [mm].
-        travel_mm: distance before and behind the face that the tip must be able to move along its normal, because
-            true robot and placement differ from nominal robot and placement [mm].
+        travel_mm: distance before and behind the face that the tip must be able to move along the normal [mm], because
+            the true robot and placement differ from the nominal ones.
         shaft_mm: length of a straight line behind the tip, which represents the torch and must be clear of the jig
             [mm].
         least_singular_value: smallest singularity measure of the robot; see `singularity_measure`.
@@ -190,7 +190,7 @@ class TouchCandidatesSection(Section):
             placements: placements of the jigs.
 
         Raises:
-            RecipeError: the robot cannot make the requested number of touches, or the sections do not fit together.
+            RecipeError: the robot can make fewer touches than requested, or the sections do not fit together.
             MeasurementError: a placement names an unknown jig.
         """
         check_names(placements)

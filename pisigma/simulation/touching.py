@@ -64,7 +64,7 @@ def simulate_touches(
 ) -> Measurements:
     """Touch faces with the true robot.
 
-    The controller moves the tool along the normal of the face with constant orientation, by the nominal inverse
+    The controller moves the tool along the normal of the face with constant orientation, using the nominal inverse
     kinematics and the nominal placement of the jig. It stops when the true tip is at the coordinate of the face in the
     frame of the jig at its true placement: `e_axis · T_jig_base · FK_true(q) = coordinate + n`. The row contains the
     joint values commanded at the contact, and the coordinate of the face, which is known from the jig; n is the
@@ -76,7 +76,7 @@ def simulate_touches(
         placements: placements of the jigs, in the order of `candidates.placements`.
         candidates: the touches.
         noise: noise of the touches and of the robot; None for no noise.
-        travel: distance [m] before and behind the expected position of the face within which it is searched for.
+        travel: distance [m] before and behind the expected position of the face within which the face is searched for.
         on_miss: "error" or "leave_out" for touches that do not meet their face within the travel or miss its edges.
 
     Returns:
@@ -177,7 +177,7 @@ def _on_faces(
 
 
 def _miss(candidates: TouchCandidates, row: int, contact: _Contact) -> Fault:
-    """Return the fault of a touch that misses; its value is the tip [mm] if the tip reached the coordinate."""
+    """Return the fault of a touch that misses, with the tip's position [mm] if it reached the coordinate."""
     name = f"touch {row} (counted from 0) along {candidates.touch_axis[row]} of jig '{candidates.frame[row]}'"
     if bool(contact.met[row]):
         tip = ", ".join(f"{value:.1f}" for value in (1e3 * contact.tip[row]).tolist())

@@ -1,4 +1,4 @@
-"""True robot of a simulation: a nominal robot with the sum of several error sources."""
+"""True robot of a simulation: a nominal robot with the sum of the errors of several sources."""
 
 import zlib
 from collections.abc import Sequence
@@ -106,8 +106,8 @@ class TrueRobotSection(Section):
 class TrueRobot:
     """A true robot: `T_base_tool = FK(q + Σ e_i(q) - half_play · approach; nominal geometry + Σ changes)`.
 
-    The approach of a joint is +1 if its value increased before it stopped, -1 if it decreased, and 0, for the middle
-    of the play, if it is not given.
+    The approach of a joint is +1 if its value increased before it stopped, -1 if it decreased, and 0, for the middle of
+    the play, if it is not stated.
 
     Every joint error e_i, including the rounding of the encoder, is evaluated at the commanded joints q and on the
     nominal geometry, and all errors are added. Their order therefore does not matter, and the effect of one source
@@ -214,10 +214,10 @@ class TrueRobot:
         return forward_kinematics(self.geometry, self.actual_joints(q, approach))
 
     def commanded_joints(self, actual: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch dof"]:
-        """Return the joint values to command [rad or m] such that the actual joint values are `actual`.
+        """Return the joint values to command [rad or m] so that the actual joint values are `actual`.
 
         The method solves `q + joint_error(q) = actual` by the fixed-point iteration `q <- actual - joint_error(q)`
-        until q changes by less than 1e-14 (16 machine epsilons in lower precision). Its rate of convergence is the
+        until q changes by less than 1e-14 (16 machine epsilons in lower precision). The rate of convergence is the
         slope of the joint errors, a few percent.
 
         Raises:
@@ -250,7 +250,7 @@ class TrueRobot:
     def inverse(
         self, T: Float[Tensor, "*batch 4 4"], start: Float[Tensor, "*starts dof"]
     ) -> Float[Tensor, "*batch dof"]:
-        """Return the joint values to command [rad or m] such that the true robot reaches the poses T.
+        """Return the joint values to command [rad or m] so that the true robot reaches the poses T.
 
         The actual joint values are computed on the true geometry by Newton steps from `start` (on its branch),
         followed by the commanded joint values, see `commanded_joints`.
@@ -262,7 +262,7 @@ class TrueRobot:
         Raises:
             PoseError: T is not a rigid transform, or the number of columns of `start` is not the robot's number of
                 joints.
-            UnreachablePoseError: the true robot cannot reach a pose, or not on this branch; or it has encoder steps.
+            UnreachablePoseError: the true robot cannot reach a pose on this branch, or it has encoder steps.
         """
         solution = solve_numeric(self.geometry, T, start)
         missed = solution.status == Status.NOT_CONVERGED

@@ -1,4 +1,4 @@
-"""The robot of a cell in three dimensions: the newest plan, rows with their errors, and a pose that was tried."""
+"""The robot of a cell in three dimensions: the newest plan, rows with their errors, and a tried pose."""
 
 import threading
 from dataclasses import replace
@@ -32,7 +32,7 @@ from pisigma.workflow.measure import MeasuringSession
 from pisigma.workflow.predicted_errors import PredictedErrors, predicted_errors
 from pisigma.workflow.settings.measuring import MeasureSettings
 
-if TYPE_CHECKING:  # the full name, which type checkers at run time find without this import
+if TYPE_CHECKING:  # the full name can be resolved by type checkers at run time even without this import
     import viser
 
 
@@ -82,7 +82,7 @@ class CellScene:
             try:
                 planned = MeasuringSession.read(newest_plan(cell.folder), MeasureSettings())
             except PisigmaError:
-                planned = None  # the tabs state the fault of the cell
+                planned = None  # the tabs show what is wrong with the cell
         arm = ArmInSurroundings.from_robot(cell.robot, cell.file.document.surroundings)
         if planned is not None and not is_movable:
             arm = planned.plan.arm
@@ -148,7 +148,7 @@ class CellScene:
         return self._predicted
 
     def dragged_values(self) -> dict[str, Any]:
-        """Return the keys of `cell.yaml` that people changed by dragging, since which call of `show_cell`.
+        """Return the keys of `cell.yaml` that were changed by dragging, and since which call of `show_cell`.
 
         A value that was dragged back is included, because the page has shown it in between.
         """
@@ -192,7 +192,7 @@ class CellScene:
         self.show_rows(state.rows)
 
     def show_rows(self, rows: RowsSoFar) -> None:
-        """Show rows, with their errors if they have been compared with each other."""
+        """Show rows, and their errors if the rows have been compared with each other."""
         with self._lock, self._server.atomic():
             self._rows, self._marked = rows, []
             times = arrow_magnification(top_of_scale(rows), self._reach)
@@ -241,7 +241,7 @@ class CellScene:
 
 
 def _body(cell: Cell, arm: ArmInSurroundings) -> AbstractBody:
-    """Return the meshes of a URDF file, or capsules if it has none."""
+    """Return the meshes of a URDF file, or capsules if the file has none."""
     document = cell.file.document
     try:
         return MeshBody(arm.robot, cell.file.robot, document.base, document.tip, cell.folder)

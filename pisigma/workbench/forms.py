@@ -31,7 +31,7 @@ FIRST = {
 _NEW_CELL = {"sensor": "--sensor", "limit_mm": "--limit-mm"}
 """Settings of a new cell, with their options."""
 _LEFT_OUT = ("map", "no_history")
-"""Settings of a form of their own, or that a cell does not have."""
+"""Settings that have a form of their own, or that a cell does not have."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Field:
         default: value without an entry: the value in `cell.yaml`, otherwise the default; "" without a default.
         value: value that the form shows as entered.
         option: option of the command, or its start if a value follows without a space; "" without a command.
-        first: whether the field is shown at once.
+        first: whether the field is shown at once, and not only behind "all settings".
     """
 
     key: str
@@ -76,7 +76,7 @@ def form_of(step: str, file: CellFile) -> list[Field]:
     stated, fields = file.stated_values(step), []
     for one in _settings(step):
         key, option = one.key, one.name
-        if one.option.is_key or one.default is False:  # these settings have no option that switches them off
+        if one.option.is_key or one.default is False:  # there is no option that switches these settings off
             option = f"--set {key}="
         default = _text(stated.get(key, one.default))
         fields.append(replace(_field(one), default=default, option=option, first=key in FIRST.get(step, ())))
@@ -84,7 +84,7 @@ def form_of(step: str, file: CellFile) -> list[Field]:
 
 
 def form_of_cell(file: CellFile) -> dict[str, list[Field]]:
-    """Return the fields of `cell.yaml` by its sections, with the values that the file states; "" is the cell itself."""
+    """Return the fields of `cell.yaml` by section, with the values that the file states; "" is the cell itself."""
     text = file.path.read_text(encoding="utf-8")
     stated = plain_content(text, PlanningError, str(file.path))
     fields: dict[str, list[Field]] = {"": []}
@@ -152,7 +152,7 @@ def _section(section: type[Section], stated: Any, prefix: str) -> Iterator[Field
         elif get_origin(kind) is not dict:
             limits = " and ".join(filter(None, map(_bound, bounds)))
             default = "required" if info.is_required() else _text(info.default) or "not stated"
-            meaning = re.split(r"[;.] None for ", meanings.get(name, ""))[0]  # an empty field says it
+            meaning = re.split(r"[;.] None for ", meanings.get(name, ""))[0]  # an empty field states this
             help_ = f"{meaning[:1].upper()}{meaning[1:]}"
             yield Field(key, help_, *_kind(kind), limits, default, _text(value))
 
@@ -219,7 +219,7 @@ def _text(value: object) -> str:
 
 
 def _value(kind: str, text: str) -> Any:
-    """Return the entry of a person as a plain value; the setting refuses a text that is not of the kind."""
+    """Return the entry of a person as a plain value; the setting refuses a text of another kind."""
     if kind == "list":
         return [_value("number", one.strip()) for one in text.split(",") if one.strip()] or None
     if kind == "flag":

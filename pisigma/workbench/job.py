@@ -1,4 +1,4 @@
-"""Running step: one at a time, with its progress, the person who started it, and a way to stop it."""
+"""The running step, of which there is only one at a time: its progress, who started it, and a way to stop it."""
 
 import datetime
 import sys
@@ -18,7 +18,7 @@ class StoppedError(Exception):
 
 
 class BusyError(Exception):
-    """Another step runs."""
+    """Another step is running."""
 
 
 @dataclass(frozen=True)
@@ -27,16 +27,16 @@ class Outcome:
 
     Attributes:
         text: the result for people; None if the step was refused.
-        refusal: why the input was refused, or the result is not accepted.
-        rows: rows at fault (file and line), by the sentences of the findings that name them.
-        field: field of the form that causes the fault; "" if no field does.
+        refusal: reason why the input was refused or the result is not accepted.
+        rows: wrong rows (file and line), by the sentences of the findings that name them.
+        field: field of the form that causes the refusal; "" if no field does.
         subject: object of the step, such as a session; "" if the step implies it.
         curve: expected accuracy by number of poses; () without a curve.
         stopped: whether a person stopped it.
         step: name of the step.
-        command: command line that does the same.
-        person: who started it.
-        ended: day and time of the end of the step.
+        command: command line that has the same effect.
+        person: who started the step.
+        ended: day and time at which the step ended.
     """
 
     text: ResultText | None = None
@@ -61,8 +61,8 @@ class Job:
 
     Attributes:
         step: name of the step.
-        person: who started it.
-        command: command line that does the same.
+        person: who started the step.
+        command: command line that has the same effect.
         what: the current activity, with the time left.
         stopped_by: name of the person who asked to stop the step; "" if nobody did.
     """
@@ -79,7 +79,7 @@ class Job:
         """Record the current activity, or end the step if a person stopped it.
 
         Raises:
-            StoppedError: a person stopped it.
+            StoppedError: a person stopped the step.
         """
         if self.stopped_by:
             raise StoppedError
@@ -106,7 +106,7 @@ class Jobs:
         """Start a step in a thread.
 
         Raises:
-            BusyError: another step runs, or the server ends.
+            BusyError: another step is running, or the server is ending.
         """
         with self._lock:
             if self.running is not None or self._closed:
@@ -117,7 +117,7 @@ class Jobs:
             self.version += 1
 
     def state(self) -> tuple[Job | None, int, int]:
-        """Return the running step, `version` and `ended` at one moment, so that an end comes with its change."""
+        """Return the running step, `version` and `ended` at the same moment, so that they are consistent."""
         with self._lock:
             return self.running, self.version, self.ended
 
@@ -125,8 +125,8 @@ class Jobs:
         """Stop the running step when it next reports progress; no incomplete files are left.
 
         Args:
-            person: who stops it.
-            number: number of steps that had ended when the person decided; after its end, no later step is stopped.
+            person: who stops the step.
+            number: number of steps that had ended when the person decided; a step that started later is not stopped.
         """
         with self._lock:
             if self.running is not None and number == str(self.ended):
@@ -134,7 +134,7 @@ class Jobs:
                 self.version += 1
 
     def close(self) -> None:
-        """Stop the running step, and wait for its end."""
+        """Stop the running step, and wait until it has ended."""
         with self._lock:
             self._closed = True
         self.stop("the end of the server", str(self.ended))

@@ -1,4 +1,4 @@
-"""`pisigma serve` of a cell as a process of the page, so that answers do not wait for computations of the page."""
+"""`pisigma serve` for a cell, as a separate process, so that answers do not wait for computations of the page."""
 
 import json
 import socket
@@ -13,16 +13,16 @@ from pisigma.files.errors import ModelError, Place
 from pisigma.robot.description import Robot
 
 _TIMEOUT = 2.0
-"""Longest time to wait for an answer of the server [s]."""
+"""Longest time to wait for an answer from the server [s]."""
 _WARM_UP = 100
-"""Number of requests after the start, whose times are the first displayed times."""
+"""Number of requests that are sent after the start; their times are the first that the page displays."""
 
 
 class ModelServer:
-    """Server of the model in use of a cell, which can be started and stopped.
+    """Server that answers with the model in use of a cell; it can be started and stopped.
 
     Attributes:
-        ports: ports by protocol; empty while it is stopped.
+        ports: ports by protocol; empty while the server is stopped.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -36,13 +36,13 @@ class ModelServer:
         self.ports: dict[str, int] = {}
 
     def start(self, robot: Robot) -> None:
-        """Start the server, if it does not run, and measure its first answers.
+        """Start the server if it is not running, and measure the times of its first answers.
 
         Args:
             robot: robot of the cell.
 
         Raises:
-            ModelError: no model is in use, or see `pisigma serve`.
+            ModelError: no model is in use, or the model cannot be served; see `pisigma serve`.
         """
         with self._lock, tempfile.TemporaryFile("w+") as said:
             if self._process is not None and self._process.poll() is None:

@@ -1,4 +1,4 @@
-"""Steps of a page: each calls the function of the cell that its command calls, and lays out its result."""
+"""Steps of a page: each calls the same function of the cell as the command of this name, and lays out the result."""
 
 import contextlib
 import itertools
@@ -80,7 +80,7 @@ def create(folder: Path, form: Form, files: list[Path]) -> Cell:
 
 
 def write_cell(folder: Path, form: Form, texts: dict[str, str]) -> None:
-    """Write `cell.yaml`, if the new one is valid and the old one is still the file that the person saw.
+    """Write `cell.yaml` if the new text is valid and the file has not changed since the person saw it.
 
     Args:
         folder: folder of the cell, whose file need not be valid.
@@ -89,7 +89,7 @@ def write_cell(folder: Path, form: Form, texts: dict[str, str]) -> None:
         texts: the text before every change, by the digest of the text after it.
 
     Raises:
-        PlanningError: the file has been changed meanwhile, or is not valid.
+        PlanningError: the file has been changed in the meantime, or the new text is not valid.
     """
     before = text_of(folder)
     digest, undo, entered = digest_of(before), form.get("undo"), form.get("text")
@@ -140,7 +140,7 @@ def verify(cell: Cell, form: Form, progress: Progress) -> Outcome:
 
 
 def rows_at_fault(findings: Sequence[Diagnostic]) -> dict[str, str]:
-    """Return the rows at fault by the sentences of findings."""
+    """Return the wrong rows by the sentences of the findings."""
     return {one.sentence: "; ".join(one.rows) for one in findings if one.rows}
 
 
@@ -163,7 +163,7 @@ def recalibrate(cell: Cell, form: Form, progress: Progress) -> Outcome:
 
 
 def _in_cell(text: ResultText, cell: Cell) -> ResultText:
-    """Return a result with the next step of the cell, as its commands state it, instead of that of the result."""
+    """Return a result with the next step of the cell, as its commands state it, in place of its own one."""
     step = uncapitalised(cell.status().step.reason)
     return replace(text, verdict=replace(text.verdict, next_step=step))
 
@@ -174,7 +174,7 @@ def incoming_rows(files: list[Path], cell: Cell, form: Form) -> IncomingRows:
     Args:
         files: uploaded files.
         cell: the cell, which states the settings of the import.
-        form: changes by a person: "column 0 3" is the meaning of the fourth column of the first file.
+        form: changes by a person; "column 0 3", for example, is the meaning of the fourth column of the first file.
     """
     changed = changed_settings("import", form)
     if lines := form.get("new_frame_at", "").split():
@@ -210,7 +210,7 @@ def import_session(incoming: IncomingRows, form: Form) -> Outcome:
 
 
 def take_back(cell: Cell, form: Form, progress: Progress) -> Outcome:
-    """Add a session that was set aside again, as the import of its file does."""
+    """Add a session that was set aside to the cell again, as the import of its file would."""
     progress("reading the rows")
     known = {one.name: one for one in cell.history.sessions() if one.set_aside and one.rows}
     name = form.get("session", "")
@@ -220,7 +220,7 @@ def take_back(cell: Cell, form: Form, progress: Progress) -> Outcome:
 
 
 def check_rows(cell: Cell, form: Form, progress: Progress) -> tuple[Outcome, SessionState]:
-    """Judge the rows of a session against the newest plan, as `measure --once --set replan=false` does."""
+    """Check the rows of a session against the newest plan, as `measure --once --set replan=false` does."""
     session = MeasuringSession.read(
         newest_plan(cell.folder), cell.file.settings_of_step("measure", replan=False)
     )
@@ -357,10 +357,10 @@ def set_aside(cell: Cell, form: Form, progress: Progress) -> Outcome:
 
 
 def file_name(name: str) -> str:
-    """Return the name of a file that a person entered.
+    """Return the file name that a person entered.
 
     Raises:
-        OutputError: it is not a name with a suffix.
+        OutputError: the entry is not a file name with a suffix.
     """
     stem, _, suffix = name.rpartition(".")
     is_plain = all(one.isalnum() or one in "._-" for one in name)
@@ -372,10 +372,10 @@ def file_name(name: str) -> str:
 
 
 def form_number(form: Form, key: str) -> float:
-    """Return a number of a form.
+    """Return a number from a form.
 
     Raises:
-        PoseError: it is not a number.
+        PoseError: the entry is not a number.
     """
     try:
         return float(form.get(key, ""))

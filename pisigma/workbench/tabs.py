@@ -51,16 +51,17 @@ _TAB_OF = {
     "session": "measure",
     "use": "status",
 }
-"""Tab of a command that has not the name of a tab."""
+"""Tab of every command whose name is not the name of a tab."""
 _FORMATS = tuple(
     name for name in BUILT_IN if name not in ("staubli", "xacro", "library", "ur-calibration", "rsi")
 )
-"""Formats that need no file of the controller."""
+"""Formats that need no file from the controller."""
 CHARTS = "-monitoring.html"
 """End of the names of pages with control charts in the reports of a cell."""
 _FIGURES = (".png", ".svg")
 _FIRST_ROWS, _MAX_ROWS, MAX_LINES = 8, 40, 2000
-"""First rows of an upload that are shown, and largest numbers of rows with findings, and of lines in a sentence."""
+"""Number of first rows of an upload that are shown, and largest numbers of rows with findings and of lines in a
+sentence."""
 _LINES = re.compile(r"\blines? ((?:\d{1,9}(?:, | to | and )?)+)")
 _RANGES = re.compile(r"(\d+)(?: to (\d+))?")
 
@@ -93,7 +94,7 @@ class Tabs:
     """Renders the page and its tabs.
 
     Attributes:
-        live: state of the session that is being followed, with the number of unchecked rows; None if none is.
+        live: state of the session that is being followed, with the number of unchecked rows; None if there is none.
         serving: the server of the model in use.
     """
 
@@ -118,7 +119,7 @@ class Tabs:
         Args:
             folder: folder of the cell.
             cell: the cell; None before there is one, and if its `cell.yaml` cannot be used.
-            is_broken: whether its `cell.yaml` cannot be used.
+            is_broken: whether the `cell.yaml` of the folder cannot be used.
         """
         robot, tabs = ("", {"status": "New cell"}) if cell is None else (cell.robot.name, TABS)
         tabs = {"cell": "Repair"} if is_broken else tabs
@@ -148,7 +149,7 @@ class Tabs:
         Args:
             name: name of the tab.
             cell: the cell.
-            status: its status.
+            status: status of the cell.
             texts: the text of `cell.yaml` before a change of the page, by the digest of the text after it.
         """
         context: dict[str, Any] = {
@@ -171,7 +172,7 @@ class Tabs:
 
         Args:
             incoming: the files.
-            numbers: their numbers, with commas.
+            numbers: numbers of the files, separated by commas.
         """
         names = [one.name for one in incoming.files]
         return self._environment.get_template("proposal.html.j2").render(
@@ -188,7 +189,7 @@ class Tabs:
         Args:
             incoming: the files.
             found: the findings.
-            problem: why the rows cannot be read; "" if they can.
+            problem: reason why the rows cannot be read; "" if they can.
         """
         repairs = {one.sentence: incoming.repair(one) for one in found if one.severity == "implausible"}
         fields = {
@@ -229,7 +230,7 @@ def line_numbers_in(text: str) -> list[int]:
 
 
 def _more(name: str, cell: Cell, status: CellStatus, texts: Mapping[str, str]) -> dict[str, Any]:
-    """Return the values for the template that only one tab shows."""
+    """Return the values for the template that only this tab shows."""
     match name:
         case "status":
             return {"timeline": timeline(status), "kinds": get_args(EventKind)}
@@ -257,7 +258,7 @@ def _more(name: str, cell: Cell, status: CellStatus, texts: Mapping[str, str]) -
 
 
 def timeline(status: CellStatus) -> list[TimelineEntry]:
-    """Return what happened to a cell, the newest first."""
+    """Return what happened to a cell, newest first."""
     facts = status.facts
     entries = [
         TimelineEntry(
@@ -284,7 +285,7 @@ def timeline(status: CellStatus) -> list[TimelineEntry]:
 
 
 def figures(cell: Cell, status: CellStatus) -> list[tuple[str, str]]:
-    """Return model and name of the figures of the newest model."""
+    """Return the newest model and the names of its figures."""
     models = status.facts.models
     if not models:
         return []
@@ -293,7 +294,7 @@ def figures(cell: Cell, status: CellStatus) -> list[tuple[str, str]]:
 
 
 def _names(folder: Path) -> list[str]:
-    """Return the names of the files in a folder, the newest first; none if it does not exist."""
+    """Return the names of the files in a folder, newest first; none if the folder does not exist."""
     files = [one for one in folder.glob("*") if one.is_file() and not one.name.startswith(".")]
     return [one.name for one in sorted(files, key=lambda one: one.stat().st_mtime, reverse=True)]
 

@@ -23,7 +23,7 @@ _GROWING = "growing"
 
 
 class UploadedRows:
-    """Answers the requests for uploaded rows of a page.
+    """Answers to the requests of a page about uploaded rows.
 
     Attributes:
         folder: folder of the cell.
@@ -52,7 +52,7 @@ class UploadedRows:
         def propose() -> str:
             incoming = self._incoming(Cell.open(self.folder), form)
             text = self._tabs.proposal(incoming, form.get("files", ""))
-            with contextlib.suppress(PisigmaError):  # the check states the fault
+            with contextlib.suppress(PisigmaError):  # the check reports what is wrong
                 rows = incoming.unchecked_rows
                 self._scene.show_rows(RowsSoFar.unjudged(rows.line, rows.q.numpy()))
             return text

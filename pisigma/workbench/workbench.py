@@ -1,4 +1,4 @@
-"""The server of a cell's page: answers requests with tabs, starts steps, and shows their results."""
+"""The server of a cell's page, which answers requests with tabs, starts steps, and shows their results."""
 
 import asyncio
 import math
@@ -36,7 +36,7 @@ from pisigma.workflow.cell.cell_file import CellFile
 
 Form = Mapping[str, str]
 _STATUS_AGE = 5.0
-"""Age after which the status is read again [s], because commands may change the cell as well."""
+"""Age after which the status is read again [s], because commands may change the cell, too."""
 _STATIC = {
     "workbench.js": ("text/javascript", "pisigma.workbench", "static"),
     "workbench.css": ("text/css", "pisigma.workbench", "static"),
@@ -65,7 +65,7 @@ class Workbench(UploadedRows):
 
     Attributes:
         folder: folder of the cell.
-        jobs: the step that runs, and the last outcomes.
+        jobs: the running step, and the last outcomes.
         url: link to the page, with its token.
         growing: file to which an instrument writes rows; None for none.
     """
@@ -111,7 +111,7 @@ class Workbench(UploadedRows):
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Stop the running step, wait for its end, and stop serving."""
+        """Stop the running step, wait until it has ended, and stop serving."""
         self.jobs.close()
         self._tabs.serving.stop()
         self._behind.close()
@@ -138,7 +138,7 @@ class Workbench(UploadedRows):
     def status(self) -> CellStatus | None:
         """Return the status of the cell, which is read again after some seconds and after every step.
 
-        It is None until there is a cell.
+        The status is None until there is a cell.
         """
         with self._reading:
             found, when = self._status
@@ -249,7 +249,7 @@ class Workbench(UploadedRows):
                 field = problem.option or str(problem.column or "")
                 return Outcome(refusal=self._uploads.without_folder(str(problem)), field=field)
             finally:
-                with self._reading:  # values that were read before the end of the step are out of date
+                with self._reading:  # values that were read before the step ended are out of date
                     self._status = self._status[0], -math.inf
 
         self.jobs.start(name, person_of(request), form.pop("command", "")[:_MAX_COMMAND], run)
@@ -263,7 +263,7 @@ class Workbench(UploadedRows):
         return _NO_CELL if status is None else status.step.to_json()
 
     def _fault(self) -> str | None:
-        """Return why `cell.yaml` cannot be used; None if it can, or if there is none."""
+        """Return why `cell.yaml` cannot be used; None if it can be used, or if there is no such file."""
         if (self.folder / CELL_FILE).is_file():
             try:
                 CellFile.read(self.folder)
@@ -311,7 +311,7 @@ class Workbench(UploadedRows):
 
         def arrived(rows: Measurements) -> None:
             self._scene.add_rows(rows.q.numpy())
-            assert self._tabs.live is not None  # the state at the start is shown before
+            assert self._tabs.live is not None  # the state at the start has already been shown
             count = self._tabs.live["rows"] + rows.rows
             self._tabs.live |= {"rows": count, "unchecked": rows.rows}
             self.jobs.version += 1
@@ -356,7 +356,7 @@ class Workbench(UploadedRows):
         return found
 
     def _write_cell(self, form: Form) -> Outcome:
-        """Write `cell.yaml`, which need not have been valid, and show the cell."""
+        """Write `cell.yaml`, whose previous text may be invalid, and show the cell."""
         steps.write_cell(self.folder, form, self._texts)
         self._scene.show_cell(Cell.open(self.folder))
         return Outcome()

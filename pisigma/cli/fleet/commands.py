@@ -98,7 +98,7 @@ def show_fleet(
 
     Args:
         folder: folder of the cells.
-        page: HTML file to write; None for none.
+        page: HTML file to write; None to write none.
         verbose: print all tables.
         as_json: print one JSON object.
     """

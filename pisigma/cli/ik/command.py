@@ -118,7 +118,7 @@ def _words(text: str) -> list[str]:
 
 
 def _numbers(option: str, text: str | None) -> list[float] | None:
-    """Return the numbers of an option, None if it is not given."""
+    """Return the numbers of an option; None if the option is not given."""
     try:
         return None if text is None else [float(word) for word in _words(text)]
     except ValueError:
@@ -140,7 +140,7 @@ def _print_pose(
     T, places = stated_pose(pose), [f"the pose {' '.join(f'{value:g}' for value in pose)}"]
     if all_branches:
         solution = solver.all_branches(T).select(0)
-        if not solver.closed_form:  # a number of solutions, and nothing behind them
+        if not solver.closed_form:  # only solutions, without padding
             solution = solution.select(slice(0, max(1, int(np.isfinite(solution.q).all(-1).sum()))))
         names = (solver.branches[branch] for branch in solution.branch.tolist())
         places = [f"{places[0]}, branch {name}" for name in names]

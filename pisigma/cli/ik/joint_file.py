@@ -27,7 +27,8 @@ _BAD_ROW = "bad_row"
 """Status of a row that is not a pose."""
 
 FAR = 50.0
-"""Multiple of the reach beyond which a position is refused; metres that are read as millimetres are off by 1000."""
+"""Multiple of the reach beyond which a position is refused; with a wrong length unit, positions are 1000 times too
+large."""
 
 _LISTED = 10
 """Largest number of failed rows that are listed."""
@@ -43,7 +44,7 @@ class FailedRow:
     Attributes:
         line: line in the file of poses.
         status: `bad_row`, or the name of a `Status` in lower case.
-        reason: the fault and its remedy.
+        reason: what is wrong with the row, and how to correct it.
     """
 
     line: int
@@ -57,7 +58,7 @@ class PoseFileResult:
 
     Attributes:
         rows: number of rows.
-        statuses: number of rows by status.
+        statuses: numbers of rows by status.
         first_failed: the first `_LISTED` rows that failed, in the order of the file.
         failed: number of rows that failed.
         switches: lines at which a path changes its branch or is interrupted, with a description.
@@ -193,7 +194,7 @@ def _solve(
 
 
 def _too_far(chunk: PoseChunk, robot: Robot) -> list[str]:
-    """Return the reason why a pose is too far away for the robot, for every pose; "" if it is not."""
+    """Return for every pose the reason why it is too far away for the robot; "" if it is not."""
     distance = (chunk.T[:, :3, 3] - torch.from_numpy(robot.base[:3].copy())).norm(dim=-1)
     reasons = [""] * len(chunk.line)
     for row in (distance > FAR * robot.reach).nonzero()[:, 0].tolist() if robot.reach > 0 else []:

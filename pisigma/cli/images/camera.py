@@ -42,7 +42,7 @@ def camera(
 
 
 def _verdict(calibrated: "CameraCalibration", out: Path) -> Verdict:
-    """Judge the intrinsics of a camera."""
+    """Return the verdict on the intrinsics of a camera."""
     detection, covered = calibrated.detection, calibrated.calibration.covered.mean()
     _, fx, sigma, _ = calibrated.parameters[0]
     return Verdict(

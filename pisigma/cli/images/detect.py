@@ -66,7 +66,7 @@ def detect(
 
 
 def _verdict(detected: "DetectedCorners", out: Path, camera: Path, board: Path) -> Verdict:
-    """Judge the corners of a board."""
+    """Return the verdict on the corners of a board."""
     detection = detected.detection
     warnings = len(detected.warnings) + len(detection.left_out)
     joints = "" if detected.joints else "add the joint values, then "

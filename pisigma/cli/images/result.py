@@ -57,5 +57,5 @@ def write_result(
 
 
 def trust_text(warnings: int, otherwise: str) -> str:
-    """Return whether to trust a result with this number of warnings."""
+    """Return a sentence on whether to trust a result with a number of warnings."""
     return f"with caution ({count_text(warnings, 'warning')})." if warnings else otherwise

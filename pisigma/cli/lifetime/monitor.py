@@ -88,7 +88,7 @@ def _print(
     verbose: bool,
     status: "CellStatus | None" = None,
 ) -> None:
-    """Print the result; `status`: of a cell."""
+    """Print the result; `status` is the status of a cell."""
     from pisigma.workflow.result_texts import monitoring_text
 
     if as_json:

@@ -80,14 +80,14 @@ def recalibrate_into(
     verbose: bool = False,
     nominal: "Robot | None" = None,
 ) -> None:
-    """Add rows to a model, write the model that was kept if a folder is stated, and print it.
+    """Recalibrate a model with new rows, write the chosen model if a folder is stated, and print the result.
 
     Args:
         context: context of the command, for the card.
         model: folder of the model.
         data: files of the rows.
         settings: settings of the recalibration.
-        out: folder to write; None for none.
+        out: folder to write; None to write none.
         accept_implausible: write the model even if it must not be trusted.
         overwrite: replace the model in the folder.
         as_json: print one JSON object.

@@ -92,8 +92,8 @@ def serve_session_page(
     Args:
         arm: the robot in its cell.
         limit_mm: limit for 95 % of the errors [mm]; None for no limit.
-        page: options of the page; None for no page.
-        camera: the camera that measures; None for another sensor.
+        page: options of the page; None if no page is served.
+        camera: the camera that measures; None if another sensor measures.
 
     Raises:
         ImportError: viser is not installed.

@@ -1,4 +1,4 @@
-"""A process that computes for this one, whose threads then answer at once and which can be ended at any time."""
+"""A process that computes for this one, so that threads of this one answer at once; it can be ended at any time."""
 
 import contextlib
 import os
@@ -18,7 +18,7 @@ COMMAND = "from pisigma.files.engines.background import serve; serve()"
 
 
 class EndedError(Exception):
-    """The process was ended before it returned a result."""
+    """Error for a process that was ended before it returned a result."""
 
 
 def compute_here(work: Callable[..., Result], progress: Progress | None = None) -> Result:
@@ -48,8 +48,8 @@ class BackgroundProcess:
                 function, and is raised.
 
         Raises:
-            EndedError: the process was closed meanwhile, died, or was ended by an exception such as an interruption
-                during an earlier call.
+            EndedError: the process was closed in the meantime, died, or was ended by an exception, such as an
+                interruption, during an earlier call.
         """
         request = pickle.dumps((work, progress is not None))
         with self._lock:
@@ -85,7 +85,7 @@ class BackgroundProcess:
             answered = True
         finally:
             if not answered:
-                self._process.kill()  # a later call would take the answer to this one for its own
+                self._process.kill()  # a later call would take the answer to this call for its own
         return *answer, stopped
 
     def _send(self, value: Any) -> None:
@@ -114,9 +114,9 @@ def serve() -> None:
     """Compute the requests of the process at the other end of stdin and stdout, until that process ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the other process handles interrupts
     if hasattr(os, "nice"):
-        os.nice(10)  # what the user sees comes first
+        os.nice(10)  # computations that the user is waiting for come first
     requests, answers = sys.stdin.buffer, os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # what functions print must not get among the answers
+    os.dup2(2, 1)  # output that functions print must not be mixed with the answers
 
     def answer(kind: str, pickled: bytes) -> None:
         answers.write(pickle.dumps((kind, pickled)))
@@ -140,7 +140,7 @@ def serve() -> None:
 
 
 class _StoppedError(BaseException):
-    """The other process does not need the result; no function takes it for an error that it can handle."""
+    """Exception that ends a computation whose result is not needed; no function may handle it as an error."""
 
 
 def _pickled_error(problem: BaseException) -> bytes:

@@ -12,14 +12,14 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 ONE_THREAD: Final = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-"""Environment of all workers. With one thread each, sums have the same order and results the same bits for any number
-of workers."""
+"""Environment of all workers. With one thread each, sums have the same order, and results have the same bits for any
+number of workers."""
 
 
 class AbstractEngine(ABC):
     """Interface of engines that run a function for many items in other processes.
 
-    The function writes its results itself, so that an interrupted call loses only the items in progress.
+    The function itself writes its results, so that an interrupted call loses only the items in progress.
     """
 
     @abstractmethod
@@ -40,7 +40,7 @@ class AbstractEngine(ABC):
             work: function to call with each item: a function at module level, or a `functools.partial` of one.
             items: the items to process; items and results are pickled. Workers first load the plug-ins of this
                 process.
-            chunk: number of items that a worker gets at once; it should be some seconds of work.
+            chunk: number of items that a worker gets at a time, which should be a few seconds of work.
         """
         size = max(1, min(chunk, math.ceil(len(items) / self.workers)))
         lost: list[Item] = []

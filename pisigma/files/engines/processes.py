@@ -1,4 +1,4 @@
-"""Run work in processes or threads of this machine, or on Ray: engines for many items, and several tasks at once."""
+"""Run work in processes or threads of this machine, or on Ray: engines for many items, and parallel tasks."""
 
 import contextlib
 import logging
@@ -104,8 +104,8 @@ def run_in_threads(tasks: Sequence[Callable[[], Result]], one_at_a_time: bool) -
     of the time: two calibrations in parallel, with one thread each, take 0.6 of the time that they take sequentially.
 
     Args:
-        tasks: functions without arguments; none may change data that others read.
-        one_at_a_time: whether to run the tasks sequentially, because one alone keeps all cores busy or needs much
+        tasks: functions without arguments, none of which may change data that others read.
+        one_at_a_time: whether to run the tasks sequentially, because a single task keeps all cores busy or needs much
             memory.
     """
     import torch  # imported here, so that workers, which import this module, start faster
@@ -126,7 +126,7 @@ def run_in_processes(tasks: Sequence[Callable[[], Result]], jobs: int) -> Iterat
         jobs: largest number of processes.
 
     Raises:
-        PisigmaError: a task raised this error. It is raised after all earlier tasks have returned, so that the
+        PisigmaError: a task raised this error. It is passed on after all earlier tasks have returned, so that the
             outcome does not depend on which task ends first.
         MemoryError: the process of a task died twice, usually because memory ran out.
     """

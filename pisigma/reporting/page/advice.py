@@ -36,9 +36,9 @@ def advice_for(
     Args:
         model: the model.
         summary: figures of its calibration; None for other models.
-        rows: judged rows, or None.
-        accuracies: error figures.
-        limit: what limits the accuracy.
+        rows: evaluated rows, or None.
+        accuracies: figures of the errors.
+        limit: contribution of measurement scatter to the error.
         causes: diagnosed causes of the errors with their remedies; these sentences come first.
     """
     held_out = [accuracy for accuracy in accuracies if accuracy.held_out]

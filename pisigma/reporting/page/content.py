@@ -52,9 +52,9 @@ class Verdict:
         sentence: accuracy of the model, improvement over nominal, place of the largest errors, and cause that limits
             the accuracy.
         worst: sentence on the place of the largest errors.
-        limit: sentence on the cause that limits the accuracy: the first diagnosed cause, or scatter or model.
+        limit: sentence on the cause that limits the accuracy: the first diagnosed cause, otherwise scatter or model.
         held_out: whether the sentence refers to rows that were not used to make the model.
-        joint: the worst joint of a network, if no pose was judged.
+        joint: the worst joint of a network, if no pose was evaluated.
     """
 
     sentence: str
@@ -76,10 +76,10 @@ def verdict_of(
 
     Args:
         model: the model.
-        accuracies: error figures, of which the first one is decisive.
+        accuracies: figures of the errors; the verdict uses the first ones.
         joints: errors of joints, which are used if no pose was evaluated.
-        rows: judged rows, or None.
-        limit: contribution of measurement scatter.
+        rows: evaluated rows, or None.
+        limit: contribution of measurement scatter to the error.
         causes: diagnosed causes of the errors; the first one is the cause that limits the accuracy.
     """
     if not accuracies:
@@ -94,11 +94,11 @@ def verdict_of(
 
 
 def causes_of(summary: CalibrationSummary | None, diagnostics: Sequence[Diagnostic]) -> tuple[str, ...]:
-    """Return sentences on the diagnosed causes of the errors: of the judged rows, or otherwise of the calibration.
+    """Return sentences on the diagnosed causes of the errors of the evaluated rows, or otherwise of the calibration.
 
     Args:
         summary: figures of the calibration; None for other models.
-        diagnostics: why the judged rows are implausible.
+        diagnostics: reasons why the evaluated rows are implausible.
     """
     found = diagnostics or (() if summary is None else summary.diagnostics)
     named = (one for one in found if one.severity == "implausible" or one.kind not in _WITHOUT_CAUSE)
@@ -146,9 +146,9 @@ class ReportContent:
         model: the model.
         summary: figures of its calibration; None for other models.
         verdict: the first statements.
-        accuracies: error figures; the verdict uses the first ones.
+        accuracies: figures of the errors; the verdict uses the first ones.
         limit: contribution of measurement scatter to the error.
-        rows: judged rows, or None.
+        rows: evaluated rows, or None.
         remarks: sentences about these rows.
         map: points of the error map.
         dependences: errors over joint values, order, payload and temperature.
@@ -241,13 +241,13 @@ def report_content(
 
     Args:
         model: the model.
-        folder: its folder.
-        measurements: rows to judge the model with, or None for the held-out rows that the folder stores.
+        folder: folder of the model.
+        measurements: rows with which to evaluate the model, or None for the held-out rows that the folder stores.
         remarks: sentences about these rows.
-        diagnostics: why these rows are implausible.
+        diagnostics: reasons why these rows are implausible.
 
     Raises:
-        MeasurementError: the rows cannot be judged.
+        MeasurementError: the model cannot be evaluated with the rows.
         ModelError: files of the folder are missing or were changed.
     """
     summary, held_out = CalibrationSummary.read(model), read_held_out(folder, model)

@@ -1,4 +1,4 @@
-"""Values that are drawn in a figure, as CSV: read from the figure, so that both agree."""
+"""Values that are drawn in a figure, as CSV; they are read from the figure, so that both agree."""
 
 import csv
 import datetime
@@ -15,7 +15,7 @@ from matplotlib.patches import StepPatch
 from matplotlib.quiver import Quiver
 
 MAX_POINTS = 5_000
-"""Points of a series above which every k-th is written; the series says so."""
+"""Number of points of a series above which only every k-th is written, as the name of the series states."""
 
 Point = dict[str, Any]
 
@@ -35,7 +35,7 @@ def csv_of(figure: Figure) -> str:
     for axes in figure.axes:
         if axes not in bars:
             points += _points_of(axes)
-    # without columns that are empty in all lines
+    # columns that are empty in all lines are left out
     columns = dict.fromkeys(name for one in points for name, text in one.items() if text)
     stream = io.StringIO()
     writer = csv.DictWriter(stream, columns, extrasaction="ignore", lineterminator="\n")
@@ -90,7 +90,7 @@ def _series(panel: str, label: object, columns: Iterable[tuple[str, Any]]) -> It
 
 
 def _entries(axes: Axes, panel: str, matrix: AxesImage) -> Iterator[Point]:
-    """Yield the entries of a matrix with names along both axes; nothing for a picture."""
+    """Yield the entries of a matrix with names along both axes; nothing for other pictures."""
     across, down = (
         [one.get_text() for one in labels] for labels in (axes.get_xticklabels(), axes.get_yticklabels())
     )
@@ -101,7 +101,7 @@ def _entries(axes: Axes, panel: str, matrix: AxesImage) -> Iterator[Point]:
 
 
 def _text(value: Any) -> str:
-    """Return a number with five digits, a day by ISO 8601, and "" for values that are not finite."""
+    """Return a number with five digits, a day in ISO 8601, and "" for values that are not finite."""
     if isinstance(value, (float, np.floating)):
         return f"{value:.5g}" if np.isfinite(value) else ""
     return str(value)

@@ -38,7 +38,7 @@ _MANY_DOTS = 200
 _PIXELS = 130
 """Resolution of rasterised dots [pixels per inch]."""
 BEFORE, AFTER, OTHER = "#b35806", "#1f5fa8", "#4d4d4d"
-"""Colours that can be distinguished with colour blindness."""
+"""Colours that people with colour blindness can distinguish."""
 _STYLE: dict[Any, Any] = {
     "text.parse_math": False,
     "svg.hashsalt": "pisigma",
@@ -134,7 +134,7 @@ def check_figures(folder: Path, inputs: Iterable[Input] = ()) -> None:
     """Check in advance that figures can be written into a folder.
 
     Raises:
-        OutputError: it is a file, is inside a model folder or an input, or cannot be made or written to.
+        OutputError: the folder is a file, is inside a model folder or an input, or cannot be created or written to.
     """
     check_conflicts(folder / "figure.png", inputs, "--figures")
     if folder.exists() and not folder.is_dir():
@@ -157,7 +157,7 @@ def write_figures(drawings: Sequence[Drawing], folder: Path) -> list[Path]:
 
     Args:
         drawings: drawings to write; characters that file names cannot have are replaced.
-        folder: folder, created where missing.
+        folder: folder, created if it is missing.
 
     Raises:
         OutputError: a file cannot be written.
@@ -308,7 +308,7 @@ def draw_map(
 
 
 def make_panel() -> tuple[Figure, Axes]:
-    """Return a panel with fixed margins; computing the margins would take as long as drawing."""
+    """Return a panel with fixed margins, because computing the margins would take as long as drawing."""
     figure = Figure(figsize=SIZE)
     figure.subplots_adjust(left=0.155, right=0.985, bottom=0.165, top=0.9)
     axes = figure.add_subplot()

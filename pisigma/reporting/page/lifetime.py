@@ -58,7 +58,7 @@ def monitoring_page(
         charts: control charts of the sessions.
         sentences: sentences on all sessions together.
         warnings: sentences that warn of problems.
-        refused: date, file and reason of every session that must not be trusted.
+        refused: date and file of every session that must not be trusted, and the reason.
         marks: days that are marked in the chart of each quantity; days under the key "" are marked in all charts.
         limit_mm: limit on the RMS error [mm]; None if there is none.
     """
@@ -88,7 +88,7 @@ def _marks_of(marks: Mapping[str, Sequence[Mark]], chart: Chart) -> list[Mark]:
 
 
 def _sessions(records: Sequence[Record], refused: Sequence[tuple[str, str, str]]) -> Table:
-    """Return a table of all sessions, verdict and reason first; refused sessions have no error."""
+    """Return a table of all sessions, with verdict and reason first; refused sessions have no error."""
     said = [_sentence(" ".join((one.session.sentence, *one.session.unobservable))) for one in records]
     rows: list[tuple[str, ...]] = [
         (date, verdict, line, error, count, pays, file)
@@ -212,7 +212,7 @@ def _dates(axes: Axes) -> None:
 
 
 def fleet_page(status: FleetStatus, folder: Path) -> str:
-    """Render the cells of a fleet as HTML, the most urgent first; texts are escaped.
+    """Render the cells of a fleet as HTML, most urgent first; texts are escaped.
 
     Args:
         status: status of the fleet.
@@ -235,7 +235,7 @@ def fleet_page(status: FleetStatus, folder: Path) -> str:
 
 
 def _cells(status: FleetStatus, cells: Sequence[CellStatus], folder: Path) -> Table:
-    """Return a table of all cells, state and reason first, with links to the cards of their models."""
+    """Return a table of all cells, with state and reason first, and links to the cards of their models."""
     link = Markup('<a href="{}">{}</a>')
     rows: list[tuple[str, ...]] = [
         (name, UNREADABLE, reason, "", "", "", "", "") for name, reason in status.unreadable.items()

@@ -44,7 +44,7 @@ def render_page(content: ReportContent, figures: ReportFigures, acceptance: Acce
 
     Args:
         content: findings of the report.
-        figures: its figures.
+        figures: figures of the report.
         acceptance: statements for the acceptance of the robot of a cell; None without a cell.
     """
     return html_page(

@@ -13,7 +13,8 @@ from pisigma.measurement.camera.pattern import Pattern, board_pattern
 from pisigma.robot.se3 import rotation_from_vector, transform
 
 _NODE_STEP = 16
-"""Distance [px] of the nodes at which rays are undistorted; a cubic spline between them is accurate to 1e-4 px."""
+"""Distance [px] between the nodes at which rays are undistorted; a cubic spline between these is accurate to 1e-4
+px."""
 _SURFACE_ITERATIONS = 4
 """Number of fixed-point iterations from the plane to a bowed surface; each reduces the error to a few percent."""
 _SUBPIXELS = 4
@@ -73,8 +74,8 @@ class TrueBoard:
 class Exposure:
     """Light and optics with which an image is taken.
 
-    A lens with the aperture A, focused at the distance F, images a point at the distance z as a disc with the diameter
-    `f A |1/z - 1/F|`, with f the focal length [px]; here it is a normal density with the same variance.
+    A lens with aperture A and focal length f [px], focused at the distance F, images a point at the distance z as a
+    disc with the diameter `f A |1/z - 1/F|`; here the disc is replaced by a normal density with the same variance.
 
     Attributes:
         black: gray level of the print, from 0 to 255.
@@ -115,8 +116,8 @@ def render_image(
         T_camera_board: pose of the board [m].
         exposure: light and optics.
         rng: random generator of the noise.
-        motion: motion of the board between the first and the last row of the image, which a rolling shutter exposes
-            one after the other: shift [m] and rotation vector [rad], in the axes of the camera. None: the board is at
+        motion: motion of the board, shift [m] and rotation vector [rad] in the axes of the camera, between the first
+            and the last row of the image, which a rolling shutter exposes one after the other; None if the board is at
             rest. The middle row shows the given pose.
 
     Returns:
@@ -163,7 +164,7 @@ def _blur(camera: Camera, exposure: Exposure, depth: np.ndarray) -> np.ndarray:
 def _bounds(
     camera: Camera, board: TrueBoard, T_camera_board: np.ndarray, exposure: Exposure
 ) -> tuple[int, int, int, int]:
-    """Return the range of pixels that the blurred board covers; the whole image if the board leaves the view."""
+    """Return the range of pixels that the blurred board covers, or the whole image if the board leaves the view."""
     left, top, right, bottom = board.pattern.sheet
     along = np.linspace(0, 1, _OUTLINE)
     x, y = left + along * (right - left), top + along * (bottom - top)
@@ -186,7 +187,7 @@ def _bounds(
 
 def _rays(camera: Camera, u: np.ndarray, v: np.ndarray) -> Float64[np.ndarray, "2 v u"]:
     """Return x / z and y / z of the rays of a grid of pixels."""
-    # imported here, because it takes 0.3 s, which other recipes do not need
+    # imported here, because it takes 0.3 s, and other recipes do not need it
     from scipy.interpolate import (
         RectBivariateSpline,
     )
@@ -199,7 +200,7 @@ def _rays(camera: Camera, u: np.ndarray, v: np.ndarray) -> Float64[np.ndarray, "
 def _on_surface(
     board: TrueBoard, T_camera_board: Float64[np.ndarray, "_rows 4 4"], rays: np.ndarray
 ) -> tuple[Float64[np.ndarray, "2 v u"], Float64[np.ndarray, "v u"]]:
-    """Return the points at which rays meet the board, in its frame [m], and their depths [m]; `FAR` if they do not.
+    """Return the points at which rays meet the board, in its frame [m], and their depths [m], `FAR` for no point.
 
     There is one pose of the board for each row of rays, or one for all.
     """
@@ -216,7 +217,7 @@ def _on_surface(
 
 
 def _reflected(surface: "_Surface", xy: Float64[np.ndarray, "2 v u"]) -> Float64[np.ndarray, "v-1 u-1"]:
-    """Return the gray level of every pixel before the blur, averaged over its area, by its four vertices."""
+    """Return the gray level of every pixel before the blur, averaged over its area, from its four vertices."""
     cell = surface.cell(xy)
     gray: np.ndarray = surface.gray.ravel()[cell[:-1, :-1]]
     across = (cell[:-1, :-1] != cell[1:, 1:]) | (cell[:-1, 1:] != cell[1:, :-1])

@@ -1,4 +1,4 @@
-"""Section of a recipe for images of a board that a camera takes on the true robot."""
+"""Section of a recipe for images of a board taken by a camera on the true robot."""
 
 import os
 from collections.abc import Iterator, Sequence
@@ -55,7 +55,7 @@ class RandomViews(Section):
     def joints(
         self, robot: Robot, camera: Camera, board: Board, is_fixed: bool = False
     ) -> Float64[Tensor, "count dof"]:
-        """Return the joint values to command [rad or m]; they are the same for every call.
+        """Return the joint values to command [rad or m], the same for every call.
 
         Args:
             robot: the robot, with its base from the board to the base and its tool from the flange to the camera (for
@@ -65,7 +65,7 @@ class RandomViews(Section):
             is_fixed: whether the camera is fixed and the board is on the flange.
 
         Raises:
-            RecipeError: the robot has no closed form, or does not reach the requested number of views.
+            RecipeError: the robot has no closed form, or reaches fewer views than requested.
         """
         solver, rng = self.check(robot), np.random.default_rng(self.seed)
         chosen, needed = list[Tensor](), _CANDIDATES * self.count
@@ -166,7 +166,7 @@ class BoardErrors(Section):
 
 
 class JointReadingDelay(Section):
-    """Delay with which joint values of a moving arm are read after an image was taken.
+    """Delay with which joint values of a moving arm are read after an image is taken.
 
     Attributes:
         delay_ms: delay from the image to the reading [ms].
@@ -182,7 +182,7 @@ class SimulatedImages(Section):
 
     The base of the true robot (an error source of the recipe) is the transform from the board to the robot, and its
     tool is the transform from the flange to the camera; for a fixed camera, they are the transforms from the camera
-    to the robot and from the flange to the board. Joints with play stop in the middle of the play.
+    to the robot and from the flange to the board. Joints with backlash stop in the middle of their play.
 
     Attributes:
         kind: "images".
@@ -281,7 +281,7 @@ def draw_board_poses(
     generator: torch.Generator,
     is_fixed: bool = False,
 ) -> Float64[Tensor, "images 4 4"]:
-    """Return T_camera_board [m] of every image of a true robot, with random errors of its repeatability.
+    """Return T_camera_board [m] of every image of a true robot, with random errors due to its repeatability.
 
     Args:
         robot: the true arm, with its base from the board to the base and its tool from the flange to the camera (for a

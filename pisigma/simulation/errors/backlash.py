@@ -16,7 +16,7 @@ class Backlash(AbstractPlaySource):
 
     The approach is +1 if the joint's value increased before it stopped and -1 if it decreased. For
     simulated trackers and distance sensors, the approach direction of every joint is drawn at random for every row and
-    written to the measurements. Touches and sockets are approached until they fit, so their joints are in the middle of
+    written to the measurements. Touches and sockets are approached until they fit, so the joints are in the middle of
     the play.
 
     Source: Whitney, Lozinski and Rourke, "Industrial robot forward calibration method and results", ASME

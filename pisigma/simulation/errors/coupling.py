@@ -17,8 +17,8 @@ from pisigma.simulation.errors.source import AbstractJointSource, JointErrorFunc
 class CouplingDeviation(AbstractJointSource):
     """A true coupling of joints that differs from the coupling in the robot's file.
 
-    `e = f_true(C_true q + b_true) - f(C q + b)` with q the controller's values: for example gears with another
-    ratio, or a parallelogram whose bars differ in length, which is a general four-bar linkage.
+    `e = f_true(C_true q + b_true) - f(C q + b)` with the controller's values q; for example, gears with a different
+    ratio, or a parallelogram whose bars differ in length and which is therefore a general four-bar linkage.
 
     Attributes:
         kind: "coupling".

@@ -13,7 +13,7 @@ from pisigma.simulation.errors.source import AbstractJointSource, JointErrorFunc
 
 
 class EncoderQuantisation(AbstractJointSource):
-    """Quantisation of joint values: the servo can hold a joint only at whole pulses of its encoder.
+    """Quantisation of joint values, because the servo can hold a joint only at whole pulses of its encoder.
 
     `e_j = step_j · round(q_j / step_j) - q_j` with `step_j = 360 deg / pulses_j`, so |e_j| <= step_j / 2.
     Halves are rounded to the nearest even multiple.

@@ -1,4 +1,4 @@
-"""Given or random errors of the geometry of links, base and tool."""
+"""Stated or random errors of the geometry of links, base and tool."""
 
 from typing import Literal
 
@@ -14,7 +14,7 @@ from pisigma.simulation.errors.source import AbstractGeometrySource, GeometryCha
 
 
 class GeometricDeviation(AbstractGeometrySource):
-    """Given errors of geometric parameters.
+    """Stated errors of geometric parameters.
 
     `dh_true = dh_nominal + rows`, `base_true = base_nominal + base`, `tool_true = tool_nominal + tool`, for every
     parameter of `A_i = RotZ(theta) Trans(a, 0, d) RotX(alpha) RotY(beta)` and of base and tool
@@ -37,7 +37,7 @@ class GeometricDeviation(AbstractGeometrySource):
     tool: FrameSection = FrameSection()
 
     def parameter_errors(self, robot: Robot, place: str) -> GeometryChange:
-        """Return the given errors [rad or m]; see `AbstractGeometrySource.parameter_errors`."""
+        """Return the stated errors [rad or m]; see `AbstractGeometrySource.parameter_errors`."""
         dh = np.zeros_like(robot.dh)
         for name, error in self.rows.items():
             dh[row_index(robot, name, place)] = error.to_si()
@@ -53,7 +53,7 @@ class RandomGeometricDeviation(AbstractGeometrySource):
 
     `p_true = p_nominal + s · u`, with s the size for lengths or angles and u uniform in [-1, 1), or standard normal.
     From one generator with `seed`, (rows, 5) values are drawn for the DH rows (theta, d, a, alpha, beta), then 6 for
-    the base and 6 for the tool, also for sizes of 0, so that a size does not change the errors of other parameters.
+    the base and 6 for the tool, even for sizes of 0, so that a size does not change the errors of other parameters.
 
     Source: the parameters are those of Hayati and Mirmirani, Journal of Robotic Systems 2(4), 1985,
     397-413; random errors on all of them are the usual way to test an identification, for example in

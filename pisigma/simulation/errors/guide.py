@@ -1,4 +1,4 @@
-"""Errors of a linear guide, joint errors that vary slowly along the travel of an axis."""
+"""Errors of a linear guide: joint errors that vary slowly along the travel of an axis."""
 
 from typing import Literal
 

@@ -33,9 +33,9 @@ class JointCompliance(AbstractJointSource):
     """Deflection of every joint in proportion to its gravity torque.
 
     `e_j = c_j · tau_j(q)` with `tau_j = Σ_k z_j · ((r_k - p_j) x m_k g)` over all masses k beyond joint j,
-    where z_j and p_j are the joint's axis and origin and r_k the centre of mass; for a prismatic joint the
-    force `tau_j = Σ_k z_j · m_k g`. The torque is computed for the nominal geometry at the commanded joint values,
-    without the deflection, which is exact to first order in the compliance.
+    where z_j and p_j are the joint's axis and origin, and r_k is the centre of mass; for a prismatic joint, the force
+    is `tau_j = Σ_k z_j · m_k g`. The torque is computed for the nominal geometry at the commanded joint values, without
+    the deflection, which is exact to first order in the compliance.
 
     Source: Whitney, Lozinski and Rourke, ASME Journal of Dynamic Systems, Measurement, and Control
     108(1), 1986, 1-8; Judd and Knasinski, IEEE Transactions on Robotics and Automation 6(1), 1990, 20-30.

@@ -1,4 +1,4 @@
-"""Interface of error sources, recipe sections that change the geometry or the joint values of a robot."""
+"""Interface of error sources, which are recipe sections that change the geometry or the joint values of a robot."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
@@ -65,7 +65,7 @@ class AbstractJointSource(AbstractErrorSource):
 
     @property
     def stepped_joints(self) -> frozenset[str]:
-        """Names of the joints that have encoder steps by this source, so that they cannot reach arbitrary values."""
+        """Names of the joints that have encoder steps due to this source and so cannot reach arbitrary values."""
         return frozenset()
 
     @abstractmethod
@@ -82,7 +82,7 @@ class AbstractJointSource(AbstractErrorSource):
 
 
 class AbstractPlaySource(AbstractErrorSource):
-    """Base class of sources of backlash, by which joints stop on the side of their approach; their plays are added.
+    """Base class of sources of backlash, with which joints stop on their side of approach; their plays are added.
 
     Attributes:
         seed: random seed of the directions of approach of simulated rows.
@@ -152,7 +152,7 @@ def stated_joints(
         axes: whether the mappings are by names of the controller's axes, `robot.axes`, instead of joints.
 
     Raises:
-        RecipeError: a joint is unknown, or in the mapping of the other type.
+        RecipeError: a joint is unknown, or is in the mapping for the other joint type.
     """
     values: dict[int, Value] = {}
     joints = robot.axes if axes else robot.joints
@@ -179,7 +179,7 @@ def joint_values(
     fields: tuple[str, str],
     place: str,
 ) -> Float64[np.ndarray, " dof"]:
-    """Return one value per joint [rad or m], 0 if not given; see `stated_joints`."""
+    """Return one value per joint [rad or m], 0 if not stated; see `stated_joints`."""
     stated = stated_joints(robot, for_revolute, for_prismatic, fields, place)
     return np.array([stated.get(index, 0.0) for index in range(robot.dof)])
 

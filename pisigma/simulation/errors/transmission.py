@@ -1,4 +1,4 @@
-"""Transmission errors, periodic functions of the joint angles."""
+"""Transmission errors, which are periodic functions of the joint angles."""
 
 from typing import Literal
 

@@ -55,10 +55,10 @@ class Access:
         return f"/{self.folder}"
 
     async def enter(self, request: web.Request) -> web.Response:
-        """Answer the link: set the cookie, and go on to the first page.
+        """Answer the link: set the cookie, and forward the browser to the first page.
 
-        A redirect would be a part of the navigation from the foreign page with the link, to which a strict cookie is
-        not sent; hence a page that is left immediately.
+        A redirect would belong to the navigation from the foreign page with the link, for which browsers send no strict
+        cookie; therefore the answer is a page that forwards the browser immediately.
         """
         if not secrets.compare_digest(
             request.match_info["token"].encode(errors="replace"), self.token.encode()
@@ -107,7 +107,7 @@ class Access:
 
 
 def is_local_host(host: str) -> bool:
-    """Return whether a Host header names this machine: by a number, or by a name that only this machine has.
+    """Return whether a Host header names this machine by an address or by a name that only this machine has.
 
     A foreign page whose name was made to point to this machine (DNS rebinding) is recognised by its name.
     """

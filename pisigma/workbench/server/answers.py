@@ -15,7 +15,7 @@ _MAX_PERSON = 60
 
 
 def with_error_answers(function: Callable[[Any, web.Request], Awaitable[web.StreamResponse]]) -> Any:
-    """Answer a refused input with its message, and a request during a step with the person who started it."""
+    """Answer a refused input with the message, and a request during a step with the name of who started it."""
 
     @functools.wraps(function)
     async def answer(self: Any, request: web.Request) -> web.StreamResponse:

@@ -1,4 +1,4 @@
-"""Server of a page, in a thread; no other server of the page listens on a port."""
+"""Server of a page, in a thread; it is the only server of the page that listens on a port."""
 
 import asyncio
 import contextlib
@@ -17,7 +17,7 @@ from pisigma.workbench.server.access import MAX_UPLOAD, Access
 _MAX_PORTS = 1000
 """Number of ports that are tried."""
 _CLOSING_TIME = 1.0
-"""Time to finish open requests at the end [s]."""
+"""Time for open requests to finish when the server ends [s]."""
 
 
 class FrontServer:
@@ -25,7 +25,7 @@ class FrontServer:
 
     Attributes:
         url: link with the token.
-        origin: its start, such as "http://127.0.0.1:8080".
+        origin: start of the link, such as "http://127.0.0.1:8080".
     """
 
     def __init__(
@@ -41,7 +41,7 @@ class FrontServer:
             pages: functions that answer a method and a path in the folder of the pages, such as ("GET", "/").
             host: address to listen on; at 127.0.0.1 only this machine can open the pages.
             port: port to listen on; if it is in use, the next free port.
-            closing: called in the thread of the server at its end.
+            closing: function that is called in the thread of the server when it ends.
 
         Raises:
             OutputError: the host is not an address of this machine, or no port is free.
@@ -98,7 +98,7 @@ def _bound(host: str, port: int) -> socket.socket:
             family, kind, _, _, address = socket.getaddrinfo(host, number, type=socket.SOCK_STREAM)[0]
             with contextlib.ExitStack() as unless_bound:
                 bound = unless_bound.enter_context(socket.socket(family, kind))
-                if os.name == "posix":  # on Windows, two servers would share the port
+                if os.name == "posix":  # on Windows, two servers would otherwise share the port
                     bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
                 bound.bind(address)
                 bound.listen()

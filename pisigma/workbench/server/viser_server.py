@@ -16,11 +16,11 @@ from aiohttp.typedefs import Handler
 
 from pisigma.files.errors import OutputError, Place
 
-if TYPE_CHECKING:  # the full name, which type checkers at run time find without this import
+if TYPE_CHECKING:  # the full name can be resolved by type checkers at run time even without this import
     import viser
 
 _MAX_MESSAGE = 50 * 2**20
-"""Largest size of a message that viser accepts [bytes]."""
+"""Size of the largest message that viser accepts [bytes]."""
 _MAX_PATH = 100
 """Longest path of a unix socket on all systems [bytes]."""
 _SCENE_POLICY = (
@@ -33,8 +33,8 @@ _starting = threading.Lock()
 class ViserBackend:
     """A viser server on a unix socket in a folder that only this user can enter.
 
-    viser has no token and does not check where a page comes from, and it listens only on ports, which all users of a
-    machine can open.
+    viser alone has no token, does not check the origin of a page, and listens on a port, which all users of a machine
+    can open.
 
     Attributes:
         path: path of the socket.
@@ -66,11 +66,11 @@ class ViserBackend:
         self._session: aiohttp.ClientSession | None = None
 
     def pages(self, folder: str) -> dict[tuple[str, str], Handler]:
-        """Return the page of viser in a folder, such as "/scene", whose socket has no slash at its end."""
+        """Return the handlers of viser's page in a folder, such as "/scene"; its socket has no slash at the end."""
         return {("GET", f"{folder}/"): self._answer, ("GET", folder): self._answer}
 
     async def _answer(self, request: web.Request) -> web.StreamResponse:
-        """Send the file of viser's page, or connect its websocket."""
+        """Send the file of viser's page, or connect to its websocket."""
         if request.headers.get("Upgrade", "").lower() == "websocket":
             return await self._connect(request)
         return web.Response(
@@ -134,14 +134,14 @@ def _started(path: Path, label: str) -> "viser.ViserServer":
     replaced while it starts.
 
     Raises:
-        RuntimeError: this version of viser starts in another way; in this case, no server listens.
+        RuntimeError: this version of viser starts in another way; no server was started.
     """
     import viser
     import websockets.asyncio.server as sockets
 
     class Private(viser.ViserServer):
         def request_share_url(self, verbose: bool = True) -> str | None:
-            return None  # every client may ask for a tunnel, even without its button
+            return None  # every client may ask for a tunnel, even if the button for it is missing
 
     serve = sockets.serve
 

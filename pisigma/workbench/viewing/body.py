@@ -22,7 +22,7 @@ from pisigma.robot.urdf_frames import Frame, frame_of, translation
 from pisigma.workbench.viewing.colors import Color
 from pisigma.workbench.viewing.surface import Surface, capsule, join_surfaces
 
-if TYPE_CHECKING:  # names in full, which type checkers at run time find without these imports
+if TYPE_CHECKING:  # full names can be resolved by type checkers at run time even without these imports
     import trimesh
     import viser
 
@@ -49,7 +49,7 @@ class AbstractBody(ABC):
 
 
 class CapsuleBody(AbstractBody):
-    """Robot that is drawn as the capsules by which plans are checked for collisions."""
+    """Robot that is drawn as the capsules with which plans are checked for collisions."""
 
     def __init__(self, capsules: Capsules) -> None:
         self._capsules = capsules

@@ -31,7 +31,7 @@ from pisigma.workbench.viewing.colors import (
 from pisigma.workbench.viewing.surface import Surface, revolve, rotation_to
 from pisigma.workflow.predicted_errors import PredictedErrors
 
-if TYPE_CHECKING:  # names in full, which type checkers at run time find without these imports
+if TYPE_CHECKING:  # full names can be resolved by type checkers at run time even without these imports
     import viser
 
 _GHOST = 0.35
@@ -45,7 +45,7 @@ _SHEET, _PRINT = (245, 245, 245), (20, 20, 20)
 _CORNER_DOT = 0.25
 """Diameter of a corner's dot, as a share of the distance of two corners."""
 _CLOUD_DOT = 0.6
-"""Diameter of a predicted error's dot, as a share of that of a row's."""
+"""Diameter of the dot of a predicted error, as a share of the diameter of the dot of a row."""
 _MAX_LABELS, _MAX_ARROWS = 50, 1000
 """Wrong rows that are labelled with their line, and errors that are drawn as arrows; more are drawn as lines."""
 _FLOOR, _TRACKER_HEAD, _CONE, _BEAM, _HANDLE = 5.0, 0.05, 0.2, 0.003, 0.3
@@ -129,12 +129,12 @@ class SessionScene:
         """Draw every row as a point in the colour of its error, with the error as an arrow.
 
         Args:
-            rows: measured rows; rows that cannot be judged yet are drawn at the tool of the nominal robot.
+            rows: measured rows; rows that cannot be checked yet are drawn at the tool of the nominal robot.
             top: error at the end of the colour scale [m].
             magnification: ratio of the lengths of the arrows to the lengths of the errors.
 
         Returns:
-            The positions at which they are drawn [m].
+            The positions at which the rows are drawn [m].
         """
         self._begin("/rows")
         if not rows.line:
@@ -156,7 +156,7 @@ class SessionScene:
         """Draw predicted errors as one cloud of points.
 
         Args:
-            errors: the errors; None for none.
+            errors: predicted errors; None to draw none.
             top: error at the end of the colour scale [m].
         """
         self._begin("/predicted")
@@ -256,7 +256,7 @@ def draw_surroundings(
 
     Args:
         scene: scene to draw in, in the robot's base frame.
-        surroundings: surroundings to draw; without a floor the grid is at the height of the robot's base.
+        surroundings: surroundings to draw; if there is no floor, the grid is at the height of the robot's base.
         reach: reach of the robot [m].
         is_movable: whether floor (height), boxes (with their yaw), tracker, and camera or board can be dragged.
     """
@@ -322,7 +322,7 @@ def draw_sight(
     Args:
         scene: scene to draw in.
         name: name of the parent node.
-        surroundings: surroundings with tracker and reflector; nothing is drawn without a tracker.
+        surroundings: surroundings with tracker and reflector; if there is no tracker, nothing is drawn.
         T_base_tool: pose of the reflector [m].
         reach: reach of the robot [m].
     """

@@ -18,7 +18,7 @@ from pisigma.workbench.viewing.body import AbstractBody, CapsuleBody
 from pisigma.workbench.viewing.colors import RAMP, round_up
 from pisigma.workbench.viewing.scene import SessionScene
 
-if TYPE_CHECKING:  # names in full, which type checkers at run time find without these imports
+if TYPE_CHECKING:  # full names can be resolved by type checkers at run time even without these imports
     import viser
     import viser.uplot
 
@@ -30,7 +30,7 @@ camera as a share of that at which this radius is visible."""
 MAGNIFICATIONS = (0, 2000, 10)
 """Smallest and largest magnification of errors, and its step."""
 _MAX_ALARMS = 8
-"""Latest alarms that are shown."""
+"""Number of latest alarms that are shown."""
 
 _CURVES: tuple["viser.uplot.Series", ...] = (
     {"label": "poses"},
@@ -144,7 +144,7 @@ def first_view(arm: ArmInSurroundings) -> tuple[Float64[np.ndarray, " 3"], Float
 
 
 def arrow_magnification(top: float, reach: float) -> int:
-    """Return the magnification with which errors can be seen next to a robot.
+    """Return the magnification with which errors are visible next to a robot.
 
     Args:
         top: error at the end of the colour scale [m].
@@ -214,7 +214,7 @@ class SessionPanel:
 def _curves(
     points: Sequence[AccuracyPoint], limit: float | None
 ) -> tuple[Float64[np.ndarray, " points"], ...]:
-    """Return the columns of the curve [mm] over the number of poses; of points with equal numbers, the last."""
+    """Return the columns of the curve [mm] over the number of poses; of points with the same number, the last one."""
     by_poses = {point.poses: point for point in points}
     line = math.nan if limit is None else limit
     rows = [

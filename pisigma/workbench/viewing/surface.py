@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 _AROUND = 24
-"""Points around the axis of revolution."""
+"""Number of points around the axis of revolution."""
 
 
 @dataclass(frozen=True, eq=False)
