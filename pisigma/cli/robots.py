@@ -164,9 +164,9 @@ def _check(robot: str, base: str | None, tip: str | None, as_json: bool) -> None
             "with those on the teach pendant; the rotation is RotZ(roll) RotY(pitch) RotX(yaw). If the first "
             "difference appears when an axis is moved, check its row and the following ones, its direction and "
             "its coupling.",
-            "Nominal inverse kinematics are solved numerically."
+            "The nominal inverse kinematics is solved numerically."
             if form is None
-            else f"Nominal inverse kinematics have the closed form {form.name} with {len(form.branches)} branches.",
+            else f"The nominal inverse kinematics has the closed form {form.name} with {len(form.branches)} branches.",
         ]
     )
 

@@ -127,7 +127,7 @@ class MjcfDrawing:
         names = [body.find("joint").get("name") for body in bodies]
         if nominal.coupling is not None or len(bodies) != len(rows) or kinds != [row.type for row in rows]:
             expected = f"the joints {', '.join(row.name for row in rows)}, one in a body and none coupled"
-            remedy = "give the MJCF file of this robot; --tip names the body behind its last joint"
+            remedy = "give the MJCF file of this robot; --tip names the body after its last joint"
             raise RobotError(
                 expected=expected,
                 value=", ".join(map(str, names)),

@@ -67,7 +67,7 @@ TOOL_LINK = "tool0"
 MASS, INERTIA, EFFORT, VELOCITY = "1", "0.01", "1000", "10"
 _PLACEHOLDERS = (
     f"Masses ({MASS} kg), inertias ({INERTIA} kg m2), efforts ({EFFORT}) and velocities ({VELOCITY}) are "
-    "placeholders, not values of the robot: only the kinematics were calibrated. Enter the values of the maker to "
+    "placeholders, not values of the robot: only the kinematics was calibrated. Enter the values of the maker to "
     "simulate forces."
 )
 

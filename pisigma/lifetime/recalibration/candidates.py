@@ -87,7 +87,7 @@ class CandidateChoice:
         )
         return (
             f"{self.names[self.kept]} is kept: the RMS error of {self.rows} rows held out in cross-validation is "
-            f"{sizes[self.kept]:.3g} mm{f', against {others}' if others else ''}."
+            f"{sizes[self.kept]:.3g} mm{f', compared with {others}' if others else ''}."
         )
 
 

@@ -92,7 +92,7 @@ def _check_joints(path: Path, first: Arm, second: Arm, document: ArmsDocument) -
             expected="arms without common joints",
             value=sorted(shared)[0],
             at=place_of_key(path, ("arms", second.name)),
-            remedy="keep this joint at rest, and state a link behind it as `base` of both arms",
+            remedy="keep this joint at rest, and state a link after it as the `base` of both arms",
         )
 
 

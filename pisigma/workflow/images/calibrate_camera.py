@@ -161,7 +161,7 @@ def calibrate_camera(
         MeasurementError: a file cannot be used, or the images do not determine the intrinsics.
     """
     of_board = Board.load(board)
-    detected = detect_boards(image_files(images), of_board, settings.most_blur, progress)
+    detected = detect_boards(image_files(images), of_board, settings.max_blur, progress)
     read = [one for one in detected if one.is_read]
     size = read[0].size
     for one in read:

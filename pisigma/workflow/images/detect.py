@@ -129,7 +129,7 @@ def detect(
         )
     names, stops = [file.stem for file in files], sum(map(is_frame, files))
     joined = None if joints is None else join_joint_values(names, joints, settings.within, stops)
-    detected = detect_boards(files, of_board, settings.most_blur, progress)
+    detected = detect_boards(files, of_board, settings.max_blur, progress)
     result = DetectedCorners(
         predict_boards(detected, of_camera, of_board), joined, (of_camera.name, of_board.name)
     )

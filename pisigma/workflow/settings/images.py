@@ -5,7 +5,7 @@ from typing import Annotated
 
 from pisigma.files.setting import KEY, Option
 
-MostBlur = Annotated[float, Option("--most-blur-px", min=0.0, is_key=True)]
+MaxBlur = Annotated[float, Option("--max-blur-px", min=0.0, is_key=True)]
 
 
 @dataclass(frozen=True)
@@ -13,12 +13,12 @@ class DetectionSettings:
     """Settings of the detection of boards in images.
 
     Attributes:
-        most_blur: maximum blur of the edges in an image, as a standard deviation [px].
+        max_blur: maximum blur of the edges in an image, as a standard deviation [px].
         within: maximum difference between the time stamps of an image and of its joint values [s].
         video_start: time at which a video starts, in the clock of the joint values [s].
     """
 
-    most_blur: MostBlur = 3.0
+    max_blur: MaxBlur = 3.0
     within: Annotated[float, KEY] = 0.2
     video_start: Annotated[float, KEY] = 0.0
 
@@ -30,9 +30,9 @@ class IntrinsicsSettings:
     Attributes:
         name: name of the camera.
         free_k3: also estimate k3 (default: 0).
-        most_blur: maximum blur of the edges in an image, as a standard deviation [px].
+        max_blur: maximum blur of the edges in an image, as a standard deviation [px].
     """
 
     name: str = "camera"
     free_k3: Annotated[bool, Option("--k3", is_key=True)] = False
-    most_blur: MostBlur = 3.0
+    max_blur: MaxBlur = 3.0
