@@ -274,7 +274,7 @@ def unpack(
     out: Annotated[Path, typer.Option(help="Folder to write.")],
     as_json: AsJson = False,
 ) -> None:
-    """Restore a cell from a file of `pisigma pack`."""
+    """Restore a cell from a file written by `pisigma pack`."""
     from pisigma.workflow.cell.archive import unpack as workflow
 
     opened = workflow(file, out)

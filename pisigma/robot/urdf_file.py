@@ -126,7 +126,7 @@ def _insert_properties(root: Any, path: str | os.PathLike[str]) -> None:
 
 def _is_xacro(path: str | os.PathLike[str]) -> RobotError:
     return RobotError(
-        "the file is xacro, which is not supported",
+        "the file is a xacro file, which is not supported",
         expected="a URDF file",
         value="xacro",
         at=Place(path),

@@ -111,7 +111,7 @@ def offset_sentences(offsets: JointOffsets) -> tuple[str, ...]:
     sentences = [_MEANING, departure_sentence("Offsets alone deviate", offsets.lost, offsets.nominal)]
     if offsets.unobservable:
         sentences.append(
-            f"Offsets of {', '.join(offsets.unobservable)} are 0 because base or tool have the same effect."
+            f"Offsets of {', '.join(offsets.unobservable)} are 0 because the base or the tool has the same effect."
         )
     return tuple(sentences)
 

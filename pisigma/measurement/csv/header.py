@@ -82,7 +82,7 @@ def read_header(table: Table, robot: Robot | None) -> Layout:
             "the columns are those of corners of a board in images",
             at=place,
             value=",".join(CORNERS),
-            remedy="describe camera and board with --camera camera.yaml --board board.yaml (of pisigma calibrate, "
+            remedy="describe camera and board with --camera camera.yaml --board board.yaml (options of calibrate, "
             "recalibrate, evaluate, verify, monitor, compare and report)",
         )
     columns = tuple(_find(place, name, number) for number, name in enumerate(table.header, start=1))

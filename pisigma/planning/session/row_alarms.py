@@ -138,7 +138,7 @@ def contradiction_alarm(
     what += f" ({usual:.2f} mm is usual here)" if usual == usual else ""
     other = _other_pose(rows, judgement, row, poses, names)
     if other:
-        advice = "Check whether points or joint values were swapped, and measure it again."
+        advice = "Check whether points or joint values were swapped, and measure the pose again."
         text = f"{what}; it looks like {other}. {advice}"
         return Alarm(line, "swapped", text, repeat=True)
     advice = "Check the reflector, its seat and the line of sight, and measure the pose again."

@@ -27,7 +27,7 @@ def check_few_rows(checked: CheckedCalibration) -> Iterator[Diagnostic]:
         yield Diagnostic(
             kind="few_rows",
             severity="warning",
-            sentence="The arm keeps its nominal geometry, and only base and tool were fitted: with the "
+            sentence="The arm keeps its nominal geometry, and only base and tool were fitted: with these "
             f"{checked.rows.rows} rows, no other geometry predicts held-out rows better; measure more poses in "
             "which all joints move.",
             values={"rows": checked.rows.rows},

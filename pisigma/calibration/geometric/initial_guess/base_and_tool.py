@@ -72,7 +72,7 @@ class BaseToolFit:
             return self.solution.status.value
         return (
             f"{self.solution.status.value}; the data determine only {rank} of the {free} unknowns of base and "
-            "tool; the others keep their initial values (poses with more different wrist orientations would "
+            "tool; the others keep their initial values (poses with a wider variety of wrist orientations would "
             "determine them)"
         )
 
