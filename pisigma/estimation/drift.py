@@ -283,7 +283,7 @@ class PosteriorUpdate:
 
     Attributes:
         shift: most probable change of the unknowns.
-        effective: number of directions that the values determine.
+        effective_unknowns: number of directions that the values determine.
     """
 
     def __init__(
@@ -312,13 +312,13 @@ class PosteriorUpdate:
             self._eigenvalues = self._eigenvalues.clamp(min=0.0)
             self._along = A.t() @ U
             z = self._along @ ((U.t() @ y) / (1 + self._eigenvalues))
-            self.effective = float((self._eigenvalues / (1 + self._eigenvalues)).sum())
+            self.effective_unknowns = float((self._eigenvalues / (1 + self._eigenvalues)).sum())
         else:
             M = A.t() @ A
             M.diagonal().add_(1.0)
             self._L = torch.linalg.cholesky(M)
             z = torch.cholesky_solve((A.t() @ y)[:, None], self._L)[:, 0]
-            self.effective = len(M) - float(torch.cholesky_inverse(self._L).trace())
+            self.effective_unknowns = len(M) - float(torch.cholesky_inverse(self._L).trace())
         directions = root.shape[1]
         # z is in units of the roots: the first part moves the old unknowns, the second part those that drifted.
         self.shift = root @ z[:directions]

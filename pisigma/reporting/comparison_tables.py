@@ -102,7 +102,7 @@ def _error_lines(comparison: ModelComparison, whole: bool) -> _Lines:
         for axis in first.axes if whole else ():
             values = [rounded(one.axes[axis]["rms"], comparison.rows) for one in errors]
             lines.append((f"{quantity}, RMS {word} {axis} [{first.unit}]", values))
-    if any(model.rows_outside for model in models):
+    if any(model.rows_outside_domain for model in models):
         for quantity, first in models[0].quantities.items():
             for where in ("inside", "outside"):
                 cells = [

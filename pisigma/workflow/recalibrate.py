@@ -263,7 +263,7 @@ def _summary(
         changed=_UNBELIEVABLE if moved is None else movements_text(moved),
         moved=moved or (),
         elsewhere=(),
-        effective_parameters=adaptation.effective,
+        effective_parameters=adaptation.effective_unknowns,
         noise=dict(adaptation.noise.value),
         warnings=_warnings(parent, choice, rows),
     )

@@ -29,4 +29,4 @@ def test_the_posterior_is_that_of_kalman(count, drifted):
     assert after.shape[1] <= MAX_DIRECTIONS * UNKNOWNS or drifted == 1
     assert_close(after @ after.t(), C - gain @ X @ C, atol=1e-9)
     assert_close(after[4].norm() > 0, drifted > 4)
-    assert_close(update.effective, torch.trace(X @ gain), rtol=1e-9)
+    assert_close(update.effective_unknowns, torch.trace(X @ gain), rtol=1e-9)

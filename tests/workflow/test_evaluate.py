@@ -24,8 +24,8 @@ MODEL = ModelFigures(
     rows_not_predicted=0,
     position=errors("mm", mean=0.5, p95=1.0, max=2.0),
     orientation=errors("deg", mean=0.1),
-    rows_inside=None,
-    rows_outside=None,
+    rows_inside_domain=None,
+    rows_outside_domain=None,
 )
 
 

@@ -21,7 +21,7 @@ class PriorRatio:
         group: the group of parameters.
         prior: smallest prior standard deviation of a parameter of the group [m or rad].
         value: the estimated ratio [1].
-        at_least: the ratio minus two standard deviations. An estimate from n effective parameters has a relative
+        lower_bound: the ratio minus two standard deviations. An estimate from n effective parameters has a relative
             standard deviation of about `1 / sqrt(2 n)`, so this is `exp(-sqrt(2 / n))` times the estimate.
     """
 
@@ -29,7 +29,7 @@ class PriorRatio:
     group: PriorGroup
     prior: float
     value: float
-    at_least: float
+    lower_bound: float
 
     @property
     def size(self) -> float:
@@ -39,7 +39,7 @@ class PriorRatio:
     @property
     def size_at_least(self) -> float:
         """The estimated standard deviation of the errors minus two of its own standard deviations [m or rad]."""
-        return self.at_least * self.prior
+        return self.lower_bound * self.prior
 
 
 def prior_ratios_of(problem: CalibrationProblem, here: Linearisation[Tensor]) -> tuple[PriorRatio, ...]:

@@ -173,7 +173,7 @@ class HybridCalibrator:
             coverage=JointCoverage.from_joints(self.geometric.robot, solved.problem.q),
             noise={sensor.name: sigma for sensor, sigma in noise if not sensor.certain},
             unknowns=refined.design.unknowns,
-            effective=refined.posterior.effective_unknowns,
+            effective_unknowns=refined.posterior.effective_unknowns,
             rounds=refined.rounds,
             outliers=_outliers(solved, refined),
         )

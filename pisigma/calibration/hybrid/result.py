@@ -29,7 +29,8 @@ class LearnedPart:
         coverage: measured ranges of joint values; outside them the correction is an extrapolation.
         noise: standard deviation per sensor [m or rad], or a factor on the standard deviations that the rows state.
         unknowns: number of parameters and weights.
-        effective: effective number of parameters and weights that the data determine; the prior determines the others.
+        effective_unknowns: effective number of parameters and weights that the data determine; the prior determines
+            the others.
         rounds: number of linearisations.
         outliers: rows with less than half of the full weight, worst first.
     """
@@ -39,7 +40,7 @@ class LearnedPart:
     coverage: JointCoverage
     noise: dict[str, float]
     unknowns: int
-    effective: float
+    effective_unknowns: float
     rounds: int
     outliers: tuple[Outlier, ...] = ()
 

@@ -73,7 +73,7 @@ class Adaptation:
         arm: geometry, frames and joint correction.
         drift: sizes of the drift of each group, and the noise.
         shift: change of all unknowns, with parameters relative to the anchors.
-        effective: number of directions that the new rows determine.
+        effective_unknowns: number of directions that the new rows determine.
         rounds: number of linearisations.
         search: evidence at the solution, from which movements are estimated.
         values: values in use at the solution.
@@ -84,7 +84,7 @@ class Adaptation:
     arm: AdaptedArm
     drift: Drift
     shift: Float64[Tensor, " unknowns"]
-    effective: float
+    effective_unknowns: float
     rounds: int
     search: DriftSearch
     values: LinearValues
@@ -147,7 +147,7 @@ def adapt(
         update = PosteriorUpdate(problem.root, values, drift)
         # Convergence is assessed with predicted values, because poorly determined unknowns may still wander.
         step = values.X @ (mean + update.shift - x) / values.deviation(drift.noise)
-        x, effective = mean + update.shift, update.effective
+        x, effective = mean + update.shift, update.effective_unknowns
         if float(step.square().mean().sqrt()) < _CONVERGENCE_TOLERANCE:
             break
     return Adaptation(
@@ -155,7 +155,7 @@ def adapt(
         arm=AdaptedArm.from_unknowns(problem, x),
         drift=drift,
         shift=update.shift,
-        effective=effective,
+        effective_unknowns=effective,
         rounds=rounds,
         search=search,
         values=values,

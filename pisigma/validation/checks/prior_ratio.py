@@ -36,8 +36,8 @@ def check_prior_ratio(checked: CheckedCalibration) -> Iterator[Diagnostic]:
     zeros of these sizes are possible. Joint zeros beyond the manufacturer's class are accepted if held-out rows are
     predicted well.
     """
-    unusual = [ratio for ratio in checked.geometric.prior_ratios if ratio.at_least > UNUSUAL]
-    large = [ratio for ratio in unusual if ratio.at_least > _IMPLAUSIBLE]
+    unusual = [ratio for ratio in checked.geometric.prior_ratios if ratio.lower_bound > UNUSUAL]
+    large = [ratio for ratio in unusual if ratio.lower_bound > _IMPLAUSIBLE]
     possible = narrowest_robot_class(checked, large)
     usual = checked.robot_class
     for ratio in unusual:
@@ -109,7 +109,7 @@ def _size(ratio: PriorRatio) -> str:
 
 
 def _consequence(ratio: PriorRatio, usual: RobotClass, possible: RobotClass | None, believed: bool) -> str:
-    if believed and (possible is usual or possible is None or ratio.at_least <= _IMPLAUSIBLE):
+    if believed and (possible is usual or possible is None or ratio.lower_bound <= _IMPLAUSIBLE):
         return (
             "so the size of the prior was estimated from the data; check the nominal geometry and the robot, or give a "
             "wider prior"

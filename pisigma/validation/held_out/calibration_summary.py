@@ -343,7 +343,7 @@ def _learned(result: HybridResult, learned: LearnedPart) -> LearnedFigures:
         ),
         orders=tuple(learned.correction.orders),
         unknowns=learned.unknowns,
-        effective_parameters=learned.effective,
+        effective_parameters=learned.effective_unknowns,
         linearisations=learned.rounds,
         noise=tuple(
             noise_figures(sensor, sigma, units[sensor])

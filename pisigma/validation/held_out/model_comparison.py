@@ -155,16 +155,16 @@ class ModelFigures:
         rows_not_predicted: number of rows with a measured length for which this model has no prediction.
         position: errors of positions, and of the lengths of other sensors in rows without a position.
         orientation: errors of orientations; None if none was measured.
-        rows_inside: number of compared rows inside the model's domain; None if it has no domain.
-        rows_outside: number of compared rows outside it; None if it has no domain.
+        rows_inside_domain: number of compared rows inside the model's domain; None if it has no domain.
+        rows_outside_domain: number of compared rows outside it; None if it has no domain.
     """
 
     name: str
     rows_not_predicted: int
     position: QuantityErrors
     orientation: QuantityErrors | None
-    rows_inside: int | None
-    rows_outside: int | None
+    rows_inside_domain: int | None
+    rows_outside_domain: int | None
 
     @property
     def quantities(self) -> dict[str, QuantityErrors]:
@@ -187,7 +187,7 @@ class ModelFigures:
             axis: {f"{name}_{one.unit}": value for one in errors for name, value in one.axes[axis].items()}
             for axis in self.position.axes
         }
-        for where, rows in (("inside", self.rows_inside), ("outside", self.rows_outside)):
+        for where, rows in (("inside", self.rows_inside_domain), ("outside", self.rows_outside_domain)):
             if rows is not None:
                 values[f"{where}_domain"] = {"rows": rows, **_with_units(errors, where)} if rows else None
         if self.position.difference is not None:
@@ -290,8 +290,8 @@ def compare_models(
             rows_not_predicted=int((measured & ~predicted[name]).sum()),
             position=position,
             orientation=orientation,
-            rows_inside=None if inside is None else int((common & inside).sum()),
-            rows_outside=None if inside is None else int((common & ~inside).sum()),
+            rows_inside_domain=None if inside is None else int((common & inside).sum()),
+            rows_outside_domain=None if inside is None else int((common & ~inside).sum()),
         )
         for name, position, orientation, inside in zip(models, positions, orientations, domains, strict=True)
     ]

@@ -146,14 +146,14 @@ class _Fit:
         motion: its estimated motions.
         after: remaining residuals.
         scale: standard deviation of one residual, per sensor.
-        effective: effective number of unknowns, including the motions.
+        effective_unknowns: effective number of unknowns, including the motions.
     """
 
     candidate: _Candidate
     motion: Float64[np.ndarray, " motions"]
     after: Float64[np.ndarray, "rows values"]
     scale: tuple[float, ...]
-    effective: float
+    effective_unknowns: float
 
     @property
     def shifts(self) -> Float64[np.ndarray, "own values"]:
@@ -296,7 +296,7 @@ class _Search:
             fit: fit of the candidate.
             values_per_independent: number of values per independent value.
         """
-        if fit.effective > _MAX_USED * self.rows.values:
+        if fit.effective_unknowns > _MAX_USED * self.rows.values:
             return -math.inf
         # Correlated values and repeats contain no more information than one pose per configuration.
         values = max(

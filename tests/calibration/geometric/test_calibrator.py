@@ -87,7 +87,7 @@ def test_default_settings_meet_exact_data_with_errors_far_beyond_the_prior() -> 
     result = GeometricCalibrator(robot, base="fixed", tool="fixed").fit(data)
     assert result.rms_path[-1] < 1e-15
     assert mean_error(result.robot, true, 200) < 1e-12
-    assert {ratio.kind for ratio in result.prior_ratios if ratio.at_least > 4.0} >= {"angle"}
+    assert {ratio.kind for ratio in result.prior_ratios if ratio.lower_bound > 4.0} >= {"angle"}
     assert result.extended
 
 

@@ -77,7 +77,7 @@ def calibrated(theta: float, length: float) -> list[str]:
 
 
 def unusual(result: CalibrationResult) -> list[str]:
-    return [ratio.kind for ratio in result.prior_ratios if ratio.at_least > UNUSUAL]
+    return [ratio.kind for ratio in result.prior_ratios if ratio.lower_bound > UNUSUAL]
 
 
 @pytest.mark.parametrize(

@@ -60,7 +60,7 @@ def test_all_errors_of_a_simulated_robot_are_learned_from_150_positions() -> Non
     assert rms(result, simulated.test) < 0.07e-3
     assert result.learned is not None
     assert 0.5 * NOISE < result.learned.noise["position"] < 1.5 * NOISE
-    assert 0 < result.learned.effective < result.learned.unknowns
+    assert 0 < result.learned.effective_unknowns < result.learned.unknowns
     assert result.learned.rounds >= 1
     assert any(trial.kept for trial in result.trials[1:])
     assert "gravity" in [feature.name for feature in result.learned.correction.features]
