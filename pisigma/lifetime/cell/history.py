@@ -133,7 +133,7 @@ class Check:
 
 
 @dataclass(frozen=True)
-class ModelUse:
+class InUse:
     """A change of the model in use.
 
     Attributes:
@@ -187,14 +187,12 @@ TABLES: dict[type, Table] = {
     Event: Table("events"),
     ModelEntry: Table("models", ("name",)),
     Check: Table("checks"),
-    ModelUse: Table("uses"),
+    InUse: Table("uses"),
     ExportEntry: Table("exports"),
     ControllerEntry: Table("controller"),
     MonitoredSession: Table("monitored_sessions", ("model_sha256", "rows_sha256")),
 }
-Entry = (
-    SessionEntry | Event | ModelEntry | Check | ModelUse | ExportEntry | ControllerEntry | MonitoredSession
-)
+Entry = SessionEntry | Event | ModelEntry | Check | InUse | ExportEntry | ControllerEntry | MonitoredSession
 """A row of a table of a history."""
 _SESSIONS_OF_MODEL = """SELECT model, rows, file, date, json_extract(session, '$.rows'), temperature_c,
     CASE WHEN json_array_length(session, '$.moved') THEN 'moved'
@@ -250,9 +248,9 @@ class History:
         """Return all monitored sessions of all models in the order in which they were added."""
         return self.database.read(MonitoredSession)
 
-    def uses(self) -> tuple[ModelUse, ...]:
+    def uses(self) -> tuple[InUse, ...]:
         """Return the changes of the model in use; the last one names the current model."""
-        return self.database.read(ModelUse)
+        return self.database.read(InUse)
 
     def exports(self) -> tuple[ExportEntry, ...]:
         """Return all exports in the order in which they were written."""

@@ -17,16 +17,7 @@ from pisigma.files.model_files import is_model
 from pisigma.files.progress import Progress
 from pisigma.lifetime.cell.controller import findings
 from pisigma.lifetime.cell.facts import settings_hash
-from pisigma.lifetime.cell.history import (
-    HISTORY,
-    Check,
-    Entry,
-    History,
-    ModelEntry,
-    ModelUse,
-    SessionEntry,
-    now,
-)
+from pisigma.lifetime.cell.history import HISTORY, Check, Entry, History, InUse, ModelEntry, SessionEntry, now
 from pisigma.lifetime.cell.layout import MODELS, PLANS, model_folder
 from pisigma.lifetime.cell.status import CellStatus, status_of
 from pisigma.measurement.camera.camera_files import CameraFiles
@@ -229,7 +220,7 @@ class Cell:
         entry = model_entry(events, started, path, sessions, remark, result)
         verdict = "accepted_implausible" if doubt else "trusted"
         check = Check("calibrate", entry.name, "", verdict, doubt, p95, False, started, rms, stated)
-        self.history.add(entry, check, *([ModelUse(entry.name, now(), remark)] if better else []))
+        self.history.add(entry, check, *([InUse(entry.name, now(), remark)] if better else []))
         return result, entry
 
     def verify(
@@ -257,7 +248,7 @@ class Cell:
         self.history.add(Check(*found_by, errors["p95"], moved, now(), errors["rms"]))
         in_use = self.history.in_use
         if found.accepted and (in_use is None or in_use.made < entry.made):
-            self.history.add(ModelUse(entry.name, now(), f"verified with session '{chosen.name}'"))
+            self.history.add(InUse(entry.name, now(), f"verified with session '{chosen.name}'"))
         return found, entry
 
     def monitor(self, progress: Progress = lambda what: None, **changed: Any) -> MonitoringResult:
@@ -345,7 +336,7 @@ class Cell:
         added: list[Entry] = [entry, Check(*of, p95, False, now(), rms)]
         if result.trusted:
             events = unrecorded_changes(result, chosen, seen.moved, self.sessions.valid_sessions())
-            added += [ModelUse(entry.name, now(), remark), *events]
+            added += [InUse(entry.name, now(), remark), *events]
         self.history.add(*added)
         return result, entry
 

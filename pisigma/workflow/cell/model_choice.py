@@ -8,7 +8,7 @@ from typing import TypeVar
 from pisigma.files.model_files import is_unchanged, model_hash
 from pisigma.files.progress import Progress
 from pisigma.lifetime.cell.events import Event, EventKind
-from pisigma.lifetime.cell.history import Check, History, ModelEntry, ModelUse, SessionEntry, now
+from pisigma.lifetime.cell.history import Check, History, InUse, ModelEntry, SessionEntry, now
 from pisigma.lifetime.cell.layout import MODELS, checked_model
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
@@ -260,7 +260,7 @@ def put_into_use(history: History, model: str, reason: str, undo: bool = False) 
     """
     if model:
         checked_model(history.path.parent, history.model(model))
-    history.add(ModelUse(model, now(), reason, undo))
+    history.add(InUse(model, now(), reason, undo))
 
 
 def with_warnings(result: Result, warnings: tuple[str, ...]) -> Result:

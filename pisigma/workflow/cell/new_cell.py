@@ -13,7 +13,7 @@ from pisigma.files.errors import ModelError, OutputError, PisigmaError, Place
 from pisigma.files.model_files import DESCRIPTION, model_hash
 from pisigma.files.output_file import write_atomically
 from pisigma.files.scratch import FOLDER, remove_stale_scratch, scratch_beside
-from pisigma.lifetime.cell.history import HISTORY, History, ModelEntry, ModelUse, now
+from pisigma.lifetime.cell.history import HISTORY, History, InUse, ModelEntry, now
 from pisigma.lifetime.cell.layout import CELL_FILE, EXPORTS, MODELS, PLANS, REPORTS, SESSIONS
 from pisigma.measurement.camera.camera_files import CameraFiles
 from pisigma.measurement.dates import is_date
@@ -124,7 +124,7 @@ class NewCell:
             remark=remark,
             has_posterior=loaded.uncertainty is not None,
         )
-        History(folder / HISTORY).add(entry, *([] if doubt else [ModelUse(name, now(), remark)]))
+        History(folder / HISTORY).add(entry, *([] if doubt else [InUse(name, now(), remark)]))
 
     def _copied_robot(self, folder: Path) -> str:
         """Copy or write the robot file into the cell; return the entry `robot`."""

@@ -23,8 +23,8 @@ from pisigma.lifetime.cell.history import (
     ControllerEntry,
     ExportEntry,
     History,
+    InUse,
     ModelEntry,
-    ModelUse,
     SessionEntry,
 )
 from pisigma.lifetime.monitoring.history import read_sessions
@@ -33,7 +33,7 @@ SESSION = SessionEntry("2026-01-10", "abc", "2026-01-10T09:00:00+00:00", "2026-0
 MODEL = ModelEntry("a", "def", "2026-01-10T12:00:00+00:00", "2026-01-10", "2026-01-10", p95_mm=0.1)
 EVENT = Event("2026-02-01", "mastering", "joint 3", "2026-02-01T08:00:00+00:00")
 CHECK = Check("verify", "a", "2026-01-10", "better", "It is better.", None, True, "2026-01-11T08:00:00+00:00")
-USE = ModelUse("a", "2026-01-11T08:00:00+00:00", "verified")
+USE = InUse("a", "2026-01-11T08:00:00+00:00", "verified")
 EXPORT = ExportEntry("dh.csv", "0123", "dh", "kinematics", "a", "2026-01-12T08:00:00+00:00")
 ACTIVE = ControllerEntry("2026-01-13", "0123", "tried at low speed", "2026-01-13T08:00:00+00:00")
 
@@ -242,7 +242,7 @@ def test_a_cell_of_schema_1_keeps_every_entry_and_the_monitored_sessions_of_its_
     with closing(sqlite3.connect(history.path)) as opened:
         stored = {
             one: opened.execute(f"SELECT * FROM {TABLES[one].name}").fetchall()
-            for one in (SessionEntry, Event, ModelEntry, Check, ModelUse)
+            for one in (SessionEntry, Event, ModelEntry, Check, InUse)
         }
     with closing(sqlite3.connect(beside)) as database:
         monitored = database.execute("SELECT model, rows, date, session, zeros FROM sessions").fetchall()

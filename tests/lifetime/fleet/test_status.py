@@ -8,7 +8,7 @@ import pytest
 from testing.refusals import refused
 
 from pisigma.files.errors import PlanningError
-from pisigma.lifetime.cell.history import HISTORY, Check, History, ModelEntry, ModelUse, SessionEntry
+from pisigma.lifetime.cell.history import HISTORY, Check, History, InUse, ModelEntry, SessionEntry
 from pisigma.lifetime.fleet.status import FleetStatus
 from pisigma.reporting.fleet_tables import cell_table, fleet_verdict, state_table
 
@@ -41,7 +41,7 @@ def fleet(tmp_path):
     cell(tmp_path, "measured", session, MODEL, replace(CHECK, rms_mm=0.2))
     cell(tmp_path, "edited", replace(session, sha256="other"), MODEL, CHECK)
     moved = Check("verify", "a", "x", "moved", "joint 3 moved", 0.9, True, "2026-04-01T00:00:00+00:00", 0.8)
-    used = ModelUse("a", "2026-03-03T00:00:00+00:00", "")
+    used = InUse("a", "2026-03-03T00:00:00+00:00", "")
     cell(tmp_path, "moved", session, MODEL, CHECK, moved, used)
     cell(tmp_path, "broken", text="robot: [\n")
     cell(tmp_path, "negative", text="robot: ur10\nlimit_mm: -1\n")
