@@ -39,7 +39,7 @@ _MAX_EFFECTIVE_SHARE = 0.75
 MAX_USUAL_SHARE = 0.97
 """Largest effective number of unknowns per value if the prior sizes of the weights start at their usual sizes, which
 regularise what few values do not determine."""
-_MIN_USUAL_SCALE = 0.4
+MIN_USUAL_SCALE = 0.4
 """Prior scale of the geometry that is also tried if the estimated scale is smaller, because a geometric calibration of
 few rows attributes the effects of missing features to noise and underestimates small errors of the geometry."""
 _USUAL_UPDATES = 5
@@ -218,7 +218,7 @@ class FeatureSearch:
                 best = self._tried([*best.design.features, chosen], best)
         together = [*others, *growing[:FIRST_MODEL_SIZES][-1:]]
         if len(together) > 1 and self.rows.groups <= _FEW_TOGETHER:
-            usual = tuple(max(scale, _MIN_USUAL_SCALE) for scale in self.prior_scale)
+            usual = tuple(max(scale, MIN_USUAL_SCALE) for scale in self.prior_scale)
             for scale in dict.fromkeys((tuple(self.prior_scale), usual)):
                 best = self._from_usual_sizes(together, scale, best)
         for chosen in last:

@@ -50,6 +50,7 @@ def find_backlash(rows: OrderedRows, measurements: Measurements) -> LostMotion |
     if len(rows.residual) < MIN_ROWS:
         return None
     assert measurements.approach is not None
+    rows = rows.with_own_noise
     approach = measurements.approach.nan_to_num(0.0).cpu().numpy()[rows.number]
     moved = (rows.joint_derivative * approach[:, None]).reshape(-1, approach.shape[1])
     free = rows.without_parameters(moved)

@@ -71,7 +71,7 @@ def find_lag(rows: OrderedRows, measurements: Measurements) -> Lag | None:
     """
     if len(rows.residual) < MIN_ROWS:
         return None
-    found = []
+    rows, found = rows.with_own_noise, []
     for before, motion in zip((True, False), motions_between_rows(measurements), strict=True):
         z = (rows.joint_derivative @ np.nan_to_num(motion[rows.number])[..., None]).reshape(-1, 1)
         free = rows.without_parameters(z)

@@ -17,6 +17,7 @@ from pisigma.calibration.geometric.problem.problem import CalibrationProblem
 from pisigma.calibration.geometric.result import CalibrationResult
 from pisigma.calibration.hybrid.gravity import USUAL, to_first_row_frame
 from pisigma.calibration.hybrid.result import HybridResult
+from pisigma.calibration.hybrid.search import MIN_USUAL_SCALE
 from pisigma.joint_correction.backlash import Backlash
 from pisigma.joint_correction.feature import AbstractFeature
 from pisigma.joint_correction.fourier_series import FourierSeries
@@ -36,6 +37,10 @@ motion."""
 _SAG = 1e-3
 """Prior standard deviation of the weights of gravity torques [rad], which are also fitted, because the sag of elastic
 joints can look like a second arm. The weights are 8.6e-4 for the measured UR10."""
+_MAX_ITERATIONS, _CONVERGENCE_TOLERANCE = 12, 1e-2
+"""Largest number of iterations of noise and prior sizes, and their relative change at convergence."""
+_MIN_EFFECTIVE, _SMALLEST_SIZE = 0.1, 1e-2
+"""Effective number of weights of a kind below which their prior size is not estimated, and smallest factor on it."""
 _VALUES_PER_POSE = 6
 """Number of independent values of a configuration (the pose of the tool), regardless of targets and repeats."""
 
@@ -53,6 +58,8 @@ class OrderedRows:
         values: number of measured values.
         noise: standard deviation of every column of values [m or rad], or the factor on the standard deviations
             stated in the rows.
+        sizes: factors on the prior standard deviations of the weights of each kind of joint errors, if they were
+            estimated; empty for stated sizes, and for the sag of masses at the origins of the frames alone.
     """
 
     result: CalibrationResult
@@ -62,6 +69,7 @@ class OrderedRows:
     derivative: Float64[np.ndarray, "rows values parameters"]
     values: int
     noise: Float64[np.ndarray, " values"]
+    sizes: tuple[float, ...] = ()
 
     @cached_property
     def content_hash(self) -> bytes:
@@ -179,7 +187,8 @@ class OrderedRows:
     def _joint_errors(self) -> tuple[tuple[AbstractFeature, Bool[np.ndarray, "dof columns"], float], ...]:
         """Derivatives with respect to weights of unmodelled joint errors, and prior standard deviations of these [rad].
 
-        Gravity acts on masses at the origins of the frames. Backlash needs stated directions of approach.
+        Gravity acts on masses at the origins of the frames, and on first moments if their size can be estimated.
+        Backlash needs stated directions of approach.
         """
         robot = self.problem.space.robot
         play = Backlash(robot)
@@ -188,20 +197,24 @@ class OrderedRows:
             FourierSeries(robot, _HARMONICS),
             GravityTorques(robot, to_first_row_frame(robot, USUAL)),
         )
-        masses = sag.used.numpy() & (np.arange(sag.used.shape[1]) % 4 == 0)
-        return (series, series.used.numpy(), _JOINT_ERROR), (sag, masses, _SAG), *backlash
+        is_mass = np.arange(sag.used.shape[1]) % 4 == 0
+        moments = ((sag, sag.used.numpy() & ~is_mass, _SAG),) if self.sizes else ()
+        masses = (sag, sag.used.numpy() & is_mass, _SAG)
+        kinds = ((series, series.used.numpy(), _JOINT_ERROR), masses, *moments, *backlash)
+        sizes = self.sizes or (1.0,) * len(kinds)
+        return tuple(
+            (feature, used, size * factor) for (feature, used, size), factor in zip(kinds, sizes, strict=True)
+        )
 
     @cached_property
     def precision(self) -> Float64[np.ndarray, " unknowns"]:
         """Prior precision (1 / variance) of the parameters and of the weights."""
         robot = self.problem.space.robot
         active = self.problem.precision[self.problem.active]
-        precision = (
-            sensor_view_of(self.result.solved.refined)
-            .scaled_precision(active, self.problem.prior_group)
-            .cpu()
-            .numpy()
-        )
+        view = sensor_view_of(self.result.solved.refined)
+        if self.sizes:
+            view = replace(view, prior_scale=view.prior_scale.clamp(min=MIN_USUAL_SCALE))
+        precision = view.scaled_precision(active, self.problem.prior_group).cpu().numpy()
         unit = np.where(robot.revolute, 1.0, robot.reach)[:, None]
         weights = [
             np.broadcast_to((size * unit) ** -2.0, used.shape)[used] for _, used, size in self._joint_errors
@@ -213,6 +226,31 @@ class OrderedRows:
         """Covariance of the parameters and weights, with full weight of all rows."""
         flat = self.jacobian.reshape(-1, self.jacobian.shape[2])
         return inverse_of(flat.T @ flat + np.diag(self.precision))
+
+    @cached_property
+    def with_own_noise(self) -> "OrderedRows":
+        """The same rows, divided by the noise that parameters and joint errors leave, for the search of small effects.
+
+        The noise of a geometric calibration contains what its parameters do not explain, such as the sag under a load.
+        It hides effects that are larger than the noise of the sensor, and a prior for errors of all sizes leaves few
+        values that could show them. Therefore the noise of every sensor and the prior size of every kind of joint
+        errors are estimated by their evidence (MacKay 1992, Neural Computation 4(3), eqs. 4.7 and 4.8, with the
+        parameters that every sensor determines of Förstner 1979), and the prior of the geometry is not narrower than
+        usual.
+        """
+        kinds = 3 + (APPROACH in self.problem.state.stated)
+        rows = replace(self, sizes=(1.0,) * kinds)
+        weights = [int(used.sum()) for _, used, _ in rows._joint_errors]
+        kind = np.repeat(np.arange(-1, kinds), [len(rows.precision) - sum(weights), *weights])
+        scale, sizes = _noise_and_sizes(rows, kind)
+        scale = np.maximum(scale, ALWAYS_GOOD / self.noise)
+        return replace(
+            self,
+            residual=self.residual / scale,
+            derivative=self.derivative / scale[:, None],
+            noise=self.noise * scale,
+            sizes=tuple(sizes.tolist()),
+        )
 
     @cached_property
     def residual_after_fit(self) -> Float64[np.ndarray, "rows values"]:
@@ -262,6 +300,44 @@ class OrderedRows:
         """Degrees of freedom after the calibration, with at most one pose per configuration."""
         count = len(self.residual) if self.configuration is None else int(self.configuration.max()) + 1
         return min(self.values, _VALUES_PER_POSE * count) - self.effective_parameters
+
+
+def _noise_and_sizes(
+    rows: OrderedRows, kind: Int64[np.ndarray, " unknowns"]
+) -> tuple[Float64[np.ndarray, " values"], Float64[np.ndarray, " kinds"]]:
+    """Estimate the noise that is left, and the prior sizes of the joint errors, in turn.
+
+    Args:
+        rows: the rows, with the first prior sizes.
+        kind: index of the kind of joint errors of every weight; -1 for parameters, whose prior is kept.
+
+    Returns:
+        Noise of every column of values, and factors on the prior standard deviations, both relative to those of `rows`.
+    """
+    sensors, weights = rows.residual.shape[1] // 3, kind >= 0
+    X, r = (
+        np.moveaxis(values.reshape(len(values), sensors, 3, -1), 1, 0).reshape(sensors, 3 * len(values), -1)
+        for values in (rows.jacobian, rows.clipped)
+    )
+    measured, normal, descent = X.any(2).sum(1), X.swapaxes(1, 2) @ X, (X.swapaxes(1, 2) @ r)[..., 0]
+    variance, sizes, held = np.ones(sensors), np.ones(kind.max() + 1), rows.precision.copy()
+    for _ in range(_MAX_ITERATIONS):
+        before = np.concatenate([variance, sizes])
+        covariance = inverse_of((normal / variance[:, None, None]).sum(0) + np.diag(held))
+        x = covariance @ (descent / variance[:, None]).sum(0)
+        used = (normal * covariance).sum((1, 2)) / variance
+        left = np.square(r[..., 0] - X @ x).sum(1)
+        variance = np.maximum(left / np.maximum(measured - used, 1.0), 1e-300)
+        determined, squares = (
+            np.bincount(kind[weights], values[weights], len(sizes))
+            for values in (1 - held * covariance.diagonal(), np.square(x) * rows.precision)
+        )
+        estimated = np.sqrt(squares / np.maximum(determined, _MIN_EFFECTIVE)).clip(_SMALLEST_SIZE)
+        sizes = np.where(determined > _MIN_EFFECTIVE, estimated, sizes)
+        held[weights] = rows.precision[weights] / np.square(sizes[kind[weights]])
+        if np.abs(np.concatenate([variance, sizes]) / before - 1).max() < _CONVERGENCE_TOLERANCE:
+            break
+    return np.repeat(np.sqrt(variance), 3), sizes
 
 
 class Effect(NamedTuple):
