@@ -24,7 +24,7 @@ int main(int count, char **words) {
         return 2;
     }
     int joints = pisigma_joints(model);
-    double pose[16], near_q[PISIGMA_MOST_JOINTS], reached[16];
+    double pose[16], near_q[PISIGMA_MAX_JOINTS], reached[16];
     pisigma_solution solution;
     while (read_numbers(pose, 16) && read_numbers(near_q, joints)) {
         int status = pisigma_solve(model, pose, isnan(near_q[0]) ? NULL : near_q, NULL, PISIGMA_ANY_BRANCH, &solution);

@@ -55,7 +55,7 @@ class Subject:
             subject: a robot, a name of the catalogue, a robot file (YAML or URDF), a model, an object that has a model,
                 or a model folder.
             base: base link of a URDF file; poses are in its frame.
-            tip: link of a URDF file that is the tool.
+            tip: tool link of a URDF file.
 
         Raises:
             RobotError: the robot is unknown.

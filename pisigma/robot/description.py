@@ -94,7 +94,7 @@ class Robot:
         Args:
             robot: catalogue name or path of a file.
             base: base link of a URDF file; poses are in its frame. None for the root link.
-            tip: link of a URDF file that is the tool; None if only one link has no child.
+            tip: tool link of a URDF file; None if only one link has no child.
 
         Raises:
             UnknownRobotError: `robot` is neither a catalogue name nor a file; the message lists the names in the

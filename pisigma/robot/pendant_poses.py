@@ -57,7 +57,7 @@ def pendant_poses(
     Args:
         robot: a robot, a name of the catalogue, or a robot file (YAML or URDF).
         base: base link of a URDF file; poses are in its frame.
-        tip: link of a URDF file that is the tool.
+        tip: tool link of a URDF file.
 
     Raises:
         RobotError: the robot cannot be read.

@@ -63,7 +63,7 @@ _WIDTH = 200
 """Width of tables before models are divided among several [characters]."""
 _EXPORT_OPTIONS = ("geometry", "targets", "branch", "config")
 _NEEDS_ACTION = "the robot needs attention (see the reasons below)."
-_NOT_STORED = "no model was stored, because the result must not be trusted, for the reasons below."
+_NOT_STORED = "no model was stored, because the result must not be trusted (see the reasons below)."
 
 
 def create(folder: Path, form: Form, files: list[Path]) -> Cell:

@@ -82,7 +82,7 @@ class MeshBody(AbstractBody):
             robot: robot as loaded from the file.
             path: URDF file.
             base: base link, as in `Robot.load`.
-            tip: link that is the tool, as in `Robot.load`.
+            tip: tool link, as in `Robot.load`.
             inside: folder that contains all meshes that may be read; None for any folder.
 
         Raises:

@@ -23,7 +23,7 @@ class ArmSection(Section):
     Attributes:
         robot: catalogue name, or a robot file (YAML or URDF).
         base: base link of the URDF file; None for its root.
-        tip: tool link of the URDF file; None for its only end.
+        tip: tool link of the URDF file; None for its only leaf link.
         sessions: measurement files (CSV) of the arm.
         camera: cameras and boards; None without cameras.
     """

@@ -91,7 +91,7 @@ class CellDocument(Section):
     Attributes:
         robot: catalogue name, or a robot file (YAML or URDF) inside the cell.
         base: base link of the URDF file; poses are in its frame. None for its root.
-        tip: tool link of the URDF file; None for its only end.
+        tip: tool link of the URDF file; None for its only leaf link.
         sensor: sensor that measures the robot.
         limit_mm: limit on the 95 % quantile of the position errors [mm]; None for no limit.
         joint_values: whether rows contain the joint values that were commanded (the default) or those that the encoders

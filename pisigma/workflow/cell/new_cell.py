@@ -34,7 +34,7 @@ class NewCell:
         sensor: "tracker", "camera", "sockets", "draw-wire" or "touch".
         limit_mm: limit on the 95 % quantile of the position errors [mm]; None for no limit.
         base: base link of the URDF file; poses are in its frame. None for its root.
-        tip: tool link of the URDF file; None for its only end.
+        tip: tool link of the URDF file; None for its only leaf link.
         cameras: cameras and boards, whose files are copied into the cell.
         calibrate: settings of `pisigma calibrate`, by key, for a short `cell.yaml`; None for a `cell.yaml` that lists
             all settings of all steps as comments.

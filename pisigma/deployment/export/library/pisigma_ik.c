@@ -23,7 +23,7 @@ typedef struct {
     char magic[8];
     uint64_t layout, description_size, memory_size, joints, branches, segments, names_size;
     int64_t arm; /* arm to evaluate; -1 for none */
-    double lowest[PISIGMA_MOST_JOINTS], highest[PISIGMA_MOST_JOINTS]; /* range of `near_q` */
+    double lowest[PISIGMA_MAX_JOINTS], highest[PISIGMA_MAX_JOINTS]; /* range of `near_q` */
     uint64_t axes_rows; /* 0 if all axes of the tool are constrained */
     double axes[8];     /* else the constrained axes, see pisigma/robot/kinematics/task_axes.py */
 } file_head;
@@ -59,7 +59,7 @@ static const char *fill(pisigma_model *model, FILE *stream) {
     if (head->layout != PISIGMA_LAYOUT || head->description_size != PISIGMA_DESCRIPTION_SIZE ||
         head->memory_size != PISIGMA_MEMORY_SIZE)
         return "was exported by another version; use the library that was exported together with it";
-    if (head->joints > PISIGMA_MOST_JOINTS || head->names_size > 4096) return cut;
+    if (head->joints > PISIGMA_MAX_JOINTS || head->names_size > 4096) return cut;
     model->names = calloc(1, head->names_size + 1);
     model->description = calloc(1, PISIGMA_DESCRIPTION_SIZE);
     if (!model->names || !model->description) return "does not fit into memory";
@@ -116,7 +116,7 @@ static int64_t run(const pisigma_model *model, int64_t task, double *pose, const
 int pisigma_solve(const pisigma_model *model, const double pose[16], const double *near_q, const double *approach,
                   int branch, pisigma_solution *solution) {
     int dof = pisigma_joints(model);
-    double T[16], near[PISIGMA_MOST_JOINTS], out[2 * PISIGMA_MOST_JOINTS + 5];
+    double T[16], near[PISIGMA_MAX_JOINTS], out[2 * PISIGMA_MAX_JOINTS + 5];
     memcpy(T, pose, sizeof T);
     for (int j = 0; near_q && j < dof; j++) {
         int possible = near_q[j] >= model->head.lowest[j] && near_q[j] <= model->head.highest[j];
@@ -126,7 +126,7 @@ int pisigma_solve(const pisigma_model *model, const double pose[16], const doubl
         if (approach[j] != -1.0 && approach[j] != 0.0 && approach[j] != 1.0) T[0] = NAN;
     if (branch >= pisigma_branches(model) || branch < PISIGMA_ANY_BRANCH) T[0] = NAN, branch = PISIGMA_ANY_BRANCH;
     run(model, SOLVE, T, near_q ? near : NULL, approach, branch, out);
-    for (int j = 0; j < PISIGMA_MOST_JOINTS; j++) {
+    for (int j = 0; j < PISIGMA_MAX_JOINTS; j++) {
         solution->q[j] = j < dof ? out[j] : NAN;
         solution->q_nominal[j] = j < dof ? out[dof + j] : NAN;
     }
@@ -138,7 +138,7 @@ int pisigma_solve(const pisigma_model *model, const double pose[16], const doubl
 }
 
 int pisigma_forward(const pisigma_model *model, const double *q, const double *approach, double pose[16]) {
-    double out[7 * PISIGMA_MOST_JOINTS + 1];
+    double out[7 * PISIGMA_MAX_JOINTS + 1];
     if (model->head.arm < 0) return -1;
     run(model, EVALUATE, pose, q, approach, model->head.arm, out);
     return 0;

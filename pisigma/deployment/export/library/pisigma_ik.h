@@ -12,7 +12,7 @@
 extern "C" {
 #endif
 
-enum { PISIGMA_MOST_JOINTS = 8 };
+enum { PISIGMA_MAX_JOINTS = 8 };
 
 enum pisigma_status {
     PISIGMA_REACHED = 0,
@@ -30,8 +30,8 @@ typedef struct pisigma_model pisigma_model;
 typedef struct {
     int status;                            /* enum pisigma_status */
     int branch;                            /* index */
-    double q[PISIGMA_MOST_JOINTS];         /* joint values to command [rad or m]; NaN after the last joint */
-    double q_nominal[PISIGMA_MOST_JOINTS]; /* joint values of the nominal robot */
+    double q[PISIGMA_MAX_JOINTS];          /* joint values to command [rad or m]; NaN after the last joint */
+    double q_nominal[PISIGMA_MAX_JOINTS];  /* joint values of the nominal robot */
     double position_residual;              /* [m] */
     double rotation_residual;              /* [rad] */
     double domain_measure;                 /* above 1 the correction is extrapolated */
@@ -48,7 +48,7 @@ const char *pisigma_branch_name(const pisigma_model *model, int branch);
 
 /* Solve one pose; returns the status, which is also in the solution.
  *
- * near_q: joint values that the solution should be near, such as the present ones, or NULL.
+ * near_q: joint values that the solution should be close to, such as the present ones, or NULL.
  * approach: direction in which every joint moves to the pose, +1, -1 or 0 if not known, or NULL.
  * branch: index of the branch to use, or PISIGMA_ANY_BRANCH.
  */
