@@ -6,7 +6,7 @@ from pathlib import Path
 from testing.models import REPOSITORY
 
 from pisigma.files.model_files import model_hash
-from pisigma.lifetime.cell.history import ModelEntry, Use, now
+from pisigma.lifetime.cell.history import InUse, ModelEntry, now
 from pisigma.workflow.cell.cell import Cell
 
 FIRST, SECOND = "kiro4", "kiro3"
@@ -25,4 +25,4 @@ def cell_of_two_models(folder: Path) -> Cell:
 
 def put_into_use(cell: Cell, model: str) -> None:
     """Put a model into use as another process does."""
-    cell.history.add(Use(model, now(), "a test"))
+    cell.history.add(InUse(model, now(), "a test"))

@@ -11,7 +11,7 @@ from pisigma.files.errors import MeasurementError, ModelError
 from pisigma.lifetime.cell.controller import RULES, Controller, Situation, record_controller
 from pisigma.lifetime.cell.exports import Contents, ControllerEntry, ExportEntry
 from pisigma.lifetime.cell.facts import CellFacts
-from pisigma.lifetime.cell.history import HISTORY, History, ModelEntry, SessionEntry, Use
+from pisigma.lifetime.cell.history import HISTORY, History, InUse, ModelEntry, SessionEntry
 from pisigma.lifetime.cell.status import next_step
 
 DH = ExportEntry("dh.csv", "dh", "dh", "kinematics", "a", "2026-01-12T08:00:00+00:00")
@@ -156,7 +156,7 @@ def test_what_cannot_be_active_is_refused(tmp_path, sha256, day, option):
 def test_days_are_those_of_the_time_zone_of_the_machine(tmp_path, monkeypatch, zone, utc, day):
     at, history = f"{utc}:00.000+00:00", History(tmp_path / HISTORY)
     made = replace(MODEL, made=at, sessions="", day="")
-    history.add(replace(OFFSETS, exported=at), made, Use("a", at, ""))
+    history.add(replace(OFFSETS, exported=at), made, InUse("a", at, ""))
     monkeypatch.setenv("TZ", zone)
     time.tzset()
     try:
