@@ -12,6 +12,7 @@ from pisigma.calibration.geometric.problem.prior_sizes import PriorGroup, prior_
 from pisigma.calibration.geometric.problem.setup import IdentifiedGeometry
 from pisigma.calibration.hybrid.calibrator import HybridCalibrator
 from pisigma.calibration.hybrid.gravity import USUAL, to_first_row_frame
+from pisigma.calibration.hybrid.noise import JOINT
 from pisigma.calibration.hybrid.result import HybridResult
 from pisigma.calibration.hybrid.sensor_values import joint_columns
 from pisigma.calibration.hybrid.uncertainty import PositionUncertainty
@@ -217,7 +218,8 @@ class RobotPosterior:
         self, columns: Float64[Tensor, "poses values unknowns"]
     ) -> Float64[Tensor, "poses values unknowns"]:
         """Divide values with unit noise by the noise that includes the repeatability of the joints, `1 + J J^T`."""
-        deviation = RobotClass.from_robot(self.uncertainty.space.robot).joint_repeatability
+        of_class = RobotClass.from_robot(self.uncertainty.space.robot).joint_repeatability
+        deviation = self.uncertainty.noise.value.get(JOINT, of_class)
         if not deviation:
             return columns
         J = deviation * columns[..., joint_columns(self.uncertainty.space)]

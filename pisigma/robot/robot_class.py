@@ -20,6 +20,8 @@ _COBOT_MAKERS: Final = (
 )
 _HOBBY_MAKERS: Final = ("Enactic", "Niryo", "AR4", "Dobot")
 _SERVO_MAKERS: Final = ("TheRobotStudio", "Alexander Koch", "Trossen", "ROBOTIS", "Elephant Robotics")
+_PLAUSIBLE_SHARE: Final = 0.01
+"""Errors, as a share of the reach, that are plausible for a calibrated robot of any class."""
 
 
 @dataclass(frozen=True)
@@ -170,3 +172,11 @@ its reach."""
 
 CLASSES: Final[dict[str, RobotClass]] = {one.name: one for one in (INDUSTRIAL, COBOT, HOBBY, SERVO)}
 """Classes of robots by name, in the order of increasing errors."""
+
+
+def plausible_share(robot: Robot) -> float:
+    """Return the largest errors of a calibrated robot, and after correction of a fault, as a share of the reach.
+
+    They are larger for arms whose joints scatter by more, such as arms of servos.
+    """
+    return max(_PLAUSIBLE_SHARE, RobotClass.from_robot(robot).remaining)

@@ -7,7 +7,6 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
-from pisigma.calibration.geometric.joint_repeatability import with_joint_repeatability
 from pisigma.calibration.geometric.problem.parameters import Prior
 from pisigma.calibration.hybrid.calibrator import HybridCalibrator
 from pisigma.calibration.hybrid.result import HybridResult
@@ -136,7 +135,6 @@ def calibrate(
     splits = splitting.split(training, settings.repeats, settings.train_rows)
     distances = matching_sockets(settings.socket_distances, training.socket or ())
     calibrator = calibrator_of(settings, nominal, distances)
-    training = _with_joint_repeatability(training, calibrator, _class_of(settings, nominal))
     drawn = None if settings.train_rows is None else draw_rows(training, settings.train_rows, settings.seed)
 
     def calibrated(every: Measurements) -> Measurements:
@@ -231,17 +229,6 @@ def compose_calibration(
 def _class_of(settings: CalibrationSettings, robot: Robot) -> RobotClass:
     """Return the stated class of a robot, or else that of its manufacturer."""
     return CLASSES[settings.robot_class] if settings.robot_class else RobotClass.from_robot(robot)
-
-
-def _with_joint_repeatability(
-    rows: Measurements, calibrator: Calibrator, robot_class: RobotClass
-) -> Measurements:
-    """Add the repeatability of the joints to rows of images; see `with_joint_repeatability`."""
-    geometric = geometric_of(calibrator)
-    try:
-        return with_joint_repeatability(rows, geometric, robot_class.joint_repeatability)
-    except IdentificationError as refusal:
-        raise explain_refusal(refusal, geometric.robot, rows) from refusal
 
 
 def _call(robot: Robot, measurements: Measurements, settings: CalibrationSettings) -> str:

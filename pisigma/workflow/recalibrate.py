@@ -37,6 +37,7 @@ from pisigma.model.stated_conditions import condition_warnings
 from pisigma.model.training_rows import with_wide_limits, without_known_rows
 from pisigma.reporting.derived_cards import write_recalibration_card
 from pisigma.robot.description import Robot
+from pisigma.robot.robot_class import plausible_share
 from pisigma.validation.checks.check import MOVES, Move
 from pisigma.validation.checks.wrong_rows import FilteredRows, without_wrong_rows
 from pisigma.validation.gate import check_rows
@@ -45,7 +46,6 @@ from pisigma.validation.held_out.distillation_summary import ParentFigures
 from pisigma.validation.held_out.few_rows import fit_if_better
 from pisigma.validation.held_out.frames.fitted_frames import fitted_kinds
 from pisigma.validation.held_out.trained_calibrations import fit
-from pisigma.validation.setup_faults.explanations import PLAUSIBLE_SHARE
 from pisigma.workflow.result import AbstractModelResult
 from pisigma.workflow.settings.recalibration import RecalibrationSettings
 
@@ -153,7 +153,9 @@ def recalibrate(
         significant_movements(adaptation) if consistency is None and _believable(choice, nominal) else None
     )
     wrong = [one.row for one in outliers]
-    diagnostics = verdict.implausible or recalibration_diagnostics(parent, choice, every, wrong, moved or ())
+    diagnostics = verdict.implausible or recalibration_diagnostics(
+        parent, choice, every, adaptation, wrong, moved or ()
+    )
     moved = None if diagnostics else moved
     summary = _summary(parent, rows, adaptation, choice, moved)
     summary = summary.with_figures(
@@ -237,7 +239,7 @@ def _believable(choice: CandidateChoice, robot: Robot) -> bool:
     error, kept = choice.rms["recalibrated"], choice.rms[choice.kept]
     if error is None or kept is None:
         return not choice.rows
-    return error <= min(PLAUSIBLE_SHARE * robot.reach, CLEAR_RATIO * kept)
+    return error <= min(plausible_share(robot) * robot.reach, CLEAR_RATIO * kept)
 
 
 def _summary(

@@ -27,6 +27,7 @@ PHONE = Camera("phone", 1280, 960, 950.0, 950.0, 642.0, 475.0, 0.05, -0.1, is_fi
 BOARD = Board("board", 4, 6, 0.018, "charuco", 0.013, "4x4_50")
 FROM_PHONE = np.array([[0.0, 1, 0, 0], [0, 0, -1, 0.2], [-1, 0, 0, 0.8], [0, 0, 0, 1]])
 """T_camera_base: the phone looks at the arm from 0.8 m in front of it, 0.2 m above the table."""
+_NONE = Repeatability(0.0, 0.0)
 RATE, REST, MOVE = 20, 12, 4
 """Frames of a video per second, at every pose, and between two poses."""
 
@@ -59,10 +60,22 @@ def arm_before_phone(seed: int) -> tuple[Robot, torch.Tensor, np.random.Generato
 def phone_rows(seed: int, count: int) -> tuple[Measurements, Robot, torch.Tensor]:
     """Return rows of images with servo noise, the arm as built, and joint values of later images [rad]."""
     true, q, random = arm_before_phone(seed)
-    actual = q[:count] + SERVO * torch.from_numpy(random.normal(size=(count, 5)))
-    noise, generator = ImageNoise(0.1, Repeatability(0.0, 0.0)), torch.Generator().manual_seed(seed)
-    seen = replace(simulate_images(true, actual, PHONE, BOARD, noise, generator, True), q=q[:count])
-    return image_measurements(seen, PHONE, BOARD, True, Repeatability(), "free"), true, q[count:]
+    return rows_of_phone(true, q[:count], random, seed), true, q[count:]
+
+
+def rows_of_phone(
+    true: Robot,
+    q: torch.Tensor,
+    random: np.random.Generator,
+    seed: int,
+    servo: float = SERVO,
+    shared: Repeatability = _NONE,
+) -> Measurements:
+    """Return rows of images of an arm at commanded joint values [rad], with noise of servos [rad] and of poses."""
+    actual = q + servo * torch.from_numpy(random.normal(size=q.shape))
+    noise, generator = ImageNoise(0.1, shared), torch.Generator().manual_seed(seed)
+    seen = replace(simulate_images(true, actual, PHONE, BOARD, noise, generator, True), q=q)
+    return image_measurements(seen, PHONE, BOARD, True, Repeatability(), "free")
 
 
 def write_video(path: Path, count: int) -> None:

@@ -26,9 +26,11 @@ from pisigma.calibration.geometric.identifiability.sufficiency import (
 )
 from pisigma.calibration.geometric.initial_guess.initial_guess import randomly_chosen_rows
 from pisigma.calibration.geometric.problem.information import information
+from pisigma.calibration.geometric.problem.joint_scatter import joint_scatter_factor
 from pisigma.calibration.geometric.problem.least_squares import SHORTEST_STEP, Solution, levenberg_marquardt
 from pisigma.calibration.geometric.problem.noise import sensor_view_of
 from pisigma.calibration.geometric.problem.parameters import ParameterSpace, Prior
+from pisigma.calibration.geometric.problem.problem import CalibrationProblem
 from pisigma.calibration.geometric.problem.setup import (
     CalibrationSetup,
     SetupOptions,
@@ -41,11 +43,13 @@ from pisigma.files.errors import IdentificationError, check_choice
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.sensors.socket import PairOfSockets
 from pisigma.robot.description import Robot
-from pisigma.robot.robot_class import CLASSES
+from pisigma.robot.robot_class import CLASSES, RobotClass
 from pisigma.robot.row import FRAME_COLUMNS
 
 _ROUGH_ROWS = 4_096
 """Largest number of rows used for the first steps."""
+_WEIGHTINGS = 3
+"""Number of times that images are weighted again by the scatter of the joints."""
 _ROUGH_STEPS = 3
 """Number of steps without the prior; they determine the noise relative to which the prior is weighted."""
 
@@ -155,9 +159,31 @@ class GeometricCalibrator:
             start = problem.combine_contributions(start.point, sensor_view_of(start))
         left = self.maximum_iterations - rough.iterations
         fine = levenberg_marquardt(problem, start, left, close_enough=SHORTEST_STEP)
+        if setup.joint_repeatability:
+            setup, problem, fine = self._weight_images(setup, problem, fine)
         refuse_implausible(problem, fine.linearisation, measurements.source)
         geometry = identified_geometry(setup, fine.linearisation.point)
         return SolvedCalibration(measurements, setup, problem, rough.continued_by(fine), findings, geometry)
+
+    def _weight_images(
+        self, setup: CalibrationSetup, problem: CalibrationProblem, found: Solution[Tensor]
+    ) -> tuple[CalibrationSetup, CalibrationProblem, Solution[Tensor]]:
+        """Continue a search with images weighted by the joints of the arm that it found, and by their scatter."""
+        corners = setup.corners_of(setup.measurements)
+        if corners is None:
+            return setup, problem, found
+        for number in range(_WEIGHTINGS):
+            factor = 1.0
+            if number:  # the first weights were those of the nominal arm, whose axes are elsewhere
+                refined = problem.with_refined_noise(found.linearisation)
+                factor = joint_scatter_factor(problem, refined, corners)
+            point = found.linearisation.point
+            setup = replace(setup, joint_repeatability=factor * setup.joint_repeatability).weighted_at(point)
+            problem = setup.problem.with_active(problem.active.tolist())
+            left = max(self.maximum_iterations - found.iterations, 1)
+            again = levenberg_marquardt(problem, point, left, close_enough=SHORTEST_STEP)
+            found = found.continued_by(again)
+        return setup, problem, found
 
     def build(self, measurements: Measurements) -> CalibrationSetup:
         """Build the problem and its start values, without solving the problem.
@@ -174,8 +200,14 @@ class GeometricCalibrator:
             socket_distances=self.socket_distances,
             socket_sigma=self.socket_sigma,
             prior_sizes=self.prior_sizes,  # type: ignore[arg-type]
+            joint_repeatability=self.class_of_robot.joint_repeatability,
         )
         return build_setup(self.robot, measurements, options, self.prior, self.loss)
+
+    @property
+    def class_of_robot(self) -> RobotClass:
+        """The stated class of the robot, or else its manufacturer's class."""
+        return RobotClass.from_robot(self.robot) if self.robot_class is None else CLASSES[self.robot_class]
 
     def _finds(self, group: str) -> bool:
         """Return whether bases or tools need start values, because they are free or named (all six of a base)."""

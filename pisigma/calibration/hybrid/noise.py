@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 from pisigma.files.errors import MeasurementError
 from pisigma.measurement.sensors.sensor import AbstractSensor
 
+JOINT = "joint"
+"""Name of the standard deviation of the values of revolute joints from image to image [rad]."""
 _MAX_ABSOLUTE = 0.01
 """Largest noise [m or rad]; in folders of earlier versions, a larger noise is a factor on stated standard
 deviations."""
@@ -18,7 +20,7 @@ class CalibrationNoise:
 
     Attributes:
         value: standard deviation of the readings by sensor [m or rad]; a factor on the stated standard deviations if
-            the rows state them.
+            the rows state them. Also that of `JOINT`, if images show that joints scatter.
         stated: median of the stated standard deviations [m or rad], by sensor whose rows state them; None for
             folders of earlier versions, which do not store it.
     """

@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from pisigma.calibration.geometric.problem.joint_repeatability import corner_factor
 from pisigma.calibration.geometric.problem.parameters import ParameterSpace
 from pisigma.calibration.geometric.problem.setup import IdentifiedGeometry
 from pisigma.calibration.hybrid.design import (
@@ -16,7 +17,7 @@ from pisigma.calibration.hybrid.design import (
     Design,
     Rows,
 )
-from pisigma.calibration.hybrid.noise import CalibrationNoise, stated_sigmas
+from pisigma.calibration.hybrid.noise import JOINT, CalibrationNoise, stated_sigmas
 from pisigma.calibration.hybrid.sensor_values import joint_columns, weight_columns
 from pisigma.estimation.covariance_root import CovarianceRoot
 from pisigma.estimation.held_out import HeldOutErrors, held_out_scale
@@ -211,5 +212,9 @@ def position_uncertainty(
     change = geometry.coordinate_jacobian[:, design.problem.active.cpu()]
     root = root.with_columns(prior_size_columns(posterior, root), prior_scale**0.5, change)
     value = {sensor.name: sigma for sensor, sigma in zip(rows.values, posterior.noise, strict=True)}
+    setup = geometry.setup
+    if setup is not None and setup.joint_repeatability and "corner" in value:
+        factor = corner_factor(setup.measurements, value["corner"])
+        value[JOINT] = factor * setup.joint_repeatability
     noise = CalibrationNoise(value, stated_sigmas(design.problem.sensors))
     return PositionUncertainty(design.problem.space, geometry, design.features, root, prior_scale, noise)

@@ -10,9 +10,10 @@ from torch import Tensor
 
 from pisigma.calibration.geometric.initial_guess.initial_guess import randomly_chosen_rows
 from pisigma.calibration.geometric.prediction import predicted_poses
+from pisigma.calibration.geometric.problem.joint_repeatability import corner_factor
 from pisigma.calibration.geometric.problem.setup import IdentifiedGeometry, identified_geometry
 from pisigma.calibration.hybrid.design import Rows
-from pisigma.calibration.hybrid.noise import CalibrationNoise, stated_sigmas
+from pisigma.calibration.hybrid.noise import JOINT, CalibrationNoise, stated_sigmas
 from pisigma.calibration.hybrid.refinement import correction_from_weights, linearise_rows
 from pisigma.estimation.drift import Drift, DriftGroup, DriftSearch, LinearValues, PosteriorUpdate
 from pisigma.estimation.wrong_rows import ExplainedRows, mark_wrong_rows
@@ -108,6 +109,9 @@ class Adaptation:
         """Noise of the sensors of the new rows."""
         sensors = self.problem.design.problem.sensors
         value = {sensor.name: sigma for sensor, sigma in zip(sensors, self.drift.noise.tolist(), strict=True)}
+        setup = self.problem.setup
+        if setup.joint_repeatability and "corner" in value:
+            value[JOINT] = setup.joint_repeatability * corner_factor(setup.measurements, value["corner"])
         return CalibrationNoise(value, stated_sigmas(sensors))
 
     def errors_of(self, measurements: Measurements) -> dict[str, Float64[Tensor, "rows components"]]:

@@ -15,13 +15,12 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.model_posterior import ModelPosterior
 from pisigma.robot.description import Robot
-from pisigma.robot.robot_class import ChangeLimits, RobotClass
+from pisigma.robot.robot_class import ChangeLimits, RobotClass, plausible_share
 from pisigma.validation.checks.mixed_rows import MIN_WRONG_SHARE, too_many_wrong_rows
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.held_out.frames.fitted_frames import FrameKind
 from pisigma.validation.held_out.model_comparison import ModelComparison
 from pisigma.validation.setup_faults.cause import join_words, length_text
-from pisigma.validation.setup_faults.explanations import PLAUSIBLE_SHARE
 from pisigma.validation.setup_faults.nominal_robot_faults import evenly_spaced_rows, measured_rows
 from pisigma.validation.setup_faults.setup_faults import judged_values
 
@@ -72,7 +71,7 @@ def session_diagnostics(
     if len(session.outliers) > MIN_WRONG_SHARE * rows.rows:
         wrong = [rows.place(row) in session.outliers for row in range(rows.rows)]
         return (too_many_wrong_rows(rows, torch.tensor(wrong)),)
-    limit = PLAUSIBLE_SHARE * model.robot.reach
+    limit = plausible_share(model.robot) * model.robot.reach
     if session.rms_after > limit:
         sentence = (
             f"{rows.source}: the RMS error is {session.rms * 1e3:.4g} mm, and no movement explains it to less than "

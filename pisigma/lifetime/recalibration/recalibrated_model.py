@@ -21,12 +21,12 @@ from pisigma.model.geometric_model import branches_of
 from pisigma.model.model_posterior import FLEET_PRIOR
 from pisigma.model.stored_starts import spread_rows
 from pisigma.model.training_rows import stored_training_rows
+from pisigma.robot.robot_class import plausible_share
 from pisigma.robot.se3 import invert, transform_from_xyzrpy, xyzrpy_from_transform
 from pisigma.validation.checks.mixed_rows import MIN_WRONG_SHARE, too_many_wrong_rows
 from pisigma.validation.gate import check_rows
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.held_out.pose_statistics import image_deviation
-from pisigma.validation.setup_faults.explanations import PLAUSIBLE_SHARE
 
 KIND = "recalibration"
 _SUSPICIOUS_FACTOR = 5.0
@@ -122,6 +122,7 @@ def recalibration_diagnostics(
     parent: CalibratedModel,
     judged: CandidateChoice,
     rows: Measurements,
+    adaptation: Adaptation,
     wrong: Sequence[int],
     moved: Sequence[Movement],
 ) -> tuple[Diagnostic, ...]:
@@ -131,6 +132,7 @@ def recalibration_diagnostics(
         parent: model that was recalibrated.
         judged: errors of held-out rows.
         rows: all rows.
+        adaptation: adaptation of the model to the rows that were not left out.
         wrong: indices of the rows that were left out.
         moved: movements that were found.
     """
@@ -142,24 +144,26 @@ def recalibration_diagnostics(
         implausible := check_rows(rows, parent.nominal or parent.robot).implausible
     ):
         return implausible
-    return (*_large_errors(parent, judged, rows), *excessive_change_diagnostics(parent.robot, moved))
+    return (*_large_errors(parent, judged, adaptation), *excessive_change_diagnostics(parent.robot, moved))
 
 
 def _large_errors(
-    parent: CalibratedModel, judged: CandidateChoice, rows: Measurements
+    parent: CalibratedModel, judged: CandidateChoice, adaptation: Adaptation
 ) -> tuple[Diagnostic, ...]:
     """Return a finding if no candidate predicts the held-out rows."""
-    error, limit = judged.rms[judged.kept], PLAUSIBLE_SHARE * parent.robot.reach
+    error, share = judged.rms[judged.kept], plausible_share(parent.robot)
     if error is None:
         return ()
     noise = (
         math.nan if parent.uncertainty is None else parent.uncertainty.noise.standard_deviation("position")
     )
+    setup = adaptation.problem.setup
+    rows = setup.weighted_rows(setup.measurements, adaptation.arm.geometry)
     usual = max(math.sqrt(3) * (0.0 if math.isnan(noise) else noise), image_deviation(rows))
     missed = f"{rows.source}: the RMS error of held-out rows is {error * 1e3:.3g} mm"
-    if error > limit:
+    if error > share * parent.robot.reach:
         sentence = (
-            f"{missed}, more than {100 * PLAUSIBLE_SHARE:.0f} % of the reach of robot '{parent.robot.name}': another "
+            f"{missed}, more than {100 * share:.0f} % of the reach of robot '{parent.robot.name}': another "
             "robot was measured, or columns or units are wrong; run `pisigma verify` on these rows."
         )
     elif error > _SUSPICIOUS_FACTOR * usual > 0 and parent.kind != FLEET_PRIOR:

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
 from pisigma.calibration.geometric.initial_guess.initial_guess import InitialGuess, guess
+from pisigma.calibration.geometric.problem.joint_repeatability import corner_factor
 from pisigma.calibration.geometric.problem.parameters import LENGTHS, ParameterSpace
 from pisigma.calibration.geometric.problem.setup import (
     CalibrationSetup,
@@ -20,6 +21,7 @@ from pisigma.calibration.geometric.problem.setup import (
     usable_rows,
 )
 from pisigma.calibration.hybrid.design import Design
+from pisigma.calibration.hybrid.noise import JOINT
 from pisigma.estimation.drift import DriftGroup, LinearValues
 from pisigma.estimation.loss import HampelLoss
 from pisigma.measurement.dataset import Measurements
@@ -29,6 +31,7 @@ from pisigma.measurement.sensors.registry import unknown_groups
 from pisigma.measurement.sensors.sensor import ParameterUnit, UnknownGroup
 from pisigma.model.calibrated_model import CalibratedModel, Frames
 from pisigma.model.model_posterior import ModelPosterior
+from pisigma.robot.robot_class import RobotClass
 
 FrameKey = tuple[str, str]
 """Key of a base or a tool: ("base", frame) or ("tool", target)."""
@@ -121,10 +124,11 @@ def recalibration_problem(
     new = {("base", name) for name in rows.frame} | {("tool", name) for name in rows.target}
     new = (new - known) | set(relocated)
     guessed = _guess(model, posterior, space, rows, new)
-    setup = setup_from_guess(space, guessed, (usable, rows), SetupOptions(True, True), None, HampelLoss())
-    start = setup.start.clone()
-    start[: space.arm_size] = torch.from_numpy(posterior.geometry.robot.dh.ravel().copy())
-    problem = replace(setup.problem, nominal=start).with_active(range(len(start)))
+    options = SetupOptions(True, True, joint_repeatability=_joint_repeatability(posterior, rows))
+    dh = posterior.geometry.robot.dh
+    setup = setup_from_guess(space, guessed, (usable, rows), options, None, HampelLoss(), dh)
+    start = setup.start
+    problem = setup.problem.with_active(range(len(start)))
     change = coordinate_change(setup, start)
     root = posterior.root.new_zeros((len(start) + len(posterior.weights), posterior.root.shape[1]))
     parameters = len(posterior.space.parameters)
@@ -139,6 +143,14 @@ def recalibration_problem(
     design = Design(problem, posterior.features)
     groups = _groups(posterior, space, rows, root, new, setup.free_unknowns)
     return RecalibrationProblem(posterior, setup, design, mean, root, change, groups, root[:, :0])
+
+
+def _joint_repeatability(posterior: ModelPosterior, rows: Measurements) -> float:
+    """Return the repeatability of the joints [rad] relative to the deviations that rows of images state."""
+    known = posterior.noise.value
+    if "corner" in rows.kinds and JOINT in known:
+        return known[JOINT] / corner_factor(rows, known["corner"])
+    return RobotClass.from_robot(posterior.space.robot).joint_repeatability
 
 
 def _joined_space(space: ParameterSpace, rows: Measurements) -> ParameterSpace:

@@ -20,7 +20,7 @@ from pisigma.model.accuracy import deviation_of_rows
 from pisigma.model.calibrated_model import CalibratedModel, poses_of_rows
 from pisigma.robot.description import Robot
 from pisigma.robot.frame_fits import LEVER_SHARE, MeasuredPoses
-from pisigma.robot.robot_class import CLASSES, RobotClass
+from pisigma.robot.robot_class import RobotClass
 from pisigma.validation.held_out.calibration_validation import CalibrationValidation, pose_errors_of
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.held_out.frames.fitted_frames import FrameKind, fit_frames, with_known_names
@@ -56,8 +56,7 @@ class CheckedCalibration:
     @property
     def robot_class(self) -> RobotClass:
         """The stated class of the robot, or else its manufacturer's class."""
-        stated = self.calibrator.robot_class
-        return RobotClass.from_robot(self.robot) if stated is None else CLASSES[stated]
+        return self.calibrator.class_of_robot
 
     @property
     def nominal(self) -> CalibrationResult:

@@ -13,6 +13,7 @@ from pisigma.calibration.geometric.initial_guess.initial_guess import MIN_TURN
 from pisigma.files.errors import IdentificationError
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel, poses_of_rows
+from pisigma.robot.robot_class import plausible_share
 from pisigma.robot.se3 import transform
 from pisigma.validation.checks.check import LARGE_SHARE, MIN_ROWS_OF_MODEL, Move, kinds_to_fit
 from pisigma.validation.held_out.diagnostic import Diagnostic
@@ -20,7 +21,6 @@ from pisigma.validation.held_out.frames.fitted_frames import FrameKind, with_kno
 from pisigma.validation.held_out.frames.row_errors import errors_of_rows
 from pisigma.validation.held_out.model_comparison import ModelComparison, ModelFigures
 from pisigma.validation.setup_faults.cause import Cause, length_text
-from pisigma.validation.setup_faults.explanations import PLAUSIBLE_SHARE
 from pisigma.validation.setup_faults.hypothesis import COLLAPSED
 from pisigma.validation.setup_faults.joint_faults import joint_causes, signs_and_swaps
 from pisigma.validation.setup_faults.setup_fault import SetupFault, fault_of_cause
@@ -85,6 +85,7 @@ def diagnose_lengths(
     if ("base" in kinds or "frame" in may_move) and (rows.touch is not None or rows.anchor_place is not None):
         return (), ()
     known, reach = with_known_names(model, rows, kinds), model.robot.reach
+    limit = plausible_share(model.robot) * reach
     with suppress(IdentificationError):
         errors = _errors(model, known)
         if (
@@ -95,11 +96,11 @@ def diagnose_lengths(
         fault = _fault(model, known, free)
         faults = () if fault is None else (fault,)
         left = _fitted(model, known, _numbers(rows.dof, moves))[0]
-        if left <= min(COLLAPSED * _rms(errors), PLAUSIBLE_SHARE * reach):
+        if left <= min(COLLAPSED * _rms(errors), limit):
             return (), faults
         if fault is not None and not moves.issuperset(fault.kinds):
             return (fault.diagnostic(),), faults
-        if left > PLAUSIBLE_SHARE * reach:
+        if left > limit:
             return (unexplained(model),), faults
         return (), faults
     return (), ()

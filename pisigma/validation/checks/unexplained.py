@@ -7,15 +7,13 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.calibration.geometric.identifiability.plausibility import IMPLAUSIBLE_SHARE
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.sensors.registry import SENSORS
 from pisigma.robot.frame_fits import best_base_and_tool
-from pisigma.robot.robot_class import SERVO
+from pisigma.robot.robot_class import SERVO, plausible_share
 from pisigma.validation.checks.check import FITTED, CheckedCalibration, RowsUnderModel
 from pisigma.validation.checks.rounding import joint_rounding
 from pisigma.validation.held_out.diagnostic import Diagnostic
-from pisigma.validation.setup_faults.explanations import PLAUSIBLE_SHARE
 from pisigma.validation.setup_faults.setup_faults import unexplained
 
 _LARGE = 1e-3
@@ -73,7 +71,7 @@ MAX_STEP = 0.3
 
 def check_unexplained_rows(judged: RowsUnderModel) -> Iterator[Diagnostic]:
     """Fit all joint zeros, a base and a tool to rows whose errors are too large for a calibrated robot."""
-    limit = PLAUSIBLE_SHARE * judged.model.robot.reach
+    limit = plausible_share(judged.model.robot) * judged.model.robot.reach
     if judged.has_large_errors and not judged.setup_faults and _left(judged) > limit:
         yield unexplained(judged.model)
 
@@ -109,17 +107,19 @@ the variance. For a healthy robot the ratio is below 0.01."""
 def check_residual(checked: CheckedCalibration) -> Iterator[Diagnostic]:
     """Compare the residuals of every sensor with the robot's reach, and those of positions with the positions' spread.
 
-    Half of the measured lengths must be within 1 % of the reach per axis, and half of the measured angles within 0.01
-    rad, which moves a point at the distance of the reach by the same amount. No calibration error exceeds these limits.
+    Half of the measured lengths must be within `plausible_share` of the reach per axis, 1 % of most robots, and half of
+    the measured angles within as many radians, which move a point at the distance of the reach equally far. No
+    calibration error exceeds these limits.
     """
     robot, by_images = checked.robot, "corner" in checked.rows.kinds
+    share = plausible_share(robot)
     rows = "images and joint values" if by_images else "rows and positions"
     for sensor, errors in checked.final_errors.items():
         typical = _typical(errors)
         if SENSORS[sensor].unit == "rad":
-            limit, size = IMPLAUSIBLE_SHARE, f"{typical:.3g} rad"
+            limit, size = share, f"{typical:.3g} rad"
         else:
-            limit, size = IMPLAUSIBLE_SHARE * robot.reach, f"{typical * 1e3:.3g} mm"
+            limit, size = share * robot.reach, f"{typical * 1e3:.3g} mm"
             if sensor == "position":
                 limit = min(limit, _UNRELATED_SHARE * _spread(checked.rows))
         if typical > limit > 0:

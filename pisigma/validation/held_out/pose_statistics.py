@@ -337,7 +337,8 @@ def _noise(result: CalibrationResult | HybridResult, measurements: Measurements)
         sigma = one.sigma if learned is None else learned.noise[one.sensor]
         stated = measurements.sigma_position
         if one.sensor == "corner":
-            by_image = position_sigmas(measurements).cpu()
+            solved = geometric.solved
+            by_image = position_sigmas(solved.setup.weighted_rows(measurements, solved.geometry)).cpu()
             deviation = torch.where(by_image.isnan(), deviation, sigma * by_image)
         elif one.sensor == "position" and one.unit != "stated":
             deviation += sigma

@@ -20,6 +20,7 @@ from pisigma.model.calibrated_model import (
     nominal_poses_of_rows,
     poses_of_rows,
 )
+from pisigma.robot.description import Robot
 from pisigma.robot.frame_fits import (
     AFFINE_UNKNOWNS,
     LEVER_SHARE,
@@ -29,6 +30,7 @@ from pisigma.robot.frame_fits import (
     best_base_and_tool,
     best_tool,
 )
+from pisigma.robot.robot_class import plausible_share
 from pisigma.robot.se3 import rotation_vector
 from pisigma.validation.setup_faults.cause import Cause, length_text
 from pisigma.validation.setup_faults.hypothesis import COLLAPSED, Hypothesis, PredictingArm, error_with_fitted
@@ -39,11 +41,6 @@ if TYPE_CHECKING:
 
 _SMALL_SHARE = 2e-4
 """Errors, as a share of the reach, below which a fault of a joint column is not their cause."""
-PLAUSIBLE_SHARE = 0.01
-"""Largest errors of a calibrated robot, and of a robot after correction of a fault, as a share of the reach."""
-PLAUSIBLE_TURN = PLAUSIBLE_SHARE / LEVER_SHARE
-"""Largest orientation errors of a calibrated robot [rad], which are treated as position errors at a distance of
-`LEVER_SHARE` of the reach."""
 AS_GOOD = 1.5
 """Ratio of the errors of a simpler explanation to the smallest errors, up to which the simpler one is chosen."""
 _MAX_CONVENTIONS = 8
@@ -69,9 +66,17 @@ _MIRROR = torch.diag(torch.tensor([1.0, -1.0, 1.0], dtype=torch.float64))
 _MIRRORED = "{} mirrored, as in a left-handed frame (an axis has the wrong sign, or two are swapped)"
 
 
-def explanation_limit(here: Hypothesis, reach: float) -> float:
-    """Return the largest error [m] that an explanation may leave, for a robot with a given reach [m]."""
-    return min(COLLAPSED * here.error, PLAUSIBLE_SHARE * reach)
+def plausible_turn(robot: Robot) -> float:
+    """Return the largest orientation errors of a calibrated robot [rad].
+
+    They are treated as position errors at a distance of `LEVER_SHARE` of the reach.
+    """
+    return plausible_share(robot) / LEVER_SHARE
+
+
+def explanation_limit(here: Hypothesis, robot: Robot) -> float:
+    """Return the largest error [m] that an explanation may leave."""
+    return min(COLLAPSED * here.error, plausible_share(robot) * robot.reach)
 
 
 def choose_simplest(fault_hypotheses: Sequence[Hypothesis], most: float) -> list[Hypothesis]:

@@ -99,7 +99,7 @@ def find_nominal_robot_faults(robot: Robot, measurements: Measurements) -> tuple
             return named
     if not here.error > usual:
         return ()
-    most = explanation_limit(here, robot.reach)
+    most = explanation_limit(here, robot)
     tried = [
         *fault_hypotheses(arm, some, raw, most),
         *_with_joints(arm, some, shifted_rows(robot, rows, chosen, measured), most),
@@ -159,7 +159,7 @@ def _named_otherwise(robot: Robot, measurements: Measurements, usual: float) -> 
     here = Hypothesis(rows.q, fit_targets(T, measured, number)[1], measured)
     if not here.error > usual:
         return ()
-    most = explanation_limit(here, robot.reach)
+    most = explanation_limit(here, robot)
     return tuple(
         fault_from_hypothesis(here, other, float("nan"))
         for other in choose_simplest(_labelled(rows, T, measured), most)

@@ -9,17 +9,17 @@ import torch
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel, poses_of_rows
 from pisigma.robot.frame_fits import LEVER_SHARE, MeasuredPoses
+from pisigma.robot.robot_class import plausible_share
 from pisigma.validation.held_out.calibration_summary import has_orientation
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.held_out.frames.fitted_frames import FrameKind, fit_frames, with_known_names
 from pisigma.validation.held_out.model_comparison import ModelFigures
 from pisigma.validation.setup_faults.explanations import (
-    PLAUSIBLE_SHARE,
-    PLAUSIBLE_TURN,
     choose_simplest,
     explanation_limit,
     fault_hypotheses,
     frame_hypotheses,
+    plausible_turn,
 )
 from pisigma.validation.setup_faults.hypothesis import Hypothesis, PredictingArm
 from pisigma.validation.setup_faults.joint_faults import NOTICED
@@ -80,7 +80,7 @@ def find_setup_faults(
     if not here.error > NOTICED:
         return ()
     arm = PredictingArm(model.robot, model)
-    most = explanation_limit(here, model.robot.reach)
+    most = explanation_limit(here, model.robot)
     tried = (
         frame_hypotheses(arm, known, [here], most)
         if frames_only
@@ -124,14 +124,16 @@ def is_implausible(figures: ModelFigures, model: CalibratedModel) -> bool:
         figures: figures of the model, or of another model with its base and tool.
         model: the model.
     """
-    reach, orientation = model.robot.reach, figures.orientation if has_orientation(model) else None
+    orientation = figures.orientation if has_orientation(model) else None
+    limit = plausible_share(model.robot) * model.robot.reach
     turn = 0.0 if orientation is None else np.deg2rad(orientation.statistics["rms"])
-    return figures.position.statistics["rms"] * 1e-3 > PLAUSIBLE_SHARE * reach > 0 or turn > PLAUSIBLE_TURN
+    return figures.position.statistics["rms"] * 1e-3 > limit > 0 or turn > plausible_turn(model.robot)
 
 
 def unexplained(model: CalibratedModel) -> Diagnostic:
     """Return the finding that no setup fault explains implausible errors of a model, with advice on what to check."""
-    limit, turn = PLAUSIBLE_SHARE * model.robot.reach * 1e3, np.rad2deg(PLAUSIBLE_TURN)
+    robot = model.robot
+    limit, turn = plausible_share(robot) * robot.reach * 1e3, np.rad2deg(plausible_turn(robot))
     return Diagnostic(
         kind="implausible_errors",
         severity="implausible",

@@ -10,9 +10,7 @@ from pisigma.calibration.geometric.problem.least_squares import Linearisation
 from pisigma.calibration.geometric.problem.noise import sensor_view_of
 from pisigma.calibration.geometric.problem.problem import CalibrationProblem
 from pisigma.files.errors import ImplausibleError, Place
-
-IMPLAUSIBLE_SHARE = 0.01
-"""Median residual, as a share of the reach, above which a fitted arm is implausible."""
+from pisigma.robot.robot_class import plausible_share
 
 _DISTANCES = ("distance", "pair")
 """Sensors that measure distances, which are tested like positions."""
@@ -54,7 +52,7 @@ def refuse_implausible(problem: CalibrationProblem, here: Linearisation[Tensor],
         return
     sizes = residual_sizes(problem, here)[torch.stack(judged).any(0)]
     size = float(sizes.median()) if len(sizes) else 0.0
-    if size > IMPLAUSIBLE_SHARE * robot.reach:
+    if size > plausible_share(robot) * robot.reach:
         raise ImplausibleError(
             f"with the best fit, the median residual is still {size * 1e3:.3g} mm per axis "
             f"({100 * size / robot.reach:.1f} % of the reach of robot '{robot.name}'), more than any calibration "

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -11,23 +11,22 @@ from jaxtyping import Float64, Int64
 from torch import Tensor
 
 from pisigma.calibration.geometric.initial_guess.initial_guess import InitialGuess, guess
-from pisigma.calibration.geometric.problem.noise import renumber
+from pisigma.calibration.geometric.problem.joint_repeatability import with_joint_repeatability
 from pisigma.calibration.geometric.problem.parameters import ParameterSpace, Prior, PriorSizes
 from pisigma.calibration.geometric.problem.problem import CalibrationProblem
+from pisigma.calibration.geometric.problem.repeats import number_repeats
 from pisigma.estimation.loss import AbstractLoss
 from pisigma.files.errors import IdentificationError, Place
 from pisigma.measurement.conditions import JointState, repeat_key
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.fields import KINDS
 from pisigma.measurement.readings import READINGS
+from pisigma.measurement.sensors.corner import CornerSensor
 from pisigma.measurement.sensors.registry import build_sensors, sort_pairs_first, unknown_groups
 from pisigma.measurement.sensors.sensor import SensorRows, numbers_of
 from pisigma.measurement.sensors.socket import PairOfSockets, SocketDistanceSensor
 from pisigma.robot.description import Robot
 from pisigma.robot.se3 import invert, rotation_from_rpy, rpy_from_rotation, transform_from_xyzrpy
-
-_MULTIPLIER, _FACTOR = 6_364_136_223_846_793_005, 1_442_695_040_888_963_407
-"""Constants of the linear congruential generator that hashes joint values (Knuth, MMIX)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +42,11 @@ class Anchors:
     bases: Float64[Tensor, "frames 4 4"]
     tools: Float64[Tensor, "targets 3 3"]
 
+    def sensor_rows(self, measurements: Measurements, frame: Tensor, target: Tensor) -> SensorRows:
+        """Return rows of measurements with the anchors of their bases and tools, whose indices are given."""
+        bases, tools = self.bases.to(frame.device), self.tools.to(frame.device)
+        return SensorRows(measurements, bases[frame], tools[target])
+
 
 @dataclass(frozen=True, eq=False)
 class CalibrationSetup:
@@ -56,6 +60,8 @@ class CalibrationSetup:
         unknown_frames: index of every owner's frame, by group of the sensors' unknowns.
         free_unknowns: indices of the sensors' unknowns to identify, such as positions of sockets.
         measurements: the rows of the problem, in the order of the problem.
+        joint_repeatability: standard deviation of the value of every revolute joint [rad], relative to the estimated
+            factor on the noise of corners; see `SetupOptions`.
     """
 
     problem: CalibrationProblem
@@ -65,6 +71,24 @@ class CalibrationSetup:
     unknown_frames: Mapping[str, Int64[Tensor, " owners"]]
     free_unknowns: list[int]
     measurements: Measurements
+    joint_repeatability: float = 0.0
+
+    def weighted_rows(self, rows: Measurements, there: "IdentifiedGeometry") -> Measurements:
+        """Return rows of images whose covariances include the repeatability of the joints of an arm."""
+        return with_joint_repeatability(rows, there.robot, there.bases, there.tools, self.joint_repeatability)
+
+    def weighted_at(self, point: Float64[Tensor, " parameters"]) -> "CalibrationSetup":
+        """Return the setup whose images are weighted by the repeatability of the joints of the arm at a point."""
+        rows = self.weighted_rows(self.measurements, identified_geometry(self, point))
+        weighted, problem = self.corners_of(rows), self.problem
+        if weighted is None or rows is self.measurements:
+            return self
+        sensors = tuple(weighted if isinstance(one, CornerSensor) else one for one in problem.sensors)
+        return replace(self, problem=replace(problem, sensors=sensors))
+
+    def corners_of(self, rows: Measurements) -> CornerSensor | None:
+        """Return the images in the rows of the problem, with the weights that these state; None without images."""
+        return CornerSensor.build(self.anchors.sensor_rows(rows, self.problem.frame, self.problem.target))
 
 
 @dataclass(frozen=True)
@@ -79,6 +103,8 @@ class SetupOptions:
         socket_distances: distances between two sockets [m].
         socket_sigma: standard deviation of the distances between sockets [m].
         prior_sizes: see `CalibrationProblem`.
+        joint_repeatability: standard deviation of the value of every revolute joint [rad], by which images are
+            weighted; see `with_joint_repeatability`.
     """
 
     free_base: bool
@@ -88,6 +114,7 @@ class SetupOptions:
     socket_distances: Mapping[PairOfSockets, float] = field(default_factory=dict)
     socket_sigma: float = 1e-5
     prior_sizes: PriorSizes = "widened"
+    joint_repeatability: float = 0.0
 
 
 def build_setup(
@@ -124,6 +151,7 @@ def setup_from_guess(
     options: SetupOptions,
     prior: Prior | None,
     loss: AbstractLoss,
+    dh: Float64[np.ndarray, "rows 5"] | None = None,
 ) -> CalibrationSetup:
     """Build the problem relative to an initial guess.
 
@@ -134,6 +162,7 @@ def setup_from_guess(
         options: settings of base, tool and sensors.
         prior: prior of the geometric errors.
         loss: loss function.
+        dh: start values of the rows of the arm [rad and m]; None for the nominal ones.
     """
     rows, measurements = usable
     device = measurements.q.device
@@ -143,10 +172,10 @@ def setup_from_guess(
         own.name: torch.tensor([space.frames.index(name) for name in own.frames]) for own in space.unknowns
     }
     anchors, start = _anchored(space, guessed, options, unknown_frames)
+    if dh is not None:
+        start[: space.arm_size] = torch.from_numpy(dh.flatten())
     start = start.to(device)
-    sensors = build_sensors(
-        SensorRows(measurements, anchors.bases.to(device)[frame], anchors.tools.to(device)[target])
-    )
+    sensors = build_sensors(anchors.sensor_rows(measurements, frame, target))
     distances = SocketDistanceSensor.assign_distances(
         measurements, options.socket_distances, options.socket_sigma
     )
@@ -172,7 +201,10 @@ def setup_from_guess(
         for own in space.unknowns
         for index in guessed.free_unknowns[own.name].flatten().nonzero()[:, 0].tolist()
     ]
-    return CalibrationSetup(problem, start, anchors, rows, unknown_frames, free, measurements)
+    setup = CalibrationSetup(
+        problem, start, anchors, rows, unknown_frames, free, measurements, options.joint_repeatability
+    )
+    return setup.weighted_at(start)
 
 
 def usable_rows(measurements: Measurements) -> tuple[Tensor, Measurements]:
@@ -206,27 +238,6 @@ def usable_rows(measurements: Measurements) -> tuple[Tensor, Measurements]:
             remedy="measure at other joint values, spread over the workspace",
         )
     return rows, chosen
-
-
-def number_repeats(q: Tensor, *names: Tensor) -> Tensor | None:
-    """Return an index for every row that is equal for equal joint values (with payload, to 1e-9) and names.
-
-    Returns:
-        The indices; None if all rows differ.
-    """
-    numbers = renumber(_mixed_keys(q, *names))
-    return None if int(numbers.max()) + 1 == len(q) else numbers
-
-
-def _mixed_keys(q: Float64[Tensor, "rows dof"], *names: Tensor) -> Int64[Tensor, " rows"]:
-    """Return a hash of every row's joint values (to 1e-9) and names."""
-    keys, dof = (q * 1e9).round().long(), q.shape[1]
-    factors = [_FACTOR * pow(_MULTIPLIER, dof - 1 - joint, 2**64) for joint in range(dof)]
-    signed = [(factor + 2**63) % 2**64 - 2**63 for factor in factors]
-    mixed: Tensor = (keys * torch.tensor(signed, device=q.device)).sum(1)  # integers wrap around
-    for name in names:
-        mixed = mixed * _MULTIPLIER + name * _FACTOR
-    return mixed
 
 
 def _anchored(
