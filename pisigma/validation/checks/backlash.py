@@ -133,8 +133,8 @@ def _diagnostic(robot: Robot, rows: Measurements, found: LostMotion) -> Diagnost
     J = joint_jacobian(robot, rows.q)[1][:, :3, list(joints)]
     error = float((J * J.new_tensor(play) / 2).square().sum((1, 2)).mean().sqrt())
     remedy = (
-        "State the side from which each joint approaches (docs/how-to/backlash.md), also for the poses to "
-        "command."
+        "State the side from which each joint approaches (docs/how-to/backlash.md), in the rows and for the poses "
+        "to command."
     )
     return Diagnostic(
         kind="backlash",

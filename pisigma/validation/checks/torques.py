@@ -39,7 +39,7 @@ def _negative(compliances: dict[int, float]) -> Iterator[Diagnostic]:
     if not negative:
         return
     is_mixed = len(negative) < len(compliances)
-    remedy = "Reverse their signs, also in later rows."
+    remedy = "Reverse their signs, in later rows too."
     columns = ", ".join(f"tau_{joint + 1} ({value:.2g})" for joint, value in negative.items())
     others = ", unlike that of the other columns" if is_mixed else ""
     yield Diagnostic(
