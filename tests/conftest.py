@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 sys.path.insert(0, str(Path(__file__).parent))
 sys.path.append(str(Path(__file__).parent.parent / "training" / "papers"))
 
+import testing.bytecode
 import testing.type_checker  # noqa: F401  its place is before pisigma's, which it shall check
 from testing.models import no_type_checker
 from testing.pictures import no_pictures
