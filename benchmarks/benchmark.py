@@ -3,9 +3,9 @@
 `python benchmarks/benchmark.py run` fits every method to every split of every series, and stores errors of all held-out
 rows in `benchmarks/results`; splits that are stored there with the same hashes of data, split and code are not run
 again. `--quick` runs the first fold of the first split of every series, and stores only in `--out`. `page` writes the
-page of the documentation from the stored results. `data` lists the series and what is missing; the files are looked for
-in `PISIGMA_DATA`. `rows SERIES SPLIT` prints the row numbers of a split as JSON.
-Packages that need other versions run with another Python: `--python pybotics=PATH`.
+page of the documentation from the stored results. `data` lists the series and the missing files, which are searched for
+in `PISIGMA_DATA`. `rows SERIES SPLIT` prints the row numbers of a split as JSON. Packages that need other versions run
+with another Python: `--python pybotics=PATH`.
 """
 
 import argparse

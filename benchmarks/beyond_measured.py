@@ -1,4 +1,4 @@
-"""Error of a hybrid far outside its measured joint values, from series C to series B of the measured UR10.
+"""Error of a hybrid far outside its measured joint values: fitted to series C of the UR10, evaluated on series B.
 
 Run `OMP_NUM_THREADS=2 python benchmarks/beyond_measured.py` with the measured files in `PISIGMA_DATA`. Every line is
 the root mean square of the position errors of series B [mm] for a hybrid fitted to series C, with base and tool fitted
@@ -85,7 +85,7 @@ def fitted(
 def amplitudes(both: RefinedFit, prior: GaussianPrior) -> GaussianPrior:
     """Return the prior of series C with the amplitude of every harmonic of every joint in both series."""
     design, precision = both.design, prior.precision.clone()
-    # base and tool of the other series are unknowns of both and precede the weights
+    # base and tool of the other series are unknowns of the fit to both series, and precede the weights
     shift = len(prior.base) - design.unknowns
     for number, feature in enumerate(design.features):
         if feature.name == "series":

@@ -108,7 +108,7 @@ def calibrate_robotkinecal(
     points = T[:3, 3] + np.cross(axes, J[:3].T)
     links = [rtb.PoERevolute(axis, point) for axis, point in zip(axes, points, strict=True)]
     peer = SerialRobotKineCal(rtb.PoERobot(links, SE3(T, check=False)))
-    peer.joint_screw_axis = peer.joint_screw_axis[1:-1]  # its first and last link are frames, not joints
+    peer.joint_screw_axis = peer.joint_screw_axis[1:-1]  # the first and the last link are frames, not joints
     peer.N_JOINTS = nominal.dof
     peer.set_observations(list(q), list(p))
     peer.solve()
@@ -122,9 +122,9 @@ PEERS = {
     "pybotics": calibrate_pybotics,
 }
 REPEATS = 7
-"""Number of fits of peers faster than `QUICK`, of which the fastest counts."""
+"""Number of fits of each peer that is faster than `QUICK`; the fastest fit counts."""
 QUICK = 2.0
-"""Duration [s]."""
+"""Duration of a fit below which it is repeated [s]."""
 
 
 def timed(

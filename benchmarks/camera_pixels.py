@@ -34,7 +34,7 @@ from pisigma.simulation.camera.simulated_images import (
 
 LENS = replace(CAMERA, k1=-0.1, k2=0.05, p1=1e-4, p2=-2e-4)
 IN_BASE = torch.tensor([0.42, 0.08, 0.05, 0.0, 0.0, np.pi], dtype=torch.float64)
-"""Pose of the board: flat in front of the arm with its print up, so that its z axis points down."""
+"""Pose of the board, which lies in front of the arm with its print up, so that its z axis points down."""
 
 
 def main(draws: int, count: int) -> None:

@@ -52,7 +52,7 @@ REFLECTOR = np.array([0.05, -0.04, 0.1, 0.0, 0.0, 0.0])
 TRACKER_NOISE = 2e-5
 WRONG_SHARE, WRONG_BY, SWAPPED = 0.05, 5.0, 3
 BOW = np.array([1e-4, 0.0, 1e-4])
-"""Heights of the three shapes [m]: the surface is between planes 0.3 mm apart."""
+"""Heights of the three shapes of the bowed surface [m], which is between planes 0.3 mm apart."""
 CHOICES: tuple[IntrinsicsChoice, ...] = ("fixed", "prior", "free")
 GEAR = np.deg2rad(0.015)
 HARMONICS = (1, 2)
@@ -76,14 +76,14 @@ class Arm:
         )
 
     def images(self, q: Tensor, is_fixed: bool = False, wobble: Tensor | float = 0.0) -> Images:
-        """Return corners in the images of the camera on the flange, or of the fixed one."""
+        """Return corners in the images of the camera on the flange, or of the fixed camera."""
         true = self.with_frames(CAMERA_IN_BASE if is_fixed else IN_BASE, ON_FLANGE.numpy())
         generator = torch.Generator().manual_seed(self.draw)
         images = simulate_images(true, q + wobble, CAMERA, BOARD, NOISE, generator, is_fixed)
         return replace(images, q=q)
 
     def rows(self, q: Tensor, is_fixed: bool = False) -> Measurements:
-        """Return the measurements of these images."""
+        """Return the measurements of images."""
         camera, board = (FIXED_CAMERA, HAND) if is_fixed else (CAMERA, BOARD)
         return solved(self.images(q, is_fixed), camera, board)
 
@@ -213,7 +213,7 @@ def gears(arm: Arm, q: Tensor, postures: Tensor) -> Iterator[tuple[str, float]]:
 
 
 def at(rows: Measurements, q: Tensor) -> Measurements:
-    """Return other joint values in the frame of some rows."""
+    """Return rows with other joint values, in the frame of given rows."""
     return Measurements(
         q, torch.zeros(len(q), 3).to(q), frame=rows.frame[:1] * len(q), target=rows.target[:1] * len(q)
     )

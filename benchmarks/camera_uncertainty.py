@@ -3,9 +3,9 @@
     OMP_NUM_THREADS=1 python benchmarks/camera_uncertainty.py [--draws 30]
 
 Set-up and errors are those of `benchmarks/camera.py`. Coverage is the share of the position coordinates over the whole
-joint space, pooled over draws, with errors within the 95 % intervals that `pisigma calibrate` predicts. Then the
-board is 0.1 % larger than stated, and a ball on the flange sits six times in each of two sockets whose distance of
-600 mm is known to 0.01 mm; the repeatability of the robot is 0.02 mm.
+joint space, pooled over draws, with errors within the 95 % intervals that `pisigma calibrate` predicts. In a second
+part, the board is 0.1 % larger than stated, and a ball on the flange sits six times in each of two sockets whose
+distance of 600 mm is known to 0.01 mm; the repeatability of the robot is 0.02 mm.
 """
 
 import argparse

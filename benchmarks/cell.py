@@ -1,4 +1,4 @@
-"""Test with simulated arms whether `pisigma status` is right after every command, from a URDF file to a verified model.
+"""Test with simulated arms whether `pisigma status` names the right next step, from a URDF file to a verified model.
 
 Run `OMP_NUM_THREADS=1 python benchmarks/cell.py FOLDER_OF_SIM [--arms kr10 scara] [--seeds 10] [--subprocess]`.
 
@@ -34,7 +34,7 @@ from pisigma.model.folder.model_folder import load_model
 ARMS = ("kr10", "irb120", "arm7", "scara", "rail")
 LIMIT_MM = 0.5
 STEPS = ("plan", "import", "calibrate", "plan", "import", "verify", "")
-"""The right next step after every command from `new` to `verify`; nothing has to be done at the end."""
+"""The right next step after every command from `new` to `verify`; at the end, no step is due."""
 PROGRAM = "from pisigma.cli.main import run; run()"
 
 
@@ -42,8 +42,8 @@ class Arm:
     """One arm with its cell, and the figures of the table.
 
     Attributes:
-        commands: number of commands that ended with exit status 0.
-        right: number of right next steps.
+        commands: number of commands that had exit status 0.
+        right: number of correct next steps.
     """
 
     def __init__(self, sim: Any, name: str, seed: int, folder: Path, alone: bool) -> None:
@@ -91,7 +91,7 @@ class Arm:
         return path
 
     def go(self) -> None:
-        """Run all commands that `status` names, one after the other."""
+        """Run all commands that `status` names as next steps, one after the other."""
         urdf = Path(self.sim.__file__).parent / f"{self.name}.urdf"
         self.run(
             "new", str(urdf), "--out", str(self.cell), "--sensor", "tracker", "--limit-mm", str(LIMIT_MM)
@@ -117,7 +117,7 @@ class Arm:
             server.terminate()
 
     def judge(self) -> tuple[float, float, float, bool]:
-        """Return the true RMS [mm] of the nominal robot, in the cell and without a cell, and whether both are equal."""
+        """Return the true RMS [mm] of the nominal robot and of both models, and whether the models are equal."""
         urdf, out = Path(self.sim.__file__).parent / f"{self.name}.urdf", self.folder / "alone"
         self.run("calibrate", str(urdf), str(self.rows[0]), "--out", str(out), "--folds", "0")
         (inside,) = (self.cell / "models").iterdir()

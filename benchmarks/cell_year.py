@@ -1,4 +1,4 @@
-"""Simulate years of a cell: are events named in their month, wrong sessions refused, and the model in use accurate?
+"""Simulate years of a cell: whether events are named, wrong sessions are refused, and the model in use is accurate.
 
 `python benchmarks/cell_year.py FOLDER_OF_SIM [--arm irb120] [--seeds 20]`
 
@@ -31,14 +31,14 @@ from pisigma.workflow.settings.calibration import CalibrationSettings
 
 QUIET = CalibrationSettings(folds=0)
 WANTED = {7: "joint 3", 9: "base", 10: "tool"}
-"""By the month, what has to be named."""
+"""Changes that have to be named, by month."""
 
 
 class Year:
     """One arm with its cell and its simulator."""
 
     def __init__(self, sim: Any, arm: str, seed: int, folder: Path) -> None:
-        """Calibrate and verify."""
+        """Create the cell, calibrate and verify."""
         self.sim, self.true, self.folder = sim, sim.True_(arm, seed=seed), folder
         self.tool: tuple[float, ...] | None = None
         self.judged = self.true.sample(300, 99)
@@ -64,7 +64,7 @@ class Year:
         return path
 
     def error(self, model: CalibratedModel) -> float:
-        """RMS position error of a model at other poses, after a rigid fit [mm]."""
+        """Return the RMS position error of a model at other poses, after a rigid fit [mm]."""
         x, _ = self.true.tip(self.judged, self.tool)
         return position_error(model, self.judged, x)
 
@@ -96,7 +96,7 @@ class Year:
         others += [self.error(recalibrate(before, self.cell.sessions.as_measured(entry)).model)]
         if self.cell.status().step.state in ("moved", "older_than_evidence"):
             self.cell.recalibrate()
-        # a session of last winter is verified again today
+        # a session of last winter is verified again on this day
         self.wrong_steps += self.cell.status().step.state not in ("up_to_date", "verification_due")
         sessions = [one for one in self.cell.history.sessions() if one.day in self.since]
         if sum(one.rows for one in sessions) >= 30:
@@ -117,7 +117,7 @@ class Year:
 
 
 def sim_folder(sim: Any) -> Path:
-    """The folder of the simulator."""
+    """Return the folder of the simulator."""
     return Path(sim.__file__).parent
 
 

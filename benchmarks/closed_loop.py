@@ -1,4 +1,4 @@
-"""Close the loop in MuJoCo: does an arm that pisigma knows only from its drawing reach the commanded poses?
+"""Close the loop in MuJoCo: how closely an arm that pisigma knows only from its drawing reaches commanded poses.
 
 `python benchmarks/closed_loop.py [--arm ur5] [--case rigid] [--seeds 5] [--jobs 1] [--out FOLDER]`
 
@@ -6,8 +6,8 @@ MuJoCo reads a drawn URDF file, and errors are added to the arm (`mujoco_arm.py`
 MuJoCo's position controllers drive 60 planned poses, and a tracker, whose frame is unknown, measures the reflector with
 a noise of 0.03 mm per axis. The cell is calibrated, and verified with 10 further planned poses. Then the corrected
 inverse kinematics solves 500 poses that were not measured, their joint values are commanded to the controllers, and the
-true positions of the reflector are compared with the requested ones. The nominal arm with base and tool fitted to the
-same 60 rows is driven to the same poses. The program needs the extra `bench`.
+true positions of the reflector are compared with the requested ones. For comparison, the arm also moves to the joint
+values of the nominal arm, with base and tool fitted to the same 60 rows. The program needs the extra `bench`.
 """
 
 import argparse
@@ -46,7 +46,7 @@ ARMS = {
     "scara": DrawnArm("scara.urdf", None, "flange", (2e5, 2e5, 1e6, 2e5), (5e4,)),
     "rail": DrawnArm("rail.urdf", None, "tool0", (2e7, 2e6, 2e6, 2e6, 3e5), (4e5, 4e5, 4e5, 6e4)),
 }
-"""Drawn arms: two of public packages, two written by hand."""
+"""Drawn arms: two from public packages, two written by hand."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ class Closed:
         seed: seed of the arm.
         nominal_mm: RMS error of the nominal arm.
         rms_mm: RMS error with the calibrated arm.
-        p95_mm: 95 % quantile of its errors.
+        p95_mm: 95 % quantile of the errors with the calibrated arm.
         predicted_p95_mm: prediction of this quantile by the model, without the noise of the tracker.
         planned_p95_mm: prediction of this quantile by the plan.
         rows: number of calibration rows: planned poses with a collision-free path.
@@ -104,7 +104,7 @@ class Closed:
         verdict: verdict of the verification.
         warnings: warnings of the calibration.
         seconds: computing time [s].
-        errors_mm: all errors.
+        errors_mm: all errors with the calibrated arm.
         nominal_errors_mm: all errors of the nominal arm.
         was_refused: whether the import refused valid rows, which were then accepted explicitly.
     """
@@ -150,13 +150,13 @@ class Loop:
         self.robot = self.cell.robot
 
     def drive(self, commands: np.ndarray) -> Driven:
-        """Drive to joint values; the result contains true positions in the frame of the tracker."""
+        """Move the arm to joint values; the result contains true positions in the frame of the tracker."""
         driven = self.arm.drive(commands, SERVO if self.case.measured else 0)
         turn, shift = self.tracker
         return replace(driven, position=turn.apply(driven.position) + shift)
 
     def measure(self, commands: np.ndarray, name: str) -> Measurements:
-        """Drive to joint values and write the measurements of the tracker as a file of rows."""
+        """Move the arm to joint values and write the measurements of the tracker as a file of rows."""
         driven = self.drive(commands)
         rows = Measurements(
             q=torch.from_numpy(driven.encoders if self.case.measured else commands),
@@ -179,7 +179,7 @@ class Loop:
 
 @cache
 def plan_of(arm: str, poses: int = POSES, candidates: int = 5000) -> pisigma.Plan:
-    """Plan the poses of the calibration and of its verification, which depend only on the drawing."""
+    """Plan the poses of the calibration and of the verification, which depend only on the drawing."""
     drawn = ARMS[arm]
     with tempfile.TemporaryDirectory() as folder:
         cell = Cell.create(Path(folder) / "cell", drawn.urdf, base=drawn.base, tip=drawn.tip)
@@ -258,7 +258,7 @@ def run_one(task: tuple[str, str, int]) -> Closed:
 
 
 def table(results: Sequence[Closed]) -> str:
-    """Return the table of the documentation: medians over the seeds, with the largest in brackets.
+    """Return the table of the documentation: medians over the seeds, with the largest values in brackets.
 
     The ratio compares the mean predicted 95 % quantile with the true one of the errors of all seeds together, with the
     ratios of single seeds in brackets.
@@ -330,7 +330,7 @@ def draw(results: Sequence[Closed], file: Path) -> None:
 
 
 def line(one: Closed) -> str:
-    """Return the line to print after a loop."""
+    """Return the line that is printed after a loop."""
     return (
         f"{one.arm} {one.case} {one.seed}: nominal {one.nominal_mm:.3f}, calibrated {one.rms_mm:.3f} mm RMS; "
         f"95 %: true {one.p95_mm:.3f}, predicted {one.predicted_p95_mm:.3f}, planned {one.planned_p95_mm:.3f}; "

@@ -29,7 +29,7 @@ from pisigma.simulation.true_robot import TrueRobot, TrueRobotSection
 
 ROWS, JUDGED = 120, 2_000
 NOISE_MM = 0.036
-"""Standard deviation of tracker and robot together [m]."""
+"""Standard deviation of a measured coordinate due to tracker and robot together [m]."""
 
 ARM = """
 - {name: theta_1, type: revolute, limits_deg: [-170, 170], d_mm: 670, a_mm: 312, alpha_deg: -90}
@@ -159,7 +159,7 @@ CASES: dict[str, tuple[Case, Case]] = {
         Case(ARM),
     ),
 }
-"""By name: an arm, and the same arm without coupling or rail."""
+"""Pairs by name: an arm, and the same arm without coupling or rail."""
 
 
 def true_error(case: Case, seed: int) -> float:

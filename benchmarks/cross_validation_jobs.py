@@ -15,7 +15,7 @@ ROWS = Path(os.environ.get("PISIGMA_DATA", "../shared/data")) / "ur10" / "series
 
 
 def timed(out: Path, jobs: int) -> tuple[float, float]:
-    """Return the seconds of calibration and cross-validation, and of the whole command."""
+    """Return the durations of calibration and cross-validation, and of the whole command [s]."""
     command = [sys.executable, "-m", "pisigma", "calibrate", "ur10", str(ROWS), "--out", str(out)]
     started = time.monotonic()
     done = subprocess.run([*command, "--jobs", str(jobs), "--json"], capture_output=True, check=True)

@@ -1,7 +1,7 @@
 """Models of MuJoCo, pinocchio, Drake and the Robotics Toolbox from an exported DH table.
 
 The module does not import pisigma, and reads the table by the convention and the units that the file states: A_i =
-RotZ(theta_i + direction q_i) Trans(a_i, 0, d_i) RotX(alpha_i) RotY(beta_i), a prismatic joint adds to d_i.
+RotZ(theta_i + direction q_i) Trans(a_i, 0, d_i) RotX(alpha_i) RotY(beta_i), a prismatic joint adds its value to d_i.
 """
 
 import csv
@@ -40,7 +40,7 @@ class Table:
     T_tool: np.ndarray
 
     def links(self) -> Iterator[tuple[str, int, np.ndarray]]:
-        """Yield type, direction and pose of the frame that moves about or along its z axis in the previous one.
+        """Yield type and direction of every joint, and the pose of its frame (with its axis as z) in the previous one.
 
         A rotation about z and a translation along it commute, so the frame comes after RotZ(theta) Trans(0, 0, d).
         """
@@ -51,7 +51,7 @@ class Table:
 
     @property
     def T_last_tool(self) -> np.ndarray:
-        """Pose of the tool in the last of these frames."""
+        """Return the pose of the tool in the last frame of `links`."""
         row = self.rows[-1]
         T = _translation(row.a, 0, 0) @ _rotation("x", row.alpha) @ _rotation("y", row.beta)
         return np.asarray(T @ self.T_tool)

@@ -1,4 +1,4 @@
-"""Time and memory of a fleet of simulated robots, with processes and with Ray, and recovery from killed runs.
+"""Time and memory that a fleet of simulated robots takes with processes and with Ray, and recovery from killed runs.
 
 Run `OMP_NUM_THREADS=1 python benchmarks/fleet.py [PART ...]` with the simulator of arms (`sim.py`) in
 `PISIGMA_SIMULATED`. Every robot is a kr10 with individual errors, measured at `--poses` poses. The part `before`
@@ -52,7 +52,7 @@ def command(out: str, *options: str) -> list[str]:
 
 
 def timed(out: str, *options: str) -> tuple[float, float]:
-    """Return the seconds of a run, and the peak memory of its child processes [GB]."""
+    """Return the duration of a run [s], and the peak memory of its child processes [GB]."""
     words = command(out, *options)
     started = time.monotonic()
     process = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
@@ -89,7 +89,7 @@ def results(out: str) -> list[dict[str, object]]:
 
 
 def seconds_of(words: list[str], checkout: Path) -> tuple[float, float]:
-    """Return the seconds of a command of a checkout, and the CPU seconds, which hardly depend on other processes."""
+    """Return duration and processor time [s] of a command of a checkout; the latter hardly depends on other load."""
     environment = os.environ | {"PYTHONPATH": os.fspath(checkout)}
     started, used = time.monotonic(), sum(resource.getrusage(resource.RUSAGE_CHILDREN)[:2])
     done = subprocess.run(
@@ -100,7 +100,7 @@ def seconds_of(words: list[str], checkout: Path) -> tuple[float, float]:
 
 
 def before(robots: int, earlier: Path, repeats: int) -> None:
-    """Compare runs and status of cells with those of a manifest in an earlier version."""
+    """Compare the times of runs and status of cells with those of a manifest in an earlier version."""
     here, ratios = Path(__file__).resolve().parents[1], dict[str, list[float]]()
     for number in range(repeats):
         old, new = f"manifest{number}", f"cells{number}"

@@ -4,7 +4,7 @@ Run `OMP_NUM_THREADS=1 python benchmarks/fleet_arms.py [--fleets 11] [--robots 3
 arms (`sim.py`) in `PISIGMA_SIMULATED`. Every arm is a kr10 with common and individual errors; the prior is estimated
 from 60 positions of each arm. All figures are root mean squares of position errors at 300 other poses without noise
 [mm]. "exact" is the expected error after ten positions if the distribution of the arms is known, averaged over the same
-number of draws of poses, which is the minimum for all estimates that are linear in the measured values.
+number of draws of poses; no estimate that is linear in the measured values has a smaller error.
 """
 
 import argparse
@@ -120,7 +120,7 @@ class Fleet:
     def _derivative(self, q: np.ndarray) -> np.ndarray:
         """Return the derivative of positions [m] by all individual errors, in units of their standard deviations."""
         arm = sim.True_("kr10", SHARED_SEED)
-        harmonic = self.gears * np.deg2rad(0.015) / np.sqrt(2)  # of its cosine and its sine
+        harmonic = self.gears * np.deg2rad(0.015) / np.sqrt(2)  # amplitudes of cosine and sine
         sizes = np.concatenate(
             [
                 np.full(arm.do.size, self.errors * 0.3e-3),

@@ -1,4 +1,4 @@
-"""Calibrations with few poses, with and without the prior of a fleet, and robots that differ from the fleet.
+"""Errors after few poses, with and without the prior of a fleet, also for robots that differ from the fleet.
 
 Run `OMP_NUM_THREADS=1 python benchmarks/fleet_prior.py [--fleets 7] [--robots 50] [--odd 5] [--judged 10]`. Robots have
 common errors of 1 mm and 1 mrad, and individual errors; the prior is estimated from 60 poses of each robot. All figures

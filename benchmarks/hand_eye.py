@@ -14,8 +14,9 @@ whole joint space. The solvers of OpenCV are part of opencv-python-headless 4, n
 
     pip install --target cv4 "opencv-python-headless<5" && PYTHONPATH=cv4:$PYTHONPATH python benchmarks/hand_eye.py
 
-Causes: the same with 14 images and one thing wrong: the arm as above, intrinsics by 15 times the error of a typical
-calibration, a board larger by 0.5 %, joint zeros off by 0.1 deg, joint readings with noise of 0.05 deg, or nothing.
+Causes: the same with 14 images and exactly one wrong thing: the arm as above, intrinsics by 15 times the error of a
+typical calibration, a board larger by 0.5 %, joint zeros off by 0.1 deg, joint readings with noise of 0.05 deg, or
+nothing.
 """
 
 import argparse
@@ -211,7 +212,7 @@ def _with_mean_base(flange: np.ndarray, R: np.ndarray, t: np.ndarray, tool: Tens
 
 
 def hand_eye(seeds: int, images: int) -> None:
-    """Print errors over the joint space with the drawn arm and with the arm calibrated along."""
+    """Print errors over the joint space with the drawn arm, and with the arm calibrated at the same time."""
     q = select_far_apart(views(NOMINAL, 8 * images, np.random.default_rng(0)), images)
     everywhere = torch.from_numpy(np.random.default_rng(1).uniform(-np.pi, np.pi, (POSTURES, 6)))
     errors: dict[str, list[float]] = {}

@@ -32,7 +32,7 @@ FUZZED = {
     "controller": "export",
     "import": "files",
 }
-"""Steps, each with a field whose hostile value has to be refused."""
+"""Steps, each with a field in which a hostile value has to be refused."""
 
 
 def hostile_request(chosen: random.Random) -> tuple[str, str, str]:

@@ -31,7 +31,7 @@ from pisigma.robot.row import Row
 
 MODELS = Path(__file__).parents[1] / "models"
 NEAR = 0.3
-"""Maximum distance of `near` from the true joint values [rad, or a tenth of it in m]."""
+"""Largest distance of `near` from the true joint values [rad; for prismatic joints, a tenth of this number in m]."""
 
 ORIGINS = (
     ("0 0 0.089159", "0 0 0"),

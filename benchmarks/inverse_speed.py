@@ -45,7 +45,7 @@ CompiledIK.load({file!r}).solve(np.load({pose!r}))
 print(time.perf_counter() - start, time.process_time() - began)
 """
 REPEATS = 5
-"""Number of runs, of which the fastest counts: other programs can only slow them down."""
+"""Number of runs, of which the fastest counts because other programs can only slow a run down."""
 
 
 def draw_joints(robot: Robot, rows: int, rng: np.random.Generator) -> torch.Tensor:

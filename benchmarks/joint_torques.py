@@ -1,11 +1,11 @@
-"""Joint torques measured in MuJoCo: what do they add to modelled gravity torques if the payload is not known?
+"""How much joint torques measured in MuJoCo improve on modelled gravity torques if the payload is unknown.
 
 `python benchmarks/joint_torques.py [--arm ur5] [--seeds 3] [--rows 60]`
 
-The false arm of `closed_loop.py` with elastic gears is driven to random poses by MuJoCo's proportional controllers,
-with another payload (0 to 5 kg) in every row; a tracker measures the reflector with a noise of 0.03 mm per axis. The
-rows state the torques of the drives (`qfrc_actuator`), with a noise of 1 % of their spread, and no payload. A hybrid is
-calibrated with and without the torques. 100 other poses, also with other payloads, are left out and predicted. Needs
+MuJoCo's proportional controllers drive the arm of `closed_loop.py` with elastic gears to random poses, with another
+payload (0 to 5 kg) in every row; a tracker measures the reflector with a noise of 0.03 mm per axis. The rows state the
+torques of the drives (`qfrc_actuator`), with a noise of 1 % of their spread, and no payload. A hybrid is calibrated
+with and without the torques. 100 other poses, also with other payloads, are left out and predicted. The program needs
 the extra `bench`.
 """
 
@@ -29,7 +29,7 @@ TORQUE_NOISE = 0.01
 
 
 def measured(drawn: DrawnArm, robot: pisigma.Robot, seed: int, rows: int) -> Measurements:
-    """Drive a false arm, with the payloads of `PAYLOADS_KG` in groups of rows."""
+    """Drive an arm with errors, with the payloads of `PAYLOADS_KG` in groups of rows."""
     rng = np.random.default_rng([seed, 11])
     arm = ArmInSurroundings.from_robot(robot)
     q = draw_candidates(arm, rows, 500 + seed).q[:rows].numpy()

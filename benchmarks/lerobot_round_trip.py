@@ -1,9 +1,10 @@
-"""Calibration files and data sets there and back through LeRobot itself, which runs in an environment of its own.
+"""Calibration files and data sets that LeRobot, in its own environment, writes, pisigma corrects and LeRobot reads.
 
 `python benchmarks/lerobot_round_trip.py --lerobot /path/to/python` needs a Python with lerobot 0.3 or later.
 LeRobot writes a calibration file and a data set, pisigma corrects both for an SO-101 whose zeros are off by 5 to 17
 deg, and LeRobot reads them: the calibration file has to be equal to the digit, LeRobot's own conversion of ticks has to
-show the zeros, and frames have to keep shape, type and order. Last, the frames that are corrected per minute.
+show the zeros, and frames have to keep shape, type and order. Finally, the number of frames that are corrected per
+minute is printed.
 """
 
 import argparse
@@ -33,7 +34,7 @@ def lerobot_bus(path: Path) -> Any:
     with path.open() as file, draccus.config_type("json"):
         calibration = draccus.load(dict[str, MotorCalibration], file)
     motors = {name: Motor(n, "sts3215", MotorNormMode.DEGREES) for n, name in enumerate(MOTORS, start=1)}
-    bus = object.__new__(FeetechMotorsBus)  # its constructor opens the serial port
+    bus = object.__new__(FeetechMotorsBus)  # the constructor would open the serial port
     bus.motors, bus.calibration = motors, calibration
     bus._id_to_model_dict = {motor.id: motor.model for motor in motors.values()}
     bus._id_to_name_dict = {motor.id: name for name, motor in motors.items()}

@@ -1,4 +1,4 @@
-"""Detection of wrong rows, and number of poses until the limit is reached, in measuring sessions of simulated arms.
+"""Measuring sessions of simulated arms: share of wrong rows that is detected, and poses until the limit is reached.
 
 Run `OMP_NUM_THREADS=1 python benchmarks/measuring.py [PART ...] [--seeds N]` with the simulator of arms (`sim.py`) in
 `PISIGMA_SIMULATED`. In the part "alarms", one of 40 random rows has an error of 5 mm, or the points of two rows are
@@ -31,7 +31,7 @@ POSES = {"planned": 80, "random": 150}
 
 
 def alarms(names: list[str], seeds: range) -> None:
-    """Print the shares of wrong and correct rows that are called wrong."""
+    """Print the shares of wrong rows and of correct rows that are called wrong."""
     wrong: list[tuple[int, bool, bool]] = []
     false = total = 0
     slowest = 0.0

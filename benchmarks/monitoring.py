@@ -1,10 +1,10 @@
-"""Share of sessions in which `pisigma monitor` names the joint that moved, and its false alarms, on measured robots.
+"""Share of sessions of measured robots in which `pisigma monitor` names the joint that moved, and false alarms.
 
 Run `OMP_NUM_THREADS=1 python benchmarks/monitoring.py [--draws N]` with the measured files in `PISIGMA_DATA`. A model
 is fitted to 600 random rows of a series; sessions are drawn from its other rows, with 0.05 deg added to the zero of one
 joint or of no joint. In some cases the tracker is moved as well. Then ten simulated arms (`PISIGMA_SIMULATED`) are
-monitored for two years with ten rows a month, with and without a drift of joint 2. The last lines time twelve sessions
-of ten rows.
+monitored for two years with ten rows a month, with and without a drift of joint 2. The last lines state the time for
+twelve sessions of ten rows.
 """
 
 import argparse
@@ -31,7 +31,7 @@ FILES = {"ur10": "ur10/series_b.csv", "ur5": "ur5/grid.csv"}
 ROWS = 600
 MOVED = math.radians(0.05)
 ARMS, ARM_ROWS, MONTHS = 10, 120, 24
-"""Number of simulated arms, of rows of their calibrations, and of monitored months."""
+"""Numbers of simulated arms, of rows of their calibrations, and of monitored months."""
 ELSEWHERE = (0.3, -0.2, 0.1, 0.5, 0.2, -0.3)
 CASES = (
     ("ur10", 5, (0, 1, 2, 3, 4, 5, 6), False),
@@ -99,7 +99,7 @@ def months() -> None:
 
 
 def _alarmed(monitoring: pisigma.MonitoringResult) -> list[bool]:
-    """Return, per session, whether a chart is outside its limits or a motion is reported."""
+    """Return for every session whether a chart is outside its limits or a motion is reported."""
     outside = torch.stack(
         [one for chart in monitoring.charts for one in chart.sessions_outside.values()]
     ).any(0)

@@ -22,7 +22,7 @@ RAMP_S = 0.3
 SETTLING_S = 1.0
 """Longest time to wait after a motion."""
 AT_REST = 1e-8
-"""Speed [rad/s or m/s] below which an arm is at rest: 2e-10 rad from its equilibrium."""
+"""Speed [rad/s or m/s] below which an arm is at rest; it is then 2e-10 rad from its equilibrium."""
 SERVO_LAG_S = 0.02
 """Damping over stiffness of controllers and elastic joints: the time constant with which they settle."""
 REFLECTOR = (0.06, 0.02, 0.12)
@@ -32,7 +32,7 @@ PAYLOAD_AT = (0.0, 0.01, 0.08)
 MAX_COMMAND = 100.0
 """Largest joint value [rad or m] that a controller accepts."""
 GEAR = " gear"
-"""What the name of an elastic gear has in addition to that of its joint."""
+"""Suffix of the name of an elastic gear after the name of its joint."""
 ROTOR = 0.1
 """Inertia of a rotor [kg m²], or mass of a drive [kg]."""
 
@@ -69,7 +69,7 @@ class DrawnArm:
         tip: link that carries reflector and payload.
         kp: stiffness of the position controllers [Nm/rad, or N/m for prismatic joints], in the order of the joints; the
             last one also applies to all others.
-        elastic: stiffness of compliant gears, see `ArmErrors`.
+        elastic: stiffness of elastic gears, see `ArmErrors`.
         package: installed package with the file; None for `drawn_arms`.
     """
 
@@ -96,7 +96,7 @@ class Driven:
     Attributes:
         position: true positions of the reflector in the world [m], shape (poses, 3).
         encoders: joint values [rad or m] that the encoders read, shape (poses, joints).
-        torque: what the drives exert on the joints [Nm or N], shape (poses, joints): `qfrc_actuator`.
+        torque: torques or forces of the drives on the joints [Nm or N], shape (poses, joints): `qfrc_actuator`.
         unsettled: largest joint speed when a pose was measured [rad/s or m/s].
     """
 

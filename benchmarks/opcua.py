@@ -3,7 +3,7 @@
 Run `python benchmarks/opcua.py models/my_ur10 --calls 10000 --clients 20`. Every client of asyncua calls
 `CorrectedJoints` with poses of the model's training rows and joint values near them, and compares the answers with
 those of Python. After a third of the calls the server gets SIGTERM, and after two thirds SIGKILL; it is restarted after
-a second. A call without an answer is repeated until it is answered. The program prints the number of wrong answers, of
+a second. A call without an answer is repeated until it is answered. The program prints the numbers of wrong answers, of
 repeated calls and of clients that did not continue, and the times of the calls.
 """
 
@@ -26,11 +26,11 @@ import pisigma
 PAUSE = 1.0
 """[s] Time between the end of a server and the start of the next."""
 MAX_WAIT = 60.0
-"""[s] After this time without an answer a client counts as one that did not go on."""
+"""[s] Time without an answer after which a client counts as one that did not continue."""
 
 
 def begin(model: Path, port: int) -> tuple["subprocess.Popen[str]", int]:
-    """Start a server and return it with its port when it is ready."""
+    """Start a server, and when it is ready return it and its port."""
     command = [sys.executable, "-m", "pisigma", "serve", str(model), "--opcua", "--opcua-port", str(port)]
     server = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     assert server.stdout is not None
@@ -80,7 +80,7 @@ class Load:
 
 
 async def measure(options: argparse.Namespace) -> dict[str, Any]:
-    """Run all clients while the server is ended twice, and return what was counted."""
+    """Run all clients while the server is ended twice, and return the counts."""
     ik = pisigma.load(options.model)
     poses, near, expected = poses_of(ik)
     per_unit = np.where(ik.revolute, 180 / np.pi, 1e3)

@@ -1,4 +1,4 @@
-"""Calibrate a simulated SO-101 with images of a phone beside it, of a ChArUco board in its gripper.
+"""Calibrate a simulated SO-101 that holds a ChArUco board in its gripper, with images of a phone beside it.
 
     OMP_NUM_THREADS=1 python benchmarks/phone.py [--seeds 4] [--first 0] [--images 40] [--drawn rendered opencv]
 
@@ -10,9 +10,9 @@ the set "opencv" OpenCV draws the board and finds the corners, without any code 
 
 Errors are those of corner 0 of the board in 400 other poses in which the phone sees the board: the error before is
 that of the nominal arm, with the true base and tool, or with the best-fitting ones; the error after is that of the
-poses that the servos really reach, compared with the error that the noise of the servos leaves to a perfect model.
-Zeros are those of the shoulder lift, the elbow and the wrist flex; those of the first and the last joint cannot be
-distinguished from the poses of the phone and of the board.
+poses that the servos really reach, compared with the error that a perfect model would have because of the noise of the
+servos. The errors of the zeros are those of the shoulder lift, the elbow and the wrist flex; the zeros of the first and
+the last joint cannot be distinguished from the poses of the phone and of the board.
 """
 
 import argparse
@@ -58,7 +58,7 @@ OBLIQUE, NEAREST = np.deg2rad(50), 0.25
 CANDIDATES, POSES, OTHERS = 8, 400, 4000
 IDENTIFIABLE = slice(1, 4)
 DOT, MARGIN, FINER = 1e-4, 60, 4
-"""Pixel of the drawn board [m], its margin [px], and the oversampling of images that OpenCV draws."""
+"""Size of a pixel of the drawn board [m], margin of the board [px], and oversampling of images that OpenCV draws."""
 LIMITS = {"ratio": (0.0, 1.3), "zeros": (0.0, 0.3), "predicted": (0.8, 1.3)}
 
 
@@ -211,7 +211,7 @@ def write(path: Path, lines: list[list[str]]) -> None:
 
 
 def rms(errors: np.ndarray) -> float:
-    """Return the root mean square length of errors [m] in [mm]."""
+    """Return the root mean square of the lengths of errors [m], in mm."""
     return float(1e3 * np.sqrt(np.square(errors).sum(1).mean()))
 
 

@@ -4,9 +4,9 @@
 
 A UR5 with errors of 1 mm and 0.3 deg in every parameter carries a camera (1920 x 1200 px, f = 1400 px, 0.3 px per
 corner, intrinsics known) that views a board of 9 x 6 corners 30 mm apart, sharp from 0.3 to 0.7 m, up to 45 deg
-oblique; its repeatability is 0.02 mm and 0.01 deg. Errors are those of the camera centre's position over 400 postures
-of the whole joint space, after the best rigid alignment. Random views are drawn from the same candidates as the planned
-ones, which are chosen by either criterion, for the geometry alone or for the hybrid, as by `pisigma plan`.
+oblique; the repeatability of the arm is 0.02 mm and 0.01 deg. Errors are those of the camera centre's position over 400
+postures of the whole joint space, after the best rigid alignment. Random views are drawn from the same candidates as
+the planned ones, which are chosen by either criterion, for the geometry alone or for the hybrid, as by `pisigma plan`.
 """
 
 import argparse

@@ -1,4 +1,4 @@
-"""Accuracy of calibrations from chosen and from random poses, and its prediction.
+"""Accuracy of calibrations from chosen and from random poses, and predictions of it.
 
 Run `OMP_NUM_THREADS=1 python benchmarks/planning.py [PART ...]` with the measured files in `PISIGMA_DATA`, and the
 simulator of arms (`sim.py`) in `PISIGMA_SIMULATED`. For measured robots, some rows are chosen from pools of 400 random
@@ -38,9 +38,9 @@ SIMULATED = Path(os.environ.get("PISIGMA_SIMULATED", "../shared/simulated"))
 POOL = 400
 ARMS = ("kr10", "irb120", "arm7")
 NOISE = 3.6e-5
-"""Standard deviation of the simulated sensor and the robot's repeatability together [m]."""
+"""Standard deviation of a coordinate due to the simulated sensor and the robot's repeatability together [m]."""
 LIMIT = 0.1
-"""Accuracy up to which poses are counted [mm]."""
+"""Accuracy [mm] that is reached by the counted poses."""
 STEPS = (14, 18, 22, 26, 30, 34, 38, 42, 46, 50, 56, 62, 70, 80)
 
 
@@ -153,7 +153,7 @@ class Arm:
 
 
 def predicted(seeds: range) -> None:
-    """Print predicted over true RMS at 15, 30 and 60 chosen poses, for the plan and the calibration."""
+    """Print the ratios of predicted to true RMS at 15, 30 and 60 chosen poses, for the plan and the calibration."""
     ratios: dict[tuple[int, str], list[float]] = {}
     for seed in seeds:
         arm = Arm(ARMS[seed % len(ARMS)], seed)

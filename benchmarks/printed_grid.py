@@ -5,9 +5,9 @@
 The arms are SO-101 with zeros off by 5 to 17 deg, links by 1 mm (standard deviation), and servos that repeat to 0.5
 deg. In the part "grid", the tip touches 40 crossings of a grid of 20 mm on one sheet, each within 0.5 mm. In the part
 "ruler", it touches pairs of points on the sheet and up to 100 mm above it, of which only the 40 lengths between them
-are known, at least 100 mm and to 0.5 mm; the position of the arm stays unknown, so errors are those after the best
-rigid alignment. Errors are those of the tip at 100 random points over the sheet, up to 100 mm above it, without the
-noise of the servos. The predicted RMS is that of the posterior.
+are known, which are at least 100 mm, to 0.5 mm; the position of the arm stays unknown, so errors are those after the
+best rigid alignment. Errors are those of the tip at 100 random points over the sheet, up to 100 mm above it, without
+the noise of the servos. The predicted RMS is that of the posterior.
 """
 
 import argparse

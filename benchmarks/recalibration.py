@@ -1,4 +1,4 @@
-"""Recalibration with few rows: accuracy between series, choice of the model, a collision, a chain, and time.
+"""Recalibration with few rows: accuracy between series, choice of the model, a collision, repeated use, and time.
 
 Run `OMP_NUM_THREADS=1 python benchmarks/recalibration.py [PART ...]` with the measured files in `PISIGMA_DATA` and the
 simulator in `PISIGMA_SIMULATED`. A part is one of the names in `PARTS`. Errors are RMS position errors [mm] of all rows
@@ -75,7 +75,7 @@ def error_of(model: CalibratedModel, rows: Measurements) -> float:
 
 
 def accuracy() -> None:
-    """Recalibrate from series B to few rows of series C."""
+    """Recalibrate a model of series B with few rows of series C."""
     for moved in (None, ("base", "tool")):
         for count, asked in ASKED.items():
             errors = []
@@ -91,7 +91,7 @@ def accuracy() -> None:
 
 
 def planned() -> None:
-    """Recalibrate from series B to rows that `pisigma plan` chooses from all of series C with the model of series B."""
+    """Recalibrate a model of series B with rows that `pisigma plan` chooses with this model from all of series C."""
     rows, every = series("C"), np.arange(series("C").rows)
     with tempfile.TemporaryDirectory() as folder:
         candidates = Path(folder) / "candidates.csv"
@@ -206,7 +206,7 @@ def chain() -> None:
 
 
 def seconds() -> None:
-    """Time a recalibration of the UR10 with ten rows, without start and files."""
+    """Time a recalibration of the UR10 with ten rows, without the start of the program and without files."""
     few, _ = drawn(series("C"), 10, 0)
     model = model_of("B")
     for moved in (None, ("base", "tool")):

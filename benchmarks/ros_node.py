@@ -1,4 +1,4 @@
-"""Round trips of the ROS 2 node over DDS on one machine, with requests to an empty node in between.
+"""Times of round trips of the ROS 2 node over DDS on one machine, alternating with those of an empty node.
 
 Run `python benchmarks/ros_node.py models/my_ur10 --ros ROS_ENVIRONMENT`, where ROS_ENVIRONMENT is a virtual environment
 with the wheels of `integrations/ros2/requirements.txt`. Three processes run in it: the node of `pisigma_ros`, an empty

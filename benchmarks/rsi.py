@@ -5,10 +5,10 @@
 `python benchmarks/rsi.py rsi.xml 10000` (in an environment with `pip install rsipi`; it does not import pisigma)
 
 The echo server reads the configuration, makes the packets, and accepts an answer only with the right sender and time
-stamp within the cycle. Here it moves along a path of the joints, adds accepted corrections to the setpoint that it
-sends, and sends a packet in every cycle. Printed is one JSON object with counts and times; `--rows` adds the setpoints
-of the program and the corrections that were received. An answer is late if its cycle is over, and wrong if the echo
-server rejects it for another reason.
+stamp within the cycle. In this benchmark, it moves along a path of the joints, adds accepted corrections to the
+setpoint that it sends, and sends a packet in every cycle. The output is one JSON object with counts and times; `--rows`
+adds the setpoints of the program and the received corrections. An answer is late if its cycle is over, and wrong if the
+echo server rejects it for another reason.
 """
 
 import argparse
@@ -26,12 +26,12 @@ from typing import Any
 START = (20.0, -80.0, 90.0, 10.0, 60.0, 15.0)
 """[deg] Joint values at the start."""
 AMPLITUDE, PERIOD_S = 15.0, 6.0
-"""[deg, s] Every joint swings like a sine, at up to 16 deg/s."""
+"""[deg, s] Amplitude and period of the sine by which every joint swings, at up to 16 deg/s."""
 
 
 def measure(configuration: Path, cycles: int, cycle_ms: int) -> dict[str, Any]:
     """Run a number of cycles, and return counts, times [ms] and rows."""
-    os.chdir(tempfile.mkdtemp())  # it writes a folder of logs
+    os.chdir(tempfile.mkdtemp())  # the server writes a folder of logs
     from RSIPI import rsi_echo_server as rsipi
 
     logging.disable()

@@ -6,8 +6,8 @@ of Python, and sleeps until its next request, half a period after that of the ot
 as the loop of a real-time controller does, and then sleeps; with `--awake-us 0` the system wakes it for every answer,
 and the times then include the wake-up, which takes longer than the answer itself on some machines. For each protocol
 the program prints the times from before a request is sent until its answer is read, the number of answers that were
-lost or wrong, and the memory of the server at the start and at the end. For comparison the same clients first use two
-minimal loops, for at most a minute each, that poll for the next request as long as the server does: one of them sends
+lost or wrong, and the memory of the server at the start and at the end. For comparison, the same clients first use two
+minimal loops, for at most a minute each, which poll for the next request as long as the server does: one of them sends
 stored answers, and the other one reads, solves once and sends. The first loop shows the cost of sockets and clients,
 and the second one the cost that the server adds to a solve.
 """
@@ -72,7 +72,7 @@ def messages(kind: str, ik: pisigma.CorrectedIK, poses: np.ndarray, near: np.nda
 
 
 def right(kind: str, answer: bytes, index: int, wanted: np.ndarray, per_unit: np.ndarray) -> bool:
-    """Return whether an answer agrees with that of Python."""
+    """Return whether an answer agrees with Python's answer."""
     if kind == "binary":
         _, _, name, _, dof, *q = ANSWER.unpack(answer)
         return bool(name == index and np.abs(np.array(q[:dof]) - wanted).max() < 1e-12)
@@ -171,7 +171,7 @@ def answer_line(ik: pisigma.CorrectedIK, message: bytes) -> bytes:
 def bare_loop(
     model: str, kind: str, stored: bool, polling: float, queue: "multiprocessing.Queue[int]"
 ) -> None:
-    """Answer all clients by a solve or a stored answer, without any check; put the port into the queue."""
+    """Answer all clients with a solution or a stored answer, without any check; put the port into the queue."""
     ik = pisigma.load(model)
     answer: Callable[[bytes], bytes] = functools.partial(
         answer_frame if kind == "binary" else answer_line, ik

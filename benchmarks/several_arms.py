@@ -1,4 +1,4 @@
-"""Base to base of two UR5s whose wrist cameras see one board, against the Cramér-Rao bound; bumped bases.
+"""Two UR5s whose wrist cameras see one board: relative pose of their bases and its bound, and bumped bases.
 
     OMP_NUM_THREADS=1 python benchmarks/several_arms.py [bound] [bumped] [--sets 200] [--images 25]
 
@@ -100,7 +100,7 @@ def bound_of_base(free: tuple[str, ...], values: np.ndarray, q: torch.Tensor) ->
 
 
 def bound(parts: list[np.ndarray], bases: list[np.ndarray]) -> np.ndarray:
-    """Return the bound of the second base in the first one: shifts and rotations about its axes."""
+    """Return the bound of the second base relative to the first one: shifts along and rotations about its axes."""
 
     def relative(of: np.ndarray) -> torch.Tensor:
         first, second = (transform_from_xyzrpy(torch.from_numpy(one)) for one in of.reshape(2, 6))
@@ -144,7 +144,7 @@ def drawn_values(free: tuple[str, ...], base: np.ndarray, rng: np.random.Generat
 def compare_with_bound(
     calibrator: GeometricCalibrator, q: list[torch.Tensor], bases: list[np.ndarray], sets: int
 ) -> None:
-    """Print RMS errors and stated standard errors over the bound."""
+    """Print the ratios of RMS errors and of stated standard errors to the bound."""
     free = tuple(calibrator.free)
     errors, stated, bounds, scores = [], [], [], []
     for seed in range(sets):
@@ -176,7 +176,7 @@ def compare_with_bound(
 def find_bumped(
     calibrator: GeometricCalibrator, q: list[torch.Tensor], bases: list[np.ndarray], still: int
 ) -> None:
-    """Print how often nothing, and the body that moved, is named; bodies move in every other cell."""
+    """Print how often nothing is named if nothing moved, and otherwise the body that moved."""
     free, named, counts = tuple(calibrator.free), Counter[tuple[str, str]](), Counter[str]()
     direction = torch.tensor([0.8, 0.0, 0.6], dtype=torch.float64)
     bump = transform(rotation_from_vector(5e-4 * direction.flip(0)), 5e-4 * direction)

@@ -25,7 +25,7 @@ def is_table(path: str) -> bool:
 
 
 def _in_base(T_base: np.ndarray, T_tool: np.ndarray, J: np.ndarray) -> Motion:
-    """Express a pose and a Jacobian in the axes of the world in those of a base that does not move."""
+    """Convert a pose and a Jacobian from the axes of the world to those of a fixed base."""
     R = T_base[:3, :3].T
     return np.linalg.inv(T_base) @ T_tool, np.concatenate([R @ J[:3], R @ J[3:]])
 

@@ -1,4 +1,4 @@
-"""Test the workbench in Chromium by clicks and keys alone: all steps, mistakes, times, and hostile requests.
+"""Test the workbench in Chromium with clicks and keys alone: all steps, mistakes, times, and hostile requests.
 
 Run `python benchmarks/workbench.py FOLDER_OF_SIM [--arms kr10 rail] [--parts arms mistakes times fuzz]` on an otherwise
 idle machine with the extra `view`, playwright and chromium. FOLDER_OF_SIM contains `sim.py` and URDF files of the arms.
@@ -47,7 +47,7 @@ CHROMIUM = (
     "--enable-unsafe-swiftshader"
 )
 PLAN, CALIBRATE = {"count": "20", "check": "5"}, {"model": "geometric", "folds": "0"}
-"""Settings that are filled in, so that the page and not the calculation is measured."""
+"""Settings that are filled in so that the page is timed and not the calculation."""
 ROWS, CHECK_ROWS, MANY_ROWS = 60, 20, 10_000
 ROW_EVERY = 1500
 """Time between two rows that are appended [ms]; a robot takes longer from pose to pose."""
@@ -63,7 +63,7 @@ COMPARED = (
 
 
 def by_clicks(browser: Browser, folder: Path, urdf: Path, first: Path, second: Path, program: Path) -> float:
-    """Carry out all steps on the page; return the time until it is shown [s]."""
+    """Carry out all steps on the page; return the time until the page is shown [s]."""
     with opened(browser, folder) as (page, _, seconds):
         page.set_input_files("[data-links]", urdf)
         page.wait_for_selector("[name=tip] option:nth-child(2)", state="attached")

@@ -1,4 +1,4 @@
-"""Use the page of a cell by clicks and keys alone: open it, show a tab, carry out a step and upload rows."""
+"""Use the page of a cell with clicks and keys alone: open it, show a tab, carry out a step and upload rows."""
 
 import contextlib
 import time

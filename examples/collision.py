@@ -1,4 +1,4 @@
-"""Collision: ten positions say which joint of an RB5 was turned by a collision, and renew its model."""
+"""Collision: ten positions show which joint of an RB5 a collision has turned, and recalibrate its model."""
 
 from matplotlib.figure import Figure
 

@@ -1,4 +1,4 @@
-"""Fixed camera: 25 images of a board on the flange identify a UR5 and where the camera is."""
+"""Fixed camera: 25 images of a board on the flange identify the geometry of a UR5 and the pose of the camera."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Fleet: what five robots of one type share lets a sixth be calibrated with eight rows."""
+"""Fleet: a prior from five robots of one type, with which eight rows suffice to calibrate a sixth robot."""
 
 import shutil
 
@@ -19,7 +19,7 @@ def errors(size, seed):
 
 
 def measure(number, count, seed):
-    """Return simulated rows of a robot with the errors of its type and a fifth of them of its own."""
+    """Return simulated rows of a robot with the errors of its type, and individual errors a fifth as large."""
     section = {
         "poses": {"kind": "joints_random", "count": count, "seed": seed, "share": 0.4},
         "sensor": "position",

@@ -1,4 +1,4 @@
-"""Own feature: a joint correction of your own, here a belt that stretches in proportion to the joint value."""
+"""Own feature: how to write a joint correction, here for a belt that stretches in proportion to the joint value."""
 
 import torch
 from matplotlib.figure import Figure

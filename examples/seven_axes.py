@@ -1,4 +1,4 @@
-"""Seven axes: a calibrated Panda reaches one pose with every elbow angle, and the nominal one misses it."""
+"""Seven axes: a calibrated Panda reaches one pose with every elbow angle, and the nominal Panda misses it."""
 
 import numpy as np
 import torch

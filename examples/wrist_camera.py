@@ -1,4 +1,4 @@
-"""Camera on the wrist: 40 images of a board identify a UR5 and the camera's place on its flange."""
+"""Camera on the wrist: 40 images of a board identify the geometry of a UR5 and the camera's pose on its flange."""
 
 from pathlib import Path
 

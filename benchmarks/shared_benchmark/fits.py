@@ -1,4 +1,4 @@
-"""Run the methods on the folds of a series, one process a fit, and compare the predictions with the held-out rows."""
+"""Run the methods on the folds of a series, one process per fit, and compare predictions with the held-out rows."""
 
 import hashlib
 import json
@@ -20,9 +20,9 @@ from shared_benchmark.series import series_of
 from shared_benchmark.splits import SEED, Fold, folds_of
 
 LIMIT_S = 300
-"""Largest time of the processor for a fit [s], with one thread."""
+"""Largest processor time of a fit [s], with one thread."""
 PATIENCE = 6
-"""Factor on the limit after which a fit that waits for other programs is ended."""
+"""Ratio of elapsed time to the limit above which a fit that waits for other programs is ended."""
 WAITED = "ended after"
 """First words of the status of such a fit, which is run again."""
 REPOSITORY = Path(__file__).parents[2]
@@ -40,11 +40,11 @@ ROOMS = (
 """Rooms of pisigma that a calibration may import; the others come later in the order of imports."""
 
 Fit = dict[str, Any]
-"""What is stored of a fit, by column."""
+"""Stored values of a fit, by column."""
 
 
 def code_hash(method: Method, series: Series) -> str:
-    """Return the SHA-256 of the nominal arm and of the files that decide what a method predicts."""
+    """Return the SHA-256 of the nominal arm and of the files that determine what a method predicts."""
     files = {PACKAGE / "rows.py", *_with_imports(PACKAGE / "methods" / f"{method.name}.py")}
     if "pisigma" in method.packages:
         files |= {path for room in ROOMS for path in (REPOSITORY / "pisigma" / room).rglob("*.py")}
@@ -62,7 +62,7 @@ def _with_imports(path: Path) -> set[Path]:
 
 
 def predict(task: Task, method: str, python: str) -> tuple[Fit, Prediction | None]:
-    """Fit and predict in a new process; a crash or an overrun is a status."""
+    """Fit and predict in a new process; a crash or an overrun is returned as status."""
     paths = [str(REPOSITORY / "benchmarks"), str(REPOSITORY)]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": "1"}
     environment |= {"OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
@@ -103,9 +103,9 @@ def fits_of(
         series: the series.
         split: name of the split.
         method: the method.
-        python: its Python.
-        folds: number of folds to run, from the first; None for all.
-        below: number of training rows from which folds are not tried, because a fit overran; an overrun lowers it.
+        python: Python that runs the method.
+        folds: number of folds to run, starting with the first; None for all.
+        below: number of training rows from which on folds are not tried because a fit overran; an overrun lowers it.
     """
     inputs = inputs_of(series, split, method)
     for number, fold in enumerate(folds_of(series, split)[:folds]):
@@ -143,12 +143,12 @@ def inputs_of(series: Series, split: str, method: Method) -> Fit:
 
 
 def overrun_rows(fits: list[Fit]) -> float:
-    """Return the smallest number of training rows of the fits that overran; infinite without any."""
+    """Return the smallest number of training rows of the fits that overran; infinite if there are none."""
     return min((fit["train_rows"] for fit in fits if fit["status"].startswith("over ")), default=math.inf)
 
 
 def make_task(series: Series, split: str, fold: Fold) -> tuple[Task, Rows, Series]:
-    """Return what a method gets, the held-out rows with their measurements, and the series of these."""
+    """Return the task of a method, the held-out rows with their measurements, and the series of these rows."""
     rows, arm = series.rows(), series.arm
     train, test, test_series = rows.select(fold.train), rows.select(fold.test), series
     if split == "session":

@@ -1,4 +1,4 @@
-"""The page of the documentation, made from stored results alone."""
+"""The page of the documentation, which is generated from stored results alone."""
 
 from pathlib import Path
 

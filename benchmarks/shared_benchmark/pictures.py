@@ -76,7 +76,7 @@ def draw_learning_curves(errors: Errors, fits: pa.Table, path: Path) -> None:
 
 
 def draw_coverage(errors: Errors, path: Path) -> None:
-    """Draw the share of coordinates within the predicted intervals over the share that shall be within."""
+    """Draw the share of coordinates within the predicted intervals over the nominal share."""
     wanted = np.linspace(0.05, 0.99, 60)
     figure, axis = plt.subplots(figsize=(4.2, 3.8), layout="constrained")
     axis.plot([0, 1], [0, 1], "k:", lw=1)

@@ -1,4 +1,4 @@
-"""A public series of measurements: where it comes from, how it is read, and into which rows it is split."""
+"""A public series of measurements: its source, how it is read, and how its rows are split."""
 
 import hashlib
 import os
@@ -25,21 +25,21 @@ class Series:
     """A series of measurements of one arm.
 
     Attributes:
-        name: short name, which is that of its file.
-        title: what is shown on the page.
+        name: short name, which is also the name of the module.
+        title: title on the page.
         citation: author, year, and where the measurements are published.
         url: address of the published files, at a fixed commit.
         licence: licence of the published files.
-        sensor: the instrument and what it measured.
+        sensor: the instrument, and the quantity that it measured.
         file: path of the file below the data folder; its columns state the units.
-        sha256: hash of this file.
+        sha256: SHA-256 of this file.
         robot: name in pisigma's catalogue.
         splits: SHA-256 of the row numbers of every split, by name; see `splits.py`.
         urdf: path of a URDF file below the data folder that replaces the robot of the catalogue.
         tip: link of the URDF file that is the tool.
         distances: distances of sockets [m], with `*` for the placement.
         other_session: name of the series that the split "session" predicts.
-        note: what a reader must know, such as what part of the published series this is.
+        note: remark for readers, such as which part of the published series the rows are.
     """
 
     name: str
@@ -59,7 +59,7 @@ class Series:
     note: str = ""
 
     def missing(self) -> str | None:
-        """Return what must be done before the series can be read; None if its file is there and complete."""
+        """Return what must be done before the series can be read; None if the file exists and is complete."""
         path = DATA / self.file
         if not path.is_file():
             return f"{path} is missing: convert {self.url} to a measurement file, or set PISIGMA_DATA to its folder"
@@ -80,7 +80,7 @@ class Series:
         """All rows of the file, in its order.
 
         Raises:
-            MeasurementError: the file is missing or is another one.
+            MeasurementError: the file is missing, or has another hash.
         """
         missing = self.missing()
         if missing is not None:
@@ -89,7 +89,7 @@ class Series:
 
     @property
     def measured(self) -> str:
-        """What its rows contain: "position", "pose" or "socket"."""
+        """Quantity that the rows contain: "position", "pose" or "socket"."""
         (kind,) = self.measurements.kinds
         return kind
 

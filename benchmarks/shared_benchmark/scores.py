@@ -1,4 +1,4 @@
-"""Errors of held-out rows, and what is computed from them."""
+"""Errors of held-out rows, and figures that are computed from them."""
 
 import statistics
 from collections.abc import Mapping
@@ -23,9 +23,9 @@ class RowErrors:
     Attributes:
         row: row numbers in the file of the held-out rows, from 0.
         group: number of the configuration or placement of every row; rows of a group are resampled together.
-        error: measured minus predicted position (rows, 3) [mm]; for a socket, its position by the other rows minus that
-            by this row.
-        sigma: predicted standard deviation of the error (rows, 3) [mm]; NaN where none was predicted.
+        error: measured minus predicted position (rows, 3) [mm]; for a socket, its position according to the other rows
+            minus that according to this row.
+        sigma: predicted standard deviation of the error (rows, 3) [mm]; NaN where no value was predicted.
         angle: angle between measured and predicted rotation (rows,) [deg]; NaN where there is none.
     """
 
@@ -41,7 +41,7 @@ class RowErrors:
         return float(np.sqrt(np.square(self.error).sum(1).mean()))
 
     def coverage(self, share: float) -> float:
-        """Return the share of coordinates within the interval that shall contain a share of them."""
+        """Return the actual share of coordinates within the predicted interval of a nominal share."""
         inside = np.abs(self.error) <= normal_quantile(share) * self.sigma
         return float(inside.mean()) if np.isfinite(self.sigma).all() else float("nan")
 
@@ -58,7 +58,7 @@ def row_errors(series: Series, prediction: Prediction, rows: Rows, numbers: Arra
         series: the series of the rows.
         prediction: the prediction.
         rows: the rows.
-        numbers: their numbers in the file.
+        numbers: numbers of the rows in the file.
         moved: whether base and tool are fitted to the rows first, because both have moved; the predicted standard
             deviations are then averaged over the axes.
     """
@@ -140,9 +140,9 @@ def from_other_rows(position: Array, rows: Rows) -> Array:
 def errors_between_sockets(
     prediction: Prediction, rows: Rows, distances: Mapping[tuple[str, str], float]
 ) -> float | None:
-    """Return the RMS error of the known distances of sockets [mm]; None without any.
+    """Return the RMS error of the known distances of sockets [mm]; None if no distance is known.
 
-    A method that predicts the same position everywhere has no other error at sockets.
+    This error reveals a method that predicts the same position everywhere, whose other errors at sockets are 0.
     """
     if rows.socket is None or not distances:
         return None

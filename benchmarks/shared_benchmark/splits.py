@@ -31,34 +31,34 @@ def _numbers(pairs: object) -> list[Fold]:
 
 
 def _random(data: Measurements) -> list[Fold]:
-    """Five random folds; rows of equal joint values stay together."""
+    """Return five random folds; rows of equal joint values stay together."""
     return _numbers(k_folds(data, 5, SEED))
 
 
 def _sixths(data: Measurements) -> list[Fold]:
-    """Six random folds of configurations."""
+    """Return six random folds of configurations."""
     return _numbers(k_folds(data, 6, SEED))
 
 
 def _placements(data: Measurements) -> list[Fold]:
-    """Every placement of the sockets once."""
+    """Return one fold per placement of the sockets."""
     return _numbers(k_folds(data, None, SEED, "placement"))
 
 
 def _space(data: Measurements) -> list[Fold]:
-    """Five blocks of the measured positions, each predicted from the others."""
+    """Return one fold for each of five blocks of the measured positions, which is predicted from the others."""
     return _numbers(k_folds(data, 5, SEED, "space"))
 
 
 def _box(data: Measurements) -> list[Fold]:
-    """From the rows with all joints between their 4 % and 96 % quantiles to all others."""
+    """Return one fold: rows with all joints between their 4 % and 96 % quantiles are fitted, all others predicted."""
     low, high = (torch.quantile(data.q, share, 0) for share in BOX)
     inside = ((data.q >= low) & (data.q <= high)).all(1)
     return [Fold(inside.nonzero()[:, 0].numpy(), (~inside).nonzero()[:, 0].numpy())]
 
 
 def _session(data: Measurements) -> list[Fold]:
-    """From all rows to all rows of another session, in which base and tool have moved."""
+    """Return one fold: all rows are fitted, and all rows of a session with other base and tool are predicted."""
     every = np.arange(data.rows)
     return [Fold(every, every[:0])]
 
@@ -81,7 +81,7 @@ SPLITS: Mapping[str, tuple[str, Callable[[Measurements], list[Fold]]]] = {
     "rows_100": ("5 random folds, 100 training rows", _few(100)),
     "rows_300": ("5 random folds, 300 training rows", _few(300)),
 }
-"""What is held out, and the function that draws it, by name."""
+"""Description of the held-out rows, and function that returns the folds, by name of the split."""
 
 
 def split_hash(folds: list[Fold]) -> str:
@@ -94,7 +94,7 @@ def folds_of(series: Series, split: str) -> list[Fold]:
     """Return the folds of a split of a series.
 
     Raises:
-        MeasurementError: they are not those of the benchmark, because a random generator gave other numbers.
+        MeasurementError: the folds differ from those of the benchmark because a random generator gave other numbers.
     """
     folds = SPLITS[split][1](series.measurements)
     found = split_hash(folds)

@@ -57,7 +57,7 @@ def tables_of(results: Iterable[tuple[Fit, RowErrors | None]]) -> tuple[pa.Table
 
 
 def read(folder: Path) -> tuple[pa.Table, pa.Table]:
-    """Return the stored tables of fits and rows; empty where nothing is stored."""
+    """Return the stored tables of fits and rows; they are empty if nothing is stored."""
     paths = folder / "fits.parquet", folder / "rows.parquet"
     fits, rows = (
         pyarrow.parquet.read_table(path, schema=schema) if path.is_file() else schema.empty_table()
@@ -67,7 +67,7 @@ def read(folder: Path) -> tuple[pa.Table, pa.Table]:
 
 
 def replace(folder: Path, new: tuple[pa.Table, pa.Table]) -> None:
-    """Replace the stored results of the same series, splits and methods, sorted by these."""
+    """Replace the stored results of the same series, splits and methods; all results are sorted by these."""
     folder.mkdir(parents=True, exist_ok=True)
     ran = {tuple(row[name] for name in KEY) for row in new[0].select(KEY).to_pylist()}
     for name, old, table in zip(("fits", "rows"), read(folder), new, strict=True):

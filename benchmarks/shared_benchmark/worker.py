@@ -1,6 +1,6 @@
 """Fit one method to one task in a process of its own: `python worker.py METHOD TASK.npz PREDICTION.npz LIMIT_S`.
 
-It prints one JSON object: the status and, if the fit was done, the time of the processor, the memory and the versions.
+It prints one JSON object: the status and, if the fit succeeded, processor time, memory and versions.
 """
 
 import importlib.metadata
@@ -28,7 +28,7 @@ def run(method: Method, task: Task, out: Path) -> dict[str, Any]:
         predict = method.fit(task)
         seconds, elapsed = time.process_time() - began, time.monotonic() - clock
         prediction = predict(task.test)
-    except Exception as problem:  # whatever a peer raises is its result
+    except Exception as problem:  # any exception of a peer is its result
         text = str(problem).splitlines()
         return {"status": f"failed: {type(problem).__name__}: {text[0][:100] if text else ''}"}
     if not np.isfinite(prediction.T[:, :3, 3]).all():
@@ -41,7 +41,7 @@ def run(method: Method, task: Task, out: Path) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Limit the time of the processor, and run."""
+    """Limit the processor time, and run."""
     name, task, out, limit = sys.argv[1:]
     resource.setrlimit(resource.RLIMIT_CPU, (int(limit), int(limit) + 5))
     done = run(method_of(name), Task.load(Path(task)), Path(out))

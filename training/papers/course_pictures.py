@@ -1,4 +1,4 @@
-"""Pictures of the course of trainings and calibrations: energies, errors at every point, RMSE over iterations."""
+"""Pictures of the progress of trainings and calibrations: energies, errors at every point, RMSE over iterations."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -18,7 +18,7 @@ STYLES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 1)))
 MARKERS = ("o", "s", "^", "v", "D", "P")
 
 _LEAST = 1e-32
-"""Value drawn for 0 on a logarithmic axis."""
+"""Value at which 0 is drawn on a logarithmic axis."""
 
 
 def draw_energies(ways: Mapping[str, Mapping[str, Any]], path: Path) -> None:

@@ -1,4 +1,4 @@
-"""The same calibration with different parameters eliminated, and the correlations that show which can be."""
+"""The same calibration with different parameters eliminated, and the correlations that show which can be eliminated."""
 
 import math
 from collections.abc import Sequence
@@ -34,7 +34,7 @@ def report_eliminations(
         cases: Parameters of the arm to eliminate; a last case without elimination is added.
         result: Calibration of the recipe, for its redundant sets.
         rows: Measurements to calibrate with.
-        held_out: Measurements to judge with.
+        held_out: Measurements for the evaluation.
 
     Returns:
         ``{"elimination_cases": [...], "true_values": {...}}``: per case the eliminated parameters, the number of

@@ -92,7 +92,7 @@ class Accuracy:
 
 
 def measure_accuracy(bench: Bench, calibration: JigCalibration) -> Accuracy:
-    """Move to the test points with the parameters of a calibration, and compare positions over the workspace.
+    """Move to the test points with the parameters of a calibration, and compare positions there and over the workspace.
 
     Raises:
         UnreachablePoseError: a test point cannot be reached.

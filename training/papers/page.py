@@ -82,7 +82,7 @@ def page_text(folder: Path) -> str:
 
 
 def _overview(published: Published, results: StoredResults) -> str:
-    """Return a table of all recipes, with their section and the time that they took."""
+    """Return a table of all recipes, with their sections and durations."""
     rows = []
     parts = [(paper.heading, paper.recipes) for paper in published.papers] + [(_MEASURED, OTHERS)]
     for heading, names in parts:

@@ -19,7 +19,7 @@ class Item(Section):
         number: Number in the paper.
         shows: What it shows.
         section: Heading of the section that compares it with ours.
-        absent: Reason why there is none.
+        absent: Reason why no section compares it with ours.
     """
 
     number: int
@@ -60,7 +60,7 @@ class DhTable(Section):
     """A published DH table, row by row.
 
     Attributes:
-        table: its number.
+        table: Number of the table in the paper.
     """
 
     table: int
@@ -75,7 +75,7 @@ class CorrelationTriangle(Section):
     """A published table of correlations.
 
     Attributes:
-        table: its number.
+        table: Number of the table in the paper.
         names: The parameters.
         lower: Lower triangle with its diagonal; None where NaN is printed.
     """
@@ -102,7 +102,7 @@ class Convergence(Section):
     """RMSE over iterations.
 
     Attributes:
-        table: its number.
+        table: Number of the table in the paper.
         iterations: Iterations of the rows.
         rmse_mm: One row per iteration, one column per elimination case, without elimination last [mm].
     """
@@ -116,7 +116,7 @@ class RedundantSums(Section):
     """Values of redundant parameters after calibration, and their sums.
 
     Attributes:
-        table: its number.
+        table: Number of the table in the paper.
         members: The parameters.
         unit: Unit of the figures.
         parameters: Number of estimated parameters, per case.
@@ -156,7 +156,7 @@ class Published(Section):
     notes: dict[str, str]
 
     def paper(self, key: str) -> Paper:
-        """Return the paper with that key."""
+        """Return the paper with a key."""
         return next(paper for paper in self.papers if paper.key == key)
 
 

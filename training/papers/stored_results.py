@@ -30,7 +30,7 @@ class StoredResults:
         """Return the result of a recipe.
 
         Raises:
-            RecipeError: There is none.
+            RecipeError: There is no result of this recipe.
         """
         if name not in self.by_name:
             raise RecipeError(

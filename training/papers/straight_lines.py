@@ -39,8 +39,8 @@ class Controller:
     def joints(self, T: Float64[Tensor, "poses 4 4"]) -> Float64[Tensor, "poses dof"]:
         """Return the joint values [rad or m] that the controller commands for T_base_tool [m].
 
-        By the nominal, closed-form inverse kinematics where that takes the parameters, else numerically from the
-        nominal solution.
+        The nominal, closed-form inverse kinematics is used if it supports the parameters, otherwise a numerical
+        solution that starts from the nominal one.
 
         Raises:
             UnreachablePoseError: A pose cannot be reached on this branch.
@@ -101,9 +101,9 @@ def move_l(
 ) -> TrackedLine:
     """Move along a straight line between two taught poses.
 
-    Both ends are taught with the true robot, so it gets there whatever the controller believes. In between, the
-    controller interpolates what it believes of the ends, positions linearly and orientations about one axis, and
-    solves the inverse kinematics of every pose.
+    Both ends are taught with the true robot, so it reaches them whatever parameters the controller uses. In between,
+    the controller interpolates the poses of the ends that follow from its parameters, positions linearly and
+    orientations about one axis, and solves the inverse kinematics of every pose.
 
     Args:
         true_robot: The true robot.
@@ -136,7 +136,7 @@ def i_move(
 ) -> TrackedLine:
     """Move from a taught pose by a translation, keeping the orientation.
 
-    Only the start is taught; direction and distance are what the controller believes them to be.
+    Only the start is taught; direction and distance follow from the parameters of the controller.
 
     Args:
         true_robot: The true robot.

@@ -20,7 +20,7 @@ VAGUE = 300.0
 LEAST_GAIN = 1e-4
 """Minimum relative gain of an exchange; the search ends below it."""
 DROPPED = 0.02
-"""Share of the measurements that is dropped per step while there are too many."""
+"""Share of the measurements that is dropped per step as long as there are too many."""
 MOST_EXCHANGES = 500
 """Maximum number of exchanges."""
 
@@ -62,8 +62,8 @@ class MeasurementPlan:
 
     Attributes:
         chosen: Indices of the chosen candidates, ascending.
-        predicted_error: Their predicted RMS position error over the workspace [m].
-        path: The same after dropping and after every exchange [m].
+        predicted_error: Predicted RMS position error over the workspace after the chosen measurements [m].
+        path: Predicted RMS position error after dropping, and after every exchange [m].
     """
 
     chosen: Int64[Tensor, " chosen"]
@@ -92,7 +92,7 @@ def build_planning_problem(
         workspace: Joint values [rad or m] where the robot should be accurate.
         free: Names of the arm's parameters that the calibration will estimate, such as "theta_2".
         prior: Standard deviations of their errors; None: no prior.
-        sigma: Standard deviation of a touch [m].
+        sigma: Standard deviation of a touched coordinate [m].
 
     Raises:
         IdentificationError: A name is not a parameter of the arm, or the workspace is empty.
@@ -139,7 +139,7 @@ def _rows_of_touches(
     Args:
         robot: Robot with its base at the origin.
         candidates: Candidate touches.
-        Ts_jig_base: where the jigs are believed to stand [m].
+        Ts_jig_base: Assumed placements of the jigs [m].
         columns: Columns of the identification Jacobian, of arm and tool.
         usual: Typical errors of their parameters [m or rad].
     """
