@@ -21,4 +21,6 @@ SERIES = Series(
         "rows_300": "a80b064bc0c9c75c436f70466d283687950626f57a5c910888483ab5eaeb8323",
     },
     other_session="ur10_c",
+    note="Rows 532, 854 and 855 are about 2 mm off for every method. They stay in all figures; without them, the error "
+    "of `hybrid` on `random` is 0.074 mm instead of 0.119 mm.",
 )
