@@ -297,9 +297,13 @@ class OrderedRows:
 
     @property
     def degrees_of_freedom(self) -> float:
-        """Degrees of freedom after the calibration, with at most one pose per configuration."""
-        count = len(self.residual) if self.configuration is None else int(self.configuration.max()) + 1
-        return min(self.values, _VALUES_PER_POSE * count) - self.effective_parameters
+        """Degrees of freedom after the calibration, with at most one pose per configuration, and no repeats."""
+        values, columns = self.values, self.residual.shape[1]
+        if self.configuration is not None:
+            targets = np.unique([self.configuration, self.problem.target.cpu().numpy()], axis=1).shape[1]
+            configurations = int(self.configuration.max()) + 1
+            values = min(values, _VALUES_PER_POSE * configurations, columns * targets)
+        return values - self.effective_parameters
 
 
 def _noise_and_sizes(

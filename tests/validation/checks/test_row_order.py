@@ -10,6 +10,7 @@ import pytest
 import torch
 from testing.checked import checked
 from testing.closeness import assert_close
+from testing.outside_arm import OutsideArm
 from testing.simulated_arm import SimulatedArm, simulate
 
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
@@ -184,3 +185,21 @@ def test_what_two_frames_leave_unexplained_is_no_motion_of_the_tool(shift, frame
     if frames == 2:
         rows = with_new_frames(rows, (82,))
     assert bool(found(simulated.nominal, rows)) == reported
+
+
+@pytest.mark.parametrize(("name", "draw"), [("rail", 1), ("rail", 2), ("scara", 1)])
+def test_repeats_of_few_poses_are_no_evidence_of_a_motion(name: str, draw: int) -> None:
+    outside = OutsideArm(name, 3, 20, draw)
+    outside.q = np.repeat(outside.q, 3, 0)
+    assert [*check_row_order(checked(GeometricCalibrator(outside.robot), outside.measured()))] == []
+
+
+def test_a_motion_between_repeated_poses_is_found() -> None:
+    outside = OutsideArm("kr10", 3, 40, 1)
+    outside.q = np.repeat(outside.q, 2, 0)
+    rows = outside.measured()
+    assert rows.position is not None
+    later = (torch.arange(80) >= 40)[:, None]
+    moved = replace(rows, position=rows.position + torch.tensor([1e-3, -1e-3, 5e-4]) * later)
+    (only,) = check_row_order(checked(GeometricCalibrator(outside.robot), moved))
+    assert (only.cause, only.values["first_row"]) == ("frame", 40)
