@@ -14,6 +14,7 @@ from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.calibration.hybrid.calibrator import HybridCalibrator
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import Robot
+from pisigma.robot.se3 import rotation_from_vector
 from pisigma.validation.checks.mixed_rows import check_two_populations
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.setup_faults.populations import two_populations
@@ -107,15 +108,26 @@ def test_poses_in_two_named_frames_are_one_population(seed):
 
 
 def test_gears_that_a_hybrid_explains_are_one_population():
-    arm = OutsideArm("scara", 3, 35, 2)
-    arm.q = np.repeat(arm.q, 2, 0)
-    rows, geometric = arm.measured(), GeometricCalibrator(arm.robot)
+    rng, rotated = np.random.default_rng(0), []
+    for seed in (3, 103):
+        arm = OutsideArm("scara", seed, 60, 2)
+        turn = rotation_from_vector(torch.from_numpy(rng.normal(0, 1e-4, (60, 3))))
+        rotated.append(replace(arm.measured(), rotation=torch.from_numpy(arm.true.measure(arm.q)[1]) @ turn))
+    rows, other = rotated
     assert populations(arm.robot, rows) != []
-    hybrid = HybridCalibrator(geometric)
+    hybrid = HybridCalibrator(GeometricCalibrator(arm.robot))
     assert list(check_two_populations(checked(hybrid, rows))) == []
-    other = OutsideArm("scara", 103, 35, 2)
-    other.q = arm.q
-    (found,) = check_two_populations(checked(hybrid, either(rows, other.measured(), np.arange(70) % 2 == 1)))
+    odd = np.arange(60) % 2 == 1
+    mixed = replace(
+        rows,
+        **{
+            name: torch.where(
+                torch.from_numpy(odd).view(-1, *[1] * (values.ndim - 1)), getattr(other, name), values
+            )
+            for name, values in (("position", rows.position), ("rotation", rows.rotation))
+        },
+    )
+    (found,) = check_two_populations(checked(hybrid, mixed))
     assert (found.severity, found.cause) == ("implausible", "arm")
 
 
