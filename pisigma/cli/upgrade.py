@@ -8,7 +8,7 @@ from pisigma.cli.output import print_json, print_lines
 
 def upgrade(model: ModelOrCell, as_json: AsJson = False) -> None:
     """Convert a model folder or a cell of an earlier version to the present format, with its history."""
-    from pisigma.lifetime.cell.layout import is_cell
+    from pisigma.lifetime.cell.layout import is_cell, is_cell_of_arms
     from pisigma.workflow.cell.upgrade import upgrade as workflow
 
     done = workflow(model)
@@ -20,7 +20,7 @@ def upgrade(model: ModelOrCell, as_json: AsJson = False) -> None:
     else:
         if done.before != done.after:
             print_lines([f"{model}: history of schema version {done.before} was upgraded to {done.after}."])
-        elif is_cell(model):
+        elif is_cell(model) and not is_cell_of_arms(model):
             print_lines([f"The history of {model} already has the newest schema version ({done.after})."])
         for one in done.models:
             name = f"model '{one.name}'" if is_cell(model) else str(model)

@@ -1,5 +1,6 @@
 """`pisigma calibrate` of a cell of several arms: a model for each, frames.yaml, and what is refused."""
 
+import hashlib
 import json
 import re
 import shutil
@@ -23,9 +24,10 @@ from pisigma.files.errors import (
     PlanningError,
     SettingError,
 )
-from pisigma.files.model_files import model_hash
+from pisigma.files.model_files import COMPILED, DESCRIPTION, model_hash
 from pisigma.files.yaml_file import read_yaml
 from pisigma.measurement.dataset import Measurements
+from pisigma.model.folder.model_document import write_document
 from pisigma.model.folder.model_folder import load_model
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
@@ -33,6 +35,7 @@ from pisigma.robot.se3 import pose_error, transform_from_xyzrpy
 from pisigma.validation.held_out.arms_summary import ArmsSummary
 from pisigma.workflow.arms.arms_cell import arms_of_cell, calibrate_arms_of_cell
 from pisigma.workflow.arms.calibrate_arms import FRAMES_FILE, Arm, ArmsCalibration, calibrate_arms
+from pisigma.workflow.cell.upgrade import upgrade
 from pisigma.workflow.settings.calibration import CalibrationSettings
 
 CELL = """arms:
@@ -105,6 +108,23 @@ def test_accepted_arms_are_written_once(disagreeing, tmp_path):
     assert read_yaml(tmp_path / "models" / FRAMES_FILE, ArmsSummary, PlanningError) == written
     with refused(OutputError, file=str(tmp_path / "models")):
         disagreeing.save(tmp_path / "models", accept_implausible=True)
+
+
+def test_frames_name_models_that_were_upgraded(disagreeing, tmp_path):
+    (tmp_path / "cell.yaml").write_text("arms: {}\n")
+    models = tmp_path / "models" / "2026-11-27"
+    disagreeing.save(models, accept_implausible=True)
+    frames, left, other = models / FRAMES_FILE, models / "left", b"of another version"
+    (left / COMPILED).write_bytes(other)
+    before = model_hash(left)
+    text = (left / DESCRIPTION).read_text().partition("compiled_sha256:")[0]
+    write_document(text, hashlib.sha256(other).hexdigest(), left / DESCRIPTION)
+    frames.write_text(frames.read_text().replace(before, model_hash(left)))
+    done = upgrade(tmp_path)
+    assert [(one.name, len(one.changes)) for one in done.models] == [("left", 1), ("right", 0)]
+    assert {one.sha256 for one in read_yaml(frames, ArmsSummary, PlanningError).arms} == {
+        model_hash(models / name) for name in ("left", "right")
+    }
 
 
 def test_sum_of_base_and_tool_is_named():
