@@ -44,7 +44,7 @@ class FeatureOptions:
 
 
 class AbstractFeature(ABC):
-    """Columns of every joint; the correction of joint j is `Σ_m weight[j, m] · columns(state)[..., j, m]`.
+    """Feature with columns for every joint; it corrects joint j by `Σ_m weight[j, m] · columns(state)[..., j, m]`.
 
     A new feature is a subclass in its own file and a line in `registry.py`; `register_feature` adds features of
     plug-ins. Models that contain a feature without `compiled` are solved in torch; models that contain a feature

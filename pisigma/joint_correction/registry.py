@@ -26,7 +26,7 @@ def register_feature(feature: type[AbstractFeature]) -> type[AbstractFeature]:
     which requires numba (`pip install 'pisigma[compile]'`).
 
     Raises:
-        ValueError: another feature has the name.
+        ValueError: a feature with this name is already registered.
     """
     if FEATURES.setdefault(feature.name, feature) is not feature:
         raise ValueError(f"a feature '{feature.name}' is already registered; choose another name.")

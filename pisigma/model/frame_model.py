@@ -112,7 +112,7 @@ def _arm_root(known: ArmUncertainty, fit: FrameFit) -> Float64[Tensor, "frames d
     `-(X^T X)^-1 X^T X_arm δ`.
     """
     problem = fit.solved.problem
-    spread = known.spread(fit.solved, fit.used, problem.active.tolist())
+    spread = known.spread(fit.solved, fit.used_rows, problem.active.tolist())
     change = fit.solved.geometry.coordinate_jacobian[fit.frames][:, problem.active]
     root: Tensor = -change @ fit.basis @ torch.linalg.pinv(fit.values.X) @ spread
     return root
@@ -146,8 +146,8 @@ def _with_frames(model: CalibratedModel, fit: FrameFit, rows: Measurements) -> C
         provenance=Provenance(
             data_source=rows.file_names,
             data_sha256=rows.content_hash(),
-            rows=len(fit.used),
-            rows_left_out=len(fit.wrong) + len(rows.left_out),
+            rows=len(fit.used_rows),
+            rows_left_out=len(fit.wrong_rows) + len(rows.left_out),
             versions=Provenance.installed_versions(),
         ),
         **frames,

@@ -123,7 +123,7 @@ def check_rows_of_frames(
     Returns:
         The findings; those that make the rows implausible come first.
     """
-    used = torch.tensor(found.fit.used)
+    used = torch.tensor(found.fit.used_rows)
     result, some = found.fit.solved.result(), rows.select(used)
     results = {"nominal": result, "geometric": result}
     kinds: dict[str, tuple[FrameKind, ...]] = {

@@ -60,7 +60,7 @@ class ImportProposal:
         """Write the mapping of columns as a file for the option `--map`.
 
         Raises:
-            OutputError: it cannot be written.
+            OutputError: the file cannot be written.
         """
         save_map(self.mappings, path)
 

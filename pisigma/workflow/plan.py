@@ -58,7 +58,7 @@ class Plan:
 
     Attributes:
         stored: the poses in their order, and the settings of the plan.
-        candidates: poses from which they were chosen.
+        candidates: poses from which the planned poses were chosen.
         curve: expected errors of the tool's position over the task, by number of poses, starting from 0 poses if there
             are earlier measurements.
         poses_needed: number of poses with which the limit is expected to be reached; None if there is no limit, or if

@@ -73,16 +73,16 @@ class Verification:
         rows: number of evaluated rows.
         settings: settings of the verification.
         verdict: "better" or "not_better" if the confidence interval of the mean difference shows that the corrected
-            model explains the rows better than the nominal robot, or not; "undecided" if it shows neither; "moved" if
-            parts of the arm have moved according to the posterior of the model and a recalibration is recommended;
-            "setup_fault" if a setup fault explains the errors, which then prove nothing; "implausible" if the errors
-            are too large for a calibrated robot and no fault explains them.
+            model explains the rows better than the nominal robot, or that it does not; "undecided" if it shows neither;
+            "moved" if parts of the arm have moved according to the posterior of the model and a recalibration is
+            recommended; "setup_fault" if a setup fault explains the errors, which then prove nothing; "implausible" if
+            the errors are too large for a calibrated robot and no fault explains them.
         sentence: sentence that states the verdict with figures.
         ratio: mean position error of the corrected model divided by the mean position error of the nominal robot;
             NaN if the latter is 0.
         better_share: fraction of the configurations in which the corrected model has the smaller error.
         comparison: figures of "nominal", "geometric" (of a hybrid) and "corrected".
-        diagnostics: why the rows must not be trusted; see `pisigma.validation.gate`.
+        diagnostics: reasons why the rows must not be trusted; see `pisigma.validation.gate`.
         setup_faults: setup faults that explain large errors; empty if `motion` explains them.
         motion: parts that have moved since the model was made; None if the model or the rows do not show motions.
         recalibration: command that updates the model; empty if this is not recommended.

@@ -177,7 +177,7 @@ def test_rows_of_the_test_set_are_not_fitted():
     found = pisigma.calibrate_frame(UR5, marked, "base")
     assert found.summary.rows == 6
     assert_close(found.fit.estimates, BASE, atol=1e-9)
-    assert not found.fit.wrong
+    assert not found.fit.wrong_rows
 
 
 def test_residuals_of_all_sensors_of_lengths_are_counted():

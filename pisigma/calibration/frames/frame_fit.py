@@ -63,8 +63,8 @@ class FrameFit:
         only: what was fitted.
         solved: the least-squares problem of the rows used, with its solution.
         rows: all rows.
-        used: indices of the rows used.
-        wrong: indices of the rows left out, in the order in which they were found.
+        used_rows: indices of the rows used.
+        wrong_rows: indices of the rows left out, in the order in which they were found.
         bases: previous bases by frame; other frames use the base of the robot.
         tools: previous tools by target; other targets use the tool of the robot.
     """
@@ -72,8 +72,8 @@ class FrameFit:
     only: FrameChoice
     solved: SolvedCalibration
     rows: Measurements
-    used: tuple[int, ...]
-    wrong: tuple[int, ...]
+    used_rows: tuple[int, ...]
+    wrong_rows: tuple[int, ...]
     bases: Frames
     tools: Frames
 
@@ -248,7 +248,7 @@ def _refuse_several(column: str, names: set[str], known: Frames, rows: Measureme
 def _wrong_row(fit: FrameFit) -> int | None:
     """Return the index of the row that the others contradict; None if there is none, or if too many rows are wrong."""
     if (
-        len(fit.wrong) + 1 > _MAX_WRONG_SHARE * fit.rows.rows
+        len(fit.wrong_rows) + 1 > _MAX_WRONG_SHARE * fit.rows.rows
         or fit.solved.solution.status == SolutionStatus.EXACT
     ):
         return None
@@ -256,4 +256,4 @@ def _wrong_row(fit: FrameFit) -> int | None:
     tested = most_deviating_row(values.X, values.y, values.row, values.exact)
     if tested is None or not tested.is_wrong:
         return None
-    return fit.used[int(fit.solved.setup.rows[tested.row])]
+    return fit.used_rows[int(fit.solved.setup.rows[tested.row])]

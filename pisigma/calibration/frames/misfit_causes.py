@@ -60,7 +60,7 @@ def misfit_causes(fit: FrameFit, uncertainty: ArmUncertainty | None = None) -> t
     Returns:
         The causes, those supported by the evidence first; none if there are fewer than `_MIN_ROWS` poses.
     """
-    rows = fit.rows.select(torch.tensor(fit.used))
+    rows = fit.rows.select(torch.tensor(fit.used_rows))
     if fit.only != "hand-eye" or rows.rows < _MIN_ROWS or not fit.solved.problem.needs_rotation:
         return ()
     counted = {"camera": set(cameras(rows) or ()), "board": set(boards(rows) or ())}
@@ -92,7 +92,7 @@ def _residuals(
             causes[kind] = X_unknowns[:, chosen] * torch.tensor(sizes, dtype=torch.float64)
     known = X_unknowns * _stated_deviations(solved, rows)
     if uncertainty is not None:
-        known = torch.cat([known, uncertainty.spread(solved, fit.used, {*frames, *unknowns})], 1)
+        known = torch.cat([known, uncertainty.spread(solved, fit.used_rows, {*frames, *unknowns})], 1)
     return FitResiduals.from_fit(
         y=unit * (values.y + X_unknowns @ moved),
         fitted=unit[:, None] * X_frames,

@@ -137,7 +137,7 @@ class GeometricCalibrator:
 
     @torch.inference_mode()
     def fit(self, measurements: Measurements) -> CalibrationResult:
-        """Calibrate and return the result; see `solve` for the errors raised."""
+        """Calibrate and return the result; see `solve` for exceptions."""
         return self.solve(measurements).result()
 
     def solve(self, measurements: Measurements) -> SolvedCalibration:

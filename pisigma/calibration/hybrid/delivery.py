@@ -20,7 +20,7 @@ from pisigma.calibration.hybrid.refinement import (
     refine,
 )
 from pisigma.calibration.hybrid.regression import build_regression
-from pisigma.calibration.hybrid.search import CLEAR_GAIN, ROUGHLY, FeatureChoice, FeatureFit
+from pisigma.calibration.hybrid.search import CLEAR_GAIN, ROUGH_TOLERANCE, FeatureChoice, FeatureFit
 from pisigma.calibration.hybrid.sensor_values import SensorValues, sensor_values
 from pisigma.estimation.held_out import standard_errors
 from pisigma.estimation.regression import Posterior
@@ -277,5 +277,5 @@ def _part(choice: FeatureChoice, features: tuple[AbstractFeature, ...]) -> Featu
     best, design = choice.best, Design(choice.rows.problem, features)
     fit = (choice.regression or build_regression(best.design, choice.rows)).select(design)
     prior = design.prior_like(best.design, best.posterior.prior)
-    posterior = fit.maximise_evidence(prior, best.posterior.noise, tolerance=ROUGHLY)
+    posterior = fit.maximise_evidence(prior, best.posterior.noise, tolerance=ROUGH_TOLERANCE)
     return replace(choice, best=FeatureFit(design, posterior, best.largest_share), regression=fit)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from pisigma.calibration.hybrid.design import AbstractDesignRegression, Design, Rows
 from pisigma.calibration.hybrid.regression import build_regression
-from pisigma.calibration.hybrid.search import CLEARLY, ROUGHLY
+from pisigma.calibration.hybrid.search import CLEAR_EVIDENCE, ROUGH_TOLERANCE
 from pisigma.estimation.regression import Posterior
 from pisigma.joint_correction.feature import AbstractFeature
 from pisigma.joint_correction.fourier_series import FourierSeries
@@ -53,9 +53,9 @@ def gravity_by_evidence(
     Geometry, a short series and the `GravityTorques` of each axis are fitted to the rows. Torques are linear in masses
     of either sign, so the evidence and all predictions are the same for both directions of an axis; the direction
     with a positive sum of masses is chosen. Directions other than down must have a log evidence above that of the
-    other axes by `CLEARLY` plus the log prior odds against them; for an inclined direction, which is fitted to the
-    rows, minus the logarithm of the share of the half sphere that is compatible with the rows (Laplace's approximation)
-    is added to this threshold, and the direction must not be near an axis (`_LEAST_INCLINATION`).
+    other axes by `CLEAR_EVIDENCE` plus the log prior odds against them. For an inclined direction, which is fitted to
+    the rows, the logarithm of the share of the half sphere that is compatible with the rows (Laplace's approximation)
+    is subtracted from this threshold, and the direction must not be near an axis (`_LEAST_INCLINATION`).
 
     Args:
         robot: the nominal robot.
@@ -71,7 +71,7 @@ def gravity_by_evidence(
         torques = (GravityTorques(robot, to_first_row_frame(robot, one)) for one in directions)
         design = Design(rows.problem, (*torques, FourierSeries(robot, _HARMONICS)))
         fit = build_regression(design, rows)
-        return fit, fit.maximise_evidence(design.prior(prior_scale), noise, tolerance=ROUGHLY), design
+        return fit, fit.maximise_evidence(design.prior(prior_scale), noise, tolerance=ROUGH_TOLERANCE), design
 
     def judged(direction: Direction) -> tuple[float, Direction]:
         _, posterior, design = fitted(direction)
@@ -85,9 +85,9 @@ def gravity_by_evidence(
     direction, share = _most_probable(_evidence_of_direction(*fitted(*AXES)))
     inclined, direction = judged(direction)
     is_inclined = max(map(abs, direction)) < math.cos(_LEAST_INCLINATION)
-    if is_inclined and inclined - first > CLEARLY + 2 * math.log(_FLOOR_ODDS) - math.log(share):
+    if is_inclined and inclined - first > CLEAR_EVIDENCE + 2 * math.log(_FLOOR_ODDS) - math.log(share):
         return direction
-    return best if first - second > CLEARLY + math.log(_FLOOR_ODDS) else USUAL
+    return best if first - second > CLEAR_EVIDENCE + math.log(_FLOOR_ODDS) else USUAL
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,7 +23,7 @@ from pisigma.joint_correction.feature import AbstractFeature
 
 _LEVEL = 1.03
 """Ratio of the held-out RMS error to the lowest one so far above which features are rejected despite the evidence."""
-CLEARLY = 5.0
+CLEAR_EVIDENCE = 5.0
 """Increase of the log evidence needed to keep features (a Bayes factor of 150: very strong, Kass and Raftery 1995).
 
 A threshold of 3 gains nothing for arms with joint errors: with 16 to 30 positions of the measured UR5 and UR10, the
@@ -32,7 +32,7 @@ simulated arms 0.997 and 1.004 times (120 fits each). For simulated arms with er
 the errors by 1.7 %."""
 CLEAR_GAIN = 1.0
 """Decrease of the held-out squared errors [standard errors] that is regarded as an improvement."""
-_STRONGLY = 3.0
+_STRONG_EVIDENCE = 3.0
 """Increase of the log evidence that is strong: a Bayes factor of 20 (Kass and Raftery 1995)."""
 _MAX_EFFECTIVE_SHARE = 0.75
 """Largest effective number of unknowns per value; with more, they cannot be separated from the noise."""
@@ -44,7 +44,7 @@ MIN_USUAL_SCALE = 0.4
 few rows attributes the effects of missing features to noise and underestimates small errors of the geometry."""
 _USUAL_UPDATES = 5
 """Number of updates of the usual sizes; few values hardly determine them, so more updates are not useful."""
-ROUGHLY = 1.0
+ROUGH_TOLERANCE = 1.0
 """Increase of the log evidence per update below which fits have converged during the selection of features."""
 FEW_GROUPS = 200
 """Number of groups up to which more folds are used."""
@@ -178,7 +178,7 @@ class FeatureSearch:
         if sizes is not None:
             prior = replace(prior, sizes=torch.cat([prior.sizes[: -len(sizes)], sizes]))
         chosen = self._regression.select(design)
-        posterior = chosen.maximise_evidence(prior, noise, tolerance=ROUGHLY)
+        posterior = chosen.maximise_evidence(prior, noise, tolerance=ROUGH_TOLERANCE)
         errors = chosen.held_out_errors(posterior, self._folds)
         return FeatureFit(design, posterior, held_out=errors), errors.rms(posterior.noise, self.noise)
 
@@ -223,7 +223,7 @@ class FeatureSearch:
                 best = self._from_usual_sizes(together, scale, best)
         for chosen in last:
             gain, sizes = self._regression.evidence_gain(best.posterior, best.design, chosen)
-            if gain > CLEARLY / 2:
+            if gain > CLEAR_EVIDENCE / 2:
                 best = self._tried([*best.design.features, chosen], best, sizes, least_gain=CLEAR_GAIN)
         return best
 
@@ -263,7 +263,7 @@ class FeatureSearch:
         began = time.monotonic()
         tried, held_out = self.fit_features(features, best, sizes)
         better = (
-            tried.posterior.log_evidence - best.posterior.log_evidence > CLEARLY + odds
+            tried.posterior.log_evidence - best.posterior.log_evidence > CLEAR_EVIDENCE + odds
             and held_out < self._least * _LEVEL
             and tried.gain(best) > least_gain
             and self._regression.effective_share(tried.posterior) < _MAX_EFFECTIVE_SHARE
@@ -290,7 +290,7 @@ class FeatureSearch:
         held_out = errors.rms(posterior.noise, self.noise)
         better = (
             posterior.log_evidence - best.posterior.log_evidence
-            > (_STRONGLY if best.design.features else CLEARLY)
+            > (_STRONG_EVIDENCE if best.design.features else CLEAR_EVIDENCE)
             and held_out < self._least * _LEVEL
             and fit.effective_share(posterior) < MAX_USUAL_SHARE
         )

@@ -10,7 +10,7 @@ from pisigma.calibration.hybrid.design import Design, Rows
 from pisigma.estimation.regression import Posterior
 from pisigma.joint_correction.feature import angle_per_joint_value
 
-HIGHEST = 3_000
+HIGHEST_ORDER = 3_000
 """Highest order of a line [1/turn]. Motors with 10 pole pairs and gears of 1:101 have cogging at 2,020; an error of
 0.1 mrad shifts the phase of the highest order by 0.3 rad."""
 _MAX_LINES = 8
@@ -52,7 +52,7 @@ def find_spectral_lines(
 
 def log_number_of_orders(joints: int) -> float:
     """Return the logarithm of the number of candidate lines: every order of every joint."""
-    return math.log(joints * HIGHEST)
+    return math.log(joints * HIGHEST_ORDER)
 
 
 def _slope_and_curvature(
@@ -78,17 +78,17 @@ def _lines_of_joint(
     least: float,
 ) -> tuple[int, ...]:
     """Find the orders with the largest gains above `least` one by one, subtracting each line from the residuals."""
-    G = _sums(angle, curvature, 2 * HIGHEST + 1)
+    G = _sums(angle, curvature, 2 * HIGHEST_ORDER + 1)
     candidates = _distinguishable(G, lowest)
     if not bool(candidates.any()):
         return ()
-    total, G2 = G[0].real, G[: 2 * HIGHEST + 1 : 2]
+    total, G2 = G[0].real, G[: 2 * HIGHEST_ORDER + 1 : 2]
     # Weighted sums of sin², cos² and sin·cos of every order k, from `exp(2ik angle)`.
     ss, cc, sc = (total - G2.real) / 2, (total + G2.real) / 2, G2.imag / 2
     determinant = ss * cc - sc.square()
     orders: list[int] = []
     while len(orders) < _MAX_LINES:
-        P = _sums(angle, slope, HIGHEST + 1)
+        P = _sums(angle, slope, HIGHEST_ORDER + 1)
         sine, cosine = (
             (cc * P.imag - sc * P.real) / determinant,
             (ss * P.real - sc * P.imag) / determinant,
@@ -112,10 +112,10 @@ def _distinguishable(G: Complex128[Tensor, " _orders"], lowest: int) -> Bool[Ten
         G: sums of the curvature times powers of `exp(i angle)`, near G_0 for powers that are equal at all joint values.
         lowest: lowest order; a joint whose values are too close together has no distinguishable orders.
     """
-    orders = torch.arange(HIGHEST + 1)
+    orders = torch.arange(HIGHEST_ORDER + 1)
     constant = (G.abs() > _ALIKE * G[0].real).nonzero()[:, 0]
     beyond = constant[constant >= lowest]
-    highest = int(beyond[0]) / 2 if len(beyond) else HIGHEST + 1
+    highest = int(beyond[0]) / 2 if len(beyond) else HIGHEST_ORDER + 1
     return (orders >= lowest) & (orders < highest)
 
 

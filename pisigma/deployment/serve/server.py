@@ -34,8 +34,8 @@ class Server:
     Attributes:
         json_port: port for lines of JSON.
         binary_port: port for binary frames.
-        zmq: server over ZeroMQ, or None.
-        opcua: server over OPC UA, or None.
+        zmq: server over ZeroMQ; None if it is not used.
+        opcua: server over OPC UA; None if it is not used.
         metrics: counts and durations of answers.
     """
 

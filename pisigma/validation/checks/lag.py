@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pisigma.calibration.hybrid.search import CLEARLY
+from pisigma.calibration.hybrid.search import CLEAR_EVIDENCE
 from pisigma.measurement.conditions import motions_between_rows
 from pisigma.measurement.dataset import Measurements
 from pisigma.validation.checks.check import CheckedCalibration
@@ -14,7 +14,7 @@ from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.setup_faults.ordered_rows import OrderedRows
 
 MIN_ROWS = 12
-LIKELY = CLEARLY + math.log(100.0)
+LIKELY = CLEAR_EVIDENCE + math.log(100.0)
 """Log Bayes factor above which a lag is reported."""
 NOTICED, _LARGE = 1.1, 1.5
 """Ratios of the errors with and without the lag above which a warning is given, and above which the calibration is

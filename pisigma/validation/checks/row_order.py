@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float64
 
 from pisigma.calibration.geometric.initial_guess.base_and_tool import fit_base_and_tool
-from pisigma.calibration.hybrid.search import CLEARLY
+from pisigma.calibration.hybrid.search import CLEAR_EVIDENCE
 from pisigma.files.errors import IdentificationError, Place
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import Robot
@@ -19,9 +19,9 @@ from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.setup_faults.cause import length_text
 from pisigma.validation.setup_faults.row_order import Motion, find_motion
 
-_LIKELY = CLEARLY + math.log(100.0)
+_LIKELY = CLEAR_EVIDENCE + math.log(100.0)
 """Log Bayes factor above which a motion is reported, assuming that something moves in 1 of 100 measurements."""
-_CERTAIN = CLEARLY + math.log(1e6)
+_CERTAIN = CLEAR_EVIDENCE + math.log(1e6)
 """Log Bayes factor above which a motion can make a calibration implausible; at most one in a million valid
 calibrations is affected."""
 _LARGE = 1.5

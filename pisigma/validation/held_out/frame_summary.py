@@ -175,7 +175,7 @@ def frame_summary(
             noise_figures(one.sensor, one.sigma, one.unit, values=one.values, used_by_parameters=one.used)
             for one in result.noise
         ),
-        outliers=contradicting_rows(result, fit.rows, fit.wrong),
+        outliers=contradicting_rows(result, fit.rows, fit.wrong_rows),
         warnings=warnings,
     )
     return summary.with_figures(

@@ -71,7 +71,7 @@ class ArmsCalibration:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Sums of bases and tools, and warnings of the arms preceded by their names, one sentence each."""
+        """Sentences on values that are known only as sums of bases and tools, and warnings with names of arms."""
         return self.summary.sums + tuple(
             f"{name}: {sentence}" for name, one in self.calibrations.items() for sentence in one.warnings
         )

@@ -64,7 +64,7 @@ CASES = pytest.mark.parametrize(
 def test_accuracy_reaches_the_bound_and_standard_errors_state_it(fit, count, true, bound):
     with no_type_checker():
         fits = [fit(vector.reshape(count, 3)) for vector in noise_vectors(3 * count)]
-    assert not any(one.wrong for one in fits)
+    assert not any(one.wrong_rows for one in fits)
     errors = np.array([one.estimates - true for one in fits])
     assert_close(np.sqrt((errors**2).mean(0) / np.diag(bound)), 1.0, atol=0.02)
     assert_close(
@@ -76,7 +76,7 @@ def test_accuracy_reaches_the_bound_and_standard_errors_state_it(fit, count, tru
 def test_wrong_row_is_named_and_left_out(fit, count, true, bound):
     for wrong in range(1, 4):
         result = fit(random_noise(count, wrong, wrong))
-        assert result.wrong == (wrong,)
+        assert result.wrong_rows == (wrong,)
         assert (np.abs(result.estimates - true) < 8 * np.sqrt(np.diag(bound))).all()
 
 
@@ -98,7 +98,7 @@ def test_coordinate_that_no_touch_determines_keeps_its_value(count, noise):
         assert_close(fit.estimates[0], TURNED.tool[0], atol=1e-4)
         assert_close(fit.estimates[1:], TIP[1:3], atol=1e-9 + 6 * NOISE * noise)
         assert fit.covariance[0, 0] > 0.05**2
-        assert not fit.wrong
+        assert not fit.wrong_rows
 
 
 def test_only_the_last_joint_turned():

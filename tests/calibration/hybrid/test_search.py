@@ -8,7 +8,7 @@ import torch
 from testing.closeness import assert_close
 from testing.linearised import LinearisedArm, linearised, random_joints, tracker_data
 
-from pisigma.calibration.hybrid.search import CLEAR_GAIN, CLEARLY, MAX_USUAL_SHARE, FeatureSearch
+from pisigma.calibration.hybrid.search import CLEAR_EVIDENCE, CLEAR_GAIN, MAX_USUAL_SHARE, FeatureSearch
 from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.joint_correction.gravity_torques import GravityTorques
 from pisigma.joint_correction.input_products import InputProducts
@@ -67,7 +67,7 @@ def test_larger_series_are_tried_until_the_evidence_is_clearly_against_them(seri
     kept = [line for line in search.trials if line.kept]
     assert kept[-1].name == best.name
     assert kept[-1].held_out < 0.4
-    assert all(b.log_evidence > a.log_evidence + CLEARLY for a, b in itertools.pairwise(kept))
+    assert all(b.log_evidence > a.log_evidence + CLEAR_EVIDENCE for a, b in itertools.pairwise(kept))
     assert [line.name for line in search.trials[1:]] == said
 
 
@@ -100,7 +100,7 @@ def test_products_have_to_gain_more_than_the_scatter(products: LinearisedArm, mo
     assert without.gain(kept) < -CLEAR_GAIN
     monkeypatch.setattr("pisigma.calibration.hybrid.search.CLEAR_GAIN", gain + 1e-6)
     assert search.select_features(SERIES[:1], [SMALL], [PRODUCTS]).name == without.name
-    assert search.trials[-1].log_evidence > without.posterior.log_evidence + CLEARLY
+    assert search.trials[-1].log_evidence > without.posterior.log_evidence + CLEAR_EVIDENCE
 
 
 def test_few_rows_are_fitted_with_all_features_from_usual_sizes() -> None:
@@ -115,7 +115,7 @@ def test_few_rows_are_fitted_with_all_features_from_usual_sizes() -> None:
     assert best.largest_share == MAX_USUAL_SHARE
     *before, together, wider = search.trials
     assert not wider.kept  # the geometry is nominal here
-    assert together.log_evidence > max(line.log_evidence for line in before) + CLEARLY
+    assert together.log_evidence > max(line.log_evidence for line in before) + CLEAR_EVIDENCE
     assert together.held_out < 0.7 * min(line.held_out for line in before if line.kept)
 
 

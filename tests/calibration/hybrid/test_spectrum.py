@@ -8,7 +8,7 @@ import torch
 from testing.linearised import LinearisedArm, linearised, random_joints, tracker_data
 
 from pisigma.calibration.hybrid.calibrator import HybridCalibrator
-from pisigma.calibration.hybrid.spectrum import HIGHEST, find_spectral_lines
+from pisigma.calibration.hybrid.spectrum import HIGHEST_ORDER, find_spectral_lines
 from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.robot import Robot
 
@@ -63,7 +63,7 @@ def test_a_calibration_keeps_no_orders_that_stand_out_of_noise_by_chance(seed: i
 def test_lines_below_the_first_order_are_left_to_the_series() -> None:
     q = random_joints(ROBOT, 400, 0)
     assert lines_of(arm_of(q, rippled(q)), 2_021) == ((),) * 6
-    assert lines_of(arm_of(q, rippled(q)), HIGHEST + 1) == ((),) * 6
+    assert lines_of(arm_of(q, rippled(q)), HIGHEST_ORDER + 1) == ((),) * 6
 
 
 @pytest.mark.parametrize("grid", [360, 1_000])

@@ -17,7 +17,7 @@ def register_closed_form(form: type[AbstractClosedForm]) -> type[AbstractClosedF
     (`pip install 'pisigma[compile]'`).
 
     Raises:
-        ValueError: a registered form already has the name.
+        ValueError: a form with this name is already registered.
     """
     if CLOSED_FORMS.setdefault(form.name, form) is not form:
         raise ValueError(f"a closed form '{form.name}' is already registered; choose another name.")
