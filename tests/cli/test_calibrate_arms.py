@@ -202,11 +202,12 @@ def torso_with_arms() -> str:
     return text + "</robot>\n"
 
 
-def test_joint_of_two_arms_is_refused_unless_it_is_before_their_base(tmp_path):
+@pytest.mark.parametrize("robot", ["torso.urdf", "./torso.urdf"])
+def test_joint_of_two_arms_is_refused_unless_it_is_before_their_base(tmp_path, robot):
     (tmp_path / "torso.urdf").write_text(torso_with_arms())
     lines = ["arms:"]
-    for side in ("left", "right"):
-        lines.append(f"  {side}: {{robot: torso.urdf, tip: {side}_2, sessions: [{side}.csv]}}")
+    for side, file in (("left", "torso.urdf"), ("right", robot)):
+        lines.append(f"  {side}: {{robot: {file}, tip: {side}_2, sessions: [{side}.csv]}}")
     (tmp_path / "cell.yaml").write_text("\n".join(lines))
     with refused(PlanningError, value="waist", column="arms.right", line=3):
         arms_of_cell(tmp_path)

@@ -85,7 +85,8 @@ def _check_joints(path: Path, first: Arm, second: Arm, document: ArmsDocument) -
     assert isinstance(first.robot, Robot)
     assert isinstance(second.robot, Robot)
     shared = {joint.name for joint in first.robot.joints} & {joint.name for joint in second.robot.joints}
-    if one.robot == other.robot and one.tip != other.tip and shared:
+    same_file = os.path.normpath(one.robot) == os.path.normpath(other.robot)
+    if same_file and one.tip != other.tip and shared:
         raise PlanningError(
             f"arms '{first.name}' and '{second.name}' share joint '{sorted(shared)[0]}', which would be calibrated "
             "twice",
