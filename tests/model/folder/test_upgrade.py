@@ -38,6 +38,7 @@ OLD_REMARKS = {
     "no effect": "without effect on what was measured",
     "outliers": "too few rows that count show it, the others are outliers",
     "in a sum": "theta_2 + theta_3 is identified, the single values are not",
+    "in a sum; prior": "theta_2 + theta_3 is identified, the single values are not; the data hardly determine it",
 }
 """Remarks of the earlier version on parameters, which had no labels, by their label."""
 
