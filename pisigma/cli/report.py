@@ -35,6 +35,12 @@ def report(
     figures: Annotated[
         Path | None, typer.Option(help="Folder for the figures as PNG, SVG and CSV files.")
     ] = None,
+    images: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="Images or videos of the corners in DATA, over which the nominal and the calibrated arm are drawn."
+        ),
+    ] = None,
     cameras: CameraFiles | None = None,
     as_json: AsJson = False,
 ) -> None:
@@ -53,9 +59,11 @@ def report(
         out = Path("report.html") if cell is None else output_in_cell(cell, REPORTS, ".html")
     if cameras is None and cell is not None:
         cameras = cell.cameras
-    workflow.check_report_outputs(out, figures, inputs=(model, data, *(cameras.files if cameras else ())))
+    workflow.check_report_outputs(
+        out, figures, inputs=(model, data, *(images or ()), *(cameras.files if cameras else ()))
+    )
     with progress_of("report") as progress:
-        result = workflow.report(model, data, progress, cameras, _acceptance(cell))
+        result = workflow.report(model, data, progress, cameras, _acceptance(cell), images or ())
         written = result.save(out, figures)
     if as_json:
         print_json({"report": str(out), "figures": [str(path) for path in written]} | result.to_json())

@@ -3,11 +3,12 @@
 import os
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from pisigma.files.conflicts import Input
+from pisigma.files.errors import MeasurementError
 from pisigma.files.output_file import check_output, write_atomically
 from pisigma.files.progress import Progress
 from pisigma.lifetime.cell.acceptance import Acceptance
@@ -23,6 +24,7 @@ from pisigma.reporting.page.page import render_page
 from pisigma.validation.checks.wrong_rows import without_wrong_rows
 from pisigma.validation.gate import check_rows
 from pisigma.validation.held_out.diagnostic import Diagnostic
+from pisigma.validation.report.arm_in_images import ArmInImages, arm_in_images
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,6 +102,7 @@ def report(
     progress: Progress = lambda what: None,
     cameras: CameraFiles | None = None,
     acceptance: Acceptance | None = None,
+    images: Sequence[str | os.PathLike[str]] = (),
 ) -> Report:
     """Report on a calibration: accuracy, place and cause of the largest errors, and what to measure next.
 
@@ -110,6 +113,8 @@ def report(
         progress: called with the current step.
         cameras: cameras and boards, for files of detected board corners.
         acceptance: statements of a cell that the report contains, see `pisigma.workflow.cell.acceptance`.
+        images: image files, folders of them, or videos, from which the corners in `data` were detected; the nominal
+            and the calibrated arm are drawn over them.
 
     Raises:
         ModelError: the folder cannot be used.
@@ -123,10 +128,38 @@ def report(
     if data is not None:
         rows, remarks = _filtered_rows(loaded, read_rows(data, loaded.robot, cameras))
         diagnostics = check_rows(rows, loaded).implausible
-    content = report_content(loaded, Path(model), rows, remarks, diagnostics)
+    arm = _arm_in_images(loaded, rows, cameras, images) if images else None
+    content = report_content(loaded, Path(model), rows, remarks, diagnostics, arm)
     progress("drawing")
     figures = draw_figures(content)
+    if arm is not None:
+        from pisigma.reporting.page.arm_pictures import arm_pictures  # imports OpenCV
+
+        figures = replace(figures, images=arm_pictures(arm))
     return Report(content, figures, diagnostics, time.perf_counter() - started, acceptance)
+
+
+def _arm_in_images(
+    model: CalibratedModel,
+    rows: Measurements | None,
+    cameras: CameraFiles | None,
+    images: Sequence[str | os.PathLike[str]],
+) -> ArmInImages:
+    """Return the nominal and the calibrated arm in images.
+
+    Raises:
+        MeasurementError: there is no file of corners, or the images are not those of this file.
+    """
+    if rows is None or cameras is None:
+        raise MeasurementError(
+            expected="the file of corners of the images, with their cameras and boards",
+            value="images only",
+            option="--images",
+            remedy="give the file of `pisigma detect`, --camera and --board",
+        )
+    from pisigma.measurement.camera.detection.detector import image_files  # imports OpenCV
+
+    return arm_in_images(model, rows, cameras, image_files(images))
 
 
 def _filtered_rows(model: CalibratedModel, rows: Measurements) -> tuple[Measurements, tuple[str, ...]]:

@@ -31,6 +31,7 @@ from pisigma.validation.report.accuracy import (
     judged_joints,
     limit_of,
 )
+from pisigma.validation.report.arm_in_images import ArmInImages
 from pisigma.validation.report.corrections import (
     CorrectionCurve,
     ParameterCorrelations,
@@ -164,6 +165,7 @@ class ReportContent:
         missing: sentences on figures that the report cannot state, with the reasons.
         missing_parameters: sentences on figures of parameters that the folder does not store.
         correlation_png: figure in the folder, if the folder does not store the correlations as numbers.
+        images: the nominal and the calibrated arm in images; None without images.
     """
 
     model: CalibratedModel
@@ -187,6 +189,7 @@ class ReportContent:
     missing: tuple[str, ...]
     missing_parameters: tuple[str, ...]
     correlation_png: bytes = b""
+    images: ArmInImages | None = None
 
     def to_json(self) -> dict[str, Any]:
         """Return figures and sentences as plain values, without single rows; NaN and infinity become None."""
@@ -226,6 +229,8 @@ class ReportContent:
             "limitations": list(self.missing),
             "provenance": dict(self.provenance),
         }
+        if self.images is not None:
+            values["images"] = self.images.to_json()
         plain: dict[str, Any] = _finite(values)
         return plain
 
@@ -236,6 +241,7 @@ def report_content(
     measurements: Measurements | None = None,
     remarks: tuple[str, ...] = (),
     diagnostics: tuple[Diagnostic, ...] = (),
+    images: ArmInImages | None = None,
 ) -> ReportContent:
     """Collect the findings of a report and write the sentences about them.
 
@@ -245,6 +251,7 @@ def report_content(
         measurements: rows with which to evaluate the model, or None for the held-out rows that the folder stores.
         remarks: sentences about these rows.
         diagnostics: reasons why these rows are implausible.
+        images: the arm in images.
 
     Raises:
         MeasurementError: the model cannot be evaluated with the rows.
@@ -282,6 +289,7 @@ def report_content(
         missing=say("missing", rows, model),
         missing_parameters=_missing_parameters(model, summary, correlations),
         correlation_png=_correlation_png(folder),
+        images=images,
     )
 
 

@@ -108,6 +108,7 @@ class ReportFigures:
         correlations: correlations of lengths and of angles.
         corrections: corrections of the joints.
         learning_curve: learning curve; empty if there is none.
+        images: images with the nominal and the calibrated arm; see `arm_pictures`.
     """
 
     map: Drawing
@@ -115,11 +116,13 @@ class ReportFigures:
     correlations: tuple[Drawing, ...]
     corrections: tuple[Drawing, ...]
     learning_curve: tuple[Drawing, ...]
+    images: tuple[Drawing, ...] = ()
 
     @property
     def all(self) -> tuple[Drawing, ...]:
         """All drawings."""
-        return (self.map, *self.dependences, *self.correlations, *self.corrections, *self.learning_curve)
+        charts = (*self.dependences, *self.correlations, *self.corrections, *self.learning_curve)
+        return (self.map, *charts, *self.images)
 
 
 @contextmanager

@@ -1,8 +1,10 @@
 """Page of board images with detected corners, self-contained."""
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from PIL import Image
 
@@ -58,6 +60,23 @@ def arrow_scale(detection: DetectedBoards) -> float:
     return float(power * max(step for step in (1, 2, 5) if step * power <= largest))
 
 
+def draw_photo(file: Path, size: tuple[int, int]) -> tuple[Figure, Axes]:
+    """Return a figure of an image with axes in its pixels.
+
+    Args:
+        file: file of the image.
+        size: its width and height [px].
+    """
+    width, height = size
+    figure = Figure(figsize=(_WIDTH, _WIDTH * height / width))
+    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+    extent = (-0.5, width - 0.5, height - 0.5, -0.5)
+    axes.imshow(_thumbnail(file), cmap="gray", vmin=0, vmax=255, extent=extent, interpolation="antialiased")
+    axes.set_axis_off()
+    axes.set(xlim=extent[:2], ylim=extent[2:])
+    return figure, axes
+
+
 def draw_image(one: BoardImage, detection: DetectedBoards, scale: float) -> Drawing:
     """Return an image with magnified arrows from predicted to detected corners.
 
@@ -66,15 +85,8 @@ def draw_image(one: BoardImage, detection: DetectedBoards, scale: float) -> Draw
         detection: detected boards, with the residuals of corners if the image was used.
         scale: magnification of the arrows.
     """
-    width, height = one.size
     with drawing_style():
-        figure = Figure(figsize=(_WIDTH, _WIDTH * height / width))
-        axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
-        extent = (-0.5, width - 0.5, height - 0.5, -0.5)
-        axes.imshow(
-            _thumbnail(one), cmap="gray", vmin=0, vmax=255, extent=extent, interpolation="antialiased"
-        )
-        axes.set_axis_off()
+        figure, axes = draw_photo(Path(one.file), one.size)
         residual = detection.residuals.get(one.name)
         if residual is None:
             return Drawing(one.name, one.name, f"Left out: {detection.left_out[one.name]}.", figure)
@@ -82,7 +94,6 @@ def draw_image(one: BoardImage, detection: DetectedBoards, scale: float) -> Draw
         axes.scatter(u, v, s=9, color=AFTER, linewidths=0)
         tips = residual * scale
         axes.quiver(u, v, *tips.T, color=BEFORE, angles="xy", scale_units="xy", scale=1.0, width=0.006)
-        axes.set(xlim=extent[:2], ylim=extent[2:])
     largest = float(np.linalg.norm(residual, axis=1).max())
     alt = (
         f"{len(residual)} corners, RMS {rms_of(residual):.3f} px, largest residual {largest:.3f} px, blur "
@@ -91,8 +102,8 @@ def draw_image(one: BoardImage, detection: DetectedBoards, scale: float) -> Draw
     return Drawing(one.name, one.name, alt, figure)
 
 
-def _thumbnail(one: BoardImage) -> np.ndarray:
+def _thumbnail(file: Path) -> np.ndarray:
     """Return a copy of an image with few pixels and gray levels."""
-    full = Image.fromarray(read_image(one.file))
+    full = Image.fromarray(read_image(file))
     full.thumbnail((_MAX_PIXELS, _MAX_PIXELS), Image.Resampling.BOX)
     return np.asarray(full) // _GRAY_STEP * _GRAY_STEP + _GRAY_STEP // 2

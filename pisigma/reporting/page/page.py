@@ -24,10 +24,12 @@ from pisigma.reporting.page.wording import (
     LAYER_LABELS,
     MODEL_LABELS,
     TITLES,
+    arm_sentence,
     layer_text,
     map_text,
     names_text,
     rows_text,
+    zeros_table,
 )
 from pisigma.reporting.rendering import render
 from pisigma.robot.description import Robot
@@ -52,6 +54,8 @@ def render_page(content: ReportContent, figures: ReportFigures, acceptance: Acce
         c=content,
         a=acceptance,
         accepted={} if acceptance is None else _acceptance(acceptance),
+        arm_sentence=None if content.images is None else arm_sentence(content.images),
+        zeros=None if content.images is None else zeros_table(content.images),
         figures=figures,
         labels=MODEL_LABELS,
         titles=TITLES,

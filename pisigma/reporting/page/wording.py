@@ -4,7 +4,9 @@ import functools
 
 from pisigma.reporting.calibration_tables import cross_validation_text
 from pisigma.reporting.rendering import sentences
+from pisigma.reporting.result_text import Table
 from pisigma.validation.report.accuracy import Accuracy, RowOrigin
+from pisigma.validation.report.arm_in_images import ArmInImages
 from pisigma.validation.report.corrections import CorrectionCurve
 from pisigma.validation.report.dependence import Dependence, ErrorsByName
 from pisigma.validation.report.error_map import ErrorMap, Layer, Quantity
@@ -73,3 +75,25 @@ def layer_text(layer: Layer, error_map: ErrorMap) -> str:
 def curve_text(curve: CorrectionCurve) -> str:
     """Return a text on the size of the correction of a joint and its measured range."""
     return say("curve", curve)[0]
+
+
+def zeros_table(arm: ArmInImages) -> Table:
+    """Return a table of the zeros of the joints."""
+    rows = [
+        (one.joint, "", "", "not found: base and tool have the same effect")
+        if one.standard_error is None
+        else (one.joint, f"{one.error:+.2f}", f"{one.standard_error:.2f}", "found")
+        for one in arm.zeros
+    ]
+    return Table(("joint", "error of the zero [deg]", "std. error [deg]", "remark"), tuple(rows))
+
+
+def arm_sentence(arm: ArmInImages) -> str:
+    """Return a sentence on the errors of both arms in the images."""
+    before, after = arm.nominal_rms * 1e3, arm.calibrated_rms * 1e3
+    times = f"{before / after:.1f} times smaller: it is halved {arm.halvings:.1f} times"
+    change = times if after < before else "not smaller"
+    return (
+        f"In {len(arm.images)} images, the board is {before:.3g} mm RMS from where the nominal arm says (base and tool "
+        f"fitted), and {after:.3g} mm from where the calibrated arm says; the error is {change}."
+    )

@@ -1,0 +1,80 @@
+"""A report draws the nominal and the calibrated arm over its images, and states zeros and errors."""
+
+import math
+
+import numpy as np
+import pytest
+from PIL import Image
+from testing.closeness import assert_close
+from testing.phone_arm import BOARD, PHONE, phone_rows
+
+import pisigma
+from pisigma.files.errors import MeasurementError
+from pisigma.measurement.camera.camera_files import CameraFiles
+from pisigma.validation.report.arm_in_images import arm_in_images
+from pisigma.workflow.report import report
+
+IDENTIFIABLE = slice(1, 4)
+
+
+@pytest.fixture(scope="module")
+def arm(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("phone")
+    rows, true, _ = phone_rows(0, 40)
+    calibration = pisigma.calibrate("so101", rows, pisigma.CalibrationSettings(model="geometric", folds=0))
+    calibration.save(folder / "model")
+    (folder / "phone.yaml").write_text(PHONE.to_yaml())
+    (folder / "board.yaml").write_text(
+        "kind: charuco\nrows: 4\ncolumns: 6\nsquare_mm: 18\nmarker_mm: 13\ndictionary: 4x4_50\n"
+    )
+    (folder / "images").mkdir()
+    for name in rows.image[:8]:
+        Image.new("L", (PHONE.width, PHONE.height), 128).save(folder / "images" / f"{name}.png")
+    cameras = CameraFiles((str(folder / "phone.yaml"),), (str(folder / "board.yaml"),), is_fixed=True)
+    return calibration.model, rows, true, cameras, folder
+
+
+def test_predictions_are_those_of_both_arms(arm):
+    model, rows, _, cameras, folder = arm
+    files = tuple(sorted((folder / "images").iterdir()))
+    found = arm_in_images(model, rows, cameras, files)
+    assert {one.name for one in found.images} == {file.stem for file in files}
+    assert found.nominal_rms > 2 * found.calibrated_rms
+    assert found.halvings == pytest.approx(math.log2(found.nominal_rms / found.calibrated_rms))
+    for one in found.images:
+        assert one.measured.shape == (len(BOARD.corners), 2)
+        # corner 0 is the origin of the tool, at which the links end
+        for predicted in (one.nominal, one.calibrated):
+            assert_close(predicted.links[-1], predicted.corners[0], atol=1e-6)
+        off = [
+            np.linalg.norm(those.corners - one.measured, axis=1) for those in (one.nominal, one.calibrated)
+        ]
+        assert off[1].max() < 40
+
+
+def test_page_states_zeros_and_errors(arm):
+    model, rows, true, cameras, folder = arm
+    result = report(folder / "model", rows, cameras=cameras, images=[folder / "images"])
+    values = result.to_json()["images"]
+    zeros = [one for one in values["zeros"] if one["standard_error_deg"] is not None]
+    real = np.rad2deg(true.dh - model.robot.dh)[IDENTIFIABLE, 0]
+    assert_close([one["error_deg"] for one in zeros], real, atol=0.4)
+    page = folder / "report.html"
+    result.save(page)
+    text = page.read_text()
+    for one in zeros:
+        assert f"{one['error_deg']:+.2f}" in text
+    assert f"{values['calibrated_rms_mm']:.3g} mm" in text
+    assert text.count('class="photo"') == 6
+
+
+def test_images_need_their_corners(arm):
+    _, rows, _, cameras, folder = arm
+    with pytest.raises(MeasurementError) as error:
+        report(folder / "model", cameras=cameras, images=[folder / "images"])
+    assert error.value.option == "--images"
+    (folder / "other").mkdir()
+    Image.new("L", (64, 48)).save(folder / "other" / "other.png")
+    with pytest.raises(MeasurementError) as error:
+        report(folder / "model", rows, cameras=cameras, images=[folder / "other"])
+    assert error.value.column == "image"
