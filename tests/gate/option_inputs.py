@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from PIL import Image
 from testing.board_images import CAMERA as SMALL_CAMERA
 from testing.board_images import cv2, draw_board, view
 from testing.camera_cell import BOARD, CAMERA, camera_cell, corner_lines
@@ -162,9 +163,10 @@ def _corners(folder: Path) -> None:
         ("fixed", 40, True),
         ("fixed_new", 12, True),
     ):
-        (folder / f"{name}.csv").write_text(
-            "\n".join(corner_lines(camera_cell(count, 1, is_fixed=fixed).images)) + "\n"
-        )
+        images = camera_cell(count, 1, is_fixed=fixed).images
+        (folder / f"{name}.csv").write_text("\n".join(corner_lines(images)) + "\n")
+    (folder / "photos").mkdir()
+    Image.new("L", (CAMERA.width, CAMERA.height), 128).save(folder / "photos" / f"{images.names[0]}.png")
     names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "width", "height", "name")
     (folder / "camera.yaml").write_text("".join(f"{name}: {getattr(CAMERA, name)}\n" for name in names))
     (folder / "board.yaml").write_text(f"rows: 6\ncolumns: 9\nsquare_mm: {BOARD.square * 1e3}\n")

@@ -213,7 +213,10 @@ def limit_of(
     source: Literal["repeats", "hybrid"] = "hybrid" if scatter is None else "repeats"
     error = accuracy.figure("rms") if accuracy is not None and accuracy.unit == "mm" else 0.0
     sensors = () if summary is None else summary.noise
-    sigma = next((one.sigma_mm for one in sensors if one.sigma_mm is not None), None)
+    # the noise of a corner is not the scatter of a position
+    sigma = next(
+        (one.sigma_mm for one in sensors if one.sigma_mm is not None and one.sensor != "corner"), None
+    )
     if noise is None or not error > 0:
         return AccuracyLimit(error=error, residual_sigma=sigma)
     return AccuracyLimit(noise, source, error, sigma)
