@@ -14,6 +14,8 @@ from pisigma.reporting.verdict import Verdict, rounded
 from pisigma.workflow.settings.images import DetectionSettings
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from pisigma.workflow.images.detect import DetectedCorners
 
 Images = Annotated[
@@ -26,6 +28,10 @@ Out = Annotated[Path | None, typer.Option(help="Corner file to write (.csv).")]
 Print = Annotated[
     Path | None,
     typer.Option("--print", help="Only write a page for printing the board at true size (.pdf)."),
+]
+RobotOfBoard = Annotated[
+    str | None,
+    typer.Option("--robot", help="Robot for which --print states how large the squares have to be."),
 ]
 Joints = Annotated[
     Path | None,
@@ -45,6 +51,7 @@ def detect(
     joints: Joints = None,
     page: Page = None,
     sheet: Print = None,
+    robot: RobotOfBoard = None,
     verbose: Verbose = False,
     as_json: AsJson = False,
 ) -> None:
@@ -53,7 +60,7 @@ def detect(
     Excludes blurred images and images without a complete board, and prints their names.
     """
     if sheet is not None:
-        _print_board(board, sheet, as_json)
+        _print_board(board, sheet, robot, camera, as_json)
         return
     if not images or camera is None or out is None:
         raise typer.BadParameter("expected IMAGES, --camera and --out, or --print to draw the board")
@@ -78,21 +85,51 @@ def _verdict(detected: "DetectedCorners", out: Path, camera: Path, board: Path) 
     )
 
 
-def _print_board(board: Path, sheet: Path, as_json: bool) -> None:
-    """Write a board as a PDF."""
+_HEIGHT_PX = 1080
+"""Height of the images of a camera that is not stated [px], as in the usual videos of phones."""
+
+
+def _print_board(board: Path, sheet: Path, robot: str | None, camera: Path | None, as_json: bool) -> None:
+    """Write a board as a PDF, and state how large its squares have to be for a robot and a fixed camera."""
     from pisigma.files.output_file import check_output, write_atomically
     from pisigma.measurement.camera.board import Board
+    from pisigma.measurement.camera.board_size import smallest_square
+    from pisigma.measurement.camera.camera import Camera
     from pisigma.reporting.board_sheet import board_pdf
+    from pisigma.robot import Robot
 
     check_output(sheet, (".pdf",), "a board to print", [board])
-    paper, content = board_pdf(Board.load(board))
+    printed = Board.load(board)
+    paper, content = board_pdf(printed)
+    size: dict[str, float] = {}
+    if robot is not None:
+        arm, seen = Robot.load(robot), None if camera is None else Camera.load(camera)
+        height = _HEIGHT_PX if seen is None else min(seen.width, seen.height)
+        size = {
+            "image_height_px": height,
+            "smallest_square_mm": smallest_square(arm, height) * 1e3,
+            "square_mm": printed.square * 1e3,
+        }
     write_atomically(sheet, content)
     if as_json:
-        print_json({"file": str(sheet), "paper": paper})
+        print_json({"file": str(sheet), "paper": paper, **size})
     else:
         print_lines(
             [
                 f"Board written to {sheet}; print it on {paper} at 100 %, measure the line below the board, and "
-                f"state its length in {board} (ruler_mm) if it is not 100 mm."
+                f"state its length in {board} (ruler_mm) if it is not 100 mm.",
+                *([_size_text(robot, size)] if robot is not None else []),
             ]
         )
+
+
+def _size_text(robot: str, size: "Mapping[str, float]") -> str:
+    """Return a sentence on the size of the squares."""
+    least, square = size["smallest_square_mm"], size["square_mm"]
+    advice = (
+        "" if square >= least else "; print a larger board, move the camera closer, or record more pixels"
+    )
+    return (
+        f"A fixed camera whose image of {size['image_height_px']:g} px covers the workspace of {robot} sees squares of "
+        f"{least:.0f} mm or more well; those of this board are {square:.0f} mm wide{advice}."
+    )

@@ -13,6 +13,7 @@ from testing.screens import assert_screen
 
 from pisigma.files.errors import MeasurementError, OutputError
 from pisigma.measurement.camera.board import Board
+from pisigma.robot import Robot
 
 BOARD = Board("board", 4, 5, 0.03)
 VIEWS = [view(BOARD, 0.33, (roll, 0.4, -0.3)) for roll in (0.0, 2.0, 0.1, 5.0)]
@@ -115,6 +116,23 @@ def test_a_board_is_drawn_to_be_printed(run, refuses, files, tmp_path):
     assert (tmp_path / "board.pdf").read_bytes().startswith(b"%PDF")
     refuses(*command, tmp_path / "board.png", error=OutputError, file="board.png", value=".png")
     assert run(*command[:-1]).exit_code == 2
+
+
+def test_the_size_of_squares_is_stated_for_a_robot(run, files, tmp_path):
+    command = (
+        "detect",
+        "--board",
+        files / "board.yaml",
+        "--print",
+        tmp_path / "board.pdf",
+        "--robot",
+        "so101",
+    )
+    values = json.loads(run(*command, "--json").stdout)
+    # the reach on both sides of the base covers the image, and a square is 25 px wide
+    pixels_per_mm = values["image_height_px"] / (2e3 * Robot.load("so101").reach)
+    assert values["smallest_square_mm"] * pixels_per_mm == pytest.approx(25)
+    assert "smallest_square_mm" not in json.loads(run(*command[:-2], "--json").stdout)
 
 
 def test_a_page_shows_every_image(run, files, tmp_path):
