@@ -37,7 +37,7 @@ def test_the_table_fits_the_robot(result: CalibrationResult) -> None:
         )
         assert_close(parameter.change, float(turn), atol=1e-15)
         assert parameter.free == (parameter.name in result.free)
-    assert table["d_2"].remark == "d_2 + d_3 + d_4 is identified, the single values are not"
+    assert table["d_2"].remark == "d_2 + d_3 + d_4 is identified; the individual values are not"
     assert table["a_2"].remark == "identified"
     assert result.parameter("a_2") is table["a_2"]
 

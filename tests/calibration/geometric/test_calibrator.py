@@ -216,7 +216,7 @@ def test_undetermined_parameters_remain_nominal_and_are_reported() -> None:
     assert "prior" in result.parameter("alpha_5").label
     assert (
         result.redundancy.dependency_sentence_of("d_2")
-        == "d_2 + d_3 + d_4 is identified, the single values are not"
+        == "d_2 + d_3 + d_4 is identified; the individual values are not"
     )
 
 

@@ -216,7 +216,7 @@ def _dependencies(
 
 
 def dependency_sentence(members: list[Parameter], coefficients: list[float]) -> str:
-    """Return a sentence such as "d_2 + d_3 + d_4 is identified, the single values are not"."""
+    """Return a sentence such as "d_2 + d_3 + d_4 is identified; the individual values are not"."""
     terms = sorted(zip(members, coefficients, strict=True), key=lambda term: (term[1] < 0, term[0].name))
     text = ""
     for member, coefficient in terms:

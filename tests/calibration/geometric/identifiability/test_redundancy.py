@@ -141,11 +141,12 @@ def test_dependencies_are_described_and_preferred_parameters_kept() -> None:
     seen, sizes = condensed(Robot.load("rb5"), 0, rows=40, poses=False, arm_only=True)
     redundancy = find_redundancy(seen, sizes)
     assert (
-        redundancy.dependency_sentence_of("d_3") == "d_2 + d_3 + d_4 is identified, the single values are not"
+        redundancy.dependency_sentence_of("d_3")
+        == "d_2 + d_3 + d_4 is identified; the individual values are not"
     )
     assert (
         redundancy.dependency_sentence_of("beta_4")
-        == "theta_4 - beta_4 is identified, the single values are not"
+        == "theta_4 - beta_4 is identified; the individual values are not"
     )
     assert redundancy.dependency_sentence_of("a_2") is None
     assert {"theta_1", "theta_4", "d_4", "a_6"} <= set(redundancy.kept)
