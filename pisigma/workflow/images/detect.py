@@ -13,7 +13,7 @@ from pisigma.measurement.camera.board import Board
 from pisigma.measurement.camera.camera import Camera
 from pisigma.measurement.camera.detection.detected_boards import DetectedBoards, predict_boards
 from pisigma.measurement.camera.detection.detector import detect_boards, image_files
-from pisigma.measurement.camera.detection.video import is_frame
+from pisigma.measurement.camera.detection.video import is_frame, is_video
 from pisigma.measurement.foreign.image_joints import JoinedJoints, join_joint_values, names_images
 from pisigma.reporting.result_text import Table
 from pisigma.workflow.settings.images import DetectionSettings
@@ -114,10 +114,20 @@ def detect(
         progress: called with the name of every image.
 
     Raises:
-        MeasurementError: a file cannot be used, the board is symmetric, or no image shows it.
+        MeasurementError: a file cannot be used, the board is symmetric, no image shows it, or joint values with time
+            stamps are joined to a video whose start is not stated.
     """
-    of_board, of_camera = Board.load(board), Camera.load(camera)
     timed = joints is not None and not names_images(joints)
+    videos = [path for path in map(Path, images) if is_video(path)]
+    if timed and videos and settings.video_start is None:
+        raise MeasurementError(
+            "the joint values have time stamps, which a video cannot be compared with",
+            expected="the time at which the video starts, in the clock of the joint values",
+            value="none",
+            at=Place(videos[0]),
+            remedy="state it in seconds with --set video_start=S (0 if both start together)",
+        )
+    of_board, of_camera = Board.load(board), Camera.load(camera)
     files = image_files(images, settings.video_start if timed else None)
     if of_board.is_symmetric:
         raise MeasurementError(

@@ -15,6 +15,7 @@ cv2 = pytest.importorskip("cv2", reason="opencv-python-headless is not installed
 
 from pisigma.measurement.camera.detection.detector import image_files, read_image  # noqa: E402
 from pisigma.measurement.camera.detection.video import still_frames  # noqa: E402
+from pisigma.workflow.images.detect import detect  # noqa: E402
 
 RATE, STOP, MOVE, STOPS = 20, 14, 8, 3
 SHARP = 9
@@ -66,6 +67,13 @@ def test_frames_of_several_videos_are_not_named_by_one_start(video, tmp_path):
     second.write_bytes(video.read_bytes())
     with refused(MeasurementError, file=str(second), value=2):
         image_files([video, second], 100.0)
+
+
+def test_times_are_joined_only_to_a_video_with_a_start(video, tmp_path):
+    joints = tmp_path / "joints.csv"
+    joints.write_text("time,q1_deg\n0,0\n1,1\n2,2\n")
+    with refused(MeasurementError, file=str(video), value="none"):
+        detect([video], tmp_path / "board.yaml", tmp_path / "camera.yaml", joints)
 
 
 def test_stops_are_paired_only_if_every_row_is_one(video, tmp_path):
