@@ -170,7 +170,8 @@ def compare_paired_arms(
         one of 1,000 comparisons.
 
     Raises:
-        MeasurementError: the arrays do not have one value per joint and row, or there are fewer than 10 rows.
+        MeasurementError: the arrays do not have one value per joint and row, there are fewer than 10 rows, or both
+            arrays are the same.
     """
     if leader.shape != follower.shape or leader.ndim != 2 or leader.shape[1] != len(names):
         raise MeasurementError(
@@ -180,6 +181,13 @@ def compare_paired_arms(
         )
     _check_rows(leader, "leader")
     _check_rows(follower, "follower")
+    if np.array_equal(leader, follower):
+        raise MeasurementError(
+            "the joint values of both arms are identical in every row, so they are not measured independently",
+            expected="joint values that each arm measured",
+            value="the same values twice",
+            option="leader, follower",
+        )
     difference = follower - leader
     center = np.angle(np.exp(1j * difference).mean(0))
     difference = center + wrap_to_pi(torch.from_numpy(difference - center)).numpy()

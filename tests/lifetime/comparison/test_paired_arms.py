@@ -97,6 +97,9 @@ def test_rows_that_do_not_fit_are_refused():
         compare_paired_arms(rows, rows[:, :4], NAMES)
     with refused(MeasurementError, option="leader"):
         compare_paired_arms(rows[:9], rows[:9], NAMES)
+    same = np.random.default_rng(0).uniform(-1, 1, (20, 2))
+    with refused(MeasurementError, option="leader, follower"):
+        compare_paired_arms(same, same.copy(), ("q1", "q2"))
 
 
 def test_positions_that_the_arm_cannot_have_are_refused():
