@@ -1,5 +1,6 @@
 """Run the methods on the folds of a series, one process per fit, and compare predictions with the held-out rows."""
 
+import ast
 import hashlib
 import json
 import math
@@ -44,14 +45,33 @@ Fit = dict[str, Any]
 
 
 def code_hash(method: Method, series: Series) -> str:
-    """Return the SHA-256 of the nominal arm and of the files that determine what a method predicts."""
+    """Return the SHA-256 of the nominal arm and of the code that determines what a method predicts."""
     files = {PACKAGE / "rows.py", *_with_imports(PACKAGE / "methods" / f"{method.name}.py")}
     if "pisigma" in method.packages:
         files |= {path for room in ROOMS for path in (REPOSITORY / "pisigma" / room).rglob("*.py")}
     digest = hashlib.sha256(np.round(series.arm.dh, 9).tobytes())
     for path in sorted(files):
-        digest.update(path.relative_to(REPOSITORY).as_posix().encode() + b"\0" + path.read_bytes())
+        digest.update(path.relative_to(REPOSITORY).as_posix().encode() + b"\0")
+        digest.update(_code(path.read_text(encoding="utf-8")).encode())
     return digest.hexdigest()
+
+
+def _code(source: str) -> str:
+    """Return the code of a module, which does not contain its comments and docstrings."""
+    tree = ast.parse(source)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+            node.body = [one for one in node.body if not _is_text(one)]
+    return ast.unparse(tree)
+
+
+def _is_text(node: ast.stmt) -> bool:
+    """Return whether a statement is a docstring, or the description of a constant or a field."""
+    return (
+        isinstance(node, ast.Expr)
+        and isinstance(node.value, ast.Constant)
+        and isinstance(node.value.value, str)
+    )
 
 
 def _with_imports(path: Path) -> set[Path]:
