@@ -87,11 +87,11 @@ def against_bound(
         rng = np.random.default_rng(seed)
         noise, direction = rng.normal(0, NOISE, (rows, 3)), rng.normal(size=3)
         found = fit(noise)
-        wrongly += len(found.wrong)
+        wrongly += len(found.wrong_rows)
         errors.append(found.estimates - true)
         stated.append(found.covariance.diagonal())
         noise[seed % rows] += OFF * direction / np.linalg.norm(direction)
-        named += fit(noise).wrong == (seed % rows,)
+        named += fit(noise).wrong_rows == (seed % rows,)
     ratio = np.sqrt((np.square(errors).mean(0) / bound).mean())
     printed = np.sqrt((np.mean(stated, 0) / bound).mean())
     print(
