@@ -2,7 +2,7 @@
 
 Run `OMP_NUM_THREADS=2 python benchmarks/beyond_measured.py` with the measured files in `PISIGMA_DATA`. Every line is
 the root mean square of the position errors of series B [mm] for a hybrid fitted to series C, with base and tool fitted
-to series B. The prior sizes are estimated from series C, or from both series together, or replaced by the amplitude of
+to series B. The prior scales are estimated from series C, or from both series together, or replaced by the amplitude of
 every harmonic of every joint in both series, so that only the phases are unknown. The last error is a lower bound for
 every rule that estimates sizes from series C.
 """
@@ -54,7 +54,7 @@ def together(first: Measurements, second: Measurements) -> Measurements:
 def fitted(
     solved: SolvedCalibration, features: tuple[AbstractFeature, ...], prior: GaussianPrior | None = None
 ) -> RefinedFit:
-    """Return the hybrid with the given features, with estimated or given prior sizes."""
+    """Return the hybrid with the given features, with estimated or given prior scales."""
     problem, group = solved.problem, held_out_groups(solved.setup.measurements)
     view, design = sensor_view_of(solved.solution.linearisation), Design(problem, features)
     x = torch.zeros(design.unknowns, dtype=torch.float64)
@@ -123,10 +123,10 @@ def main() -> None:
         features += (InputProducts(robot),)
     solved, solved_both = (GeometricCalibrator(robot).solve(rows) for rows in (c, together(c, b)))
     own, both = fitted(solved, features), fitted(solved_both, features)
-    print(f"prior sizes from series C                  {error(solved, own, b):.3f}", flush=True)
+    print(f"prior scales from series C                  {error(solved, own, b):.3f}", flush=True)
     known = replace(own.posterior.prior, sizes=both.posterior.prior.sizes)
     at_best = fitted(solved, features, known)
-    print(f"prior sizes from both series               {error(solved, at_best, b):.3f}", flush=True)
+    print(f"prior scales from both series               {error(solved, at_best, b):.3f}", flush=True)
     at_best = fitted(solved, features, amplitudes(both, known))
     print(f"amplitude of every harmonic from both      {error(solved, at_best, b):.3f}")
 

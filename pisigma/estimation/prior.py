@@ -7,9 +7,9 @@ from jaxtyping import Float64, Int64
 from torch import Tensor
 
 SMALLEST_SIZE = 1e-9
-"""Prior size [rad] below which a group of weights is excluded."""
+"""Prior scale [rad] below which a group of weights is excluded."""
 FIRST_SIZE = 2e-5
-"""Initial prior size of weights [rad]."""
+"""Initial prior standard deviation of weights [rad]."""
 _RELAXATION = 1.5
 """Over-relaxation of MacKay's rule, in logarithms; above about 1.8 it overshoots."""
 

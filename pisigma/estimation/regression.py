@@ -1,4 +1,4 @@
-"""Bayesian linear regression: posterior, and prior sizes and noise by maximum evidence."""
+"""Bayesian linear regression: posterior, and prior scales and noise by maximum evidence."""
 
 import math
 from abc import ABC, abstractmethod
@@ -14,7 +14,7 @@ from pisigma.estimation.prior import GaussianPrior
 SMALLEST_NOISE = 1e-8
 """Lower bound of the estimated noise [m or rad], far below the resolution of instruments."""
 MIN_EFFECTIVE = 0.5
-"""Number of unknowns of a group that the data must determine for its prior size to matter."""
+"""Number of unknowns of a group that the data must determine for its prior scale to matter."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +99,7 @@ class AbstractRegression(ABC):
     def maximise_evidence(
         self, prior: GaussianPrior, noise: tuple[float, ...], iterations: int = 40, tolerance: float = 0.2
     ) -> Posterior:
-        """Estimate prior sizes and noise together with the unknowns.
+        """Estimate prior scales and noise together with the unknowns.
 
         Args:
             prior: prior with initial sizes.
@@ -122,7 +122,7 @@ class AbstractRegression(ABC):
 
 
 def prior_size_columns(posterior: Posterior, root: CovarianceRoot) -> Float64[Tensor, "unknowns groups"]:
-    """Return the columns that the uncertainty of the prior sizes adds to a root of the covariance C of the unknowns.
+    """Return the columns that the uncertainty of the prior scales adds to a root of the covariance C of the unknowns.
 
     With `dx / d log s_g = 2 C Λ_g x` for the unknowns of group g and `var(log s_g) = 1 / (2 n_g)`, where n_g of
     them are determined by the data (first order; Kass and Steffey 1989, J. Amer. Statist. Assoc. 84(407), 717-726).

@@ -59,7 +59,7 @@ FILE = Option(kind=Path, read=str)
 
 
 def as_texts(stated: Iterable[object]) -> tuple[str, ...]:
-    """Return several command-line values as texts."""
+    """Return several command-line values as strings."""
     return tuple(map(str, stated))
 
 

@@ -193,7 +193,7 @@ def read_yaml(path: str | os.PathLike[str], document: type[Document], error: typ
 def parse_yaml(text: str, document: type[Document], error: type[PisigmaError], source: str) -> Document:
     """Read YAML text as a `document`; `source` is its name in errors. See `read_yaml`.
 
-    Types are strict: a text is not accepted as a number, nor a number as a text.
+    Types are strict: a string is not accepted as a number, nor a number as a string.
     """
     node, content = _load(text, error, source)
     if node is None or not isinstance(content, dict):

@@ -25,7 +25,7 @@ class Backlash(AbstractFeature):
     """`Δ_j = b_j · approach_j`: half the backlash of a joint in its direction of approach.
 
     The approach is +1 if the joint value increased before it stopped and -1 if it decreased; it is 0, the middle of
-    the backlash, if it is not stated. The weight b_j of a joint is half its backlash; all joints share a prior size.
+    the backlash, if it is not stated. The weight b_j of a joint is half its backlash; all joints share a prior scale.
 
     Source: Whitney, Lozinski and Rourke, ASME Journal of Dynamic Systems, Measurement, and Control 108(1), 1986, 1-8,
     who list backlash among the errors of joints. Its effect on the pose is the multi-directional pose accuracy

@@ -12,7 +12,7 @@ from pisigma.measurement.conditions import JointState
 from pisigma.robot.description import Robot
 
 _HARMONICS, LOW = 8, 3
-"""Number of harmonics of every axis, and number of low harmonics, which have a separate prior size: guides have
+"""Number of harmonics of every axis, and number of low harmonics, which have a separate prior scale: guides have
 errors in low harmonics, gears also in higher ones."""
 
 

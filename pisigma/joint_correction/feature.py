@@ -16,7 +16,7 @@ from pisigma.robot.description import Robot
 from pisigma.robot.kernels.forms import CompiledForm
 
 USUAL_SIZE = 2e-5
-"""Default prior size of weights [rad]."""
+"""Default prior standard deviation of weights [rad]."""
 Feature = TypeVar("Feature", bound="AbstractFeature")
 
 
@@ -59,8 +59,8 @@ class AbstractFeature(ABC):
         usually_zero: whether the correction is 0 if only joint values are stated, so that kernels and graphs may
             omit the feature.
         used: `(dof, m)`: mask of the columns that a joint uses; weights of other columns must be 0.
-        group: `(dof, m)`: index of the prior size of a column's weight, from 0.
-        group_names: names of the prior sizes.
+        group: `(dof, m)`: index of the prior scale of a column's weight, from 0.
+        group_names: names of the groups of weights that have a common prior scale.
         size: size among features of the same name that are tried in sequence, such as the number of harmonics; 0 if
             there is only one.
         fastest: highest harmonic of a joint value in the columns.

@@ -24,9 +24,9 @@ BAND_STARTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256)
 FINE_BAND_STARTS = (*range(1, 10), 11, 13, 15, 18, 21, 25, 30, 35, 41, 49, 58, 69, 82, 97, 115, 137, 163)
 """First harmonic of every band for many configurations: one harmonic per band up to 8, then about four bands per
 octave. In all 29 subsets of the measured UR5 and UR10 that were tested (random folds, boxes and halves), the log
-evidence is higher than with `BAND_STARTS`, by 12 on average for 11 additional prior sizes. Eight bands per octave raise
-it by another 17 for 18 sizes, which is less than one per size (Akaike 1974, IEEE Transactions on Automatic Control
-19(6))."""
+evidence is higher than with `BAND_STARTS`, by 12 on average for 11 additional prior scales. Eight bands per octave
+raise it by another 17 for 18 scales, which is less than one per scale (Akaike 1974, IEEE Transactions on Automatic
+Control 19(6))."""
 MANY_CONFIGURATIONS = 200
 """Smallest number of configurations with which fine bands are used; fewer do not determine the size of every band."""
 BAND_SIZES = (
@@ -132,7 +132,7 @@ def add_series_slope(arms: Any, correction: Any, first: int, memory: Any, q: Any
 class FourierSeries(AbstractFeature):
     """Columns sin(k q_j) and cos(k q_j) of the value q_j of a joint for k = 1 … K.
 
-    Weights of neighbouring harmonics share a prior size (see `BAND_STARTS`), so that the data determine how the
+    Weights of neighbouring harmonics share a prior scale (see `BAND_STARTS`), so that the data determine how the
     spectrum of the error decreases with k; fine bands (see `FINE_BAND_STARTS`) contain fewer harmonics. Source of the
     model: Judd and Knasinski, IEEE Transactions on Robotics and Automation 6(1), 1990, 20-30.
     """

@@ -57,7 +57,7 @@ class GearLines(AbstractFeature):
 
     The error of a strain wave gear of ratio N has 2N and 4N cycles per turn, and the cogging of a motor with p pole
     pairs has multiples of pN. Between these lines, the spectrum is empty, and a series up to them would have thousands
-    of weights. `hybrid.spectrum` finds the significant orders. All lines of a joint share a prior size.
+    of weights. `hybrid.spectrum` finds the significant orders. All lines of a joint share a prior scale.
 
     Source: Tuttle and Seering, IEEE Transactions on Robotics and Automation 12(3), 1996, 368-374, on the transmission
         errors of strain wave gears.

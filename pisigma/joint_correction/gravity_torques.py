@@ -82,8 +82,8 @@ class GravityTorques(AbstractFeature):
     """Typical distance of centres of mass from the origins of the frames, as a share of the reach."""
     group_names = ("gravity",)
     usual_sizes = (3e-4,)
-    """Prior size of the weights [rad]: 1.8e-4 for simulated arms with a payload, 8.6e-4 for the measured UR10 and
-    1.7e-4 for the UR5."""
+    """Prior standard deviation of the weights [rad]: 1.8e-4 for simulated arms with a payload, 8.6e-4 for the measured
+    UR10 and 1.7e-4 for the UR5."""
 
     def __init__(self, robot: Robot, gravity: Direction = (0.0, 0.0, -1.0)) -> None:
         """Create the feature for a robot and a direction of gravity.

@@ -203,7 +203,7 @@ class Measurements:
         return self.as_fields().place_of(row, column)
 
     def place(self, row: int) -> str:
-        """Return the place of a row as a text; see `place_of`."""
+        """Return the place of a row as text; see `place_of`."""
         return self.as_fields().place_text(row)
 
     def split_sets(self) -> "tuple[Measurements, Measurements | None]":

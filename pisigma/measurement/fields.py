@@ -113,7 +113,7 @@ class MeasuredFields:
         return RowPlace(source, line or None, column, None if line else row, image)
 
     def place_text(self, row: int) -> str:
-        """Return the place of a row as a text; see `place_of`."""
+        """Return the place of a row as text; see `place_of`."""
         return str(self.place_of(row))
 
     def is_measured(self, kind: Kind) -> Bool[Tensor, " rows"]:

@@ -138,7 +138,7 @@ class GrowingFile:
 
 
 def _values(data: MeasuredFields, row: int) -> str:
-    """Return all values of a row as a text, independent of empty columns."""
+    """Return all values of a row as text, independent of empty columns."""
     numbers = {
         name: (values[row].round(decimals=_DIGITS) + 0.0).tolist()  # -0.0 becomes 0.0
         for name, values in sorted(data.numbers.items())

@@ -85,7 +85,7 @@ class ModelPosterior:
 
     @cached_property
     def rms_weights(self) -> Float64[Tensor, " weights"]:
-        """Posterior root mean square [rad or m] of the weights that share a prior size, for every weight."""
+        """Posterior root mean square [rad or m] of the weights that share a prior scale, for every weight."""
         square = self.weights.square() + self.root[len(self.space.parameters) :].square().sum(1)
         first, numbers = 0, []
         for feature in self.features:

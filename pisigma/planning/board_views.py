@@ -66,8 +66,8 @@ class BoardViews:
         """Draw joint values [rad or m] of random views, each in a random branch; NaN if a view is not reached.
 
         Depth, obliqueness, its direction, the rotation about the line of sight and the position in the image are
-        uniformly distributed. For an arm without a closed form, or with fewer than six joints, the poses are those
-        nearest to a view that numeric inverse kinematics finds from random joint values.
+        uniformly distributed. For an arm without closed-form inverse kinematics, or with fewer than six joints, the
+        poses are those nearest to a view that numeric inverse kinematics finds from random joint values.
         """
         T_board = self._sampled_boards(count, generator)
         T_frame_target = T_board if self.sight.is_fixed else invert(T_board)

@@ -26,7 +26,7 @@ REACHED = (Status.REACHED, Status.OUTSIDE_DOMAIN)
 TASK_POSES = 300
 """Number of joint vectors that represent the task if more, or none, are stated."""
 _STARTS = 200
-"""Number of joint vectors at which the inverse kinematics of a robot without a closed form starts."""
+"""Number of joint vectors at which a numeric inverse kinematics starts."""
 
 
 def task_poses(

@@ -47,7 +47,7 @@ class BranchSection(Section):
             T: desired T_base_tool.
 
         Raises:
-            RecipeError: there is no such branch or joint, or the robot has no closed form with named branches.
+            RecipeError: there is no such branch or joint, or the robot has no closed-form inverse kinematics.
             UnreachablePoseError: the nominal robot does not reach a pose on this branch.
         """
         near = self._near(robot).to(T.device)
@@ -83,7 +83,7 @@ class BranchSection(Section):
             singularities; the values of other poses are meaningless.
 
         Raises:
-            RecipeError: there is no such branch or joint, or the robot has no closed form with named branches.
+            RecipeError: there is no such branch or joint, or the robot has no closed-form inverse kinematics.
         """
         near = self._near(robot).to(T.device)
         solver = closed_form_solver(robot)
@@ -155,7 +155,7 @@ class AbstractCommandedJoints(Section):
         return self
 
     def commanded_joints(self, robot: TrueRobot) -> Float64[Tensor, "rows dof"]:
-        """Return the joint values to command [rad or m], the same for every call; see `joints_for_poses`."""
+        """Return the joint values to command [rad or m], identical for every call; see `joints_for_poses`."""
         if isinstance(self.poses, JointsRandom):
             return self.poses.joints(robot.nominal)
         assert self.branch is not None  # the validator has checked this

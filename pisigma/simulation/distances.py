@@ -59,7 +59,7 @@ class SimulatedSockets(Section):
         return sockets
 
     def measure(self, robot: TrueRobot) -> Measurements:
-        """Return joint values with which the true tool point is in the sockets, the same for every call.
+        """Return joint values with which the true tool point is in the sockets; every call returns the same values.
 
         With noise, `FK_true(q) + n_robot = socket + n_sensor`.
 
@@ -112,7 +112,7 @@ class SimulatedDistances(AbstractCommandedJoints):
     noise: SensorNoise | None = None
 
     def measure(self, robot: TrueRobot) -> Measurements:
-        """Return the distances `|FK_true(q) + n_robot - anchor| + zero + n_sensor`, the same for every call.
+        """Return the distances `|FK_true(q) + n_robot - anchor| + zero + n_sensor`; every call returns the same.
 
         Raises:
             RecipeError: a distance is negative.
@@ -154,7 +154,7 @@ class SimulatedPairs(AbstractCommandedJoints):
         return self
 
     def measure(self, robot: TrueRobot) -> Measurements:
-        """Return the distances `|p_1 - p_2| + n_sensor` of `p = FK_true(q) + n_robot`, the same for every call.
+        """Return the distances `|p_1 - p_2| + n_sensor` of `p = FK_true(q) + n_robot`; every call returns the same.
 
         Raises:
             RecipeError: the number of poses is odd, or a distance is negative.

@@ -38,7 +38,7 @@ class SimulatedMeasurements(AbstractCommandedJoints):
     target: str = ""
 
     def measure(self, robot: TrueRobot) -> Measurements:
-        """Return simulated measurements, the same for every call; see `simulate`."""
+        """Return simulated measurements, identical for every call; see `simulate`."""
         measured = simulate(robot, self.commanded_joints(robot), self.sensor, self.noise)
         rows = measured.rows
         return replace(measured, frame=(self.frame,) * rows, target=(self.target,) * rows)
@@ -112,5 +112,5 @@ class SimulatedSensors(Section):
     sensors: tuple[SimulatedSensor, ...] = Field(min_length=1)
 
     def measure(self, robot: TrueRobot) -> Measurements:
-        """Return the rows of all sensors, the same for every call, joined by `pisigma.measurement.join`."""
+        """Return the rows of all sensors, identical for every call and joined by `pisigma.measurement.join`."""
         return join([sensor.measure(robot) for sensor in self.sensors])

@@ -42,7 +42,7 @@ class MeasurementNoise(Section):
         return float(torch.deg2rad(torch.tensor(self.orientation_deg, dtype=torch.float64)))
 
     def apply(self, T: Float64[Tensor, "rows 4 4"]) -> Float64[Tensor, "rows 4 4"]:
-        """Return measured poses: true poses with noise, the same for every call.
+        """Return measured poses: true poses with noise; every call returns the same poses.
 
         Args:
             T: true poses in the frame of measurement.
@@ -85,7 +85,7 @@ class SensorNoise(Section):
     seed: Seed
 
     def draw(self, rows: int) -> NoiseDraws:
-        """Return random deviations of the given number of rows, the same for every call."""
+        """Return random deviations of the given number of rows; every call returns the same values."""
         generator = torch.Generator().manual_seed(self.seed)
         draws = torch.randn(2, rows, 3, generator=generator, dtype=torch.float64)
         return NoiseDraws(self.sensor_mm / 1e3 * draws[0], self.repeatability_mm / 1e3 * draws[1])

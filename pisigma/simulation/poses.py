@@ -95,7 +95,7 @@ class JointsRandom(Section):
     range_mm: dict[str, Range] = Field(default_factory=dict)
 
     def joints(self, robot: Robot) -> Float64[Tensor, "count dof"]:
-        """Return the joint values to command [rad or m], the same for every call.
+        """Return the joint values to command [rad or m]; every call returns the same values.
 
         The controller's values are drawn and converted to joint values.
 
@@ -174,7 +174,7 @@ class AbstractPoses(Section, ABC):
         return self
 
     def transforms(self) -> Float64[Tensor, "count 4 4"]:
-        """Return the desired T_base_tool [m], the same for every call."""
+        """Return the desired T_base_tool [m]; every call returns the same poses."""
         generator = None if self.seed is None else torch.Generator().manual_seed(self.seed)
         positions = self._positions(generator)
         return transform(self.orientation.rotations(len(positions), generator), positions)
@@ -222,7 +222,7 @@ class PolarGrid(AbstractPoses):
 class CubeGrid(AbstractPoses):
     """Grid with equal steps along x, y and z; z varies fastest.
 
-    Source: Jeong, Kim and Kwak 1998, section 4.2.1, after ISO 9283.
+    Source: Jeong, Kim and Kwak 1998, section 4.2.1, according to ISO 9283.
 
     Attributes:
         kind: "cube_grid".

@@ -183,7 +183,7 @@ class TouchCandidatesSection(Section):
     branch: BranchSection = BranchSection(near_deg={})
 
     def find(self, robot: Robot, placements: Sequence[JigPlacement]) -> TouchCandidates:
-        """Return random candidates, the same for every call, in the order of the placements.
+        """Return random candidates in the order of the placements; every call returns the same candidates.
 
         Args:
             robot: the nominal robot.

@@ -48,7 +48,7 @@ class SimulatedTouches(Section):
     on_miss: OnMiss = "error"
 
     def measure(self, robot: TrueRobot) -> Measurements:
-        """Return the simulated touches, the same for every call; see `simulate_touches`."""
+        """Return the simulated touches, identical for every call; see `simulate_touches`."""
         candidates = self.candidates.find(robot.nominal, self.placements)
         travel = self.candidates.travel_mm / 1e3
         return simulate_touches(robot, self.placements, candidates, self.noise, travel, self.on_miss)

@@ -168,7 +168,7 @@ class TrueRobot:
     def draw_approach(self, q: Float64[Tensor, "rows dof"]) -> Float64[Tensor, "rows dof"] | None:
         """Return random directions of approach of every joint, +1 or -1; None if no joint has play.
 
-        They are the same for every call, because the seed depends only on the sources' seeds and the joint values.
+        Every call returns the same directions: the seed depends only on the sources' seeds and the joint values.
         """
         if not bool(self.half_play.any()):
             return None

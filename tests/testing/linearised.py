@@ -86,7 +86,7 @@ class LinearisedArm:
     prior_scale: tuple[float, ...]
 
     def fitted(self, features: Sequence[AbstractFeature], iterations: int = 40) -> FeatureFit:
-        """Fit geometry and a unit of order 1, with prior sizes and noise by the evidence."""
+        """Fit geometry and a unit of order 1, with prior scales and noise by the evidence."""
         design = Design(self.rows.problem, tuple(features))
         sums = NormalEquations.from_rows(design, self.rows)
         return FeatureFit(

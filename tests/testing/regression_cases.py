@@ -66,7 +66,7 @@ def case_of(
     smaller: tuple[AbstractFeature, ...],
     exactness: float = 1e-6,
 ) -> RegressionCase:
-    """Return a case with different prior sizes of the groups."""
+    """Return a case with different prior scales of the groups."""
     design = Design(arm.rows.problem, features)
     prior = design.prior(arm.prior_scale)
     factor = torch.linspace(0.5, 3.0, len(prior.sizes), dtype=torch.float64)

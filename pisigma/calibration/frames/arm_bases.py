@@ -135,9 +135,9 @@ def fit_arm_bases(arms: Sequence[ArmPosterior]) -> ArmBases:
     The arms were calibrated independently of each other. Their joint posterior is the product of their individual
     posteriors, given that every shared frame is one frame and every shared point is one point; the bases have no prior.
     The individual posteriors summarise the rows as normal distributions. The result therefore equals that of one
-    least-squares fit to all rows with the noise and prior sizes of the individual fits, to first order in the errors of
-    the arms, and exactly if positions are linear in the parameters. The equations are linearised repeatedly until they
-    close.
+    least-squares fit to all rows with the noise and prior scales of the individual fits, to first order in the errors
+    of the arms, and exactly if positions are linear in the parameters. The equations are linearised repeatedly until
+    they close.
 
     With one shared frame, the equations determine only the bases. With more, the arms also improve each other's
     parameters.

@@ -1,4 +1,4 @@
-"""Estimated sizes of the errors of parameters, compared with the prior sizes."""
+"""Estimated sizes of the errors of parameters, compared with their prior standard deviations."""
 
 import math
 from dataclasses import dataclass

@@ -71,7 +71,7 @@ _NOTHING_HELPS = (
 class HybridCalibrator:
     """Calibrator that fits `T(q) = base · Π A_i(q_i + Δ_i(q); dh_i + ε_i) · tool` with a Pi-Sigma network Δ.
 
-    All unknowns have normal priors with nominal means. The prior sizes of weights maximise the evidence; those of
+    All unknowns have normal priors with nominal means. The prior scales of weights maximise the evidence; those of
     geometric errors are taken from the geometric calibration. Features that do not raise the evidence, or that increase
     the held-out errors, are rejected. The remaining features must predict rows that are held out of exact fits
     better than the geometric calibration does; if no feature remains, the result is the geometric calibration.

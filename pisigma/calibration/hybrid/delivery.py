@@ -31,7 +31,7 @@ _FOLDS, _FOLDS_OF_FEW, FEW_GROUPS = 4, 8, 60
 """Number of folds that are held out, number of folds for few groups, and number of groups up to which groups are
 few."""
 _MANY_GROUPS = 600
-"""Number of groups up to which noise and prior sizes are updated for every fold."""
+"""Number of groups up to which noise and prior scales are updated for every fold."""
 EXACT_GROUPS = 200
 """Number of poses or positions up to which held-out rows are predicted by exact fits; rows of other sensors always
 are."""
@@ -110,7 +110,7 @@ def held_out_rows(
         posterior: posterior from all rows.
         group: see `Rows.group`.
         folds: groups that are held out together.
-        updates: number of updates of noise and prior sizes for every fold.
+        updates: number of updates of noise and prior scales for every fold.
 
     Returns:
         Errors per sensor; None for sensors whose values are given.

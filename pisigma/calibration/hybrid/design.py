@@ -47,7 +47,7 @@ class Design:
 
     @property
     def classes(self) -> int:
-        """Number of classes of geometric parameters, whose prior sizes are the first ones."""
+        """Number of classes of geometric parameters, whose prior scales are the first ones."""
         return len(PriorGroup)
 
     @property
@@ -93,7 +93,7 @@ class Design:
     def prior(self, prior_scale: Sequence[float]) -> GaussianPrior:
         """Return the prior of all unknowns, with the prior scales of the geometric calibration.
 
-        The weights of a prismatic joint are lengths; their prior sizes are in radians times the reach.
+        The weights of a prismatic joint are lengths; their prior standard deviations are angles [rad] times the reach.
         """
         problem, robot = self.problem, self.problem.space.robot
         base, group = [problem.precision[problem.active]], [problem.prior_group]
@@ -130,7 +130,7 @@ class Design:
         return replace(prior_here, sizes=sizes)
 
     def group_starts(self, classes: int) -> list[int]:
-        """Return the index of the first prior size of every feature."""
+        """Return the index of the first prior scale of every feature."""
         counts = [len(chosen.group_names) for chosen in self.features]
         return [classes + sum(counts[:k]) for k in range(len(counts))]
 
@@ -311,7 +311,7 @@ class AbstractDesignRegression(AbstractRegression):
     def held_out_errors(
         self, posterior: Posterior, folds: Sequence[Int64[Tensor, " _groups"]]
     ) -> HeldOutErrors:
-        """Return the errors of every fold, predicted without it, with the prior sizes and the noise of a posterior.
+        """Return the errors of every fold, predicted without it, with the prior scales and the noise of a posterior.
 
         Args:
             posterior: posterior from all values.
@@ -321,7 +321,7 @@ class AbstractDesignRegression(AbstractRegression):
     def held_out_errors_refitted(
         self, posterior: Posterior, folds: Sequence[Int64[Tensor, " _groups"]], updates: int
     ) -> HeldOutErrors:
-        """Return the errors of every fold, predicted without it, with updated noise and prior sizes."""
+        """Return the errors of every fold, predicted without it, with updated noise and prior scales."""
         parts = []
         for groups in folds:
             rest = self.without_groups(groups).maximise_evidence(posterior.prior, posterior.noise, updates)
@@ -331,7 +331,7 @@ class AbstractDesignRegression(AbstractRegression):
     def evidence_gain(
         self, posterior: Posterior, design: Design, features: AbstractFeature
     ) -> tuple[float, Float64[Tensor, " groups"] | None]:
-        """Compute the gain of log evidence by additional features, with fixed noise and all other prior sizes fixed.
+        """Compute the gain of log evidence by additional features, with fixed noise and all other prior scales fixed.
 
         Args:
             posterior: posterior without the features.
@@ -339,6 +339,6 @@ class AbstractDesignRegression(AbstractRegression):
             features: the additional features.
 
         Returns:
-            The gain, or infinity if a fit takes no longer; and initial prior sizes of the features.
+            The gain, or infinity if a fit takes no longer; and initial prior scales of the features.
         """
         return math.inf, None

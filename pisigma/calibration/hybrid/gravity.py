@@ -95,7 +95,7 @@ class _EvidenceOfDirection:
     """Log evidence for gravity along `Σ c_k a_k`, for the `AXES` a_k, with the same masses for all axes.
 
     With the precision `P = 1 + Σ c_k c_l N_kl` and the right-hand side `d = Σ c_k d_k` of the normal equations of the
-    masses, it is `(d P^-1 d - log det P) / 2`. c may have any length, which scales the prior size of the masses.
+    masses, it is `(d P^-1 d - log det P) / 2`. c may have any length, which only scales the prior of the masses.
 
     Attributes:
         normal: the matrices `N_kl + N_lk`.
@@ -143,7 +143,7 @@ def _evidence_of_direction(
     # Inverting the block of the covariance marginalises geometry and series; minus the prior, data alone are left.
     root = fit.covariance_root(posterior).as_matrix[weights].cpu()
     total, prior = torch.linalg.inv(root @ root.t()), posterior.prior.precision[weights].cpu()
-    # In units of the prior sizes, the prior precision of the masses is 1 for every direction.
+    # In units of the prior standard deviations, the prior precision of the masses is 1 for every direction.
     size = prior.reshape(count, -1)[0].rsqrt()
     normal = (total - prior.diag()).reshape(count, len(size), count, len(size))
     normal = (normal * size[:, None, None] * size).transpose(1, 2)

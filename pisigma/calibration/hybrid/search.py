@@ -37,7 +37,7 @@ _STRONG_EVIDENCE = 3.0
 _MAX_EFFECTIVE_SHARE = 0.75
 """Largest effective number of unknowns per value; with more, they cannot be separated from the noise."""
 MAX_USUAL_SHARE = 0.97
-"""Largest effective number of unknowns per value if the prior sizes of the weights start at their usual sizes, which
+"""Largest effective number of unknowns per value if the prior scales of the weights start at their usual sizes, which
 regularise what few values do not determine."""
 MIN_USUAL_SCALE = 0.4
 """Prior scale of the geometry that is also tried if the estimated scale is smaller, because a geometric calibration of
@@ -161,12 +161,12 @@ class FeatureSearch:
     def fit_features(
         self, features: Sequence[AbstractFeature], near: FeatureFit | None = None, sizes: Tensor | None = None
     ) -> tuple[FeatureFit, float]:
-        """Fit geometry and features, starting with the noise and prior sizes of another fit.
+        """Fit geometry and features, starting with the noise and prior scales of another fit.
 
         Args:
             features: the features.
-            near: another fit; None to start with noise and prior sizes of the geometric calibration.
-            sizes: start values of the prior sizes of the last feature.
+            near: another fit; None to start with noise and prior scales of the geometric calibration.
+            sizes: start values of the prior scales of the last feature.
 
         Returns:
             The fit, and the ratio of the held-out RMS error to the noise of the geometric calibration.

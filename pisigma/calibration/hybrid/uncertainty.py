@@ -33,12 +33,12 @@ from pisigma.robot.kinematics.parameter_jacobian import identification_jacobian
 CHUNK = 128
 """Number of rows whose columns are in memory at a time."""
 FEW_GROUPS = 600
-"""Number of groups up to which noise and prior sizes are estimated again for every fold that is held out."""
+"""Number of groups up to which noise and prior scales are estimated again for every fold that is held out."""
 _VERY_FEW_GROUPS = 60
 """Number of groups up to which `FOLDS_OF_FEW` folds are held out: with a quarter of so few rows left out, a calibration
 is much worse than with all rows, so its errors are not representative."""
 _FOLD_UPDATES, _FEWER_UPDATES, _SOME_GROUPS = 3, 1, 150
-"""Number of updates of noise and prior sizes for every fold, for few and for more groups, and the number of groups
+"""Number of updates of noise and prior scales for every fold, for few and for more groups, and the number of groups
 up to which the first applies. With one update, the share of rows in the predicted 95 % intervals is 0.9 % lower for 30
 rows, 0.4 % for 100 rows and 0.3 % for 300 rows; fitting 300 rows then takes four fifths of the time."""
 
@@ -199,7 +199,7 @@ def position_uncertainty(
         posterior: posterior of the unknowns.
         geometry: geometry in the user's coordinates.
         held_out: held-out predictions of this fit, if available; they are used if there are too many groups to
-            estimate noise and prior sizes again for every fold.
+            estimate noise and prior scales again for every fold.
     """
     folds = rows.folds(FOLDS if rows.groups > _VERY_FEW_GROUPS else FOLDS_OF_FEW, MAX_GROUPS)
     if rows.groups <= FEW_GROUPS:

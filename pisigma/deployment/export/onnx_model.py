@@ -244,7 +244,7 @@ def _forward(model: CalibratedModel, arm: HybridArm, sha256: str) -> bytes:
 
 
 def _metadata(model: CalibratedModel, computes: str, sha256: str) -> dict[str, str]:
-    """Return the metadata as texts, with lists and tables as JSON; base and tool are those of the graph."""
+    """Return the metadata as strings, with lists and tables as JSON; base and tool are those of the graph."""
     arm = model.hybrid if computes == FORWARD else None
     robot = model.robot if arm is None else arm.robot
     values: dict[str, Any] = {

@@ -59,7 +59,7 @@ class CellFacts:
         settings_sha256: SHA-256 of the current settings of a calibration; see `Check`.
         changed_models: names of the model in use and of the newest model, if these were changed or removed after they
             were made.
-        incomplete: number of measured poses of the newest plan as a text, if there are too few; otherwise "".
+        incomplete: number of measured poses of the newest plan as text, if there are too few; otherwise "".
         controller: exports that were active on the controller, with the times.
         has_several_arms: whether `cell.yaml` lists several arms, for which no steps are kept.
     """

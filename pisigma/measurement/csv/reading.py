@@ -245,7 +245,7 @@ def number_column(table: Table, name: str) -> Float64[np.ndarray, " rows"]:
 
 
 def text_column(table: Table, name: str) -> list[str]:
-    """Return a column of a table as texts without surrounding spaces.
+    """Return a column of a table as strings without surrounding spaces.
 
     Raises:
         MeasurementError: there is no such column.

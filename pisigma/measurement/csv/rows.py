@@ -35,7 +35,7 @@ class CheckedRows:
 
     Attributes:
         values: numbers in the file's units; NaN in empty cells and texts.
-        cells: all cells as texts.
+        cells: all cells as strings.
         faults: faults of the rows that cannot be used.
     """
 

@@ -201,7 +201,7 @@ def _dates(file: ExportFile, column: MappedColumn) -> tuple[str, ...]:
 
 
 def _numbers(file: ExportFile, column: MappedColumn) -> tuple[str, ...]:
-    """Return the numbers of a column, as texts in the unit of measurement files; "" if nothing was measured.
+    """Return the numbers of a column, as strings in the unit of measurement files; "" if nothing was measured.
 
     Raises:
         MeasurementError: a cell is not a number.
@@ -227,7 +227,7 @@ def _numbers(file: ExportFile, column: MappedColumn) -> tuple[str, ...]:
 def _rotation(
     file: ExportFile, encoding: RotationEncoding, columns: list[MappedColumn]
 ) -> dict[str, tuple[str, ...]]:
-    """Return the quaternions of all rows as texts, by column; "" in rows without a rotation."""
+    """Return the quaternions of all rows as strings, by column; "" in rows without a rotation."""
     rows = list(zip(*(_numbers(file, column) for column in columns), strict=True))
     values = torch.tensor([[float(text or "nan") for text in row] for row in rows], dtype=torch.float64)
     if columns[0].target.unit and UNITS[columns[0].target.unit].column == "deg":
@@ -249,7 +249,7 @@ def _rotation(
 def _quaternion_texts(
     encoding: RotationEncoding, values: Float64[Tensor, "rows values"], measured: Tensor
 ) -> list[tuple[str, ...]]:
-    """Return the quaternion of every row as texts, empty if nothing was measured."""
+    """Return the quaternion of every row as strings, empty if nothing was measured."""
     texts: list[tuple[str, ...]] = [("",) * 4] * len(values)
     quaternions = quaternion_from_rotation(encoding.to_rotation(values[measured]))
     for row, quaternion in zip(measured.nonzero()[:, 0].tolist(), quaternions.tolist(), strict=True):

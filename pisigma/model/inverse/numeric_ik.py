@@ -131,7 +131,7 @@ class NumericIK:
         single: bool | None = None,
         axes: TaskAxes | None = None,
     ) -> Solution:
-        """Find solutions on every branch, `(*batch, branches)`; a robot without a closed form has one branch."""
+        """Find solutions on every branch, `(*batch, branches)`; a robot that is solved numerically has one branch."""
         poses = _Poses.from_values(T_base_tool, single, True)
 
         def solve(ik: "NumericIK", rows: Tensor) -> Solution:

@@ -33,7 +33,7 @@ def write_model(model: CalibratedModel, folder: Path) -> None:
 
 
 def check_written(model: CalibratedModel, folder: Path) -> None:
-    """Compare a model with its folder in poses, corrected IK, predicted deviations and prior sizes of weights.
+    """Compare a model with its folder in poses, corrected IK, predicted deviations and prior scales of weights.
 
     Raises:
         AssertionError: the model and its folder differ.
@@ -47,15 +47,15 @@ def check_written(model: CalibratedModel, folder: Path) -> None:
         _check("poses", poses_of_rows(model, rows), poses_of_rows(loaded, rows), TOLERANCE)
         T = model.forward(rows.q)
     _check("predicted deviations", deviation_of_rows(model, rows), deviation_of_rows(loaded, rows), TOLERANCE)
-    _check("prior sizes of weights", _prior_sizes(model), _prior_sizes(loaded), 0.0)
+    _check("prior scales of weights", _prior_scales(model), _prior_scales(loaded), 0.0)
     finite = T[torch.isfinite(T).flatten(1).all(1)].numpy()
     before, after = CorrectedIK(model)(finite, throw=False), ik(finite, throw=False)
     _check("joint values", torch.as_tensor(before.q), torch.as_tensor(after.q), _JOINT_TOLERANCE)
     _check("statuses", torch.as_tensor(before.status).double(), torch.as_tensor(after.status).double(), 0.0)
 
 
-def _prior_sizes(model: CalibratedModel) -> Tensor:
-    """Return the index and the usual value of the prior size of every weight, which limits its drift."""
+def _prior_scales(model: CalibratedModel) -> Tensor:
+    """Return the index and the usual value of the prior standard deviation of every weight, which limits its drift."""
     rows = [torch.zeros(0, 2, dtype=torch.float64)]
     for feature in model.uncertainty.features if model.uncertainty else ():
         number = feature.group[feature.used]

@@ -288,7 +288,7 @@ class Surroundings(Section):
         return self.clearance_mm / 1e3
 
     def robot_with_tool(self, robot: Robot) -> Robot:
-        """Return the robot with the reflector as its tool, if the surroundings state it."""
+        """Return the robot with the reflector as its tool; unchanged if the surroundings state no reflector."""
         if self.tool is None:
             return robot
         nominal_tool, reflector = (

@@ -232,7 +232,7 @@ def draw_correction(curve: CorrectionCurve) -> Drawing:
 
 
 def draw_correlations(tables: Sequence[Correlations]) -> tuple[Drawing, ...]:
-    """Draw correlations of lengths and of angles; redundant pairs are marked with a sign."""
+    """Draw correlations of lengths and of angles; redundant pairs are marked with the sign of their correlation."""
     named = zip(("lengths", "angles"), tables, strict=False)
     return tuple(_correlations(title, table) for title, table in named if table[0])
 

@@ -7,7 +7,7 @@ from pisigma.robot.kernels.rows import Array, kernel
 
 @kernel
 def rotation_vector(R: Array) -> tuple[float, float, float]:
-    """Write the rotation vector [rad] of the rotation in the first three columns: axis times angle in [0, pi]."""
+    """Return the rotation vector [rad] of the rotation in the first columns of `R`: axis times angle in [0, pi]."""
     x, y, z = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
     cosine = (R[0, 0] + R[1, 1] + R[2, 2] - 1) / 2
     square = (x * x + y * y + z * z) / 4

@@ -60,7 +60,7 @@ BRANCH_MISS = 0.05
 may still reach a pose; its parameter errors are far smaller."""
 
 ATTEMPTS, MORE_ATTEMPTS = 4, 128
-"""Numbers of stored starts that are tried for a pose, nearest first, for arms with a closed form and for other arms."""
+"""Numbers of stored starts that are tried for a pose, nearest first, for closed-form and numeric inverse kinematics."""
 
 FAR_AWAY = 0.1
 """Distance [rad or m] from the reference joint values above which a solution may not be the intended one."""

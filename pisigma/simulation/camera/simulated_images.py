@@ -55,7 +55,7 @@ class RandomViews(Section):
     def joints(
         self, robot: Robot, camera: Camera, board: Board, is_fixed: bool = False
     ) -> Float64[Tensor, "count dof"]:
-        """Return the joint values to command [rad or m], the same for every call.
+        """Return the joint values to command [rad or m]; every call returns the same values.
 
         Args:
             robot: the robot, with its base from the board to the base and its tool from the flange to the camera (for
@@ -65,7 +65,7 @@ class RandomViews(Section):
             is_fixed: whether the camera is fixed and the board is on the flange.
 
         Raises:
-            RecipeError: the robot has no closed form, or reaches fewer views than requested.
+            RecipeError: the robot has no closed-form inverse kinematics, or reaches fewer views than requested.
         """
         solver, rng = self.check(robot), np.random.default_rng(self.seed)
         chosen, needed = list[Tensor](), _CANDIDATES * self.count
@@ -92,7 +92,7 @@ class RandomViews(Section):
         """Return the closed-form inverse kinematics for the views.
 
         Raises:
-            RecipeError: the robot has no closed form.
+            RecipeError: the robot has no closed-form inverse kinematics.
         """
         solver = closed_form_solver(robot)
         if solver is None:
@@ -215,7 +215,7 @@ class SimulatedImages(Section):
         return self.board.name if self.camera.is_fixed else self.camera.name
 
     def measure(self, robot: TrueRobot) -> Measurements:
-        """Simulate the corners of all images, the same for every call; see `image_measurements`."""
+        """Simulate the corners of all images; every call returns the same values. See `image_measurements`."""
         q, is_fixed = self._joints(robot), self.camera.is_fixed
         noise = ImageNoise(self.noise.corner_px, self.noise.repeatability)
         actual = robot.actual_joints(q)

@@ -82,7 +82,7 @@ class RandomGeometricDeviation(AbstractGeometrySource):
     tool_angle_deg: float = Field(default=0.0, ge=0)
 
     def parameter_errors(self, robot: Robot, place: str) -> GeometryChange:
-        """Return the random errors [rad or m], the same for every call; see `AbstractGeometrySource`."""
+        """Return the random errors [rad or m], identical for every call; see `AbstractGeometrySource`."""
         generator = torch.Generator().manual_seed(self.seed)
         dh = self._draw(generator, len(robot.rows), 5)
         base, tool = self._draw(generator, 6), self._draw(generator, 6)

@@ -50,5 +50,5 @@ def join_words(words: Iterable[str]) -> str:
 
 
 def length_text(length: float) -> str:
-    """Return a length [m] as a text in millimetres, with three significant digits or all integer digits."""
+    """Format a length [m] in millimetres, with three significant digits or all integer digits."""
     return f"{length * 1e3:.3g} mm" if abs(length) < 1 else f"{length * 1e3:,.0f} mm"

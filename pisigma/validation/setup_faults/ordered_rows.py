@@ -38,9 +38,9 @@ _SAG = 1e-3
 """Prior standard deviation of the weights of gravity torques [rad], which are also fitted, because the sag of elastic
 joints can look like a second arm. The weights are 8.6e-4 for the measured UR10."""
 _MAX_ITERATIONS, _CONVERGENCE_TOLERANCE = 12, 1e-2
-"""Largest number of iterations of noise and prior sizes, and their relative change at convergence."""
+"""Largest number of iterations of noise and prior scales, and their relative change at convergence."""
 _MIN_EFFECTIVE, _SMALLEST_SIZE = 0.1, 1e-2
-"""Effective number of weights of a kind below which their prior size is not estimated, and smallest factor on it."""
+"""Effective number of weights of a kind below which their prior scale is not estimated, and smallest factor on it."""
 _VALUES_PER_POSE = 6
 """Number of independent values of a configuration (the pose of the tool), regardless of targets and repeats."""
 
@@ -233,7 +233,7 @@ class OrderedRows:
 
         The noise of a geometric calibration contains what its parameters do not explain, such as the sag under a load.
         It hides effects that are larger than the noise of the sensor, and a prior for errors of all sizes leaves few
-        values that could show them. Therefore the noise of every sensor and the prior size of every kind of joint
+        values that could show them. Therefore the noise of every sensor and the prior scale of every kind of joint
         errors are estimated by their evidence (MacKay 1992, Neural Computation 4(3), eqs. 4.7 and 4.8, with the
         parameters that every sensor determines of Förstner 1979), and the prior of the geometry is not narrower than
         usual.
@@ -309,10 +309,10 @@ class OrderedRows:
 def _noise_and_sizes(
     rows: OrderedRows, kind: Int64[np.ndarray, " unknowns"]
 ) -> tuple[Float64[np.ndarray, " values"], Float64[np.ndarray, " kinds"]]:
-    """Estimate the noise that is left, and the prior sizes of the joint errors, in turn.
+    """Estimate the noise that is left, and the prior scales of the joint errors, in turn.
 
     Args:
-        rows: the rows, with the first prior sizes.
+        rows: the rows, with the first prior scales.
         kind: index of the kind of joint errors of every weight; -1 for parameters, whose prior is kept.
 
     Returns:

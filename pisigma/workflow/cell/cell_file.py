@@ -97,8 +97,8 @@ class CellDocument(Section):
         joint_values: whether rows contain the joint values that were commanded (the default) or those that the encoders
             read ("measured"), to which the controller then has to move without a deviation.
         instrument: measuring instrument and its calibration certificate; None if it is not stated.
-        pose_repeatability_mm: pose repeatability RP after ISO 9283 that the maker of the robot states [mm]; None if it
-            is not stated.
+        pose_repeatability_mm: pose repeatability RP according to ISO 9283 that the maker of the robot states [mm];
+            None if it is not stated.
         expansion_per_k: coefficient of linear expansion of the arm [1/K], about 1.2e-5 for steel and 2.3e-5 for
             aluminium; None if it is not stated.
         camera: cameras and boards; None without cameras.

@@ -122,7 +122,7 @@ def detect(
     if timed and videos and settings.video_start is None:
         raise MeasurementError(
             "the joint values have time stamps, which a video cannot be compared with",
-            expected="the time at which the video starts, in the clock of the joint values",
+            expected="the time at which the video starts, by the clock of the joint values",
             value="none",
             at=Place(videos[0]),
             remedy="state it in seconds with --set video_start=S (0 if both start together)",

@@ -15,7 +15,7 @@ class DetectionSettings:
     Attributes:
         max_blur: maximum blur of the edges in an image, as a standard deviation [px].
         within: maximum difference between the time stamps of an image and of its joint values [s].
-        video_start: time at which a video starts, in the clock of the joint values [s]; None if it is not known.
+        video_start: time at which a video starts, by the clock of the joint values [s]; None if it is not known.
     """
 
     max_blur: MaxBlur = 3.0

@@ -1,4 +1,4 @@
-"""Posterior, log evidence and prior sizes against the direct formulas of a normal density."""
+"""Posterior, log evidence and prior scales against the direct formulas of a normal density."""
 
 import math
 from dataclasses import replace

@@ -235,7 +235,7 @@ def _pose(literal: re.Match[str]) -> Pose:
 
 
 def _axes(text: str) -> dict[str, str]:
-    """Return the values of external axes in a list of all six, as texts."""
+    """Return the values of external axes in a list of all six, as strings."""
     return dict(zip(_AXES, (value.strip() for value in text.strip("[]").split(",")), strict=True))
 
 
