@@ -166,7 +166,7 @@ def true_error(case: Case, seed: int) -> float:
     """Return the RMS of the true position error [mm] of the calibrated arm at other poses."""
     true = case.true(seed)
     train, test = (
-        JointsRandom(kind="joints_random", count=count, seed=1_000 * seed + index, share=0.9).joints(
+        JointsRandom(kind="joints_random", count=count, seed=1_000 * seed + index, range_fraction=0.9).joints(
             true.nominal
         )
         for index, count in enumerate((ROWS, JUDGED))

@@ -18,7 +18,7 @@ after = TrueRobot(robot, [errors, JointOffset(kind="joint_offset", offset_deg={"
 def measure(true, count, seed):
     """Return simulated rows of a tracker with a noise of 0.03 mm."""
     section = {
-        "poses": {"kind": "joints_random", "count": count, "seed": seed, "share": 0.4},
+        "poses": {"kind": "joints_random", "count": count, "seed": seed, "range_fraction": 0.4},
         "sensor": "position",
         "noise": {"position_mm": 0.03, "seed": seed},
     }

@@ -18,7 +18,7 @@ for seed, (name, point) in enumerate(anchors.items()):
     section = SimulatedDistances.model_validate(
         {
             "kind": "distances",
-            "poses": {"kind": "joints_random", "count": 60, "seed": seed, "share": 0.4},
+            "poses": {"kind": "joints_random", "count": 60, "seed": seed, "range_fraction": 0.4},
             "anchor": {"name": name, "point_mm": point, "zero_mm": 12},
             "noise": {"sensor_mm": 0.05, "seed": seed},
         }

@@ -21,7 +21,7 @@ def errors(size, seed):
 def measure(number, count, seed):
     """Return simulated rows of a robot with the errors of its type, and individual errors a fifth as large."""
     section = {
-        "poses": {"kind": "joints_random", "count": count, "seed": seed, "share": 0.4},
+        "poses": {"kind": "joints_random", "count": count, "seed": seed, "range_fraction": 0.4},
         "sensor": "position",
         "noise": {"position_mm": 0.03, "seed": seed},
     }

@@ -37,7 +37,7 @@ true = TrueRobot(robot, [errors, tilted])
 def measure(count, seed):
     """Return simulated rows of a tracker with a noise of 0.05 mm."""
     section = {
-        "poses": {"kind": "joints_random", "count": count, "seed": seed, "share": 0.8},
+        "poses": {"kind": "joints_random", "count": count, "seed": seed, "range_fraction": 0.8},
         "sensor": "position",
         "noise": {"position_mm": 0.05, "seed": seed},
     }

@@ -16,7 +16,7 @@ true = TrueRobot(robot, [errors])
 def measure(count, seed):
     """Return simulated poses of a tracker with a noise of 0.02 mm and 0.005 deg."""
     section = {
-        "poses": {"kind": "joints_random", "count": count, "seed": seed, "share": 0.9},
+        "poses": {"kind": "joints_random", "count": count, "seed": seed, "range_fraction": 0.9},
         "noise": {"position_mm": 0.02, "orientation_deg": 0.005, "seed": seed},
     }
     return SimulatedMeasurements.model_validate(section).measure(true)

@@ -14,7 +14,7 @@ errors = RandomGeometricDeviation(
 )
 true = TrueRobot(robot, [errors])
 section = {
-    "poses": {"kind": "joints_random", "count": 80, "seed": 1, "share": 0.7},
+    "poses": {"kind": "joints_random", "count": 80, "seed": 1, "range_fraction": 0.7},
     "noise": {"position_mm": 0.03, "orientation_deg": 0.005, "seed": 1},
 }
 rows = SimulatedMeasurements.model_validate(section).measure(true)

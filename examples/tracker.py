@@ -16,7 +16,7 @@ true = TrueRobot(robot, [errors])
 def measure(count, seed):
     """Return simulated rows of a tracker with a noise of 0.05 mm."""
     section = {
-        "poses": {"kind": "joints_random", "count": count, "seed": seed, "share": 0.4},
+        "poses": {"kind": "joints_random", "count": count, "seed": seed, "range_fraction": 0.4},
         "sensor": "position",
         "noise": {"position_mm": 0.05, "seed": seed},
     }

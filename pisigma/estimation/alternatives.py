@@ -31,7 +31,8 @@ class Cause:
         name: name of the cause.
         log_bayes_factor: log evidence with this cause alone, minus that with noise alone [nats].
         size: most probable size relative to the scale of the cause.
-        share: share of the squared residuals, in units of the noise, that the cause alone explains at this size.
+        explained_share: share of the squared residuals, in units of the noise, that the cause alone explains at
+            this size.
         named: whether the evidence supports the cause, because it is the clearest one, or clear in addition to clearer
             ones.
     """
@@ -39,7 +40,7 @@ class Cause:
     name: str
     log_bayes_factor: float
     size: float
-    share: float
+    explained_share: float
     named: bool = False
 
 

@@ -147,7 +147,7 @@ class SessionEvidence:
         gain, covariance = self._gain(groups, noise_factor)
         return gain @ self.values.y, covariance
 
-    def influence(
+    def sensitivity_and_covariance(
         self, groups: Sequence[DriftGroup], noise_factor: float
     ) -> tuple[Float64[Tensor, "members directions"], Float64[Tensor, "members members"]]:
         """Return the sources of error of an estimate of `estimate_shift` if nothing has moved.

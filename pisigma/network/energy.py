@@ -34,12 +34,12 @@ def energy_gradient(
     """
     weighted = weigh_sums(x, network.weight.detach(), network.bias.detach(), network.fixed)
     difference = d - sum_of_products(weighted, network.orders)
-    by_weight, by_bias = pull_back(-difference, x, weighted, network.fixed, network.orders)
-    return difference.square().sum(0) / 2, by_weight, by_bias
+    weight_gradient, bias_gradient = pull_back(-difference, x, weighted, network.fixed, network.orders)
+    return difference.square().sum(0) / 2, weight_gradient, bias_gradient
 
 
 def pull_back(
-    by_output: Float[Tensor, "patterns *models"],
+    output_gradient: Float[Tensor, "patterns *models"],
     x: Float[Tensor, "patterns inputs"],
     weighted: Float[Tensor, "patterns *models units"],
     fixed: Float[Tensor, "*models units"],
@@ -48,18 +48,18 @@ def pull_back(
     """Backpropagate derivatives with respect to the outputs to weights and biases, summed over the patterns.
 
     Args:
-        by_output: derivative of any quantity with respect to every output of every pattern.
+        output_gradient: derivative of any quantity with respect to every output of every pattern.
         x: scaled inputs.
         weighted: `W_j h_j` of the summing units, see `weigh_sums`.
         fixed: fixed weights W.
         orders: number of summing units of every product unit.
 
     Returns:
-        The derivatives with respect to weights and biases: `J^T by_output` without forming J.
+        The derivatives with respect to weights and biases: `J^T output_gradient` without forming J.
     """
-    by_sum = by_output[..., None] * products_of_others(weighted, orders) * fixed
-    by_weight = by_sum.reshape(x.shape[0], -1).mT @ x
-    return by_weight.reshape(*by_sum.shape[1:], x.shape[-1]), by_sum.sum(0)
+    sum_gradient = output_gradient[..., None] * products_of_others(weighted, orders) * fixed
+    weight_gradient = sum_gradient.reshape(x.shape[0], -1).mT @ x
+    return weight_gradient.reshape(*sum_gradient.shape[1:], x.shape[-1]), sum_gradient.sum(0)
 
 
 def output_jacobian(
@@ -79,9 +79,9 @@ def output_jacobian(
     Returns:
         For each summing unit, the derivatives with respect to its weights and then to its bias.
     """
-    by_sum = (products_of_others(weighted, orders) * fixed).movedim(0, -2)
+    sum_gradient = (products_of_others(weighted, orders) * fixed).movedim(0, -2)
     with_bias = torch.cat([x, x.new_ones((x.shape[0], 1))], -1)
-    return (by_sum[..., None] * with_bias[:, None, :]).flatten(-2)
+    return (sum_gradient[..., None] * with_bias[:, None, :]).flatten(-2)
 
 
 @dataclass(frozen=True, eq=False)

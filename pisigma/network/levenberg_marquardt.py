@@ -177,10 +177,10 @@ class LevenbergMarquardt(nn.Module):
         small = 2 * bend.flatten(-2).norm(dim=-1) <= _BEND * step.flatten(-2).norm(dim=-1)
         return torch.where(small[..., None, None], step + bend, step)
 
-    def _pull_back(self, by_output: Tensor, x: Tensor, weighted: Tensor, fitted: Tensor) -> Tensor:
-        by_output = by_output * fitted[:, None, None]
-        by_weight, by_bias = pull_back(by_output, x, weighted, self.fixed, self.orders)
-        return torch.cat([by_weight, by_bias[..., None]], -1)
+    def _pull_back(self, output_gradient: Tensor, x: Tensor, weighted: Tensor, fitted: Tensor) -> Tensor:
+        output_gradient = output_gradient * fitted[:, None, None]
+        weight_gradient, bias_gradient = pull_back(output_gradient, x, weighted, self.fixed, self.orders)
+        return torch.cat([weight_gradient, bias_gradient[..., None]], -1)
 
     def _normal_matrix(self, x: Tensor, weighted: Tensor, fitted: Tensor) -> Tensor:
         """Return `J^T J` over the fitted patterns, computed in chunks of patterns that fit into memory."""

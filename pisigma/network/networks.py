@@ -216,10 +216,10 @@ class NetworkTraining(lightning.LightningModule):
         """Write `η ∂E/∂w` (Jeong et al. 1998, eq. 4) into the parameters' `grad`; return the energy of every output."""
         energies = []
         for network, group, rates in zip(self.networks, patterns, self._rates, strict=True):
-            value, by_weight, by_bias = energy_gradient(network, group.x, group.d)  # type: ignore[arg-type]
+            value, weight_gradient, bias_gradient = energy_gradient(network, group.x, group.d)  # type: ignore[arg-type]
             network.weight.grad, network.bias.grad = (
-                by_weight * rates[:, None, None],
-                by_bias * rates[:, None],
+                weight_gradient * rates[:, None, None],
+                bias_gradient * rates[:, None],
             )
             energies.append(value)
         return torch.cat(energies)

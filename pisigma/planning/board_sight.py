@@ -46,14 +46,14 @@ class BoardSight:
         T = self.board_in_camera(T_frame_target)
         corners = torch.from_numpy(self.board.corners).to(T)
         in_camera = corners @ T[:, :3, :3].mT + T[:, None, :3, 3]
-        by_point = torch.from_numpy(self.camera.project(in_camera.numpy())[1])
+        point_jacobian = torch.from_numpy(self.camera.project(in_camera.numpy())[1])
         origin = T_frame_target[:, None, :3, 3]
         # A camera on the flange moves relative to the board, so the sign and the axes change.
         if self.is_fixed:
-            by_shift, lever = by_point, in_camera - origin
+            shift_jacobian, lever = point_jacobian, in_camera - origin
         else:
-            by_shift, lever = -by_point @ T[:, None, :3, :3], corners - origin
-        J = torch.cat([by_shift, -by_shift @ skew(lever)], -1)
+            shift_jacobian, lever = -point_jacobian @ T[:, None, :3, :3], corners - origin
+        J = torch.cat([shift_jacobian, -shift_jacobian @ skew(lever)], -1)
         # Cramér-Rao bound of the pose from all corners; the repeatability of the robot is independent of it.
         covariance = self.corner_noise**2 * torch.linalg.inv(torch.einsum("ncki,nckj->nij", J, J))
         variances = [self.repeatability.length**2] * 3 + [self.repeatability.angle**2] * 3

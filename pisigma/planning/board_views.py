@@ -170,8 +170,8 @@ class BoardViews:
         points = self._sheet @ T_camera_board[:, :3, :3].mT + T_camera_board[:, None, :3, 3]
         in_front = points.clone()
         in_front[..., 2] = points[..., 2].clamp(min=1e-3)
-        pixels, by_point = map(torch.from_numpy, self.sight.camera.project(in_front.numpy()))
-        across = by_point[..., :2]
+        pixels, point_jacobian = map(torch.from_numpy, self.sight.camera.project(in_front.numpy()))
+        across = point_jacobian[..., :2]
         is_regular = (torch.linalg.det(across) > 0) & (across.diagonal(dim1=-2, dim2=-1).sum(-1) > 0)
         return points, pixels, is_regular
 

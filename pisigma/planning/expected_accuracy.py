@@ -52,12 +52,12 @@ class RemainingError:
         name: name of the group, such as "correction of joint 2" or "tool".
         rms: contribution to the RMS error over the task, `sqrt(rms² - rms'²)` with the error rms' if the group were
             known exactly [m].
-        share: share of the variance.
+        variance_share: share of the variance.
     """
 
     name: str
     rms: float
-    share: float
+    variance_share: float
 
 
 def accuracy_curve(

@@ -8,7 +8,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from pisigma.calibration.geometric.problem.parameters import ParameterSpace
-from pisigma.calibration.geometric.problem.prior_sizes import PriorGroup, prior_group_of
+from pisigma.calibration.geometric.problem.prior_scales import PriorGroup, prior_group_of
 from pisigma.calibration.geometric.problem.setup import IdentifiedGeometry
 from pisigma.calibration.hybrid.calibrator import HybridCalibrator
 from pisigma.calibration.hybrid.gravity import USUAL, to_first_row_frame

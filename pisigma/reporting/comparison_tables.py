@@ -23,7 +23,7 @@ _Lines = list[tuple[str, Sequence[str]]]
 
 
 def comparison_tables(
-    comparison: ModelComparison, data: str, width: int, whole: bool = True
+    comparison: ModelComparison, data: str, width: int, full: bool = True
 ) -> list[tuple[str, Table]]:
     """Return titled tables of the errors of every model, and of the differences to the first model.
 
@@ -33,14 +33,14 @@ def comparison_tables(
         comparison: comparison of one model or more.
         data: name of the rows.
         width: width of the screen [characters].
-        whole: show all figures; otherwise only RMS, 95 % quantile and maximum, and the mean difference.
+        full: show all figures; otherwise only RMS, 95 % quantile and maximum, and the mean difference.
     """
     names = [model.name for model in comparison.models]
     rows = f"{comparison.rows} rows ({comparison.configurations} configurations) of {data}"
-    tables = [(f"Errors of {rows}", names, _error_lines(comparison, whole))]
+    tables = [(f"Errors of {rows}", names, _error_lines(comparison, full))]
     if len(names) > 1:
         title = f"Differences from {names[0]} on the same rows, negative is better"
-        tables.append((title, names[1:], _difference_lines(comparison, whole)))
+        tables.append((title, names[1:], _difference_lines(comparison, full)))
     return [(title, one) for title, heads, lines in tables for one in _fitting(heads, lines, width)]
 
 
@@ -57,19 +57,19 @@ def comparison_blocks(
 ) -> tuple[list[Block], list[Block]]:
     """Return the errors of models on rows as text; unless `verbose`, remarks state which figures are omitted."""
 
-    def blocks(whole: bool) -> list[Block]:
-        tables = comparison_tables(comparison, Path(data).name, width, whole)
+    def blocks(full: bool) -> list[Block]:
+        tables = comparison_tables(comparison, Path(data).name, width, full)
         return [
-            table_block(title, *cells, "all statistics" if whole else title.split()[0].lower())
+            table_block(title, *cells, "all statistics" if full else title.split()[0].lower())
             for title, cells in tables
         ]
 
-    shown = blocks(whole=verbose)
+    shown = blocks(full=verbose)
     if comparison.socket_distance is not None:
         shown.append(
             table_block("stated distances between sockets", *distance_table(comparison.socket_distance))
         )
-    return shown, [] if verbose else blocks(whole=True)
+    return shown, [] if verbose else blocks(full=True)
 
 
 def _fitting(heads: Sequence[str], lines: _Lines, width: int) -> list[Table]:
@@ -90,16 +90,16 @@ def _fitting(heads: Sequence[str], lines: _Lines, width: int) -> list[Table]:
     ]
 
 
-def _error_lines(comparison: ModelComparison, whole: bool) -> _Lines:
+def _error_lines(comparison: ModelComparison, full: bool) -> _Lines:
     """Return errors with confidence intervals, per axis, and inside and outside the domain."""
-    shown = _SHOWN if whole else {key: text for key, text in _SHOWN.items() if key != "mean"}
+    shown = _SHOWN if full else {key: text for key, text in _SHOWN.items() if key != "mean"}
     models = comparison.models
     lines: _Lines = []
     for quantity, first in models[0].quantities.items():
         errors = [model.quantities[quantity] for model in models]
         lines += _statistic_lines(comparison, f"{quantity}, {{}} [{first.unit}]", shown, errors)
         word = "along" if quantity == "position" else "about"
-        for axis in first.axes if whole else ():
+        for axis in first.axes if full else ():
             values = [rounded(one.axes[axis]["rms"], comparison.rows) for one in errors]
             lines.append((f"{quantity}, RMS {word} {axis} [{first.unit}]", values))
     if any(model.rows_outside_domain for model in models):
@@ -131,16 +131,16 @@ def _statistic_lines(
     return lines
 
 
-def _difference_lines(comparison: ModelComparison, whole: bool) -> _Lines:
+def _difference_lines(comparison: ModelComparison, full: bool) -> _Lines:
     """Return the differences of the other models to the first, with intervals and Wilcoxon's p."""
     first, *others = comparison.models
     lines: _Lines = []
     for quantity, errors in first.quantities.items():
         differences = [_difference(model.quantities[quantity]) for model in others]
         label = f"{quantity}, {{}} [{errors.unit}]"
-        statistics = {"mean": "mean", "rms": "RMS"} if whole else {"mean": "mean"}
+        statistics = {"mean": "mean", "rms": "RMS"} if full else {"mean": "mean"}
         lines += _statistic_lines(comparison, label, statistics, differences)
-        if not whole:
+        if not full:
             continue
         shares = [f"{100 * one.better_share:.0f} %" for one in differences]
         lines.append((f"{quantity}, better in", shares))

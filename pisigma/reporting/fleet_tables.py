@@ -44,7 +44,7 @@ def _row(one: CellStatus) -> tuple[str, ...]:
 
 def fleet_verdict(status: FleetStatus) -> Verdict:
     """Return the verdict on a fleet: its largest error, and the cells that need attention."""
-    worst = next(iter(status.by_error), None)
+    worst = next(iter(status.sorted_by_error), None)
     serious = [state for state in status.states if state in (UNREADABLE, *ATTENTION)]
     count = len(status.cells) + len(status.unreadable)
     found = ", ".join(f"{len(status.states[state])} {state}" for state in serious)

@@ -28,7 +28,7 @@ _PLAUSIBLE_SHARE: Final = 0.01
 class GeometricSizes:
     """Sizes of errors by kind of geometric parameter.
 
-    The order is that of `pisigma.calibration.geometric.problem.prior_sizes.PriorGroup`.
+    The order is that of `pisigma.calibration.geometric.problem.prior_scales.PriorGroup`.
 
     Attributes:
         joint_offset: size for theta [rad].

@@ -82,15 +82,15 @@ class JointsRandom(Section):
         kind: "joints_random".
         count: number of joint vectors.
         seed: random seed.
-        share: fraction of the range between the joint limits, about its centre, that is used.
-        range_deg: smallest and largest value [deg] by name of a revolute joint, instead of the share.
-        range_mm: smallest and largest value [mm] by name of a prismatic joint, instead of the share.
+        range_fraction: fraction of the range between the joint limits, about its centre, that is used.
+        range_deg: smallest and largest value [deg] by name of a revolute joint, instead of the fraction.
+        range_mm: smallest and largest value [mm] by name of a prismatic joint, instead of the fraction.
     """
 
     kind: Literal["joints_random"]
     count: Count
     seed: Seed
-    share: float = Field(default=1.0, gt=0, le=1)
+    range_fraction: float = Field(default=1.0, gt=0, le=1)
     range_deg: dict[str, Range] = Field(default_factory=dict)
     range_mm: dict[str, Range] = Field(default_factory=dict)
 
@@ -128,7 +128,7 @@ class JointsRandom(Section):
         limits = robot.axis_limits
         with np.errstate(invalid="ignore"):  # joints without limits are refused later
             middle, half = limits.mean(1, keepdims=True), np.diff(limits) / 2
-            bounds: np.ndarray = middle + self.share * half * np.array([-1.0, 1.0])
+            bounds: np.ndarray = middle + self.range_fraction * half * np.array([-1.0, 1.0])
         fields = ("range_deg", "range_mm")
         ranges = stated_joints(robot, self.range_deg, self.range_mm, fields, "joints_random", axes=True)
         for index, stated in ranges.items():

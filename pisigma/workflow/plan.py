@@ -94,9 +94,9 @@ class Plan:
     def main_error_sources(self) -> tuple[str, ...]:
         """Groups of unknowns that will remain uncertain, and the contribution of each to the expected error."""
         return tuple(
-            f"{error.name}: {error.rms * 1e3:.3f} mm, {100 * error.share:.0f} % of the variance"
+            f"{error.name}: {error.rms * 1e3:.3f} mm, {100 * error.variance_share:.0f} % of the variance"
             for error in self.error_sources
-            if error.share >= _MIN_WEAK_SHARE
+            if error.variance_share >= _MIN_WEAK_SHARE
         )
 
     def to_json(self) -> dict[str, object]:

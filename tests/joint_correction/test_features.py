@@ -103,7 +103,7 @@ def test_the_period_of_an_unlimited_prismatic_joint_is_twice_the_reach():
 
 @pytest.mark.parametrize(("fine", "starts"), [(False, BAND_STARTS), (True, FINE_BAND_STARTS)])
 @pytest.mark.parametrize("harmonics", [1, 2, 5, 30])
-def test_harmonics_share_prior_sizes_in_bands(harmonics, fine, starts):
+def test_harmonics_share_prior_scales_in_bands(harmonics, fine, starts):
     series = FourierSeries(Robot.load("rb5"), harmonics, fine)
     assert series.count == 2 * harmonics
     assert bool(series.used.all())

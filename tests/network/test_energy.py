@@ -27,12 +27,12 @@ def test_energy_is_half_the_sum_of_squares():
 
 def test_the_gradient_agrees_with_autograd(problem):
     net, x, d = problem
-    E, by_weight, by_bias = energy_gradient(net, x, d)
+    E, weight_gradient, bias_gradient = energy_gradient(net, x, d)
     expected = energy(net.products(x), d)
     weight, bias = torch.autograd.grad(expected.sum(), [net.weight, net.bias])
     assert_close(E, expected, rtol=1e-13)
-    assert_close(by_weight, weight, rtol=1e-11, atol=1e-13)
-    assert_close(by_bias, bias, rtol=1e-11, atol=1e-13)
+    assert_close(weight_gradient, weight, rtol=1e-11, atol=1e-13)
+    assert_close(bias_gradient, bias, rtol=1e-11, atol=1e-13)
 
 
 def test_the_gradient_agrees_with_equation_4(generator):
@@ -53,9 +53,9 @@ def test_the_gradient_agrees_with_equation_4(generator):
             expected_b[j] += step
             for i in range(2):
                 expected_w[j][i] += step * row[i]
-    _, by_weight, by_bias = energy_gradient(net, x, d)
-    assert_close(by_weight[0], torch.tensor(expected_w, dtype=torch.float64), rtol=1e-12)
-    assert_close(by_bias[0], torch.tensor(expected_b, dtype=torch.float64), rtol=1e-12)
+    _, weight_gradient, bias_gradient = energy_gradient(net, x, d)
+    assert_close(weight_gradient[0], torch.tensor(expected_w, dtype=torch.float64), rtol=1e-12)
+    assert_close(bias_gradient[0], torch.tensor(expected_b, dtype=torch.float64), rtol=1e-12)
 
 
 def test_the_output_jacobian_agrees_with_torch_func(problem):
@@ -78,10 +78,10 @@ def test_the_output_jacobian_agrees_with_torch_func(problem):
 def test_pull_back_multiplies_by_the_transposed_jacobian(problem):
     net, x, d = problem
     weighted = weigh_sums(x, net.weight, net.bias, net.fixed).detach()
-    by_weight, by_bias = pull_back(d, x, weighted, net.fixed, net.orders)
+    weight_gradient, bias_gradient = pull_back(d, x, weighted, net.fixed, net.orders)
     J = output_jacobian(x, weighted, net.fixed, net.orders)
     expected = (J.mT @ d.T[..., None])[..., 0].reshape(2, -1, 4)
-    assert_close(torch.cat([by_weight, by_bias[..., None]], -1), expected, rtol=1e-11, atol=1e-13)
+    assert_close(torch.cat([weight_gradient, bias_gradient[..., None]], -1), expected, rtol=1e-11, atol=1e-13)
 
 
 def test_the_gradient_is_finite_if_all_sums_are_zero():

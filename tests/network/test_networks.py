@@ -72,12 +72,12 @@ def test_gradient_descent_is_the_papers_rule(data):
     network.initialise(0.2, torch.Generator().manual_seed(0))
     energies = []
     for _ in range(50):
-        E, by_weight, by_bias = energy_gradient(network, data.x, data.d)
+        E, weight_gradient, bias_gradient = energy_gradient(network, data.x, data.d)
         energies.append(E)
         with torch.no_grad():
             rates = torch.tensor([0.02, 0.01], dtype=torch.float64)
-            network.weight -= rates[:, None, None] * by_weight
-            network.bias -= rates[:, None] * by_bias
+            network.weight -= rates[:, None, None] * weight_gradient
+            network.bias -= rates[:, None] * bias_gradient
     trained, history = fit_one(data, DESCENT)
     assert_close(history, torch.stack(energies), rtol=1e-12)
     assert_close(trained.weight, network.weight, rtol=1e-12)
@@ -101,10 +101,10 @@ def test_a_step_follows_the_rates(data):
     fit = DESCENT.model_copy(update={"learning_rate": rates, "epochs": 1})
     network = PiSigma(2, 2, (2,), fixed_product=0.5)
     network.initialise(fit.spread, torch.Generator().manual_seed(fit.seed))
-    _, _, by_bias = energy_gradient(network, data.x, data.d)
+    _, _, bias_gradient = energy_gradient(network, data.x, data.d)
     trained, _ = fit_one(data, fit)
     assert_close(trained.bias[0], network.bias[0], atol=0)
-    assert_close(trained.bias[1], network.bias[1] - 0.02 * by_bias[1], rtol=1e-15)
+    assert_close(trained.bias[1], network.bias[1] - 0.02 * bias_gradient[1], rtol=1e-15)
 
 
 @pytest.mark.parametrize("epochs", [400, 9])

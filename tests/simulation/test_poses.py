@@ -90,7 +90,9 @@ def test_cube_random_poses_fill_their_region():
 
 def test_joints_fill_a_share_of_their_limits_and_stated_ranges():
     robot = Robot.load("kiro3")
-    source = JointsRandom(kind="joints_random", count=3000, seed=2, share=0.5, range_mm={"d_3": (-300, -200)})
+    source = JointsRandom(
+        kind="joints_random", count=3000, seed=2, range_fraction=0.5, range_mm={"d_3": (-300, -200)}
+    )
     q = source.joints(robot)
     bounds = torch.tensor([[-90, 90], [-79, 79], [-0.3, -0.2], [-180, 180]], dtype=torch.float64)
     bounds[[0, 1, 3]] = torch.deg2rad(bounds[[0, 1, 3]])

@@ -24,7 +24,7 @@ SOCKETS = {
     "seed": 1,
     "branch": {"near_deg": {}},
 }
-JOINTS = {"kind": "joints_random", "count": 40, "seed": 3, "share": 0.4}
+JOINTS = {"kind": "joints_random", "count": 40, "seed": 3, "range_fraction": 0.4}
 WIRE = {"name": "wire", "point_mm": (1500, -200, 900), "zero_mm": 12}
 NOISE = {"sensor_mm": 0.3, "repeatability_mm": 0.4, "seed": 5}
 

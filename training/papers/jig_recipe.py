@@ -169,9 +169,9 @@ class JigRecipe(Section):
     def calibrator(self, free: Free, jigs: Sequence[str]) -> GeometricCalibrator:
         """Return the calibrator for some jigs: the paper's parameters by plain least squares, or pisigma's default."""
         robot = Robot.load(self.robot)
-        frames = {name: base.tolist() for name, base in self.believed_bases().items() if name in jigs}
+        guesses = {name: base.tolist() for name, base in self.believed_bases().items() if name in jigs}
         if free == "default":
-            return GeometricCalibrator(robot, frames=frames)
+            return GeometricCalibrator(robot, base_guesses=guesses)
         return GeometricCalibrator(
             robot,
             free=self.paper_parameters,
@@ -179,7 +179,7 @@ class JigRecipe(Section):
             elimination="none",
             prior=None,
             loss=SquaredLoss(),
-            frames=frames,
+            base_guesses=guesses,
         )
 
     def believed_bases(self) -> dict[str, Float64[np.ndarray, " 6"]]:

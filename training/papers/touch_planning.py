@@ -153,8 +153,8 @@ def _rows_of_touches(
         rows[chosen, : len(columns)] = torch.einsum("ni,nip->np", along, J[:, :3, columns]) * usual
         # Derivatives by a small translation and rotation in the frame of the base: they span the same space as x, y, z,
         # roll, pitch and yaw, so the predicted error is the same.
-        by_base = torch.cat([along, torch.linalg.cross(T[:, :3, 3], along)], -1)
-        rows[chosen, start : start + 6] = by_base * usual_base
+        base_jacobian = torch.cat([along, torch.linalg.cross(T[:, :3, 3], along)], -1)
+        rows[chosen, start : start + 6] = base_jacobian * usual_base
     return rows
 
 

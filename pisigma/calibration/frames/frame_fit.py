@@ -201,7 +201,7 @@ def fit_frames(
         elimination="none",
         prior=None,
         loss=SquaredLoss(),
-        frames={name: tuple(base) for name, base in bases.items()} if only == "tool" else {},
+        base_guesses={name: tuple(base) for name, base in bases.items()} if only == "tool" else {},
     )
     used, wrong = list(range(rows.rows)), list[int]()
     while True:

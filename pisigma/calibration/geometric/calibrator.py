@@ -72,10 +72,10 @@ class GeometricCalibrator:
             correlation, as in Park et al. 2022), or "none". The predicted poses do not depend on it.
         prior: standard deviations of the errors of the parameters, or None. With a prior, parameters that the data
             do not determine keep their nominal values.
-        prior_sizes: "estimated" (one factor on the prior is estimated for each of joint offsets, lengths, lengths that
-            are nominally 0, and angles between axes), "widened" (one factor >= 1 for lengths and one for angles), or
-            "stated" (the prior is used unchanged).
-        frames: approximate base in frames with touches: x, y, z [m], roll, pitch, yaw [rad], such as the planned
+        prior_scaling: "estimated" (one factor on the prior is estimated for each of joint offsets, lengths, lengths
+            that are nominally 0, and angles between axes), "widened" (one factor >= 1 for lengths and one for
+            angles), or "stated" (the prior is used unchanged).
+        base_guesses: approximate base in frames with touches: x, y, z [m], roll, pitch, yaw [rad], such as the planned
             placement of a jig. It is needed only if the touches do not determine the base.
         socket_distances: distances between two sockets [m], which determine the scale:
             `{("plate/0", "plate/1"): 0.05}`.
@@ -94,8 +94,8 @@ class GeometricCalibrator:
     prior: Prior | None = field(default_factory=Prior)
     loss: AbstractLoss = field(default_factory=HampelLoss)
     maximum_iterations: int = 100
-    prior_sizes: str = "estimated"
-    frames: Mapping[str, Sequence[float]] = field(default_factory=dict)
+    prior_scaling: str = "estimated"
+    base_guesses: Mapping[str, Sequence[float]] = field(default_factory=dict)
     socket_distances: Mapping[PairOfSockets, float] = field(default_factory=dict)
     socket_sigma: float = 1e-5
     robot_class: str | None = None
@@ -106,7 +106,7 @@ class GeometricCalibrator:
             ("base", ("free", "fixed")),
             ("tool", ("free", "position", "fixed")),
             ("elimination", ("exact", "pairwise", "none")),
-            ("prior_sizes", ("stated", "widened", "estimated")),
+            ("prior_scaling", ("stated", "widened", "estimated")),
             ("robot_class", (None, *CLASSES)),
         ):
             if getattr(self, name) not in choices:
@@ -123,10 +123,10 @@ class GeometricCalibrator:
                 expected="names of parameters such as a_2, separated by single commas",
                 value=tuple(self.free),
             )
-        for name, base in self.frames.items():
+        for name, base in self.base_guesses.items():
             if len(base) != 6 or not all(math.isfinite(value) for value in base):
                 raise IdentificationError(
-                    option="frames",
+                    option="base_guesses",
                     expected=f"six finite numbers for '{name}': x, y, z [m], roll, pitch, yaw [rad]",
                     value=tuple(base),
                 )
@@ -196,10 +196,10 @@ class GeometricCalibrator:
             free_base=self._finds("base"),
             free_tool=self._finds("tool"),
             turn_tool=self.tool == "free",
-            frames={name: tuple(base) for name, base in self.frames.items()},
+            base_guesses={name: tuple(base) for name, base in self.base_guesses.items()},
             socket_distances=self.socket_distances,
             socket_sigma=self.socket_sigma,
-            prior_sizes=self.prior_sizes,  # type: ignore[arg-type]
+            prior_scaling=self.prior_scaling,  # type: ignore[arg-type]
             joint_repeatability=self.class_of_robot.joint_repeatability,
         )
         return build_setup(self.robot, measurements, options, self.prior, self.loss)

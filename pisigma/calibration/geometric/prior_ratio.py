@@ -8,7 +8,7 @@ from torch import Tensor
 
 from pisigma.calibration.geometric.problem.least_squares import Linearisation, covariance_of
 from pisigma.calibration.geometric.problem.noise import sensor_view_of
-from pisigma.calibration.geometric.problem.prior_sizes import LENGTH_GROUPS, PriorGroup, effective_parameters
+from pisigma.calibration.geometric.problem.prior_scales import LENGTH_GROUPS, PriorGroup, effective_parameters
 from pisigma.calibration.geometric.problem.problem import CalibrationProblem
 
 

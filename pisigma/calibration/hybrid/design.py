@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
-from pisigma.calibration.geometric.problem.prior_sizes import PriorGroup
+from pisigma.calibration.geometric.problem.prior_scales import PriorGroup
 from pisigma.calibration.geometric.problem.problem import CalibrationProblem
 from pisigma.calibration.hybrid.sensor_values import SensorValues
 from pisigma.estimation.held_out import HeldOutErrors

@@ -27,7 +27,7 @@ from pisigma.joint_correction.feature import AbstractFeature
 from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.measurement.conditions import JointState
 from pisigma.measurement.dataset import Measurements
-from pisigma.measurement.sensors.sensor import numbers_of
+from pisigma.measurement.sensors.sensor import indices_of_names
 from pisigma.robot.kinematics.parameter_jacobian import identification_jacobian
 
 CHUNK = 128
@@ -96,8 +96,8 @@ class PositionUncertainty:
             correction: the joint correction; None without one.
         """
         state = JointState.from_measurements(measurements)
-        frame = numbers_of(measurements.frame, self.space.frames, measurements.rows)
-        target = numbers_of(measurements.target, self.space.targets, measurements.rows)
+        frame = indices_of_names(measurements.frame, self.space.frames, measurements.rows)
+        target = indices_of_names(measurements.target, self.space.targets, measurements.rows)
         deviation = torch.full((measurements.rows, 3), torch.nan, dtype=torch.float64)
         for f in range(len(self.space.frames)):
             for t in range(len(self.space.targets)):

@@ -170,7 +170,7 @@ def _print_status(seen: "FleetStatus", page: Path | None, verbose: bool) -> None
     from pisigma.lifetime.cell.step import ATTENTION
     from pisigma.reporting.fleet_tables import ERRORS_NOTE, cell_table, fleet_verdict, state_table
 
-    worst, few = [one for one, _ in seen.by_error], len(seen.cells) <= _SHOWN
+    worst, few = [one for one, _ in seen.sorted_by_error], len(seen.cells) <= _SHOWN
     warned = [f"{one.name}: {one.step.reason}" for one in seen.cells if one.step.state in ATTENTION]
     warned += [f"{name}: {reason}" for name, reason in seen.unreadable.items()]
     print_screen(

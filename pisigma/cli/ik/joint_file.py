@@ -134,7 +134,7 @@ def write_joint_file(
             chunk_rows = _solved_rows(solver, chunk, branch, accuracy, outcome, path)
             writer.writerows(cells + [""] * (len(header) - len(cells)) for cells in chunk_rows)
             rate = outcome.rows / max(time.monotonic() - begun, 1e-3)
-            share = "" if math.isnan(chunk.share) else f", {100 * chunk.share:.0f} %"
+            share = "" if math.isnan(chunk.read_fraction) else f", {100 * chunk.read_fraction:.0f} %"
             tell(f"{outcome.rows:,} rows{share}, {rate:,.0f} rows/s")
     return outcome
 

@@ -56,7 +56,7 @@ class FleetStatus:
         return states
 
     @cached_property
-    def by_error(self) -> tuple[tuple[CellStatus, Check], ...]:
+    def sorted_by_error(self) -> tuple[tuple[CellStatus, Check], ...]:
         """Cells with a known error, and the check that determined it, largest RMS error first."""
         known = [(one, check) for one in self.cells if (check := one.last_error) is not None]
         return tuple(sorted(known, key=lambda one: -(one[1].rms_mm or 0.0)))
@@ -73,7 +73,7 @@ class FleetStatus:
             "states": {state: list(cells) for state, cells in self.states.items()},
             "largest_errors": [
                 {"cell": one.name, "rms_mm": check.rms_mm, "command": check.command}
-                for one, check in self.by_error
+                for one, check in self.sorted_by_error
             ],
             "unreadable": [{"cell": name, "reason": reason} for name, reason in self.unreadable.items()],
             "cells": [one.to_json() for one in self.cells],

@@ -20,6 +20,13 @@ from pisigma.model.training_rows import repeated_row_warnings
 
 _SESSION = TypeAdapter(Session)
 _VALUES = ("numbers", "steps", "kind", "file")
+_ZEROS = {
+    "shift": "shift",
+    "deviation": "deviation",
+    "model_sensitivity": "influence",
+    "session_covariance": "own",
+}
+"""Key of every field of `JointZeros` in a history."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,10 +143,7 @@ def _packed(zeros: JointZeros, values: RowValues | None) -> bytes:
     rows = {} if values is None else {f"rows_{name}": getattr(values, name).numpy() for name in _VALUES}
     np.savez(
         stream,
-        shift=zeros.shift.numpy(),
-        deviation=zeros.deviation.numpy(),
-        influence=zeros.influence.numpy(),
-        own=zeros.own.numpy(),
+        **{key: getattr(zeros, field).numpy() for field, key in _ZEROS.items()},
         **rows,
     )
     return stream.getvalue()
@@ -147,8 +151,9 @@ def _packed(zeros: JointZeros, values: RowValues | None) -> bytes:
 
 def _unpacked(content: bytes) -> tuple[JointZeros, RowValues | None]:
     with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
-        names = ("shift", "deviation", "influence", "own")
-        zeros = JointZeros(*(torch.from_numpy(arrays[name].astype(np.float64)) for name in names))
+        zeros = JointZeros(
+            **{f: torch.from_numpy(arrays[key].astype(np.float64)) for f, key in _ZEROS.items()}
+        )
         if not {f"rows_{name}" for name in _VALUES} <= set(arrays):
             return zeros, None
         return zeros, RowValues(*(torch.from_numpy(arrays[f"rows_{name}"]) for name in _VALUES))

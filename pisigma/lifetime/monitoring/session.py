@@ -54,15 +54,15 @@ class JointZeros:
     Attributes:
         shift: shifts [rad or m].
         deviation: standard deviations, including the uncertainty of the model and the prior of about 1 deg [rad or m].
-        influence: derivatives of the shifts with respect to the directions of the model's uncertainty, which all
-            sessions share.
-        own: covariance due to the noise and the moved bases and tools of this session.
+        model_sensitivity: derivatives of the shifts with respect to the directions of the model's uncertainty, which
+            all sessions share.
+        session_covariance: covariance due to the noise and the moved bases and tools of this session.
     """
 
     shift: Float64[Tensor, " dof"]
     deviation: Float64[Tensor, " dof"]
-    influence: Float64[Tensor, "dof directions"]
-    own: Float64[Tensor, "dof dof"]
+    model_sensitivity: Float64[Tensor, "dof directions"]
+    session_covariance: Float64[Tensor, "dof dof"]
 
 
 @dataclass(frozen=True)
@@ -362,8 +362,8 @@ def _zeros(solved: _Solved) -> JointZeros:
     """Estimate the zeros of all joints together."""
     evidence, noise_factor = solved.evidence.with_moved(solved.moved_frames), solved.explanation.noise_factor
     shift, covariance = evidence.estimate_shift(_joints(solved), noise_factor)
-    influence, own = evidence.influence(_joints(solved), noise_factor)
-    return JointZeros(shift, covariance.diagonal().sqrt(), influence, own)
+    sensitivity, session_covariance = evidence.sensitivity_and_covariance(_joints(solved), noise_factor)
+    return JointZeros(shift, covariance.diagonal().sqrt(), sensitivity, session_covariance)
 
 
 def _joints(solved: _Solved) -> list[DriftGroup]:

@@ -315,9 +315,9 @@ def _joint_values(records: Sequence[Record], joint: int) -> tuple[Tensor, Tensor
     The shifts are correlated, because all sessions share the uncertainty of the model.
     """
     values = [float(one.zeros.shift[joint]) if one.session.observable[joint] else math.nan for one in records]
-    influence = torch.stack([one.zeros.influence[joint] for one in records])
-    own = torch.stack([one.zeros.own[joint, joint] for one in records])
-    return torch.tensor(values, dtype=torch.float64), influence @ influence.t() + own.diag()
+    sensitivity = torch.stack([one.zeros.model_sensitivity[joint] for one in records])
+    variance = torch.stack([one.zeros.session_covariance[joint, joint] for one in records])
+    return torch.tensor(values, dtype=torch.float64), sensitivity @ sensitivity.t() + variance.diag()
 
 
 def _error_score(record: Record) -> float:

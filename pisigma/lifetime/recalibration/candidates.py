@@ -93,7 +93,7 @@ class CandidateChoice:
 
 def choose_candidate(
     model: CalibratedModel,
-    whole: Adaptation,
+    adaptation: Adaptation,
     relocated: Set[FrameKey],
     rows: Measurements,
     calibrator: Calibrator,
@@ -103,13 +103,13 @@ def choose_candidate(
 
     Args:
         model: the model that is recalibrated.
-        whole: adaptation of the model to all rows.
+        adaptation: adaptation of the model to all rows.
         relocated: bases and tools that were moved since the model was made.
         rows: new rows, frames and targets by the names of the model.
         calibrator: calibrator for the calibration from scratch.
         progress: callback that is called with the fold that is being predicted.
     """
-    posterior, noise = whole.problem.posterior, whole.drift.noise
+    posterior, noise = adaptation.problem.posterior, adaptation.drift.noise
     folds = min(_FOLDS, int(groups_to_keep_whole(rows).max()) + 1)
     names = get_args(Kept)
     errors: dict[Kept, Tensor] = {name: torch.full((rows.rows,), torch.nan).double() for name in names}
@@ -119,7 +119,7 @@ def choose_candidate(
         test = test[_predictable(rows, test, training)]
         problem = recalibration_problem(model, posterior, training, relocated)
         candidates: dict[Kept, Callable[[], ErrorPredictor]] = {
-            "recalibrated": partial(adapt, problem, noise, whole.drift),
+            "recalibrated": partial(adapt, problem, noise, adaptation.drift),
             "old": partial(adapt, problem.with_fixed_arm(), noise),
             "scratch": partial(fit, calibrator, training, lambda what: None),
         }

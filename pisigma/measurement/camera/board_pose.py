@@ -32,8 +32,8 @@ class BoardPose:
             the noise of the corners is 1 px.
         distance: length of every corner's residual, divided by the relative standard deviation of the corner [px].
         weight: weight of every corner by the robust loss.
-        by_intrinsics: derivative of the solved pose (shift of t [m], rotation vector of R in the camera's frame [rad])
-            with respect to the intrinsics.
+        intrinsics_jacobian: derivative of the solved pose (shift of t [m], rotation vector of R in the camera's frame
+            [rad]) with respect to the intrinsics.
         root: square root of the corners' information on the intrinsics k, with the pose eliminated and a noise of 1
             px: `root (k - present) = residual`.
         residual: right-hand side of the equation of `root` [px].
@@ -44,7 +44,7 @@ class BoardPose:
     cofactor: Float64[np.ndarray, "6 6"]
     distance: Float64[np.ndarray, " corners"]
     weight: Float64[np.ndarray, " corners"]
-    by_intrinsics: Float64[np.ndarray, "6 9"]
+    intrinsics_jacobian: Float64[np.ndarray, "6 9"]
     root: Float64[np.ndarray, "9 9"]
     residual: Float64[np.ndarray, " 9"]
 
@@ -79,8 +79,8 @@ def solve_board_pose(
             break
     residual, J, _ = linearise_pixels(camera, corners, pixels, sigma, R, t)
     weight = _weights(residual, loss)
-    by_intrinsics = camera.by_intrinsics(corners @ R.T + t) / sigma[:, None, None]
-    columns = np.concatenate([J, by_intrinsics, residual[..., None]], -1)
+    intrinsics_jacobian = camera.intrinsics_jacobian(corners @ R.T + t) / sigma[:, None, None]
+    columns = np.concatenate([J, intrinsics_jacobian, residual[..., None]], -1)
     # blocks of the factor: pose, intrinsics after elimination of the pose, and the residual as last column
     factor = triangular_factor((np.sqrt(weight)[:, None, None] * columns).reshape(-1, columns.shape[-1]))
     inverse = np.linalg.inv(factor[:POSE, :POSE])
@@ -90,7 +90,7 @@ def solve_board_pose(
         inverse @ inverse.T,
         np.linalg.norm(residual, axis=1),
         weight,
-        by_intrinsics=-inverse @ factor[:POSE, POSE:-1],
+        intrinsics_jacobian=-inverse @ factor[:POSE, POSE:-1],
         root=factor[POSE:-1, POSE:-1],
         residual=factor[POSE:-1, -1],
     )
@@ -115,10 +115,14 @@ def linearise_pixels(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return measured minus predicted pixels, and derivatives with respect to pose and point, all divided by sigma."""
     rotated = corners @ R.T
-    predicted, by_point = camera.project(rotated + t)
-    by_rotation = -by_point @ skew(torch.from_numpy(rotated)).numpy()
-    J = np.concatenate([by_point, by_rotation], -1)
-    return (pixels - predicted) / sigma[:, None], J / sigma[:, None, None], by_point / sigma[:, None, None]
+    predicted, point_jacobian = camera.project(rotated + t)
+    rotation_jacobian = -point_jacobian @ skew(torch.from_numpy(rotated)).numpy()
+    J = np.concatenate([point_jacobian, rotation_jacobian], -1)
+    return (
+        (pixels - predicted) / sigma[:, None],
+        J / sigma[:, None, None],
+        point_jacobian / sigma[:, None, None],
+    )
 
 
 def _weights(residual: np.ndarray, loss: AbstractLoss) -> np.ndarray:

@@ -227,13 +227,15 @@ class Camera:
         xy = points[..., :2] / points[..., 2:]
         distorted, derivative = self._distorted(xy)
         scale = np.array([self.fx, self.fy])
-        by_point = np.zeros((*xy.shape, 3))
-        by_point[..., 0, 0] = by_point[..., 1, 1] = 1.0
-        by_point[..., 2] = -xy
-        by_point /= points[..., 2, None, None]
-        return distorted * scale + (self.cx, self.cy), scale[:, None] * (derivative @ by_point)
+        point_jacobian = np.zeros((*xy.shape, 3))
+        point_jacobian[..., 0, 0] = point_jacobian[..., 1, 1] = 1.0
+        point_jacobian[..., 2] = -xy
+        point_jacobian /= points[..., 2, None, None]
+        return distorted * scale + (self.cx, self.cy), scale[:, None] * (derivative @ point_jacobian)
 
-    def by_intrinsics(self, points: Float64[np.ndarray, "*batch 3"]) -> Float64[np.ndarray, "*batch 2 9"]:
+    def intrinsics_jacobian(
+        self, points: Float64[np.ndarray, "*batch 3"]
+    ) -> Float64[np.ndarray, "*batch 2 9"]:
         """Return the derivative of the pixels of points in the camera's frame [m] with respect to the intrinsics.
 
         Pixels are focal lengths times a polynomial that is linear in the distortion, so the derivatives are the

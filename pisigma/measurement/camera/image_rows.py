@@ -273,9 +273,9 @@ def update_bend(
     prior = max(noise, MIN_NOISE) / (board.flatness / 2)
     rows = [np.concatenate([prior * np.eye(_SHAPES), -prior * bend[:, None]], 1)]
     for number, at, deviation, pose in zip(numbers, pixels, sigma, poses, strict=True):
-        residual, J, by_point = linearise_pixels(camera, corners[number], at, deviation, pose.R, pose.t)
-        by_height = (by_point @ pose.R[:, 2])[..., None] * of_corner[number][:, None]
-        columns = np.concatenate([J, by_height, residual[..., None]], -1)
+        residual, J, point_jacobian = linearise_pixels(camera, corners[number], at, deviation, pose.R, pose.t)
+        height_jacobian = (point_jacobian @ pose.R[:, 2])[..., None] * of_corner[number][:, None]
+        columns = np.concatenate([J, height_jacobian, residual[..., None]], -1)
         weighted = np.sqrt(pose.weight)[:, None, None] * columns
         rows.append(triangular_factor(weighted.reshape(-1, columns.shape[-1]))[POSE:-1, POSE:])
     stacked = np.concatenate(rows)

@@ -81,7 +81,7 @@ class SolvedImages:
         rows = (len(self.poses), len(INTRINSICS))
         stated = (self.present.intrinsics, self.camera.intrinsics, self.sigma)
         return ImageIntrinsics(
-            np.stack([pose.by_intrinsics for pose in self.poses]),
+            np.stack([pose.intrinsics_jacobian for pose in self.poses]),
             np.stack([pose.root for pose in self.poses]) / self.noise,
             np.stack([pose.residual for pose in self.poses]) / self.noise,
             *(np.broadcast_to(values, rows) for values in stated),

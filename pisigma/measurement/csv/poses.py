@@ -40,13 +40,13 @@ class PoseChunk:
         T: T_base_tool [m] of the valid rows.
         line: line numbers of the valid rows.
         bad: invalid rows, with their faults.
-        share: fraction of the file that has been read, 0 to 1; NaN if the length of the file is unknown.
+        read_fraction: fraction of the file that has been read, 0 to 1; NaN if the length of the file is unknown.
     """
 
     T: Float64[Tensor, "rows 4 4"]
     line: tuple[int, ...]
     bad: tuple[UnusableRow, ...]
-    share: float
+    read_fraction: float
 
 
 def read_poses(path: str | os.PathLike[str]) -> PoseChunk:
@@ -62,7 +62,7 @@ def read_poses(path: str | os.PathLike[str]) -> PoseChunk:
             raise bad.error(str(path))
         T.append(chunk.T)
         lines.extend(chunk.line)
-    return PoseChunk(torch.cat(T), tuple(lines), bad=(), share=1.0)
+    return PoseChunk(torch.cat(T), tuple(lines), bad=(), read_fraction=1.0)
 
 
 def read_pose_chunks(path: str | os.PathLike[str], rows: int = CHUNK_ROWS) -> Iterator[PoseChunk]:
@@ -99,7 +99,7 @@ def _chunks(file: TextIO, source: str, rows: int) -> Iterator[PoseChunk]:
             T=T[sound],
             line=tuple(number for (number, _), good in zip(some, sound.tolist(), strict=True) if good),
             bad=tuple(UnusableRow.from_fault(some[row][0], fault) for row, fault in sorted(faults.items())),
-            share=file.buffer.tell() / length if length else float("nan"),
+            read_fraction=file.buffer.tell() / length if length else float("nan"),
         )
     if not any_row:
         raise MeasurementError(

@@ -21,7 +21,7 @@ from pisigma.measurement.sensors.sensor import (
     Values,
     component_along,
     distinct_names,
-    numbers_of,
+    indices_of_names,
     owners_of,
     unit_vectors,
 )
@@ -110,7 +110,7 @@ class AnchorSensor(AbstractSensor):
             return None
         values = torch.zeros(len(names), 4, dtype=torch.float64)
         free = torch.ones_like(values, dtype=torch.bool)
-        number = numbers_of(measurements.anchor, names, measurements.rows)
+        number = indices_of_names(measurements.anchor, names, measurements.rows)
         for k, name in enumerate(names):
             rows = (number == k).nonzero()[:, 0]
             points, distance = T[rows, :3, 3], measurements.distance.cpu()[rows]

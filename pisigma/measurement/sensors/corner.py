@@ -96,9 +96,9 @@ class CornerSensor(AbstractSensor):
         present: mask of the rows from images.
         camera: index of the camera among those whose intrinsics are estimated, -1 in rows without one.
         at: intrinsics with which the poses were solved.
-        by_intrinsics: derivative of the weighted measured pose with respect to the intrinsics.
+        intrinsics_jacobian: derivative of the weighted measured pose with respect to the intrinsics.
         board: index of the board, -1 in rows without one.
-        by_scale: derivative of the weighted measured pose with respect to the scale of the board [m].
+        scale_derivative: derivative of the weighted measured pose with respect to the scale of the board [m].
         sigma: None; the noise is estimated.
     """
 
@@ -118,9 +118,9 @@ class CornerSensor(AbstractSensor):
     present: Bool[Tensor, " rows"]
     camera: Int64[Tensor, " rows"]
     at: Float64[Tensor, "9 rows"]
-    by_intrinsics: Float64[Tensor, "6 9 rows"]
+    intrinsics_jacobian: Float64[Tensor, "6 9 rows"]
     board: Int64[Tensor, " rows"]
-    by_scale: Float64[Tensor, "6 rows"]
+    scale_derivative: Float64[Tensor, "6 rows"]
     sigma: Float64[Tensor, " rows"] | None = None
 
     @classmethod
@@ -140,7 +140,9 @@ class CornerSensor(AbstractSensor):
         images = ImageIntrinsics.from_texts(texts_of(data, INTRINSICS_COLUMN))
         of_camera, of_board = cameras(data), boards(data)
         at, by = (torch.from_numpy(values).to(R) for values in (images.at, images.pose_jacobian))
-        by_scale = torch.where(present, torch.einsum("nij,nj->in", weight[..., :3], data.position), 0.0)
+        scale_derivative = torch.where(
+            present, torch.einsum("nij,nj->in", weight[..., :3], data.position), 0.0
+        )
         return cls(
             position,
             rotation.permute(1, 2, 0).contiguous(),
@@ -148,9 +150,9 @@ class CornerSensor(AbstractSensor):
             present,
             camera=rows.numbers(of_camera, distinct_names(of_camera)),
             at=at.t(),
-            by_intrinsics=(weight @ by).permute(1, 2, 0),
+            intrinsics_jacobian=(weight @ by).permute(1, 2, 0),
             board=rows.numbers(of_board, distinct_names(of_board)),
-            by_scale=by_scale,
+            scale_derivative=scale_derivative,
         )
 
     def residual(self, motion: ToolMotion, unknowns: Unknowns, rows: slice) -> Values:
@@ -159,9 +161,9 @@ class CornerSensor(AbstractSensor):
         residual: Tensor = torch.einsum("ijn,jn->in", self.weight[..., rows], error)
         if "camera" in unknowns:
             moved = unknowns["camera"][:, self.camera[rows]] - self.at[:, rows]
-            residual += torch.einsum("ijn,jn->in", self.by_intrinsics[..., rows], moved)
+            residual += torch.einsum("ijn,jn->in", self.intrinsics_jacobian[..., rows], moved)
         if "board" in unknowns:
-            residual += self.by_scale[:, rows] * unknowns["board"][:, self.board[rows]]
+            residual += self.scale_derivative[:, rows] * unknowns["board"][:, self.board[rows]]
         return residual
 
     def derivative(self, motion: ToolMotion, unknowns: Unknowns, rows: slice) -> Derivative:
@@ -183,9 +185,9 @@ class CornerSensor(AbstractSensor):
     ) -> tuple[UnknownDerivative, ...]:
         """Return the negative derivative of the measured pose with respect to intrinsics and board scale."""
         of_camera = UnknownDerivative(
-            "camera", self.camera[rows], -self.by_intrinsics[..., rows].transpose(0, 1)
+            "camera", self.camera[rows], -self.intrinsics_jacobian[..., rows].transpose(0, 1)
         )
-        of_board = UnknownDerivative("board", self.board[rows], -self.by_scale[None, :, rows])
+        of_board = UnknownDerivative("board", self.board[rows], -self.scale_derivative[None, :, rows])
         return tuple(one for one in (of_camera, of_board) if one.group in unknowns)
 
     def _rotation_error(self, motion: ToolMotion, rows: slice) -> Float[Tensor, "3 poses"]:

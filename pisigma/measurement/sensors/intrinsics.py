@@ -23,7 +23,7 @@ from pisigma.measurement.sensors.sensor import (
     Unknowns,
     Values,
     distinct_names,
-    numbers_of,
+    indices_of_names,
     owners_of,
 )
 from pisigma.robot.kinematics.parameter_jacobian import ToolMotion
@@ -218,7 +218,7 @@ class IntrinsicsSensor(AbstractSensor):
             return None
         images = ImageIntrinsics.from_texts(texts_of(data, INTRINSICS_COLUMN))
         noise = torch.nan_to_num(rows.readings(NOISE_COLUMN), nan=1.0)
-        number = numbers_of(names, distinct_names(names), data.rows).numpy()
+        number = indices_of_names(names, distinct_names(names), data.rows).numpy()
         owners = np.full(data.rows, -1)
         roots, means = np.zeros((NUMBERS, NUMBERS, data.rows)), np.zeros((NUMBERS, data.rows))
         for camera in range(number.max() + 1):

@@ -23,7 +23,7 @@ from pisigma.measurement.sensors.sensor import (
     SensorRows,
     UnknownGroup,
     distinct_names,
-    numbers_of,
+    indices_of_names,
 )
 from pisigma.measurement.sensors.socket import SocketSensor
 from pisigma.measurement.sensors.touch import TouchSensor
@@ -107,7 +107,7 @@ def sort_pairs_first(measurements: Measurements, rows: Int64[Tensor, " rows"]) -
     if measurements.pair is None:
         return rows
     order = distinct_names(measurements.pair)
-    number = numbers_of(measurements.pair, order, measurements.rows).to(rows.device)[rows]
+    number = indices_of_names(measurements.pair, order, measurements.rows).to(rows.device)[rows]
     number = torch.where(number < 0, len(order), number)
     return rows[torch.sort(number, stable=True).indices]
 

@@ -131,7 +131,7 @@ class SensorRows:
 
     def numbers(self, names: tuple[str, ...] | None, order: tuple[str, ...]) -> Int64[Tensor, " rows"]:
         """Return the index of every row's name in `order`; -1 if `order` does not contain it."""
-        return numbers_of(names, order, self.measurements.rows).to(self.measurements.q.device)
+        return indices_of_names(names, order, self.measurements.rows).to(self.measurements.q.device)
 
 
 @dataclass(frozen=True, eq=False)
@@ -266,7 +266,9 @@ def _names_in(measurements: Measurements, row: int) -> set[str]:
     return {texts[row] for texts in measurements.as_fields().texts.values()}
 
 
-def numbers_of(names: tuple[str, ...] | None, order: Sequence[str], rows: int) -> Int64[Tensor, " rows"]:
+def indices_of_names(
+    names: tuple[str, ...] | None, order: Sequence[str], rows: int
+) -> Int64[Tensor, " rows"]:
     """Return the index of every row's name in `order`; -1 if `order` does not contain it."""
     numbers = {name: number for number, name in enumerate(order)}
     different = set(names or ("",))

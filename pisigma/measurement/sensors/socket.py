@@ -21,7 +21,7 @@ from pisigma.measurement.sensors.sensor import (
     Unknowns,
     Values,
     distinct_names,
-    numbers_of,
+    indices_of_names,
     owners_of,
     unit_vectors,
 )
@@ -97,7 +97,7 @@ class SocketSensor(AbstractSensor):
         names = distinct_names(measurements.socket)
         if not names:
             return None
-        socket = numbers_of(measurements.socket, names, measurements.rows)
+        socket = indices_of_names(measurements.socket, names, measurements.rows)
         points, socket = T[socket >= 0, :3, 3], socket[socket >= 0]
         middle = group_means(points, socket, len(names))
         usual = float((points - middle[socket]).norm(dim=-1).median())
@@ -115,7 +115,7 @@ class SocketSensor(AbstractSensor):
         cls, measurements: Measurements, owner: str, T: Poses, calibrated: Collection[str]
     ) -> Float64[Tensor, " columns"]:
         """Return the mean position of the rows of a socket, without outliers."""
-        rows = numbers_of(measurements.socket, (owner,), measurements.rows).to(T.device) == 0
+        rows = indices_of_names(measurements.socket, (owner,), measurements.rows).to(T.device) == 0
         points = T[rows, :3, 3]
         off = (points - points.quantile(0.5, dim=0)).norm(dim=-1)
         middle: Tensor = points[off <= _OUTLIER_FACTOR * off.quantile(0.5)].mean(0)

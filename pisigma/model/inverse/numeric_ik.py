@@ -316,7 +316,7 @@ class NumericIK:
         """Compute the residuals [m, rad] in the axes of the tool; NaN where the model has no prediction."""
         known = torch.isfinite(reached).flatten(1).all(-1)[:, None]
         safe = torch.nan_to_num(reached)
-        error = pose_error(T, safe) if self.task_axes.whole else task_error(self.task_axes, T, safe)[0]
+        error = pose_error(T, safe) if self.task_axes.is_exact else task_error(self.task_axes, T, safe)[0]
         return torch.where(known, error, torch.nan)
 
     def _rank(self, T: Tensor, q: Tensor, branch: Tensor, near: Tensor | None) -> Tensor:

@@ -120,7 +120,7 @@ def _attached(robot: Robot, T: Tensor, axes: TaskAxes, q: Tensor, motion: Motion
 
 def _inverse(robot: Robot, T: Tensor, axes: TaskAxes, reached: Tensor, J: Tensor) -> Tensor:
     """Compute matrices from twists of target poses to joint motions in the constrained axes, `(poses, dof, 6)`."""
-    if axes.whole:
+    if axes.is_exact:
         return pseudo_inverse(robot, J)
     _, turn = task_error(axes, T, reached)
     turn = turn * turn.new_tensor(axes.weights(robot.dof))[:, None]

@@ -12,7 +12,7 @@ from torch import Tensor
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.calibration.geometric.identifiability.sufficiency import floating_bases
 from pisigma.calibration.geometric.problem.parameters import USUAL_LENGTH
-from pisigma.calibration.geometric.problem.prior_sizes import PriorGroup
+from pisigma.calibration.geometric.problem.prior_scales import PriorGroup
 from pisigma.calibration.geometric.problem.setup import (
     CalibrationSetup,
     IdentifiedGeometry,

@@ -218,7 +218,7 @@ def fleet_page(status: FleetStatus, folder: Path) -> str:
         status: status of the fleet.
         folder: folder of the page, from which the cards of the models are linked.
     """
-    place = {one.name: number for number, (one, _) in enumerate(status.by_error)}
+    place = {one.name: number for number, (one, _) in enumerate(status.sorted_by_error)}
     cells = sorted(status.cells, key=lambda one: (*urgency(one), place.get(one.name, len(place))))
     kinds = {state: "good" if state == "up_to_date" else "doubt" for state in status.states}
     bad = (UNREADABLE, *ATTENTION)

@@ -192,7 +192,7 @@ class TaskMotion:
     ) -> tuple[Float[Tensor, "poses 6"], Float[Tensor, "poses 6 dof"]]:
         """Return the weighted errors of the poses at joint values relative to the target poses, and their Jacobian."""
         reached, J = self.motion(q)
-        if self.axes.whole:
+        if self.axes.is_exact:
             return pose_error(T, reached), J.clone()
         error, turn = task_error(self.axes, T, reached)
         return self.weights * error, self.weights[:, None] * (turn @ J)

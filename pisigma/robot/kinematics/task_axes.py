@@ -53,7 +53,7 @@ class TaskAxes:
         return tuple(value < 0 or value == math.inf for value in self.tolerance)
 
     @cached_property
-    def whole(self) -> bool:
+    def is_exact(self) -> bool:
         """Whether all axes must be met exactly."""
         return not any(self.tolerance)
 
@@ -85,7 +85,7 @@ class TaskAxes:
     def directions(self) -> tuple[bool, ...]:
         """Tool axes whose directions measure the distance between poses; see `StoredStarts.nearest`."""
         counted = self.free.count(False) > 3
-        return tuple(self.whole or (counted and k == self.pivot) for k in range(3))
+        return tuple(self.is_exact or (counted and k == self.pivot) for k in range(3))
 
     @cached_property
     def pivot(self) -> int:
@@ -101,7 +101,7 @@ class TaskAxes:
     @cached_property
     def row(self) -> Any:
         """Kernel form `(1, 8)`: tolerances, elbow angle (NaN if free) and pivot; `(0, 8)` if all axes are exact."""
-        if self.whole and self.elbow_angle is None:
+        if self.is_exact and self.elbow_angle is None:
             return np.zeros((0, 8))
         elbow = math.nan if self.elbow_angle is None else self.elbow_angle
         return np.array([[*self.tolerance, elbow, self.pivot]])

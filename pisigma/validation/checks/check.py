@@ -103,9 +103,9 @@ LARGE_SHARE = 2e-3
 """Size of errors, as a share of the reach, above which their cause is a mistake or a motion, not wear."""
 _STEP = 1e-6
 """Step of finite differences with respect to joint values [rad or m]."""
-FITTED = 9
+FITTED_PARAMETERS = 9
 """Number of parameters of a base and of the position of a tool."""
-MIN_ROWS_OF_MODEL = 5
+MIN_POSITION_ROWS = 5
 """Smallest number of rows with positions that a check requires."""
 
 
@@ -145,7 +145,7 @@ class RowsUnderModel:
         some = judged_values(model, rows)
         T = poses_of_rows(model, with_known_names(model, some, kinds))
         there = torch.isfinite(rows.position).all(-1) & torch.isfinite(T).flatten(1).all(-1)
-        if int(there.sum()) < MIN_ROWS_OF_MODEL:
+        if int(there.sum()) < MIN_POSITION_ROWS:
             return None
         some = replace(some.select(there), pair=None, distance=None)
         return RowsUnderModel(model, some, kinds, frozenset(may_move), nominal)

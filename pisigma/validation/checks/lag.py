@@ -28,13 +28,13 @@ class Lag:
     Attributes:
         before: whether joint values were logged before the arrival, on the way from the previous row; otherwise they
             were logged after departure.
-        share: lag as a share of the motion between two rows [1].
+        motion_fraction: lag as a share of the motion between two rows [1].
         factor: ratio of the errors with and without the lag [1].
         log_bayes_factor: logarithm of the odds of a lag against no lag.
     """
 
     before: bool
-    share: float
+    motion_fraction: float
     factor: float
     log_bayes_factor: float
 
@@ -54,10 +54,10 @@ def check_lag(checked: CheckedCalibration) -> Iterator[Diagnostic]:
         kind="lag",
         severity="implausible" if lag.factor > _LARGE else "warning",
         sentence=f"The joint values were logged {when}: they differ from those at the measurement by "
-        f"{abs(lag.share):.2g} of the motion {motion} and make the errors {lag.factor:.3g} times as large; log "
-        "them when the robot has stopped.",
+        f"{abs(lag.motion_fraction):.2g} of the motion {motion} and make the errors {lag.factor:.3g} times as large; "
+        "log them when the robot has stopped.",
         cause="before_arrival" if lag.before else "after_departure",
-        values={"share": lag.share, "factor": lag.factor, "log_odds": lag.log_bayes_factor},
+        values={"share": lag.motion_fraction, "factor": lag.factor, "log_odds": lag.log_bayes_factor},
         remedy="Log them when the robot has stopped.",
     )
 

@@ -15,7 +15,7 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel, poses_of_rows
 from pisigma.robot.robot_class import plausible_share
 from pisigma.robot.se3 import transform
-from pisigma.validation.checks.check import LARGE_SHARE, MIN_ROWS_OF_MODEL, Move, kinds_to_fit
+from pisigma.validation.checks.check import LARGE_SHARE, MIN_POSITION_ROWS, Move, kinds_to_fit
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.held_out.frames.fitted_frames import FrameKind, with_known_names
 from pisigma.validation.held_out.frames.row_errors import errors_of_rows
@@ -89,7 +89,7 @@ def diagnose_lengths(
     with suppress(IdentificationError):
         errors = _errors(model, known)
         if (
-            int(torch.isfinite(errors).all(-1).sum()) < MIN_ROWS_OF_MODEL
+            int(torch.isfinite(errors).all(-1).sum()) < MIN_POSITION_ROWS
             or not _rms(errors) > LARGE_SHARE * reach
         ):
             return (), ()

@@ -38,12 +38,12 @@ class Rounding:
     Attributes:
         steps: rounding step of every joint [rad or m]; 0 for joints that are not rounded.
         error: RMS position error caused by the rounding [m].
-        share: share of the rows' squared errors that is caused by rounding [1].
+        error_share: share of the rows' squared errors that is caused by rounding [1].
     """
 
     steps: tuple[float, ...]
     error: float
-    share: float
+    error_share: float
 
 
 def check_rounding(checked: CheckedCalibration) -> Iterator[Diagnostic]:
@@ -58,10 +58,10 @@ def check_rounding(checked: CheckedCalibration) -> Iterator[Diagnostic]:
             kind="rounding",
             severity="warning",
             sentence=f"The joint values are rounded to {_steps_text(checked.robot, rounding.steps)}: this alone "
-            f"causes position errors of {length_text(rounding.error)} RMS, {100 * rounding.share:.0f} % of the squared "
-            "errors of the rows; log them with more decimals.",
+            f"causes position errors of {length_text(rounding.error)} RMS, {100 * rounding.error_share:.0f} % of the "
+            "squared errors of the rows; log them with more decimals.",
             cause="joint_values",
-            values={"error_mm": rounding.error * 1e3, "share": rounding.share},
+            values={"error_mm": rounding.error * 1e3, "share": rounding.error_share},
         )
     step = (
         _common_step(checked.rows.position.cpu().numpy() * 1e3) if checked.rows.position is not None else 0.0

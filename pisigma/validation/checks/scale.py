@@ -15,7 +15,7 @@ from pisigma.calibration.geometric.problem.parameters import USUAL_LENGTH
 from pisigma.calibration.geometric.result import CalibrationResult
 from pisigma.robot.frame_fits import best_base_and_tool
 from pisigma.robot.se3 import skew
-from pisigma.validation.checks.check import FITTED, CheckedCalibration, RowsUnderModel
+from pisigma.validation.checks.check import FITTED_PARAMETERS, CheckedCalibration, RowsUnderModel
 from pisigma.validation.held_out.calibration_summary import ScaleFigures
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.setup_faults.cause import length_text
@@ -183,7 +183,7 @@ def check_scale_of_rows(judged: RowsUnderModel) -> Iterator[Diagnostic]:
     """Fit a factor on the measured positions together with base and tool, and compare it with moved joint zeros."""
     usual = float(judged.predicted_deviation.square().mean().sqrt())
     single = len(set(judged.rows.frame)) == len(set(judged.rows.target)) == 1
-    if not single or 3 * judged.rows.rows < 2 * FITTED or not usual > 0:
+    if not single or 3 * judged.rows.rows < 2 * FITTED_PARAMETERS or not usual > 0:
         return
     base, tool = best_base_and_tool(judged.poses_before_fit, judged.measured)
     T = base @ judged.poses_before_fit @ tool

@@ -10,7 +10,7 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import Robot
 from pisigma.robot.frame_fits import MeasuredPoses, best_base_and_tool
 from pisigma.robot.kinematics.forward import forward_kinematics
-from pisigma.validation.checks.check import FITTED, CheckedCalibration, RowsUnderModel
+from pisigma.validation.checks.check import FITTED_PARAMETERS, CheckedCalibration, RowsUnderModel
 from pisigma.validation.held_out.diagnostic import Diagnostic, Severity
 from pisigma.validation.setup_faults.explanations import position_spread
 from pisigma.validation.setup_faults.hypothesis import COLLAPSED
@@ -135,5 +135,5 @@ def _errors(robot: Robot, rows: Measurements, q: Float64[Tensor, "maps rows dof"
     for T in forward_kinematics(robot, q):
         base, tool = best_base_and_tool(T, measured)
         square = measured.squared_errors(base @ T @ tool).mean()
-        errors.append(float((square * 3 * rows.rows / (3 * rows.rows - FITTED)).sqrt()))
+        errors.append(float((square * 3 * rows.rows / (3 * rows.rows - FITTED_PARAMETERS)).sqrt()))
     return errors

@@ -11,7 +11,7 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.sensors.registry import SENSORS
 from pisigma.robot.frame_fits import best_base_and_tool
 from pisigma.robot.robot_class import SERVO, plausible_share
-from pisigma.validation.checks.check import FITTED, CheckedCalibration, RowsUnderModel
+from pisigma.validation.checks.check import FITTED_PARAMETERS, CheckedCalibration, RowsUnderModel
 from pisigma.validation.checks.rounding import joint_rounding
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.setup_faults.setup_faults import unexplained
@@ -95,7 +95,7 @@ def _left(judged: RowsUnderModel) -> float:
         step = torch.linalg.lstsq(J, error.flatten(), driver="gelsd").solution
         zeros = zeros + step.clamp(-largest, largest)
     values = 3 * known.rows
-    spare = max(values - FITTED - (known.dof if moves else 0), 1)
+    spare = max(values - FITTED_PARAMETERS - (known.dof if moves else 0), 1)
     return least * math.sqrt(values / spare)
 
 

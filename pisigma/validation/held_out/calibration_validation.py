@@ -280,7 +280,7 @@ def learning_curve(
     sizes: Sequence[int],
     seed: int,
     progress: Progress = lambda what: None,
-    whole: CalibrationValidation | None = None,
+    full_training: CalibrationValidation | None = None,
     jobs: int | None = None,
 ) -> tuple[LearningPoint, ...]:
     """Compute the errors of the test rows as a function of the number of training rows.
@@ -292,7 +292,7 @@ def learning_curve(
         sizes: numbers of training rows.
         seed: random seed of the selection of training rows; smaller selections are subsets of larger ones.
         progress: called with the current step.
-        whole: validation with all training rows, as the last point of the curve; None to omit it.
+        full_training: validation with all training rows, as the last point of the curve; None to omit it.
         jobs: see `validate`.
 
     Returns:
@@ -307,8 +307,8 @@ def learning_curve(
         fewer = with_fewer_training_rows(measurements, splits, rows, seed)
         of_rows = with_stage(progress, f"{rows} training rows")
         points.append((rows, validate(calibrator, measurements, fewer, of_rows, jobs)))
-    if whole is not None:
-        points.append((min(len(train) for train, _ in splits), whole))
+    if full_training is not None:
+        points.append((min(len(train) for train, _ in splits), full_training))
     figures = ((rows, validation.figures().model_dump(exclude_unset=True)) for rows, validation in points)
     return tuple(
         LearningPoint.model_validate({**values, "rows": rows, "held_out": values["rows"]})

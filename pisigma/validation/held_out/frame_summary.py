@@ -132,7 +132,7 @@ def _cause_figures(cause: Cause) -> CauseFigures:
     return CauseFigures(
         cause=cause.name,
         log_bayes_factor=cause.log_bayes_factor,
-        share=cause.share,
+        share=cause.explained_share,
         size=size_text(cause),
         named=cause.named,
     )

@@ -108,7 +108,7 @@ def drop_missing_frames(
     no_socket = (set(all_rows.socket or ()) - set(rows.socket or ())) - {""}
     return replace(
         calibrator,
-        frames={name: base for name, base in calibrator.frames.items() if name not in no_frame},
+        base_guesses={name: base for name, base in calibrator.base_guesses.items() if name not in no_frame},
         socket_distances={
             pair: distance
             for pair, distance in calibrator.socket_distances.items()
@@ -168,7 +168,7 @@ def _bases(
         base="free",
         tool="fixed",
         loss=SquaredLoss(),
-        frames={name: base for name, base in calibrator.frames.items() if name in frames},
+        base_guesses={name: base for name, base in calibrator.base_guesses.items() if name in frames},
         socket_distances={},
     )
     return only_bases.fit(rows).bases

@@ -44,7 +44,7 @@ class IsoCube:
         lower = torch.cat([around, -torch.ones(4, 1, dtype=torch.float64)], 1)
         return self.centre + self.edge / 2 * torch.cat([upper, lower])
 
-    def poses(self, plane: str = "C1-C2-C7-C8", share: float = 0.1) -> Float64[Tensor, "5 3"]:
+    def poses(self, plane: str = "C1-C2-C7-C8", diagonal_fraction: float = 0.1) -> Float64[Tensor, "5 3"]:
         """Compute the positions of P1 to P5 [m] (ISO 9283:1998, 6.8).
 
         P1 is the intersection of the diagonals of the plane, the centre of the cube; P2 to P5 are on the diagonals near
@@ -52,21 +52,21 @@ class IsoCube:
 
         Args:
             plane: one of `PLANES`.
-            share: distance from the end of the diagonal, divided by its length, 0.08 to 0.12.
+            diagonal_fraction: distance from the end of the diagonal, divided by its length, 0.08 to 0.12.
 
         Raises:
-            MeasurementError: the plane is unknown, or the standard does not allow the share.
+            MeasurementError: the plane is unknown, or the standard does not allow this fraction.
         """
         check_choice(MeasurementError, "plane", plane, PLANES)
         low, high = _FROM_THE_ENDS
-        if not low <= share <= high:
+        if not low <= diagonal_fraction <= high:
             raise MeasurementError(
-                option="share",
+                option="diagonal_fraction",
                 expected=f"a share of {low:g} to {high:g} of the diagonal",
-                value=share,
+                value=diagonal_fraction,
             )
         ends = self.corners[list(PLANES[plane])]
-        return torch.cat([self.centre[None], ends + share * (ends.roll(2, 0) - ends)])
+        return torch.cat([self.centre[None], ends + diagonal_fraction * (ends.roll(2, 0) - ends)])
 
 
 def largest_cube(

@@ -29,7 +29,7 @@ class JointGap:
         unit: "deg" or "mm", of all values.
         measured: measured stretches of the range; the constant value if the joint was not moved.
         range: the whole range.
-        share: share of the range that was measured.
+        measured_share: share of the range that was measured.
         whole_turn: whether the range is one revolution.
     """
 
@@ -37,13 +37,13 @@ class JointGap:
     unit: str
     measured: tuple[Stretch, ...]
     range: Stretch
-    share: float
+    measured_share: float
     whole_turn: bool
 
     @property
     def was_moved(self) -> bool:
         """Whether the joint was moved at all."""
-        return self.share >= _NOT_MOVED
+        return self.measured_share >= _NOT_MOVED
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ def joint_gaps(model: CalibratedModel, rows: JudgedRows | None) -> tuple[JointGa
                 unit=unit,
                 measured=tuple((a * factor, b * factor) for a, b in measured),
                 range=(low * factor, high * factor),
-                share=share,
+                measured_share=share,
                 whole_turn=revolute and high - low > 2 * math.pi - 1e-6,
             )
         )

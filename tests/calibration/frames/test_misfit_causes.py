@@ -40,7 +40,7 @@ def test_cause_is_named(kind):
     assert first.name == kind
     assert first.named
     assert first.log_bayes_factor > 2 * CLEAR
-    assert 0.3 < first.share <= 1.0
+    assert 0.3 < first.explained_share <= 1.0
 
 
 def test_no_fault_is_named_for_valid_rows():

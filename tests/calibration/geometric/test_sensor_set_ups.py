@@ -33,15 +33,15 @@ def test_a_frame_touched_once_is_refused() -> None:
 def test_touches_along_one_axis_do_not_tell_the_frame() -> None:
     data = join([touch_data(), touch_data(("back",), axes="z")])
     given = {"back": tuple(TRUE_BASES["back"])}
-    result = calibrator(frames=given).fit(data)
+    result = calibrator(base_guesses=given).fit(data)
     assert [one.subject for one in result.warning_details if one.kind == "touched_frame"] == ["back"]
 
 
 def test_a_missing_start_of_a_frame_is_refused() -> None:
-    with refused(IdentificationError, option="frames", value="lefd"):
-        calibrator(frames={"lefd": (0.0,) * 6}).fit(touch_data())
-    with refused(IdentificationError, option="frames", value=(0.0, 0.0, 0.0)):
-        calibrator(frames={"left": (0.0, 0.0, 0.0)})
+    with refused(IdentificationError, option="base_guesses", value="lefd"):
+        calibrator(base_guesses={"lefd": (0.0,) * 6}).fit(touch_data())
+    with refused(IdentificationError, option="base_guesses", value=(0.0, 0.0, 0.0)):
+        calibrator(base_guesses={"left": (0.0, 0.0, 0.0)})
 
 
 def test_touches_that_fit_nowhere_ask_for_a_start() -> None:
@@ -65,8 +65,8 @@ def test_touches_of_one_plane_have_no_scale() -> None:
     flat = replace(data, touch=torch.zeros(90, dtype=torch.float64))
     start = {"left": tuple(TRUE_BASES["left"])}
     with refused(IdentificationError, value="left"):
-        calibrator(frames={}).fit(flat)
-    assert kinds_of_warnings(calibrator(frames=start).fit(flat)) >= {"scale_of_touches"}
+        calibrator(base_guesses={}).fit(flat)
+    assert kinds_of_warnings(calibrator(base_guesses=start).fit(flat)) >= {"scale_of_touches"}
 
 
 @pytest.mark.parametrize(
@@ -120,7 +120,7 @@ def test_rows_named_after_another_frame_are_noticed() -> None:
     mixed = replace(data, frame=tuple(frame))
     with refused(IdentificationError, value="back"):
         calibrator().fit(mixed)
-    result = calibrator(frames={"back": tuple(TRUE_BASES["back"])}).fit(mixed)
+    result = calibrator(base_guesses={"back": tuple(TRUE_BASES["back"])}).fit(mixed)
     assert ("frame_misfit", "back") in [(one.kind, one.subject) for one in result.warning_details]
 
 
@@ -138,7 +138,7 @@ def test_noise_is_estimated_for_every_kind() -> None:
 def test_priors_are_estimated_and_bring_weak_data_nearer_to_the_truth() -> None:
     true = true_robot().geometric_robot
     sizes = []
-    for options in ({}, {"prior_sizes": "widened"}, {"prior": None}):
+    for options in ({}, {"prior_scaling": "widened"}, {"prior": None}):
         result = calibrator(**options).fit(touch_data(count=96, noise=2e-4))
         sizes.append(float(abs(result.robot.dh - true.dh)[:, 3:].max()))
     assert sizes[0] < 0.7 * sizes[1]
@@ -146,8 +146,8 @@ def test_priors_are_estimated_and_bring_weak_data_nearer_to_the_truth() -> None:
 
 
 def test_options_that_do_not_exist_are_refused() -> None:
-    with refused(IdentificationError, option="prior_sizes", value="guessed"):
-        calibrator(prior_sizes="guessed")
+    with refused(IdentificationError, option="prior_scaling", value="guessed"):
+        calibrator(prior_scaling="guessed")
     with refused(IdentificationError, option="tool", value="positions"):
         calibrator(tool="positions")
     with refused(IdentificationError, expected="measured values"):

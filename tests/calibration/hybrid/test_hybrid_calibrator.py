@@ -272,7 +272,7 @@ def test_touches_are_sufficient_without_other_sensors() -> None:
         touch_axis=("x", "y", "z") * len(q),
         frame=("jig",) * 3 * len(q),
     )
-    geometric = GeometricCalibrator(simulated.robot, tool="position", frames={"jig": (0.0,) * 6})
+    geometric = GeometricCalibrator(simulated.robot, tool="position", base_guesses={"jig": (0.0,) * 6})
     result = HybridCalibrator(geometric, harmonics=(8,), products=False).fit(data)
     test = simulated.test.q
     where = Measurements(q=test, frame=("jig",) * len(test))

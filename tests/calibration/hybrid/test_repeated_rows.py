@@ -79,7 +79,7 @@ def test_other_sights_of_a_pose_are_no_repeats() -> None:
         touch_axis=("x", "x", "y", "y", "z", "z") * 20,
         frame=("jig",) * 120,
     )
-    problem = GeometricCalibrator(robot, frames={"jig": (0.0,) * 6}).build(data).problem
+    problem = GeometricCalibrator(robot, base_guesses={"jig": (0.0,) * 6}).build(data).problem
     assert problem.pose is not None
     (values,) = sensor_values(problem.with_active(range(30)), problem.nominal)
     collapsed = values.merge_repeats(problem.pose)

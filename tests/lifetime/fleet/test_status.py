@@ -61,7 +61,7 @@ def test_cells_are_grouped_by_state_the_most_urgent_first(fleet):
 
 
 def test_the_last_error_of_each_model_is_used(fleet):
-    assert [(one.name, check.rms_mm) for one, check in fleet.by_error] == [
+    assert [(one.name, check.rms_mm) for one, check in fleet.sorted_by_error] == [
         ("moved", 0.8),
         ("measured", 0.2),
         ("edited", 0.05),

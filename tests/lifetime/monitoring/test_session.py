@@ -95,7 +95,11 @@ def test_moved_frames_can_be_stated():
 def test_scores_are_as_large_as_expected_where_nothing_changes():
     zeros = [judged(rows_after_change(10, 200 + seed))[1] for seed in range(12)]
     scores = torch.stack(
-        [one.shift / (one.influence @ one.influence.mT + one.own).diagonal().sqrt() for one in zeros]
+        [
+            one.shift
+            / (one.model_sensitivity @ one.model_sensitivity.mT + one.session_covariance).diagonal().sqrt()
+            for one in zeros
+        ]
     )
     assert 0.4 < float(scores[:, :5].square().mean().sqrt()) < 1.6
 

@@ -55,7 +55,7 @@ def test_the_derivative_is_that_of_the_pixels() -> None:
 
 def test_the_derivative_by_the_intrinsics_is_that_of_the_pixels() -> None:
     at = points()
-    derivative = CAMERA.by_intrinsics(at)
+    derivative = CAMERA.intrinsics_jacobian(at)
     assert derivative.shape == (5, 4, 2, 9)
     for k, step in enumerate(1e-6 * np.eye(9)):
         more, less = (CAMERA.with_intrinsics(CAMERA.intrinsics + change) for change in (step, -step))

@@ -43,16 +43,16 @@ def test_the_derivative_of_a_pose_by_the_intrinsics() -> None:
         for pose, before, after in zip(here, less, more, strict=True):
             turn = rotation_vector(torch.from_numpy(after.R @ before.R.T)).numpy()
             change = np.concatenate([after.t - before.t, turn]) / 2e-5
-            size = np.abs(pose.by_intrinsics).max()
-            assert_close(pose.by_intrinsics[:, k], change, atol=1e-2 * size, rtol=0.05)
+            size = np.abs(pose.intrinsics_jacobian).max()
+            assert_close(pose.intrinsics_jacobian[:, k], change, atol=1e-2 * size, rtol=0.05)
 
 
 def test_the_reduced_equations_are_those_of_the_complete_least_squares_problem() -> None:
     (pose,) = poses_of(camera_cell(1).images)(CAMERA)
     points = BOARD.corners @ pose.R.T + pose.t
-    B = CAMERA.by_intrinsics(points).reshape(-1, 9)
-    turned, by_point = BOARD.corners @ pose.R.T, CAMERA.project(points)[1]
-    A = np.concatenate([by_point, np.cross(turned[:, None], by_point)], -1).reshape(-1, 6)
+    B = CAMERA.intrinsics_jacobian(points).reshape(-1, 9)
+    turned, point_jacobian = BOARD.corners @ pose.R.T, CAMERA.project(points)[1]
+    A = np.concatenate([point_jacobian, np.cross(turned[:, None], point_jacobian)], -1).reshape(-1, 6)
     left = B - A @ np.linalg.lstsq(A, B, rcond=None)[0]
     assert_close(pose.root.T @ pose.root, left.T @ left, rtol=1e-5, atol=1e-3)
 

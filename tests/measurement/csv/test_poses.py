@@ -119,7 +119,7 @@ def test_chunks_contain_every_row_once_and_in_order(tmp_path, rows):
     assert [bad.line for chunk in chunks for bad in chunk.bad] == list(BAD)
     only_sound = read(tmp_path, QUATERNION, *(ROWS[line - 2] for line in SOUND))
     assert_close(torch.cat([chunk.T for chunk in chunks]), only_sound.T, atol=0.0)
-    shares = [chunk.share for chunk in chunks]
+    shares = [chunk.read_fraction for chunk in chunks]
     assert shares == sorted(shares)
     assert shares[-1] == 1
 

@@ -29,7 +29,7 @@ from pisigma.measurement.sensors import (
     Unknowns,
     register_sensor,
 )
-from pisigma.measurement.sensors.sensor import component_along, distinct_names, numbers_of, owners_of
+from pisigma.measurement.sensors.sensor import component_along, distinct_names, indices_of_names, owners_of
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.kinematics.parameter_jacobian import ToolMotion
 
@@ -142,7 +142,7 @@ class HeightGauge(AbstractSensor):
         names = distinct_names(gauges(measurements))
         if not names:
             return None
-        number = numbers_of(gauges(measurements), names, measurements.rows)
+        number = indices_of_names(gauges(measurements), names, measurements.rows)
         off = T[:, 2, 3] - measurements.readings["height"]
         zeros = torch.stack([off[number == k].median() for k in range(len(names))])[:, None]
         return InitialUnknowns(zeros, torch.ones_like(zeros, dtype=torch.bool))

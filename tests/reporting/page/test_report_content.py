@@ -269,7 +269,7 @@ def test_gaps_of_joints_that_were_measured_in_part(name, tmp_path):
     gap = joint_gaps(model, None)[0]
     own = np.degrees(model.starts[:, 0].numpy())
     assert gap.joint == "theta_1"
-    assert gap.share < 1
+    assert gap.measured_share < 1
     assert_close(gap.measured[0], [own.min(), own.max()], atol=0.51)
     assert any("theta_1" in line for line in report_content(model, tmp_path).advice)
 

@@ -99,5 +99,5 @@ def test_an_ignored_axis_does_not_affect_the_others():
     error, _ = task_error(TaskAxes((0.0, 0.0, 0.0, 0.0, 0.0, INF)), turned, T)
     assert_close(error[:, :5], 0.0, atol=1e-14)
     assert_close(error[:, 5], angle, atol=1e-13)
-    assert WHOLE.whole
+    assert WHOLE.is_exact
     assert len(WHOLE.row) == 0

@@ -137,7 +137,7 @@ def test_distances_of_sockets_that_no_row_has_are_still_refused() -> None:
 def test_frames_of_exact_touches_are_met_where_they_were_held_out() -> None:
     data = touch_data(("right", "left", "back"))
     frames = {name: tuple(base + 0.01) for name, base in TRUE_BASES.items()}
-    found = validate(exact(frames=frames), data, k_folds(data, None, 0, "placement"))
+    found = validate(exact(base_guesses=frames), data, k_folds(data, None, 0, "placement"))
     assert (found.folds, found.sockets_held_out, found.frames_fitted) == (3, 0, 3)
     assert_close(found.models["geometric"].position, torch.zeros(data.rows, dtype=torch.float64), atol=1e-8)
     assert float(found.models["nominal"].position.square().mean().sqrt()) > 5e-4
@@ -161,7 +161,7 @@ def test_a_held_out_frame_with_several_targets_is_refused() -> None:
     two = replace(data, target=("A", "B") * (data.rows // 2))
     frames = {name: tuple(TRUE_BASES[name]) for name in ("right", "left")}
     with refused(IdentificationError, value=("A", "B")):
-        validate(exact(frames=frames), two, k_folds(two, None, 0, "placement"))
+        validate(exact(base_guesses=frames), two, k_folds(two, None, 0, "placement"))
 
 
 def test_rows_without_a_socket_are_in_no_test() -> None:

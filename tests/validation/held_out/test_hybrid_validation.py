@@ -127,7 +127,9 @@ def test_rows_kept_aside(arm):
 
 def test_a_learning_curve_falls_and_ends_with_all_rows(arm, found):
     whole, parts, _ = found
-    points = learning_curve(small(arm.true.nominal), arm.measurements, parts, (100, 40), 0, whole=whole)
+    points = learning_curve(
+        small(arm.true.nominal), arm.measurements, parts, (100, 40), 0, full_training=whole
+    )
     assert [point.rows for point in points] == [40, 100, 160]
     assert points[-1].hybrid == whole.figures().hybrid
     assert [figure.held_out for figure in points] == [ROWS] * 3

@@ -36,8 +36,8 @@ def test_poses_lie_on_diagonals_of_a_plane_through_the_centre(plane: str, share:
 
 
 def test_what_the_standard_does_not_allow_is_refused():
-    with refused(MeasurementError, option="share", value=0.2):
-        CUBE.poses(share=0.2)
+    with refused(MeasurementError, option="diagonal_fraction", value=0.2):
+        CUBE.poses(diagonal_fraction=0.2)
     with refused(MeasurementError, option="plane", value="C1-C2-C7"):
         CUBE.poses("C1-C2-C7")
 

@@ -280,7 +280,7 @@ def check_touched_base(measurements: Measurements, name: str, rms: float, reach:
         value=name,
         at=Place(measurements.source),
         remedy="check that all touches belong to this frame, or give the approximate base of the robot in it, "
-        f"frames={{'{name}': (x, y, z, roll, pitch, yaw)}}",
+        f"base_guesses={{'{name}': (x, y, z, roll, pitch, yaw)}}",
     )
 
 

@@ -23,7 +23,7 @@ from pisigma.calibration.geometric.problem.parameters import ParameterSpace
 from pisigma.files.errors import IdentificationError, Place, nearest_choice
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.sensors.registry import SENSORS
-from pisigma.measurement.sensors.sensor import distinct_names, numbers_of
+from pisigma.measurement.sensors.sensor import distinct_names, indices_of_names
 from pisigma.measurement.sensors.socket import group_means
 from pisigma.robot.description import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
@@ -108,14 +108,14 @@ def guess(
     all_tools = np.stack([tools.get(name, space.robot.tool) for name in space.targets])
     if poses_alone:
         return InitialGuess(np.stack([bases[name] for name in space.frames]), all_tools, {}, {})
-    target = numbers_of(measurements.target, space.targets, measurements.rows)
+    target = indices_of_names(measurements.target, space.targets, measurements.rows)
     T_tool = T_flange @ transform_from_xyzrpy(torch.from_numpy(all_tools))[target]
     for name, rows in touched.items():
         bases[name] = _from_touches(space, measurements, name, rows, T_tool[:, :3, 3])
     for name in wired:
         bases[name] = base_from_anchors(measurements, name, T_tool[:, :3, 3], bases[name])
     all_bases = np.stack([bases[name] for name in space.frames])
-    frame = numbers_of(measurements.frame, space.frames, measurements.rows)
+    frame = indices_of_names(measurements.frame, space.frames, measurements.rows)
     T = transform_from_xyzrpy(torch.from_numpy(all_bases))[frame] @ T_tool
     unknowns, free = {}, {}
     for sensor in SENSORS.values():
@@ -138,7 +138,7 @@ def _from_positions(
         return bases, tools
     positions = (measurements.is_measured("position") | measurements.is_measured("pose")).cpu()
     touches = measurements.is_measured("touch").cpu()
-    frame = numbers_of(measurements.frame, space.frames, measurements.rows)
+    frame = indices_of_names(measurements.frame, space.frames, measurements.rows)
     count = [int((positions & (frame == number)).sum()) for number in range(len(space.frames))]
     for number in sorted(range(len(space.frames)), key=lambda number: -count[number]):
         name, rows = space.frames[number], (positions & (frame == number)).nonzero()[:, 0]
@@ -194,7 +194,7 @@ def _touched_rows(
     if measurements.touch is None:
         return {}
     touches = measurements.is_measured("touch").cpu()
-    frame = numbers_of(measurements.frame, space.frames, measurements.rows)
+    frame = indices_of_names(measurements.frame, space.frames, measurements.rows)
     touched = {name: touches & (frame == number) for number, name in enumerate(space.frames)}
     return {name: rows for name, rows in touched.items() if bool(rows.any()) and name not in bases}
 
@@ -207,8 +207,8 @@ def _from_sockets(
 ) -> dict[str, np.ndarray]:
     """Add guesses of tools that have none, from the sockets in which their ball was measured."""
     tools = dict(tools)
-    socket = numbers_of(measurements.socket, distinct_names(measurements.socket), measurements.rows)
-    target = numbers_of(measurements.target, space.targets, measurements.rows)
+    socket = indices_of_names(measurements.socket, distinct_names(measurements.socket), measurements.rows)
+    target = indices_of_names(measurements.target, space.targets, measurements.rows)
     for number, name in enumerate(space.targets):
         rows = (socket >= 0) & (target == number)
         if name in tools or not bool(rows.any()):
@@ -235,7 +235,7 @@ def _from_touches(
     """Guess the base of one frame from its touches."""
     assert measurements.touch is not None
     part = measurements.select(rows.nonzero()[:, 0].to(measurements.q.device))
-    axis = numbers_of(part.touch_axis, ("x", "y", "z"), part.rows)
+    axis = indices_of_names(part.touch_axis, ("x", "y", "z"), part.rows)
     assert part.touch is not None
     base, rms = fit_base_to_touches(
         tip[rows], axis, part.touch.cpu(), torch.from_numpy(space.robot.base.copy())
@@ -283,7 +283,7 @@ def _check_frame_names(stated: Mapping[str, object], frames: tuple[str, ...], so
         if name not in frames:
             raise IdentificationError(
                 f"no row is in the frame '{name}'",
-                option="frames",
+                option="base_guesses",
                 value=name,
                 at=Place(source),
                 remedy=nearest_choice(name, frames),

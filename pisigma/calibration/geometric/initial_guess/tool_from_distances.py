@@ -19,7 +19,7 @@ from pisigma.measurement.sensors.anchor import (
     anchor_from_distances,
     stated_position,
 )
-from pisigma.measurement.sensors.sensor import distinct_names, numbers_of
+from pisigma.measurement.sensors.sensor import distinct_names, indices_of_names
 from pisigma.robot.description import Robot
 from pisigma.robot.robot_class import RobotClass
 from pisigma.robot.se3 import rotation_from_rpy, rpy_from_rotation
@@ -93,8 +93,8 @@ class _Distances:
         J = torch.zeros(*length.shape, unknown.shape[-1], dtype=torch.float64)
         J[..., :3] = (direction[..., None, :] @ self.R)[..., 0, :]
         columns = 3 + 4 * self.anchor[wires, None] + torch.arange(4)
-        by_anchor = torch.cat([-direction, torch.ones_like(length)[..., None]], -1)
-        J[..., wires[:, None], columns] = by_anchor[..., wires, :]
+        anchor_jacobian = torch.cat([-direction, torch.ones_like(length)[..., None]], -1)
+        J[..., wires[:, None], columns] = anchor_jacobian[..., wires, :]
         return self.measured - length - zero, J
 
     def fitted(
@@ -285,7 +285,7 @@ def _distances_of(measurements: Measurements, T: Tensor, target: str) -> _Distan
         return _Distances(R[:0], p[:0], torch.zeros(0, dtype=torch.int64), p[:0, 0])
     distance = measurements.distance.cpu()
     own = torch.tensor([name == target for name in measurements.target]) & torch.isfinite(distance)
-    number = numbers_of(measurements.anchor, distinct_names(measurements.anchor), measurements.rows)
+    number = indices_of_names(measurements.anchor, distinct_names(measurements.anchor), measurements.rows)
     # An anchor has four unknowns (position and zero offset), so few distances say nothing about the tool.
     known, counts = torch.unique(number[own & (number >= 0)], return_counts=True)
     wires = own & torch.isin(number, known[counts >= MIN_DISTANCES])

@@ -11,7 +11,7 @@ from jaxtyping import Float64, Int64
 from torch import Tensor
 
 from pisigma.calibration.geometric.problem.least_squares import Linearisation
-from pisigma.calibration.geometric.problem.prior_sizes import PriorGroup, scaled_precision
+from pisigma.calibration.geometric.problem.prior_scales import PriorGroup, scaled_precision
 from pisigma.estimation.loss import AbstractLoss
 from pisigma.measurement.sensors.sensor import AbstractSensor
 

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
-from pisigma.calibration.geometric.problem.prior_sizes import PriorGroup, prior_group_of
+from pisigma.calibration.geometric.problem.prior_scales import PriorGroup, prior_group_of
 from pisigma.files.errors import IdentificationError, nearest_choice
 from pisigma.measurement.sensors.sensor import ParameterUnit, UnknownGroup, Unknowns
 from pisigma.robot.description import Robot
@@ -30,7 +30,7 @@ _USUAL_ERRORS: dict[ParameterUnit, float] = {"m": USUAL_LENGTH, "rad": USUAL_ANG
 _SMALLEST_PRIOR = 1e-12
 """Smallest prior standard deviation [m or rad]; parameters that are more certain should not be in `free`."""
 
-PriorSizes = Literal["stated", "widened", "estimated"]
+PriorScaling = Literal["stated", "widened", "estimated"]
 """Whether the prior scales are 1, at least 1, or estimated without bounds."""
 
 

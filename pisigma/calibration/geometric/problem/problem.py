@@ -27,8 +27,8 @@ from pisigma.calibration.geometric.problem.noise import (
     renumber,
     sensor_view_of,
 )
-from pisigma.calibration.geometric.problem.parameters import EVERYWHERE, ParameterSpace, PriorSizes
-from pisigma.calibration.geometric.problem.prior_sizes import (
+from pisigma.calibration.geometric.problem.parameters import EVERYWHERE, ParameterSpace, PriorScaling
+from pisigma.calibration.geometric.problem.prior_scales import (
     SMALLEST_PRIOR,
     converged_prior_scales,
     has_converged,
@@ -62,7 +62,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         configuration: index of every row's joint values and frame; None if no configuration has several targets.
         pairs: number of pairs of rows that are measured together, which come first.
         stated: conditions stated in the rows (see `JointState`), for corrections that depend on them.
-        prior_sizes: "stated": prior scales are 1; "widened": at least 1; "estimated": estimated without bounds.
+        prior_scaling: "stated": prior scales are 1; "widened": at least 1; "estimated": estimated without bounds.
         held: directions along which the search does not move, because the rows do not determine them.
         memory: cache of the last motion, shared by problems that differ only in free parameters or prior.
     """
@@ -80,7 +80,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
     configuration: Int64[Tensor, " rows"] | None = None
     pairs: int = 0
     stated: Mapping[str, Tensor] = field(default_factory=dict)
-    prior_sizes: PriorSizes = "widened"
+    prior_scaling: PriorScaling = "widened"
     held: HeldDirections | None = None
     memory: MotionMemory = field(default_factory=MotionMemory, repr=False)
 
@@ -103,7 +103,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
     def prior_group(self) -> Int64[Tensor, " active"]:
         """Group of the prior scale of every free parameter: its `PriorGroup`, or one for lengths or angles."""
         active = self.active
-        if self.prior_sizes != "estimated":
+        if self.prior_scaling != "estimated":
             return self.space.is_length.to(active.device)[active].long()
         nonzero = (self.nominal.square() * self.precision > 1)[active].long()
         return self.space.prior_groups.to(active.device)[nonzero, active]
@@ -222,7 +222,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         Residuals are linearised for this purpose.
         """
         floor, prior = (
-            1.0 if self.prior_sizes == "widened" else SMALLEST_PRIOR,
+            1.0 if self.prior_scaling == "widened" else SMALLEST_PRIOR,
             (self._prior, self.prior_group),
         )
         scale = prior_scales(off, *prior, view.prior_scale, covariance, floor)
@@ -234,7 +234,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
     @cached_property
     def _sized(self) -> bool:
         """Whether the problem has a prior with estimated scales."""
-        return self.prior_sizes != "stated" and bool((self._prior > 0).any())
+        return self.prior_scaling != "stated" and bool((self._prior > 0).any())
 
     def _off(self, point: Tensor) -> Float64[Tensor, " active"]:
         """Return the difference of the free parameters from their prior means."""

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from pisigma.calibration.geometric.initial_guess.initial_guess import InitialGuess, guess
 from pisigma.calibration.geometric.problem.joint_repeatability import with_joint_repeatability
-from pisigma.calibration.geometric.problem.parameters import ParameterSpace, Prior, PriorSizes
+from pisigma.calibration.geometric.problem.parameters import ParameterSpace, Prior, PriorScaling
 from pisigma.calibration.geometric.problem.problem import CalibrationProblem
 from pisigma.calibration.geometric.problem.repeats import number_repeats
 from pisigma.estimation.loss import AbstractLoss
@@ -23,7 +23,7 @@ from pisigma.measurement.fields import KINDS
 from pisigma.measurement.readings import READINGS
 from pisigma.measurement.sensors.corner import CornerSensor
 from pisigma.measurement.sensors.registry import build_sensors, sort_pairs_first, unknown_groups
-from pisigma.measurement.sensors.sensor import SensorRows, numbers_of
+from pisigma.measurement.sensors.sensor import SensorRows, indices_of_names
 from pisigma.measurement.sensors.socket import PairOfSockets, SocketDistanceSensor
 from pisigma.robot.description import Robot
 from pisigma.robot.se3 import invert, rotation_from_rpy, rpy_from_rotation, transform_from_xyzrpy
@@ -99,10 +99,10 @@ class SetupOptions:
         free_base: whether to identify bases.
         free_tool: whether to identify tools.
         turn_tool: whether to identify the rotations of tools.
-        frames: initial guesses of bases by frame: x, y, z [m], roll, pitch, yaw [rad].
+        base_guesses: initial guesses of bases by frame: x, y, z [m], roll, pitch, yaw [rad].
         socket_distances: distances between two sockets [m].
         socket_sigma: standard deviation of the distances between sockets [m].
-        prior_sizes: see `CalibrationProblem`.
+        prior_scaling: see `CalibrationProblem`.
         joint_repeatability: standard deviation of the value of every revolute joint [rad], by which images are
             weighted; see `with_joint_repeatability`.
     """
@@ -110,10 +110,10 @@ class SetupOptions:
     free_base: bool
     free_tool: bool
     turn_tool: bool = True
-    frames: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    base_guesses: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     socket_distances: Mapping[PairOfSockets, float] = field(default_factory=dict)
     socket_sigma: float = 1e-5
-    prior_sizes: PriorSizes = "widened"
+    prior_scaling: PriorScaling = "widened"
     joint_repeatability: float = 0.0
 
 
@@ -139,7 +139,7 @@ def build_setup(
         unknown_groups(measurements),
     )
     guessed = guess(
-        space, measurements, options.free_base, options.free_tool, options.turn_tool, options.frames
+        space, measurements, options.free_base, options.free_tool, options.turn_tool, options.base_guesses
     )
     return setup_from_guess(space, guessed, (rows, measurements), options, prior, loss)
 
@@ -166,8 +166,8 @@ def setup_from_guess(
     """
     rows, measurements = usable
     device = measurements.q.device
-    frame = numbers_of(measurements.frame, space.frames, measurements.rows).to(device)
-    target = numbers_of(measurements.target, space.targets, measurements.rows).to(device)
+    frame = indices_of_names(measurements.frame, space.frames, measurements.rows).to(device)
+    target = indices_of_names(measurements.target, space.targets, measurements.rows).to(device)
     unknown_frames = {
         own.name: torch.tensor([space.frames.index(name) for name in own.frames]) for own in space.unknowns
     }
@@ -194,7 +194,7 @@ def setup_from_guess(
         configuration=number_repeats(repeats, frame) if len(space.targets) > 1 else None,
         pairs=len(set(measurements.pair or ()) - {""}),
         stated=JointState.from_measurements(measurements).stated,
-        prior_sizes=options.prior_sizes,
+        prior_scaling=options.prior_scaling,
     )
     free = [
         space.indices_of(own.name).start + index

@@ -23,7 +23,7 @@ def test_millimetres_for_metres():
     refuses(replace(measurements, position=1000 * measurements.position))
 
 
-@pytest.mark.parametrize("options", [{}, {"prior_sizes": "widened"}])
+@pytest.mark.parametrize("options", [{}, {"prior_scaling": "widened"}])
 def test_metres_for_millimetres(options):
     measurements = simulate(ROBOT, rows=80).measurements
     refuses(replace(measurements, position=measurements.position / 1000), **options)

@@ -11,7 +11,7 @@ from testing.simulated_arm import dh_errors, mean_error, simulate
 
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.calibration.geometric.problem.parameters import Prior
-from pisigma.calibration.geometric.problem.prior_sizes import PriorGroup, prior_group_of
+from pisigma.calibration.geometric.problem.prior_scales import PriorGroup, prior_group_of
 from pisigma.calibration.geometric.result import CalibrationResult
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot
@@ -52,7 +52,7 @@ def test_a_length_shorter_than_its_tolerance_counts_as_zero() -> None:
 
 @pytest.mark.parametrize("sizes", ["widened", "stated"])
 def test_other_sizes_are_for_angles_and_for_lengths(sizes: str) -> None:
-    found = groups(prior_sizes=sizes)
+    found = groups(prior_scaling=sizes)
     assert {found[name] for name in ("theta_1", "alpha_2", "beta_3")} == {0}
     assert {found[name] for name in ("d_1", "d_2", "a_1", "a_5")} == {1}
 
@@ -110,7 +110,8 @@ def test_errors_of_one_size_everywhere_are_no_worse_off() -> None:
         found[sizes] = np.mean(
             [
                 mean_error(
-                    GeometricCalibrator(arm.nominal, prior_sizes=sizes).fit(arm.measurements).robot, arm.true
+                    GeometricCalibrator(arm.nominal, prior_scaling=sizes).fit(arm.measurements).robot,
+                    arm.true,
                 )
                 for arm in arms
             ]
