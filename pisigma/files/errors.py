@@ -67,6 +67,10 @@ class Place:
         return ", ".join(parts)
 
 
+class Phrase(str):
+    """A value that is described in words, such as ``"none"``; a message does not put it in quotation marks."""
+
+
 class PisigmaError(Exception):
     """Base class of every error that pisigma raises on purpose.
 
@@ -171,8 +175,8 @@ class PisigmaError(Exception):
 
 
 def _quoted(value: Any) -> str:
-    """Format a value for a message: texts in quotation marks, numbers without."""
-    if isinstance(value, str):
+    """Format a value for a message: texts in quotation marks, numbers and phrases without."""
+    if isinstance(value, str) and not isinstance(value, Phrase):
         return f"'{value}'"
     return f"{value:,.12g}" if isinstance(value, float) else str(value)
 

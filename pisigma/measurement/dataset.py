@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Bool, Float64
 from torch import Tensor
 
-from pisigma.files.errors import MeasurementError, Place
+from pisigma.files.errors import MeasurementError, Phrase, Place
 from pisigma.measurement.csv.reading import read_fields
 from pisigma.measurement.csv.writing import write_fields
 from pisigma.measurement.faults import RowPlace
@@ -192,7 +192,7 @@ class Measurements:
             lacking = "orientation" if self.rotation is None else "position"
             raise MeasurementError(
                 expected="poses",
-                value=f"no {lacking}",
+                value=Phrase(f"no {lacking}"),
                 at=Place(self.source),
                 remedy="use positions or orientations alone, or measure poses",
             )
@@ -340,13 +340,13 @@ def join(
             contradict each other.
     """
     if not data:
-        raise MeasurementError(option="data", expected="one or more data sets", value="none")
+        raise MeasurementError(option="data", expected="one or more data sets", value=Phrase("none"))
     dofs = sorted({one.dof for one in data})
     if len(dofs) > 1:
         raise MeasurementError(
             option="data",
             expected="data sets with the same number of joints",
-            value=f"{dofs[0]} and {dofs[-1]}",
+            value=Phrase(f"{dofs[0]} and {dofs[-1]}"),
             remedy="give data sets of one robot",
         )
     if len({one.split is None for one in data if one.rows}) > 1:

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
-from pisigma.files.errors import MeasurementError, Place
+from pisigma.files.errors import MeasurementError, Phrase, Place
 from pisigma.measurement.dataset import Measurements
 
 _MIN_GROUPS = 3
@@ -100,7 +100,7 @@ def placements(measurements: Measurements) -> tuple[str, ...]:
     if len(placed) < 2:
         raise MeasurementError(
             expected="two or more placements",
-            value=placed[0] if placed else "no names of sockets or frames",
+            value=Phrase(placed[0] if placed else "no names of sockets or frames"),
             at=Place(measurements.source),
             remedy="name sockets by placement, such as low/0 and low/1, or frames, or split by joints, time or space",
         )

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from pisigma.files.errors import MeasurementError, Place, nearest_choice
+from pisigma.files.errors import MeasurementError, Phrase, Place, nearest_choice
 from pisigma.measurement.dates import EXPECTED_DATE, is_date
 from pisigma.measurement.faults import Fault
 from pisigma.measurement.fields import NUMBERS, TEXTS, MeasuredFields
@@ -178,7 +178,7 @@ def row_faults(data: MeasuredFields, labels: FieldLabels) -> Iterator[RowAndFaul
             Fault(
                 column=names[0],
                 expected="one measured length per row",
-                value=" and ".join(names),
+                value=Phrase(" and ".join(names)),
                 remedy="put each length in a separate row with equal joint values",
             ),
         )

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
-from pisigma.files.errors import MeasurementError, Place, check_choice
+from pisigma.files.errors import MeasurementError, Phrase, Place, check_choice
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import groups_of_equal_joints as groups_of_equal_joints
 from pisigma.measurement.groups import groups_to_keep_whole, placement_groups
@@ -356,7 +356,7 @@ def _group_positions(
         raise MeasurementError(
             option="by",
             expected="positions in one frame, to split them by space",
-            value=f"{len(set(measurements.frame))} frames",
+            value=Phrase(f"{len(set(measurements.frame))} frames"),
             at=Place(measurements.source),
             remedy="split by joints or by time",
         )

@@ -8,7 +8,7 @@ from jaxtyping import Float64, Int64
 from torch import Tensor
 
 from pisigma.estimation.covariance_root import multiply_updated_root
-from pisigma.files.errors import PlanningError
+from pisigma.files.errors import Phrase, PlanningError
 from pisigma.planning.plan_settings import Criterion
 
 DROPPED_VARIANCE = 1e-10
@@ -64,7 +64,10 @@ def select_poses(
         )
     if not len(D):
         raise PlanningError(
-            expected="joint values of the task", value="none", option="task", remedy="add poses to the task"
+            expected="joint values of the task",
+            value=Phrase("none"),
+            option="task",
+            remedy="add poses to the task",
         )
     goal = condense_derivatives(D)
     first = PoseSelection(B, goal, "D")

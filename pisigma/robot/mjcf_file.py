@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from pisigma.files.errors import Place, RobotError
+from pisigma.files.errors import Phrase, Place, RobotError
 from pisigma.files.input_file import read_input
 from pisigma.robot.description import Robot
 from pisigma.robot.row import Row
@@ -130,7 +130,7 @@ class MjcfDrawing:
             remedy = "give the MJCF file of this robot; --tip names the body after its last joint"
             raise RobotError(
                 expected=expected,
-                value=", ".join(map(str, names)),
+                value=Phrase(", ".join(map(str, names))),
                 at=Place(self.path),
                 option="--like",
                 remedy=remedy,

@@ -10,7 +10,7 @@ from jaxtyping import Float64
 from pydantic import Field, field_validator, model_validator
 from torch import Tensor
 
-from pisigma.files.errors import RecipeError
+from pisigma.files.errors import Phrase, RecipeError
 from pisigma.files.yaml_file import MAX_POSES, Count, Section, Seed
 from pisigma.robot.description import Robot
 from pisigma.robot.se3 import rotation_from_rpy, transform
@@ -147,7 +147,7 @@ class JointsRandom(Section):
                     option="joints_random",
                     expected=f"a range of joint '{joint.name}' within its limits {joint.lower:g} to {joint.upper:g} "
                     f"{'rad' if joint.type == 'revolute' else 'm'}",
-                    value=f"{lower:g} to {upper:g}",
+                    value=Phrase(f"{lower:g} to {upper:g}"),
                 )
         return bounds
 

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float64, Int64
 from pydantic import Field
 from torch import Tensor
 
-from pisigma.files.errors import RecipeError
+from pisigma.files.errors import Phrase, RecipeError
 from pisigma.files.yaml_file import Count, Section, Seed
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.jig import Jig
@@ -66,7 +66,7 @@ def check_names(placements: Sequence[JigPlacement]) -> None:
     """
     names = [placement.name for placement in placements]
     if not names:
-        raise RecipeError(option="touches", expected="one or more placements of jigs", value="none")
+        raise RecipeError(option="touches", expected="one or more placements of jigs", value=Phrase("none"))
     if twice := [name for name in names if names.count(name) > 1]:
         raise RecipeError(
             f"the placement '{twice[0]}' appears twice",

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from pisigma.files.errors import MeasurementError, Place
+from pisigma.files.errors import MeasurementError, Phrase, Place
 from pisigma.files.output_file import check_output, write_atomically
 from pisigma.measurement.csv.reading import fields_of
 from pisigma.measurement.dataset import Measurements, with_new_frames
@@ -206,7 +206,7 @@ def _in_new_frames(content: MeasurementTable, lines: Sequence[int]) -> Measureme
         raise MeasurementError(
             option="new_frame_at",
             expected="rows of one file",
-            value=", ".join(files),
+            value=Phrase(", ".join(files)),
             remedy="import one by one",
         )
     table, frames = (

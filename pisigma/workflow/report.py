@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from pisigma.files.conflicts import Input
-from pisigma.files.errors import MeasurementError
+from pisigma.files.errors import MeasurementError, Phrase
 from pisigma.files.output_file import check_output, write_atomically
 from pisigma.files.progress import Progress
 from pisigma.lifetime.cell.acceptance import Acceptance
@@ -153,7 +153,7 @@ def _arm_in_images(
     if rows is None or cameras is None:
         raise MeasurementError(
             expected="the file of corners of the images, with their cameras and boards",
-            value="images only",
+            value=Phrase("images only"),
             option="--images",
             remedy="give the file of `pisigma detect`, --camera and --board",
         )

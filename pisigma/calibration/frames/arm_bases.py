@@ -11,7 +11,7 @@ from torch import Tensor
 
 from pisigma.calibration.frames.shared_objects import ArmPosterior, SharedObject, find_shared_objects
 from pisigma.estimation.equalities import ConditionedUnknowns, condition_on_equalities
-from pisigma.files.errors import IdentificationError
+from pisigma.files.errors import IdentificationError, Phrase
 from pisigma.robot.frame_fits import MeasuredPoses, best_base
 from pisigma.robot.se3 import (
     invert,
@@ -273,7 +273,7 @@ def _start(arms: Sequence[ArmPosterior], shared: Sequence[SharedObject]) -> list
             raise IdentificationError(
                 expected=f"a frame, or {_MIN_POINTS} sockets or anchors that are not on one line, that arm "
                 f"'{lost[0]}' shares with the other arms",
-                value=", ".join(f"{one.kind} '{one.name}'" for one in shared) or "none",
+                value=Phrase(", ".join(f"{one.kind} '{one.name}'" for one in shared) or "none"),
                 remedy="name the same board, jig or instrument in the column 'frame' of the rows of both arms, or the "
                 "same sockets in the column 'socket'",
             )

@@ -26,7 +26,7 @@ from pisigma.calibration.geometric.problem.parameters import Parameter
 from pisigma.calibration.geometric.result import SolvedCalibration
 from pisigma.estimation.leave_one_out import most_deviating_row
 from pisigma.estimation.loss import SquaredLoss
-from pisigma.files.errors import IdentificationError, Place
+from pisigma.files.errors import IdentificationError, Phrase, Place
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import Robot
 
@@ -209,7 +209,7 @@ def fit_frames(
         if only != "tool" and (floating := floating_frames(free.setup)):
             raise IdentificationError(
                 expected="rows at stated positions, which determine the base",
-                value=", ".join(sorted(rows.kinds)),
+                value=Phrase(", ".join(sorted(rows.kinds))),
                 at=Place(rows.source),
                 option="only",
                 remedy=f"measure positions or poses{f' in frame {floating[0]}' if floating[0] else ''}, or fit the "

@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
-from pisigma.files.errors import MeasurementError
+from pisigma.files.errors import MeasurementError, Phrase
 from pisigma.measurement.sensors.sensor import AbstractSensor
 
 JOINT = "joint"
@@ -65,7 +65,7 @@ class CalibrationNoise:
             if math.isnan(usual := self.standard_deviation(name)):
                 raise MeasurementError(
                     expected=f"rows that state the standard deviation of {name}, as those of the calibration do",
-                    value="none",
+                    value=Phrase("none"),
                     remedy="add the column (such as sigma_mm), or calibrate again with this version",
                 )
             return usual

@@ -9,7 +9,7 @@ import numpy as np
 from pisigma.deployment.export.export_format import Exported, ExportFormat, ExportRequest, model_facts
 from pisigma.deployment.export.geometry import offset_remarks
 from pisigma.deployment.export.joint_offsets import fit_joint_offsets, offset_sentences
-from pisigma.files.errors import MeasurementError, OutputError, Place
+from pisigma.files.errors import MeasurementError, OutputError, Phrase, Place
 from pisigma.measurement.foreign.lerobot_motors import (
     DAMIAO,
     TICKS,
@@ -80,7 +80,7 @@ def with_offsets(motors: Mapping[str, Motor], offsets: Mapping[str, float], file
     if missing := sorted(set(offsets) - set(motors)):
         raise OutputError(
             expected=f"motors named {', '.join(offsets)}, as the joints of the robot",
-            value=", ".join(motors),
+            value=Phrase(", ".join(motors)),
             at=Place(file),
             option="--like",
             remedy=f"give the calibration file of this arm, or rename joint {missing[0]} of the robot",

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float64
 
 from pisigma.deployment.export.joint_offsets import JointOffsets, fit_joint_offsets
-from pisigma.files.errors import MeasurementError
+from pisigma.files.errors import MeasurementError, Phrase
 from pisigma.files.model_files import DESCRIPTION, WEIGHTS, content_hash, read_model_file
 from pisigma.measurement.foreign.lerobot_dataset import joint_motors
 from pisigma.measurement.foreign.lerobot_motors import LeRobotUnits, Motor, radians_per_unit, read_motors
@@ -152,7 +152,7 @@ class LeRobotCorrection:
         if missing := [self.names[index] for index in self.joints if self.names[index] not in frame]:
             raise MeasurementError(
                 expected=f"the values {', '.join(self.names[index] for index in self.joints)}",
-                value=", ".join(frame),
+                value=Phrase(", ".join(frame)),
                 remedy=f"add {missing[0]}",
             )
         moved = {self.names[index] for index in self.joints}
@@ -209,7 +209,7 @@ def joints_of_values(robot: Robot, names: Sequence[str], prefix: str) -> tuple[i
     if sorted(motors) != sorted(axes) or any(axis.type != "revolute" for axis in robot.axes):
         raise MeasurementError(
             expected=f"one value for each of the revolute joints {', '.join(axes)} of robot '{robot.name}'",
-            value=", ".join(names),
+            value=Phrase(", ".join(names)),
             option="names",
             remedy="give the joints of the robot the names of LeRobot's motors, or state the prefix of the arm",
         )

@@ -25,7 +25,7 @@ import numpy as np
 
 from pisigma.deployment.export.rsi import AXES, RsiAddress, check_six_axes
 from pisigma.deployment.serve.metrics import KEPT_DURATIONS
-from pisigma.files.errors import ModelError, OutputError, RequestError
+from pisigma.files.errors import ModelError, OutputError, Phrase, RequestError
 from pisigma.model.inverse.compiled_ik import CompiledIK
 from pisigma.model.inverse.corrected_ik import CorrectedIK
 from pisigma.robot.kernels import arrays
@@ -198,7 +198,7 @@ def _kernels(ik: CorrectedIK) -> CompiledIK:
 def _fault(expected: str, limit: str, values: tuple[float, ...]) -> RequestError:
     return RequestError(
         expected=f"{expected} {limit}",
-        value=", ".join(f"{axis} {value:.4f}" for axis, value in zip(AXES, values, strict=True)),
+        value=Phrase(", ".join(f"{axis} {value:.4f}" for axis, value in zip(AXES, values, strict=True))),
         option="AKorr",
         remedy="check that the joints of the controller have the zeros and directions of the robot description, and "
         "avoid singularities",

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
 
-from pisigma.files.errors import MeasurementError, ModelError, Place
+from pisigma.files.errors import MeasurementError, ModelError, Phrase, Place
 from pisigma.lifetime.cell.events import ARM_EVENTS, Event
 from pisigma.lifetime.cell.exports import ON_CONTROLLER, Contents, ControllerEntry, ExportEntry
 from pisigma.lifetime.cell.history import HISTORY, History, ModelEntry, SessionEntry, day_of, now
@@ -304,14 +304,14 @@ def record_controller(history: History, sha256: str, day: str, note: str) -> Con
     if sha256 and sha256 not in exports:
         raise MeasurementError(
             expected="an unchanged file written by `pisigma export CELL`, or none",
-            value=f"SHA-256 {sha256[:16]}",
+            value=Phrase(f"SHA-256 {sha256[:16]}"),
             option="--export",
             remedy="export it again",
         )
     if sha256 and exports[sha256].contains not in ON_CONTROLLER:
         raise MeasurementError(
             expected="kinematics or joint zeros of a controller",
-            value=f"a file of --format {exports[sha256].format}",
+            value=Phrase(f"a file of --format {exports[sha256].format}"),
             option="--export",
             remedy="record only what the controller computes with, not what programs use",
         )

@@ -10,7 +10,7 @@ from scipy.stats import f as fisher
 from torch import Tensor
 
 from pisigma.calibration.frames.shared_objects import ArmPosterior, is_determined
-from pisigma.files.errors import IdentificationError
+from pisigma.files.errors import IdentificationError, Phrase
 from pisigma.model.frame_model import FittedFrames
 from pisigma.robot.se3 import invert, rotation_from_vector, rotation_vector, skew, transform_from_xyzrpy
 
@@ -147,7 +147,7 @@ def find_moved_bases(arms: Sequence[ArmBefore]) -> MovedBases:
             raise IdentificationError(
                 expected=f"rows of arm '{arm.posterior.name}' that determine its base in a named frame of its "
                 "calibration",
-                value=", ".join(arm.now.fit.solved.geometry.bases),
+                value=Phrase(", ".join(arm.now.fit.solved.geometry.bases)),
                 remedy="use the same name in the column 'frame', and measure 6 different poses or more",
             )
         for frame in arm.frames:

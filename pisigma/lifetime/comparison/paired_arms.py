@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float64
 from scipy.stats import t as student
 
-from pisigma.files.errors import MeasurementError
+from pisigma.files.errors import MeasurementError, Phrase
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.robot.robot_class import RobotClass
 from pisigma.robot.se3 import wrap_to_pi
@@ -88,7 +88,7 @@ def estimate_zero_changes(
     if q.shape != (rows, joints) or position.shape != (rows, 3):
         raise MeasurementError(
             expected=f"rows of {joints} joint values and of 3 coordinates",
-            value=f"{q.shape} and {position.shape}",
+            value=Phrase(f"{q.shape} and {position.shape}"),
             option="q, position",
         )
     _check_rows(q, "q")
@@ -119,7 +119,7 @@ def _check_rows(rows: Float64[np.ndarray, "rows columns"], option: str) -> None:
         finite = int(np.isfinite(rows).all(1).sum())
         raise MeasurementError(
             expected=f"at least {_MIN_ROWS} rows of finite numbers",
-            value=f"{finite} of {len(rows)}",
+            value=Phrase(f"{finite} of {len(rows)}"),
             option=option,
         )
 
@@ -176,7 +176,7 @@ def compare_paired_arms(
     if leader.shape != follower.shape or leader.ndim != 2 or leader.shape[1] != len(names):
         raise MeasurementError(
             expected=f"two arrays of rows of {len(names)} joint values",
-            value=f"{leader.shape} and {follower.shape}",
+            value=Phrase(f"{leader.shape} and {follower.shape}"),
             option="leader, follower",
         )
     _check_rows(leader, "leader")

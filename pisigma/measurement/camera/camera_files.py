@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal, get_args
 
-from pisigma.files.errors import IdentificationError, MeasurementError, check_choice
+from pisigma.files.errors import IdentificationError, MeasurementError, Phrase, check_choice
 from pisigma.files.setting import KEY, Option, as_texts
 
 IntrinsicsChoice = Literal["fixed", "prior", "free"]
@@ -31,7 +31,7 @@ class Repeatability:
             raise IdentificationError(
                 option="repeatability",
                 expected="standard deviations of 0 to 10 mm and 0 to 6 deg",
-                value=f"{self.length * 1e3:g} mm and {math.degrees(self.angle):g} deg",
+                value=Phrase(f"{self.length * 1e3:g} mm and {math.degrees(self.angle):g} deg"),
             )
 
 

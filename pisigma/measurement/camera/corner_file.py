@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from jaxtyping import Float64, Int64
 
-from pisigma.files.errors import MeasurementError, Place, nearest_choice
+from pisigma.files.errors import MeasurementError, Phrase, Place, nearest_choice
 from pisigma.measurement.camera.board import Board
 from pisigma.measurement.camera.board_pose import MIN_CORNERS
 from pisigma.measurement.camera.camera import Camera
@@ -283,7 +283,7 @@ def _check_corners(
         if (pixels[row] < -1).any() or (pixels[row] > size).any():
             raise MeasurementError(
                 expected=f"a corner within the {camera.width} x {camera.height} px of camera '{camera.name}'",
-                value=f"u = {pixels[row, 0]:g}, v = {pixels[row, 1]:g} px",
+                value=Phrase(f"u = {pixels[row, 0]:g}, v = {pixels[row, 1]:g} px"),
                 at=table.place_of(row),
                 remedy=_RESOLUTION_REMEDY,
             )
@@ -301,7 +301,7 @@ def _check_resolution(table: Table, pixels: Float64[np.ndarray, "rows 2"], camer
     if (pixels.max(0) < np.array([camera.width, camera.height]) / 2).all():
         raise MeasurementError(
             expected=f"corners across the {camera.width} x {camera.height} px of camera '{camera.name}'",
-            value=f"corners within {pixels[:, 0].max():.0f} x {pixels[:, 1].max():.0f} px",
+            value=Phrase(f"corners within {pixels[:, 0].max():.0f} x {pixels[:, 1].max():.0f} px"),
             at=Place(table.source),
             remedy=_RESOLUTION_REMEDY,
         )

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float64
 
 from pisigma.estimation.loss import AbstractLoss, HampelLoss, SquaredLoss
-from pisigma.files.errors import MeasurementError, Place
+from pisigma.files.errors import MeasurementError, Phrase, Place
 from pisigma.measurement.camera.board_pose import (
     MIN_NOISE,
     POSE,
@@ -240,7 +240,7 @@ def initial_camera(views: Sequence[BoardView], name: str, size: tuple[int, int])
     if not squared > 0:
         raise MeasurementError(
             expected="oblique images of the board, which determine the focal length",
-            value="perpendicular ones",
+            value=Phrase("perpendicular ones"),
             remedy="take images tilted by up to 40 deg",
         )
     focal = width / np.sqrt(squared)

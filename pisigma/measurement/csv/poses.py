@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float64
 from torch import Tensor
 
-from pisigma.files.errors import MeasurementError, Place, nearest_choice
+from pisigma.files.errors import MeasurementError, Phrase, Place, nearest_choice
 from pisigma.files.input_file import open_input
 from pisigma.measurement.csv.columns import POSITION, QUATERNION, RPY, Column, find_column, quoted_names
 from pisigma.measurement.csv.header import check_separators
@@ -254,7 +254,10 @@ def _check_whole(columns: dict[str, tuple[int, Column]], place: Place) -> None:
     groups = [group for group in (RPY, QUATERNION) if set(group) & set(columns)]
     if len(groups) > 1:
         raise MeasurementError(
-            expected="roll, pitch, yaw or a quaternion", value="both", at=place, remedy="keep one of them"
+            expected="roll, pitch, yaw or a quaternion",
+            value=Phrase("both"),
+            at=place,
+            remedy="keep one of them",
         )
     orientation = groups[0] if groups else RPY
     for name in (*POSITION, *orientation):
@@ -267,7 +270,7 @@ def _check_whole(columns: dict[str, tuple[int, Column]], place: Place) -> None:
     if len({column.unit for column in lengths}) > 1:
         raise MeasurementError(
             expected=f"one unit for {quoted_names(lengths)}",
-            value=", ".join(column.unit for column in lengths),
+            value=Phrase(", ".join(column.unit for column in lengths)),
             at=place,
             remedy="use mm or m for all three",
         )

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.files.errors import MeasurementError, Place, check_choice, nearest_choice
+from pisigma.files.errors import MeasurementError, Phrase, Place, check_choice, nearest_choice
 from pisigma.measurement.csv.columns import (
     CORNERS,
     PRISMATIC_UNITS,
@@ -112,7 +112,7 @@ def _sound_rows(table: Table, layout: Layout, robot: Robot | None) -> MeasuredFi
         if "torque" in numbers:
             raise MeasurementError(
                 expected=f"no torques for robot '{robot.name}', whose joints are coupled",
-                value="tau_1, ...",
+                value=Phrase("tau_1, ..."),
                 at=Place(table.source),
                 remedy="remove these columns: the torques of the axes are not those of the joints",
             )
@@ -213,7 +213,7 @@ def _joint_column(table: Table, number: int, robot: Robot) -> Column:
     if len(there) != 1:
         raise MeasurementError(
             expected=f"one column for joint '{axis.name}' of robot '{robot.name}'",
-            value=" and ".join(there) or "none",
+            value=Phrase(" and ".join(there) or "none"),
             at=table.header_place,
             remedy=f"give {' or '.join(valid)}",
         )

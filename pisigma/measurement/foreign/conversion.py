@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.files.errors import MeasurementError, Place
+from pisigma.files.errors import MeasurementError, Phrase, Place
 from pisigma.measurement.csv.columns import POSITION, QUATERNION, RPY, find_column
 from pisigma.measurement.csv.reading import fields_of
 from pisigma.measurement.csv.table import Table
@@ -101,7 +101,7 @@ def check_complete(mapping: FileMapping) -> None:
     if mapping.incomplete:
         raise MeasurementError(
             expected="all values of a rotation",
-            value=", ".join(column.heading for column in mapping.incomplete),
+            value=Phrase(", ".join(column.heading for column in mapping.incomplete)),
             at=header,
             remedy="add the missing column, or omit the rotation with --rotation none",
         )
@@ -290,14 +290,14 @@ def measurement_table(rows: ConvertedRows) -> MeasurementTable:
     if not names:
         raise MeasurementError(
             expected="columns of joint values or measurements",
-            value="none",
+            value=Phrase("none"),
             at=Place(rows.source),
             remedy="name them with --map, such as --map HEADING=q1_deg,OTHER=x_mm",
         )
     if not any(filled):
         raise MeasurementError(
             expected="measurements",
-            value="joint values only",
+            value=Phrase("joint values only"),
             at=Place(rows.source),
             remedy="name their columns with --map, or join the file that contains them with --join point, order or "
             "time",
@@ -305,7 +305,7 @@ def measurement_table(rows: ConvertedRows) -> MeasurementTable:
     if _order(names[0])[0]:
         raise MeasurementError(
             expected="joint values",
-            value="measurements only",
+            value=Phrase("measurements only"),
             at=Place(rows.source),
             remedy="name their columns with --map HEADING=q1_deg and so on, or join the file that contains them with "
             "--join point, order or time",

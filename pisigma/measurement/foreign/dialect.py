@@ -10,7 +10,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal, get_args
 
-from pisigma.files.errors import MeasurementError, Place
+from pisigma.files.errors import MeasurementError, Phrase, Place
 from pisigma.measurement.csv.table import SPREADSHEET_ERRORS
 
 _SEPARATORS = ("\t", ";", ",", "|", " ")
@@ -161,7 +161,7 @@ def detect_dialect(lines: Sequence[tuple[int, str]], source: str, decimal: Decim
     if best <= 0:
         raise MeasurementError(
             expected="a table of numbers with one measurement per line",
-            value="no lines with the same number of numbers",
+            value=Phrase("no lines with the same number of numbers"),
             at=Place(source),
             remedy="separate cells with tabs, semicolons, commas or spaces",
         )

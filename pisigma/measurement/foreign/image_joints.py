@@ -4,7 +4,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from pisigma.files.errors import MeasurementError, Place
+from pisigma.files.errors import MeasurementError, Phrase, Place
 from pisigma.measurement.csv.columns import find_column
 from pisigma.measurement.csv.reading import number_column, text_column
 from pisigma.measurement.csv.table import read_table
@@ -63,7 +63,7 @@ def join_joint_values(
     if not joints or (by == "time" and "time" not in table.header):
         raise MeasurementError(
             expected="joint values (q1_deg and so on) and a column image or time",
-            value=", ".join(table.header),
+            value=Phrase(", ".join(table.header)),
             at=table.header_place,
         )
     if by == "point" and stops not in (0, len(table.lines)):

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from pisigma.files.errors import MeasurementError, Place
+from pisigma.files.errors import MeasurementError, Phrase, Place
 from pisigma.measurement.foreign.accounting import FileLine, LeftOutRow
 from pisigma.measurement.foreign.conversion import ConvertedRows
 from pisigma.measurement.foreign.quantities import KEYS, is_measured, joints_of
@@ -263,7 +263,7 @@ def _check_key(rows: ConvertedRows, key: str, what: str) -> None:
     if key not in rows.cells:
         raise MeasurementError(
             expected=f"a column of {what}, to join rows by them",
-            value="none",
+            value=Phrase("none"),
             at=Place(rows.source),
             remedy=f"name it with --map HEADING={key}, or join in another way",
         )

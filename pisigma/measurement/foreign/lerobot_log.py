@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pisigma.files.errors import MeasurementError
+from pisigma.files.errors import MeasurementError, Phrase
 from pisigma.files.output_file import check_output, write_atomically
 from pisigma.measurement.foreign.lerobot_dataset import STATE, LeRobotDataset, joint_motors
 from pisigma.measurement.foreign.lerobot_motors import (
@@ -81,12 +81,14 @@ def read_joint_log(
         )
     source = LeRobotDataset.open(dataset)
     if STATE not in source.names:
-        raise MeasurementError(expected=f"the feature {STATE}", value=", ".join(source.names), option="files")
+        raise MeasurementError(
+            expected=f"the feature {STATE}", value=Phrase(", ".join(source.names)), option="files"
+        )
     names = source.names[STATE]
     motors = joint_motors(names, prefix)
     if not motors:
         raise MeasurementError(
-            expected="positions of motors", value=", ".join(names), option="lerobot_prefix"
+            expected="positions of motors", value=Phrase(", ".join(names)), option="lerobot_prefix"
         )
     columns = list(motors.values())
     known = None if calibration is None else read_motors(calibration)

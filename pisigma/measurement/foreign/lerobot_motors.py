@@ -11,7 +11,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from jaxtyping import Float
 
-from pisigma.files.errors import MeasurementError, Place, check_choice
+from pisigma.files.errors import MeasurementError, Phrase, Place, check_choice
 from pisigma.files.input_file import read_text
 
 LeRobotUnits = Literal["degrees", "normalized"]
@@ -74,7 +74,7 @@ def _motor(entry: Any, at: Place, keys: list[str]) -> Motor:
     if not isinstance(entry, dict) or sorted(entry) != sorted(keys):
         raise MeasurementError(
             expected=f"a motor with {', '.join(keys)}",
-            value=", ".join(entry) if isinstance(entry, dict) else type(entry).__name__,
+            value=Phrase(", ".join(entry) if isinstance(entry, dict) else type(entry).__name__),
             at=at,
             remedy="calibrate again with LeRobot 0.2 or later",
         )
@@ -85,7 +85,7 @@ def _motor(entry: Any, at: Place, keys: list[str]) -> Motor:
     if motor.drive_mode not in (0, 1) or motor.range_min >= motor.range_max:
         raise MeasurementError(
             expected="a drive_mode of 0 or 1, and range_min < range_max",
-            value=f"{motor.drive_mode}, {motor.range_min} and {motor.range_max}",
+            value=Phrase(f"{motor.drive_mode}, {motor.range_min} and {motor.range_max}"),
             at=at,
         )
     return motor

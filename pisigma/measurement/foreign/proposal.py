@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
-from pisigma.files.errors import MeasurementError, Place
+from pisigma.files.errors import MeasurementError, Phrase, Place
 from pisigma.measurement.csv.columns import POSITION, QUATERNION, RPY
 from pisigma.measurement.foreign.export_file import ExportFile
 from pisigma.measurement.foreign.headings import (
@@ -156,7 +156,7 @@ def _take_by_order(proposal: Proposal, rotation: str | None) -> None:
     if not is_usual:
         raise MeasurementError(
             expected="headings, or columns of six or seven joints and a position",
-            value=f"{len(proposal.headings)} columns without headings",
+            value=Phrase(f"{len(proposal.headings)} columns without headings"),
             at=Place(proposal.file.source),
             remedy="name them by their numbers, such as --map 1=q1_deg,2=q2_deg,3=x_mm,4=-, and with --rotation if "
             "three angles or a quaternion follow the position",

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
-from pisigma.files.errors import IdentificationError, Place, nearest_choice
+from pisigma.files.errors import IdentificationError, Phrase, Place, nearest_choice
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.sensors.sensor import (
     AbstractSensor,
@@ -104,7 +104,7 @@ class SocketSensor(AbstractSensor):
         if usual > _MAX_SCATTER * reach:
             raise IdentificationError(
                 expected="the nominal robot to place the rows of a socket at one position",
-                value=f"a median distance of {usual * 1e3:.3g} mm from their mean",
+                value=Phrase(f"a median distance of {usual * 1e3:.3g} mm from their mean"),
                 at=Place(measurements.source),
                 remedy="check the directions and zeros of the joints, the tool, and the names of the sockets",
             )
@@ -229,7 +229,7 @@ def _check_distance(one: str, other: str, distance: float, order: tuple[str, ...
         raise IdentificationError(
             option="socket_distances",
             expected="a distance > 0 between two different sockets",
-            value=f"{distance * 1e3:.6g} mm between '{one}' and '{other}'",
+            value=Phrase(f"{distance * 1e3:.6g} mm between '{one}' and '{other}'"),
             at=Place(source),
         )
 
@@ -260,7 +260,7 @@ def matching_sockets(
             raise IdentificationError(
                 option="socket_distances",
                 expected=f"names of two sockets of the data ({', '.join(names) or 'none'})",
-                value=f"{first} and {second}",
+                value=Phrase(f"{first} and {second}"),
             )
         for pair in pairs:
             known = matching.get(pair, matching.get((pair[1], pair[0]), distance))
@@ -268,7 +268,7 @@ def matching_sockets(
                 raise IdentificationError(
                     option="socket_distances",
                     expected=f"one distance between the sockets '{pair[0]}' and '{pair[1]}'",
-                    value=f"{known * 1e3:g} and {distance * 1e3:g} mm",
+                    value=Phrase(f"{known * 1e3:g} and {distance * 1e3:g} mm"),
                 )
             matching[pair] = distance
     return matching

@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, NullLocator
 
 from pisigma.files.conflicts import Input, check_conflicts
-from pisigma.files.errors import OutputError, Place
+from pisigma.files.errors import OutputError, Phrase, Place
 from pisigma.files.output_file import write_atomically
 from pisigma.reporting.calibration_figures import STYLES, show_correlations
 from pisigma.reporting.page.content import ReportContent
@@ -141,7 +141,7 @@ def check_figures(folder: Path, inputs: Iterable[Input] = ()) -> None:
     """
     check_conflicts(folder / "figure.png", inputs, "--figures")
     if folder.exists() and not folder.is_dir():
-        raise OutputError(expected="a folder", value="a file", at=Place(folder), option="--figures")
+        raise OutputError(expected="a folder", value=Phrase("a file"), at=Place(folder), option="--figures")
     if not folder.exists() and not folder.parent.is_dir():
         raise OutputError(
             f"there is no folder {folder.parent}",

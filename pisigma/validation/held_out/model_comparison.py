@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
-from pisigma.files.errors import MeasurementError, Place
+from pisigma.files.errors import MeasurementError, Phrase, Place
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import groups_to_keep_whole
 from pisigma.measurement.sensors.socket import PairOfSockets
@@ -262,7 +262,7 @@ def compare_models(
     if not bool((measured | others).any()):
         raise MeasurementError(
             expected="positions, balls in sockets, wires, pairs or touches",
-            value="none",
+            value=Phrase("none"),
             at=Place(measurements.source),
             remedy="give x, y and z",
         )

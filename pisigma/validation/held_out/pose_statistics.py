@@ -12,7 +12,7 @@ from pisigma.calibration.geometric.result import CalibrationResult
 from pisigma.calibration.hybrid.result import HybridResult
 from pisigma.calibration.hybrid.uncertainty import PositionUncertainty
 from pisigma.estimation.covariance_root import CovarianceRoot
-from pisigma.files.errors import MeasurementError, Place
+from pisigma.files.errors import MeasurementError, Phrase, Place
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.sensors.corner import position_sigmas
 from pisigma.measurement.sensors.intrinsics import NOISE_COLUMN
@@ -131,7 +131,7 @@ def error_statistics(errors: Float64[Tensor, " rows"]) -> dict[str, float]:
     if not len(present):
         raise MeasurementError(
             expected="a row with both a measured and a predicted value",
-            value="none",
+            value=Phrase("none"),
             remedy="give other rows",
         )
     return {
@@ -153,7 +153,7 @@ def _no_positions(measurements: Measurements) -> MeasurementError:
     kinds = " and ".join(sorted(measurements.kinds - {"rotation"}))
     return MeasurementError(
         expected="positions",
-        value=kinds or "none",
+        value=Phrase(kinds or "none"),
         at=Place(measurements.source),
         remedy="give x, y and z, use `pisigma evaluate` or `pisigma verify`, which accept such rows, or hold rows out "
         "with `pisigma calibrate --set hold_out=0.2`"

@@ -10,7 +10,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from pisigma.calibration.geometric.problem.parameters import row_labels
-from pisigma.files.errors import MeasurementError, Place
+from pisigma.files.errors import MeasurementError, Phrase, Place
 from pisigma.measurement.camera.board import Board
 from pisigma.measurement.camera.camera import Camera
 from pisigma.measurement.camera.camera_files import CameraFiles
@@ -147,7 +147,7 @@ def arm_in_images(
     if not chosen:
         raise MeasurementError(
             expected="the names of the images in the file of corners",
-            value=", ".join(sorted(by_name)[:3]),
+            value=Phrase(", ".join(sorted(by_name)[:3])),
             at=Place(rows.source, column="image"),
             remedy="give the images from which `pisigma detect` made the file of corners",
         )

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
-from pisigma.files.errors import Place, RobotError
+from pisigma.files.errors import Phrase, Place, RobotError
 from pisigma.files.input_file import read_input
 from pisigma.planning.surroundings.capsules import Capsules
 from pisigma.robot.description import Robot
@@ -94,7 +94,7 @@ class MeshBody(AbstractBody):
         if [joint.name for joint in chain.joints] != self._joints:
             raise RobotError(
                 expected=f"the joints of robot '{robot.name}': {', '.join(self._joints)}",
-                value=", ".join(joint.name for joint in chain.joints),
+                value=Phrase(", ".join(joint.name for joint in chain.joints)),
                 at=Place(path),
                 remedy="give the file that the robot was loaded from",
             )

@@ -6,7 +6,7 @@ import zipfile
 import zlib
 from pathlib import Path, PurePosixPath
 
-from pisigma.files.errors import OutputError, Place, PlanningError
+from pisigma.files.errors import OutputError, Phrase, Place, PlanningError
 from pisigma.files.output_file import check_output
 from pisigma.files.scratch import FILE, FOLDER, scratch_beside
 from pisigma.lifetime.cell.layout import CELL_FILE
@@ -42,7 +42,9 @@ def pack(cell: Cell, path: str | os.PathLike[str]) -> int:
     )
     for one in files:
         if one.is_symlink() or not one.is_file():
-            raise OutputError(expected="regular files in the cell", value="a link or a device", at=Place(one))
+            raise OutputError(
+                expected="regular files in the cell", value=Phrase("a link or a device"), at=Place(one)
+            )
     if (size := sum(one.stat().st_size for one in files)) > MAX_BYTES:
         raise OutputError(
             expected=f"files of at most {MAX_BYTES:,} bytes in total", value=size, at=Place(cell.folder)
@@ -134,7 +136,7 @@ def _extract(
             if left < 0:
                 raise PlanningError(
                     expected=f"{member.file_size:,} bytes",
-                    value="more",
+                    value=Phrase("more"),
                     at=Place(path, None, member.filename),
                 )
             file.write(chunk)

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from pisigma.files.errors import ModelError, OutputError, PisigmaError, Place
+from pisigma.files.errors import ModelError, OutputError, Phrase, PisigmaError, Place
 from pisigma.files.model_files import DESCRIPTION, model_hash
 from pisigma.files.output_file import write_atomically
 from pisigma.files.scratch import FOLDER, remove_stale_scratch, scratch_beside
@@ -148,7 +148,7 @@ def cell_from_model(model: Path, cell: NewCell) -> NewCell:
     if loaded.kind == FLEET_PRIOR:
         raise ModelError(
             expected="the model of one robot",
-            value="the prior of a fleet",
+            value=Phrase("the prior of a fleet"),
             at=Place(model),
             remedy="create a cell with `pisigma new ROBOT`, and calibrate it with --prior",
         )

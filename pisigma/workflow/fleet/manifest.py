@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from pisigma.files.errors import FleetError, PisigmaError, Place, nearest_choice
+from pisigma.files.errors import FleetError, Phrase, PisigmaError, Place, nearest_choice
 from pisigma.files.setting import build_settings, by_key
 from pisigma.files.setting_values import read_assignments
 from pisigma.lifetime.cell.facts import sha256_of
@@ -98,7 +98,7 @@ def _check_names(robots: Mapping[str, list[_Row]], source: Path) -> None:
         raise FleetError(
             expected="a manifest (CSV) with the columns id, robot and data, a model folder, or a folder with one "
             "folder or one CSV file per robot",
-            value="no robot",
+            value=Phrase("no robot"),
             at=Place(source),
         )
     first: dict[str, str] = {}

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pisigma.files.errors import MeasurementError, Place
+from pisigma.files.errors import MeasurementError, Phrase, Place
 from pisigma.files.output_file import check_page, write_atomically
 from pisigma.measurement.camera.board import Board
 from pisigma.measurement.camera.camera import INTRINSICS
@@ -168,7 +168,7 @@ def calibrate_camera(
         if one.size != size:
             raise MeasurementError(
                 expected=f"an image of {size[0]} x {size[1]} px like {read[0].file}",
-                value=f"{one.size[0]} x {one.size[1]} px",
+                value=Phrase(f"{one.size[0]} x {one.size[1]} px"),
                 at=Place(one.file),
                 remedy="give images of one camera",
             )

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from pisigma.calibration.geometric.problem.least_squares import AbstractLeastSquares, Linearisation
 from pisigma.calibration.geometric.problem.noise import SMALLEST_NOISE
-from pisigma.files.errors import IdentificationError, Place
+from pisigma.files.errors import IdentificationError, Phrase, Place
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.sensors.pose import rotation_difference
 from pisigma.robot.description import Robot
@@ -212,7 +212,7 @@ def build_base_and_tool_problem(
     if measurements.position is None:
         raise IdentificationError(
             expected="measured positions or poses for base and tool",
-            value="none",
+            value=Phrase("none"),
             at=Place(measurements.source),
             remedy="give the columns x_mm, y_mm, z_mm",
         )

@@ -7,7 +7,7 @@ import numpy as np
 
 from pisigma.deployment.export.approximation import joint_offsets
 from pisigma.deployment.export.joint_offsets import joints_by_axes
-from pisigma.files.errors import Place, RobotError
+from pisigma.files.errors import Phrase, Place, RobotError
 from pisigma.files.yaml_file import plain_content
 from pisigma.robot.description import Robot
 from pisigma.robot.robot_file import FrameSection
@@ -28,7 +28,7 @@ def read_offsets(text: str, source: str, nominal: Robot) -> Robot:
         names = ", ".join(axis.name for axis in nominal.axes)
         raise RobotError(
             expected=f"offsets of the joints {names}",
-            value=", ".join(joints) or "none",
+            value=Phrase(", ".join(joints) or "none"),
             at=Place(source),
         )
     offsets = np.array([_offset(axis, joints[axis.name], source) for axis in nominal.axes])

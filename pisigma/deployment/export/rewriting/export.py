@@ -13,7 +13,7 @@ from pisigma.deployment.export.rewriting.krl import scan_krl, scan_krl_data
 from pisigma.deployment.export.rewriting.rapid import scan_rapid
 from pisigma.deployment.export.rewriting.scan import ScannedProgram
 from pisigma.deployment.export.rewriting.urscript import scan_urscript
-from pisigma.files.errors import OutputError, Place
+from pisigma.files.errors import OutputError, Phrase, Place
 from pisigma.files.input_file import read_input
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.inverse.corrected_ik import load
@@ -48,7 +48,7 @@ def check_rewriting(request: ExportRequest) -> None:
     if suffix not in SCANNERS or request.out.suffix.lower() != suffix:
         raise OutputError(
             expected=f"a program ({', '.join(SCANNERS)}) and an --out file with the same suffix",
-            value=f"{suffix} and {request.out.suffix}",
+            value=Phrase(f"{suffix} and {request.out.suffix}"),
             at=Place(request.program),
             option="--program" if suffix not in SCANNERS else "--out",
         )

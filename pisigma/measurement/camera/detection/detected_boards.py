@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from pisigma.estimation.loss import HampelLoss
-from pisigma.files.errors import MeasurementError, Place
+from pisigma.files.errors import MeasurementError, Phrase, Place
 from pisigma.measurement.camera.board import Board
 from pisigma.measurement.camera.board_pose import solve_board_pose
 from pisigma.measurement.camera.camera import Camera
@@ -126,7 +126,7 @@ def predict_boards(images: Sequence[BoardImage], camera: Camera, board: Board) -
         if one.is_read and one.size != (camera.width, camera.height):
             raise MeasurementError(
                 expected=f"an image of {camera.width} x {camera.height} px of camera '{camera.name}'",
-                value=f"{one.size[0]} x {one.size[1]} px",
+                value=Phrase(f"{one.size[0]} x {one.size[1]} px"),
                 at=Place(one.file),
                 remedy="check the camera",
             )

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float64
 
-from pisigma.files.errors import MeasurementError, Place
+from pisigma.files.errors import MeasurementError, Phrase, Place
 from pisigma.files.input_file import read_input
 from pisigma.measurement.camera.board import Board, BoardKind
 from pisigma.measurement.camera.board_pose import MIN_CORNERS
@@ -122,7 +122,9 @@ def image_files(
         files += [one for one in inside if one.suffix.lower() in _ENDINGS] if path.is_dir() else [path]
     if not files:
         raise MeasurementError(
-            expected=f"images ({', '.join(_ENDINGS)})", value="none", at=Place(", ".join(map(str, paths)))
+            expected=f"images ({', '.join(_ENDINGS)})",
+            value=Phrase("none"),
+            at=Place(", ".join(map(str, paths))),
         )
     of_name: dict[str, Path] = {}
     for file in files:

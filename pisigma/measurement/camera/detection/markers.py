@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from pisigma.files.errors import MeasurementError
+from pisigma.files.errors import MeasurementError, Phrase
 from pisigma.measurement.camera.board import Board
 from pisigma.measurement.camera.detection.detected_board import (
     DetectedBoard,
@@ -76,7 +76,7 @@ def dictionary_of(board: Board) -> cv2.aruco.Dictionary:
         raise MeasurementError(
             option="dictionary",
             expected=f"a dictionary with {needed} markers for board '{board.name}'",
-            value=f"{board.dictionary} with {there}",
+            value=Phrase(f"{board.dictionary} with {there}"),
             remedy="choose another",
         )
     return dictionary
