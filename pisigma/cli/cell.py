@@ -212,7 +212,7 @@ def event(
         ),
     ],
     date: Annotated[str, typer.Option(help="Day of the event, such as 2026-11-22. [default: today]")] = "",
-    note: Annotated[str, typer.Option(help="Free text.")] = "",
+    note: Annotated[str, typer.Option(help="Remark to record with the event.")] = "",
     by: Annotated[
         str, typer.Option(help="Name of the person who accepted the model or reported the change.")
     ] = "",

@@ -21,7 +21,7 @@ Subject = Annotated[
     str,
     typer.Argument(
         metavar="ROBOT|MODEL|CELL",
-        help="Catalogue name, robot file (YAML or URDF), model folder to measure again, or cell.",
+        help="Catalogue name, robot file (YAML or URDF), model folder of a robot to measure again, or cell.",
         autocompletion=complete_robot,
     ),
 ]

@@ -38,7 +38,8 @@ def report(
     images: Annotated[
         list[Path] | None,
         typer.Option(
-            help="Images or videos of the corners in DATA, over which the nominal and the calibrated arm are drawn."
+            help="Images or videos in which the corners in DATA were detected; the nominal and the calibrated arm are "
+            "drawn over them."
         ),
     ] = None,
     cameras: CameraFiles | None = None,

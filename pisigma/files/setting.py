@@ -36,6 +36,7 @@ class Option:
         default: default that the help shows, if the setting's default has another type.
         is_key: whether the setting has no option of its own and is set by its key, in `cell.yaml` and with `--set`.
         hidden: whether the setting can be set only in Python.
+        help: help of the option if it differs from the description of the setting, as of `--no-history`.
     """
 
     name: str | None = None
@@ -48,6 +49,7 @@ class Option:
     default: Any = None
     is_key: bool = False
     hidden: bool = False
+    help: str = ""
 
 
 HIDDEN = Option(hidden=True)
@@ -136,7 +138,7 @@ def settings_of(group: type) -> tuple[Setting, ...]:
         is_required = one.default is MISSING and one.default_factory is MISSING
         default = _stated_default(None if one.default is MISSING else one.default, option)
         kind = option.kind or _stated_as(kind)
-        meaning = _help(meanings.get(one.name, ""), option, get_origin(kind) is list)
+        meaning = _help(option.help or meanings.get(one.name, ""), option, get_origin(kind) is list)
         found.append(Setting(one.name, kind, default, is_required, meaning, option))
     return tuple(found)
 
@@ -182,7 +184,7 @@ def build_settings(group: type, stated: Mapping[str, Any], is_optional: bool = F
     names = " and ".join(one.spelling for one in needed)
     if missing == needed != []:
         given = ", ".join(one.spelling for one in flat_settings(group) if one.key in stated)
-        raise PisigmaError(f"needs {names}", option=given, expected=names)
+        raise PisigmaError(f"{names} must also be given", option=given, expected=names)
     if missing:
         raise PisigmaError(expected=f"{names} together", option=missing[0].spelling, remedy="give both")
     try:

@@ -94,7 +94,11 @@ def _check_shapes(data: MeasuredFields) -> None:
             )
         if values.dtype != torch.float64:
             raise MeasurementError(
-                option=name, expected="float64", value=values.dtype, at=Place(source), remedy="convert it"
+                option=name,
+                expected="float64",
+                value=values.dtype,
+                at=Place(source),
+                remedy="convert the values",
             )
         if values.device != q.device:
             raise MeasurementError(
@@ -102,7 +106,7 @@ def _check_shapes(data: MeasuredFields) -> None:
                 expected=f"values on the device of q, {q.device}",
                 value=values.device,
                 at=Place(source),
-                remedy="move them there",
+                remedy="move the values to that device",
             )
     for name, entries in {**data.texts, "line": data.line}.items():
         if name not in (*TEXTS, "line", *reading_texts()):

@@ -77,9 +77,10 @@ def frames_of_model(model: CalibratedModel, rows: Measurements, only: FrameChoic
     """
     if model.network is not None:
         raise ModelError(
-            f"the network of model '{model.name}' was trained for its base and tool",
+            f"the network of model '{model.name}' is valid only for the base and tool with which it was trained, so "
+            "neither can be fitted",
             value=model.kind,
-            remedy="use a geometric or hybrid calibration",
+            remedy="use a geometric or hybrid model",
         )
     arm = model.hybrid
     bases, tools = (model.bases, model.tools) if arm is None else (model.hybrid_bases, model.hybrid_tools)

@@ -118,7 +118,7 @@ def under_stated_torques(model: CalibratedModel, torques_nm: Sequence[float]) ->
             "largest of the calibration",
             value=float(values[joint]),
             option="torques_nm",
-            remedy="give Nm (N for prismatic joints)",
+            remedy="give torques in Nm (forces in N for prismatic joints)",
         )
     correction, shift = at_torques(arm.correction, values)
     return replace(model, hybrid=replace(arm, robot=_shifted(arm.robot, shift), correction=correction))

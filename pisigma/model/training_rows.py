@@ -43,7 +43,8 @@ def without_known_rows(model: CalibratedModel, rows: Measurements) -> tuple[Meas
     known = known_rows(model, rows)
     if bool(known.all()):
         raise MeasurementError(
-            f"expected new rows, got rows with which {model.name} was calibrated (equal joint values and readings)",
+            f"expected new rows, got only rows whose joint values and readings are those of rows of model "
+            f"'{model.name}'",
             expected="new rows",
             at=Place(rows.source),
             remedy="measure new rows",

@@ -213,7 +213,11 @@ def _numbers(table: Table, name: str) -> list[int]:
     """Return the cells of a column of numbers from 1."""
     cells = _cells(table, name)
     for line, cell in zip(table.lines, cells, strict=True):
-        if not (cell.isascii() and cell.isdigit()):
-            at = Place(table.source, line, name)
-            raise MeasurementError(expected="a number >= 1", value=cell, at=at)
+        if not (cell.isascii() and cell.isdigit() and int(cell) >= 1):
+            raise MeasurementError(
+                expected="an integer >= 1",
+                value=cell,
+                at=Place(table.source, line, name),
+                remedy="give the poses as `pisigma plan` wrote them",
+            )
     return list(map(int, cells))

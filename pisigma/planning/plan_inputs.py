@@ -153,11 +153,12 @@ def check_measured(model: CalibratedModel | None, settings: PlanSettings, robot:
         raise MeasurementError(f"{settings.measured}: {implausible[0].sentence}", value=implausible[0].kind)
     if model is not None and bool(known_rows(model, rows).all()):
         raise MeasurementError(
-            f"expected rows to which model '{model.name}' was not fitted, because these would be used twice",
+            f"expected rows to which model '{model.name}' was not fitted, got only rows of its calibration, which "
+            "would count twice",
             value=model.name,
             at=Place(settings.measured),
             option="--measured",
-            remedy="plan with the model alone",
+            remedy="omit --measured",
         )
     twice = "the measurements count twice, and the expected errors are too small"
     known = () if model is None else training_row_warnings(model, rows, consequence=twice)

@@ -68,7 +68,7 @@ class Robot:
                 raise RobotError(
                     f"{robot}: {name} has an entry that is not finite or exceeds {MAX_MAGNITUDE / 1e3:.0e} m or rad",
                     expected=f"finite values up to {MAX_MAGNITUDE / 1e3:.0e} m or rad",
-                    remedy="correct it",
+                    remedy="correct the entry",
                 )
             values.setflags(write=False)
             object.__setattr__(self, name, values)

@@ -101,7 +101,7 @@ def read_chain(path: str | os.PathLike[str], base: str | None = None, tip: str |
             f"there is no moving joint between the links '{base}' and '{tip}'",
             expected="a joint that moves",
             at=Place(path),
-            remedy="choose other links with base and tip",
+            remedy="choose another base or tip",
         )
     content = etree.tostring(root.getroottree(), xml_declaration=True, encoding="UTF-8")
     return Chain(urdf.name, base, tip, tuple(joints), origin, make_printable(str(path), cut=False), content)
@@ -141,8 +141,8 @@ def _root(urdf: Any, at: Place) -> str:
         raise RobotError(
             f"expected {expected}, but the joints form a loop", expected=expected, value=0, at=at
         )
-    problem = f"{len(roots)} links have no parent ({', '.join(roots)})"
-    remedy = "state with base where the chain starts"
+    problem = f"{len(roots)} links have no parent: {', '.join(roots)}"
+    remedy = "state the first link of the chain as base"
     raise RobotError(problem, expected=expected, value=len(roots), at=at, remedy=remedy)
 
 
@@ -164,8 +164,8 @@ def _only_tip(urdf: Any, base: str, at: Place) -> str:
         return str(ends[0])
     names = ", ".join(sorted(ends)) or "none"
     problem, remedy = (
-        f"the chain below '{base}' has {len(ends)} ends ({names})",
-        "state the last link with tip",
+        f"the chain below '{base}' has {len(ends)} ends: {names}",
+        "state the last link of the chain as tip",
     )
     raise RobotError(problem, expected="one end", value=len(ends), at=at, remedy=remedy)
 
@@ -181,7 +181,7 @@ def _joints_between(urdf: Any, base: str, tip: str, at: Place) -> list[Any]:
     while link != base:
         if link not in urdf.parent_map or len(joints) > len(urdf.joints):
             problem = f"the link '{tip}' is not below '{base}'"
-            raise RobotError(problem, value=tip, at=at, remedy="choose other links with base and tip")
+            raise RobotError(problem, value=tip, at=at, remedy="choose another base or tip")
         name, link = urdf.parent_map[link]
         joints.append(urdf.joint_map[name])
     return joints[::-1]
@@ -249,10 +249,10 @@ def _limits(joint: Any, at: Place) -> tuple[float, float]:
     lower, upper = float(joint.limit.lower), float(joint.limit.upper)
     if not lower < upper:
         raise RobotError(
-            f"joint '{joint.name}': the lower limit {lower:g} is not below the upper limit {upper:g} (default: 0)",
+            f"joint '{joint.name}': the lower limit {lower:g} is not below the upper limit {upper:g}",
             expected="a lower limit below the upper limit",
             value=(lower, upper),
             at=at,
-            remedy=f"correct them{alternative}",
+            remedy=f"state both limits, whose default is 0{alternative}",
         )
     return lower, upper

@@ -211,7 +211,7 @@ def _type(row: Row, robot: str) -> str:
         f"got {'one' if bounded.any() else 'none'}",
         expected="two limits",
         value=row.name,
-        remedy="give the robot both limits",
+        remedy="give the joint both limits",
     )
 
 

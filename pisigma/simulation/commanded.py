@@ -108,7 +108,7 @@ class BranchSection(Section):
         """Return the solutions of all branches, or only of the named branch."""
         if solver is None:
             raise RecipeError(
-                f"robot '{robot.name}' has no closed form and therefore no branch '{self.name}'",
+                f"robot '{robot.name}' has no closed-form inverse kinematics and therefore no branch '{self.name}'",
                 option="branch",
                 value=self.name,
                 remedy="give near_deg instead",

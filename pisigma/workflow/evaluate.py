@@ -244,9 +244,10 @@ def load_models(sources: Mapping[str, ModelSource]) -> dict[str, CalibratedModel
     if not loaded:
         only = " ".join(sources)
         raise ModelError(
-            f"expected a model folder in addition to '{only}', which is derived from a model; give one (a folder of "
-            f"that name as ./{next(iter(sources), 'model')}).",
+            f"expected a model folder in addition to '{only}', which is computed from a model",
+            expected="a model folder",
             value=only,
+            remedy=f"add one (write ./{next(iter(sources), 'model')} if your folder has that name)",
         )
     return loaded
 

@@ -207,7 +207,7 @@ def _in_new_frames(content: MeasurementTable, lines: Sequence[int]) -> Measureme
             option="new_frame_at",
             expected="rows of one file",
             value=Phrase(", ".join(files)),
-            remedy="import one by one",
+            remedy="import the files one by one",
         )
     table, frames = (
         content.table,

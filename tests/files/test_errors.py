@@ -1,13 +1,17 @@
 """Messages are built from fields and are safe to print on a terminal."""
 
+import ast
 import json
 import pickle
+from pathlib import Path
 
 import pytest
 
+import pisigma
 from pisigma.files.errors import (
     MAX_MESSAGE_CHARACTERS,
     MissingExtraError,
+    Phrase,
     PisigmaError,
     Place,
     RobotError,
@@ -53,6 +57,7 @@ def test_a_message_is_built_from_its_fields():
         == "--camera: expected a file, got 'x'."
     )
     assert str(PisigmaError("no rows", at=Place("a.csv", 3, 2))) == "no rows (a.csv, line 3, column 2)."
+    assert str(PisigmaError(expected="rows", value=Phrase("none"))) == "expected rows, got none."
     assert str(PisigmaError("the whole message")) == "the whole message"
 
 
@@ -90,3 +95,19 @@ def test_fields_survive_pickling_and_an_appended_text():
         assert type(other) is RobotError
         assert {**other.fields(), "message": ""} == {**problem.fields(), "message": ""}
     assert str(problem.followed_by(" See the log.")) == "--rows: no rows (a.csv, line 3). See the log."
+
+
+def test_no_problem_ends_in_parentheses_before_its_place():
+    """The place of an error follows in parentheses."""
+    doubled = []
+    for path in Path(pisigma.__file__).parent.rglob("*.py"):
+        for call in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if not isinstance(call, ast.Call):
+                continue
+            keywords = {one.arg: one.value for one in call.keywords}
+            before = call.args[0] if call.args else None if "value" in keywords else keywords.get("expected")
+            if isinstance(before, ast.JoinedStr):
+                before = before.values[-1]
+            if "at" in keywords and isinstance(before, ast.Constant) and str(before.value).endswith(")"):
+                doubled.append(f"{path}, line {call.lineno}")
+    assert doubled == []

@@ -38,8 +38,8 @@ fleet = typer.Typer(name="fleet", help="Calibrate and monitor all cells in a fol
 def run(folder: Folder, settings: FleetSettings, as_json: AsJson = False) -> None:
     """Calibrate, verify, monitor and recalibrate all cells in a folder, as the status of each requires.
 
-    Writes FOLDER/results.parquet, one row per check. Continues after an interruption. Names the cells that need
-    attention, and exits with status 3 if there are any.
+    Writes FOLDER/results.parquet, one row per check. After an interruption, the next run continues where it
+    stopped. Names the cells that need attention, and exits with status 3 if there are any.
     """
     from pisigma.workflow.fleet.run import run_fleet
 

@@ -88,7 +88,9 @@ def _size(orders: str | None, harmonics: int | None) -> "NetworkSize | None":
 
     if orders is None:
         if harmonics is not None:
-            raise RecipeError("needs --orders", option="--harmonics", remedy="give both or neither")
+            raise RecipeError(
+                "the option requires --orders", option="--harmonics", remedy="give both or neither"
+            )
         return None
     numbers = orders.split(",")
     if not all(number.strip().isdecimal() and 1 <= int(number) <= 20 for number in numbers):

@@ -105,7 +105,7 @@ def export_model(name: str, request: ExportRequest) -> Exported:
         if option not in form.options:
             takers = " or ".join(other for other in export_names() if option in export_format(other).options)
             raise OutputError(
-                f"applies only to --format {takers}, not to {name}",
+                f"the option applies only to --format {takers}, not to {name}",
                 option=f"--{option.replace('_', '-')}",
                 value=name,
                 remedy="omit it",
@@ -134,7 +134,7 @@ def _write_folder(folder: Path, files: Mapping[str, bytes]) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as problem:
         raise OutputError(
-            f"the folder cannot be created ({problem.strerror})",
+            f"the folder cannot be created: {problem.strerror}",
             at=Place(folder),
             option="--out",
             remedy="choose another folder",

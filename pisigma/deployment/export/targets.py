@@ -67,7 +67,9 @@ def targets_csv(targets: Targets) -> str:
 
 def _check(request: ExportRequest) -> None:
     if request.poses is not None and request.program is not None:
-        raise OutputError("cannot be combined with --program", option="--poses", remedy="give one of them")
+        raise OutputError(
+            "the option cannot be combined with --program", option="--poses", remedy="give only one of them"
+        )
     if request.poses is None and request.program is None:
         raise OutputError(
             "--format targets needs poses", option="--poses", remedy="give --poses, or a --program with poses"
@@ -84,7 +86,7 @@ def _check(request: ExportRequest) -> None:
         )
     elif request.frames is not None or request.tolerance_mm is not None:
         option = "--frames" if request.frames is not None else "--tolerance-mm"
-        raise OutputError("applies only with --program", option=option, remedy="omit it")
+        raise OutputError("the option applies only to a --program", option=option, remedy="omit it")
 
 
 def _check_options(request: ExportRequest) -> None:
@@ -96,7 +98,7 @@ def _check_options(request: ExportRequest) -> None:
         for name, value in (("--targets", kind), ("--config", request.config)):
             if value is not None:
                 raise OutputError(
-                    "applies only to programs; a .csv file includes all targets",
+                    "the option applies only to programs, because a .csv file includes all targets",
                     option=name,
                     value=value,
                     remedy="omit it",

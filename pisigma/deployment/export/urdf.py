@@ -51,10 +51,10 @@ def check_tip(request: ExportRequest) -> None:
     """Check that a tip is given only together with the file that contains this link."""
     if request.tip is not None and request.like is None:
         raise OutputError(
-            "names a link of the file given with --like",
+            "the option names a link of the file given with --like",
             option="--tip",
             value=request.tip,
-            remedy="give both options or none",
+            remedy="give --like too, or omit --tip",
         )
 
 

@@ -193,7 +193,7 @@ def _checked_type(values: Any, what: str) -> Any:
     dtype = getattr(values, "dtype", type(values))
     if not (dtype.is_floating_point if isinstance(dtype, torch.dtype) else np.issubdtype(dtype, np.floating)):
         raise MeasurementError(
-            expected="floating-point values", value=str(dtype), option=what, remedy="convert them"
+            expected="floating-point values", value=str(dtype), option=what, remedy="convert the values"
         )
     return values
 

@@ -91,7 +91,7 @@ def correct_lerobot_dataset(
             scratch.rename(target)
     except shutil.Error as problem:  # of `copytree`: a list of file, copy and reason
         file, _, reason = problem.args[0][0]
-        raise MeasurementError(f"it cannot be copied ({reason})", at=Place(file)) from None
+        raise MeasurementError(f"the file cannot be copied: {reason}", at=Place(file)) from None
     except OSError as problem:
         raise write_failure(out, problem) from None
     return CorrectedDataset(target, frames, corrections)

@@ -315,7 +315,10 @@ def _trusted_certificates(folder: Path) -> frozenset[bytes]:
             found.add(read(content).public_bytes(Encoding.DER))
         except ValueError:
             raise OutputError(
-                expected="a certificate (DER or PEM)", at=Place(path), option="--opcua-certificates"
+                expected="a DER or PEM certificate",
+                at=Place(path),
+                option="--opcua-certificates",
+                remedy="replace or remove the file",
             ) from None
     return frozenset(found)
 
@@ -352,7 +355,7 @@ def _make_own_certificate(folder: Path, uri: str) -> None:
             file.write(cert_gen.dump_private_key_as_pem(key))
     except OSError as problem:
         raise OutputError(
-            f"the certificate cannot be written ({problem.strerror})",
+            f"the certificate cannot be written: {problem.strerror}",
             at=Place(folder),
             option="--opcua-certificates",
         ) from None

@@ -55,7 +55,7 @@ class ServeSettings:
         opcua_certificates: folder of the certificate for OPC UA, which is created if it is missing, and of the
             certificates of clients in the subfolder `trusted`. Required if other machines can reach the server.
         token: token that every client has to send first; on a command line, a file that contains the token.
-        client_timeout: see `_CLIENT_TIMEOUT`.
+        client_timeout: longest time for the remainder of a message, a token, or the reception of an answer [s].
         rsi: file written by `pisigma export --format rsi`, to serve only a KUKA controller over RSI.
         rsi_max_correction: largest correction of a joint over RSI [rad]; a larger correction ends the stream.
         polling: time to busy-poll for the next request [s] (0: sleep at once). The server polls only if requests

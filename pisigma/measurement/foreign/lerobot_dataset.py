@@ -115,7 +115,7 @@ def read_table(file: Path) -> "pyarrow.Table":
     try:
         return parquet.read_table(file)
     except (ArrowException, OSError) as problem:
-        raise MeasurementError(f"it cannot be read ({problem})", at=Place(file)) from None
+        raise MeasurementError(f"the file cannot be read: {problem}", at=Place(file)) from None
 
 
 def _value_names(feature: Any, key: str, at: Place) -> tuple[str, ...]:
@@ -154,7 +154,12 @@ def joint_motors(names: Sequence[str], prefix: str = "") -> dict[str, int]:
         if motor.endswith((_GRIPPER, _SHADOW)):
             continue
         if motor in motors:
-            raise MeasurementError("a motor appears twice", value=", ".join(names), option="names")
+            raise MeasurementError(
+                f"motor '{motor}' appears twice",
+                value=motor,
+                option="names",
+                remedy="give the position of every motor once",
+            )
         motors[motor] = index
     sides = [side for side in _SIDES if any(motor.startswith(side) for motor in motors)]
     if len(sides) > 1:

@@ -65,7 +65,9 @@ def read_motors(path: str | os.PathLike[str]) -> dict[str, Motor]:
         raise MeasurementError(expected=expected, value=type(document).__name__, at=Place(path))
     motors = {name: _motor(entry, Place(path, column=name), keys) for name, entry in document.items()}
     if len({motor.id for motor in motors.values()}) < len(motors):
-        raise MeasurementError("two motors have the same id", at=Place(path), remedy="calibrate again")
+        raise MeasurementError(
+            "two motors have the same id", at=Place(path), remedy="calibrate the motors again"
+        )
     return motors
 
 

@@ -195,7 +195,7 @@ def read_signed_text(path: Path) -> str:
     stated = stated_format(text)
     if stated is not None and stated > FORMAT:
         raise ModelError(
-            f"format {stated} is newer than the newest that this pisigma reads ({FORMAT})",
+            f"format {stated} is newer than format {FORMAT}, the newest that this version of pisigma reads",
             value=stated,
             at=Place(path, column="format"),
             remedy="upgrade pisigma",

@@ -248,7 +248,7 @@ class CompiledIK:
             f"axes ({', '.join(self.task_axes.ignored) or 'none'}) can be ignored",
             value=axes.ignored,
             option="ignore_axes",
-            remedy="calibrate a hybrid",
+            remedy="calibrate a hybrid model",
         )
 
     def _solution(self, out: Any, axes: TaskAxes) -> Solution:

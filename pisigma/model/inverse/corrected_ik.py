@@ -224,7 +224,7 @@ class CorrectedIK(AbstractInverse):
         kernels = self._kernels_of(q)
         if kernels is None and approach is not None:
             raise PoseError(
-                "requires an array and a model with compiled kernels",
+                "the argument requires an array and a model with compiled kernels",
                 option="approach",
                 remedy="give q as an array",
             )

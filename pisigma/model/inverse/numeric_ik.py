@@ -75,7 +75,7 @@ class NumericIK:
         self.task_axes = axes or (TaskAxes() if whole else default_axes(model.robot.dof))
         if self.task_axes.elbow_angle is not None:
             raise PoseError(
-                f"requires compiled kernels, which are not available for model '{model.name}'",
+                f"the argument requires compiled kernels, which are not available for model '{model.name}'",
                 value=self.task_axes.elbow_angle,
                 option="elbow_angle",
                 remedy="omit it",

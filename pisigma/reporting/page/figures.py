@@ -147,11 +147,11 @@ def check_figures(folder: Path, inputs: Iterable[Input] = ()) -> None:
             f"there is no folder {folder.parent}",
             at=Place(folder),
             option="--figures",
-            remedy="create it or choose another",
+            remedy="create it or choose another folder",
         )
     if not os.access(folder if folder.exists() else folder.parent, os.W_OK):
         raise OutputError(
-            "cannot be written to", at=Place(folder), option="--figures", remedy="choose another folder"
+            "the folder is not writable", at=Place(folder), option="--figures", remedy="choose another folder"
         )
 
 
@@ -175,7 +175,7 @@ def write_figures(drawings: Sequence[Drawing], folder: Path) -> list[Path]:
                 write_atomically(written[-1], content)
     except OSError as problem:
         raise OutputError(
-            f"cannot be written to: {problem.strerror}",
+            f"the folder cannot be written to: {problem.strerror}",
             at=Place(folder),
             option="--figures",
             remedy="choose another folder",

@@ -98,7 +98,7 @@ class RandomViews(Section):
         if solver is None:
             raise RecipeError(
                 option="poses",
-                expected="a robot with a closed form, for views of a board",
+                expected="a robot with closed-form inverse kinematics, for views of a board",
                 value=robot.name,
                 remedy="simulate a tracker with joints_random instead",
             )

@@ -264,7 +264,7 @@ def compare_models(
             expected="positions, balls in sockets, wires, pairs or touches",
             value=Phrase("none"),
             at=Place(measurements.source),
-            remedy="give x, y and z",
+            remedy="give the columns x_mm, y_mm, z_mm",
         )
     predicted = {name: torch.isfinite(errors.position).all(-1) for name, errors in vectors.items()}
     common = torch.stack(list(predicted.values())).all(0)

@@ -14,7 +14,7 @@ import aiohttp
 from aiohttp import web
 from aiohttp.typedefs import Handler
 
-from pisigma.files.errors import OutputError, Place
+from pisigma.files.errors import OutputError
 
 if TYPE_CHECKING:  # the full name can be resolved by type checkers at run time even without this import
     import viser
@@ -56,10 +56,9 @@ class ViserBackend:
         path = Path(self._folder.name) / "viser"
         if len(os.fsencode(path)) > _MAX_PATH:
             raise OutputError(
-                expected=f"a path for temporary files of at most {_MAX_PATH} bytes",
+                expected=f"a path of at most {_MAX_PATH} bytes for temporary files",
                 value=str(path),
-                at=Place(path),
-                remedy="set TMPDIR to a shorter one",
+                remedy="set TMPDIR to a shorter path",
             )
         self.path = path
         self.server = _started(path, label)

@@ -43,7 +43,7 @@ def output_path(cell: str | os.PathLike[str], part: str, suffix: str) -> Path:
     try:
         folder.mkdir(exist_ok=True)
     except OSError as problem:
-        raise OutputError(f"the folder cannot be created ({problem.strerror})", at=Place(folder)) from None
+        raise OutputError(f"the folder cannot be created: {problem.strerror}", at=Place(folder)) from None
     return free_path(folder, datetime.date.today().isoformat(), suffix)
 
 

@@ -83,6 +83,8 @@ SocketDistances = Annotated[
         read=parse_socket_distances,
         unit="mm",
         metavar="A,B,MM",
+        help="Known distance between two sockets [mm], such as */0,*/1,50. An asterisk stands for the same text in "
+        "both names, here for every placement.",
         is_key=True,
     ),
 ]
@@ -98,7 +100,8 @@ class CalibrationSettings:
         hold_out: fraction of the rows to hold out once, instead of a cross-validation.
         split: how to split the rows: joints (at random), interleaved, time, space or placement. Rows of equal joint
             values always stay together.
-        repeats: number of repeats of the cross-validation. None: 200 / number of different joint values, 1 to 10.
+        repeats: number of repeats of the cross-validation. None: 200 divided by the number of distinct joint
+            configurations, limited to 1 to 10.
         jobs: number of processes that calibrate in parallel, for all rows and for each fold. Each uses one thread.
             None: threads of one process.
         seed: random seed of the split and of the choice of training rows.
@@ -112,8 +115,8 @@ class CalibrationSettings:
         features: features of the joint correction to try, such as gravity,lines,series. None: all that apply.
         gravity: direction of gravity in the robot's base frame, such as 0,0,-1. None: estimated from the data.
         new_frame_at: first line measured after the instrument was moved; the rows from there on are in a new frame.
-        socket_distances: known distance between two sockets [m], such as */0,*/1,50. An asterisk stands for the same
-            text in both names, here for every placement.
+        socket_distances: known distances [m] by the names of two sockets, such as {("*/0", "*/1"): 0.05}. An asterisk
+            stands for the same text in both names, here for every placement.
         cameras: cameras and boards, for files of detected board corners.
 
     Raises:

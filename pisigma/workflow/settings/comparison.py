@@ -19,10 +19,10 @@ class ComparisonSettings:
     """Settings of the comparison of two models.
 
     Attributes:
-        frames: compare base and tool unchanged, for models measured in the same frame with the same tool ("fixed").
-            Otherwise ("fitted"), base and tool of the second model are first fitted so that the arms agree best, and
-            are compared separately.
-        level: probability of calling any parameter different by chance.
+        frames: "fixed" compares base and tool unchanged, for models measured in the same frame with the same tool;
+            "fitted" first fits base and tool of the second model so that the arms agree best, and compares them
+            separately.
+        level: probability of reporting a difference in any parameter by chance.
         bootstrap: how confidence intervals of errors on rows are computed.
         cameras: cameras and boards, for files of detected board corners.
 
@@ -30,7 +30,17 @@ class ComparisonSettings:
         IdentificationError: the level is not a probability, or `frames` is not a valid choice.
     """
 
-    frames: Annotated["FrameChoice", Option("--fixed-frames", kind=bool, read=_FRAMES.get)] = "fitted"
+    frames: Annotated[
+        "FrameChoice",
+        Option(
+            "--fixed-frames",
+            kind=bool,
+            read=_FRAMES.get,
+            help="Compare base and tool unchanged, for models measured in the same frame with the same tool. "
+            "Otherwise, base and tool of the second model are first fitted so that the arms agree best, and are "
+            "compared separately.",
+        ),
+    ] = "fitted"
     level: Annotated[float, KEY] = 0.01
     bootstrap: Annotated[Bootstrap, HIDDEN] = field(default_factory=Bootstrap)
     cameras: CameraFiles | None = None

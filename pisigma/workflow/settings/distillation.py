@@ -16,7 +16,7 @@ class DistillationSettings:
     """Settings of a distillation.
 
     Attributes:
-        region: where poses are drawn. None: around the joint values that the model was measured at.
+        region: where poses are drawn. None: around the joint values at which the model was calibrated.
         poses: number of poses to fit to, in addition to those for model selection and testing.
         size: the only network size to fit. None: those of `sizes_for`.
         seed: random seed.

@@ -99,8 +99,8 @@ class EvaluationSettings:
             or more.
         bootstrap: how confidence intervals are computed.
         cameras: cameras and boards, for files of detected board corners.
-        socket_distances: known distance between two sockets [m], such as */0,*/1,50. An asterisk stands for the same
-            text in both names, here for every placement.
+        socket_distances: known distances [m] by the names of two sockets, such as {("*/0", "*/1"): 0.05}. An asterisk
+            stands for the same text in both names, here for every placement.
     """
 
     limits: Limits = field(default_factory=Limits)

@@ -21,7 +21,7 @@ class MonitorSettings:
         moved: what was moved after the model was made: base, tool or base,tool (empty: neither). None: detected from
             the rows.
         limit_mm: limit on the RMS error [mm]; the date on which it will be exceeded is predicted.
-        history: do not read or write the history of the model, which stores the sessions of all calls.
+        history: read and write the history of the model, which stores the sessions of all calls.
         cameras: cameras and boards, for files of detected board corners.
 
     Raises:
@@ -32,7 +32,15 @@ class MonitorSettings:
     dates: Annotated[tuple[str, ...], Option(kind=str, read=split_names, metavar="DAY,...")] = ()
     moved: Moved = None
     limit_mm: float | None = None
-    history: Annotated[bool, Option("--no-history", kind=bool, read=not_)] = True
+    history: Annotated[
+        bool,
+        Option(
+            "--no-history",
+            kind=bool,
+            read=not_,
+            help="Do not read or write the history of the model, which stores the sessions of all calls.",
+        ),
+    ] = True
     cameras: CameraFiles | None = None
 
     def __post_init__(self) -> None:

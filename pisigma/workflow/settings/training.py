@@ -13,8 +13,8 @@ class TrainSettings:
     """Settings for running a training; they do not change the result.
 
     Attributes:
-        checkpoints: folder for checkpoints of networks, and of a hybrid on mini-batches. It is kept after the training.
-            None: no checkpoints.
+        checkpoints: folder for checkpoints of networks, and of a hybrid trained on mini-batches. It is kept after the
+            training. None: no checkpoints.
         resume: resume the interrupted training in this folder.
         show_progress: show the networks' progress bar on stderr, if that is a terminal.
         logs: folder for the metrics of every epoch (metrics.csv), and for TensorBoard if it is installed.

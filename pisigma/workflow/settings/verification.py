@@ -21,8 +21,8 @@ class VerificationSettings:
             or more.
         seed: random seed of the resamples for confidence intervals.
         cameras: cameras and boards, for files of detected board corners.
-        socket_distances: known distance between two sockets [m], such as */0,*/1,50. An asterisk stands for the same
-            text in both names, here for every placement.
+        socket_distances: known distances [m] by the names of two sockets, such as {("*/0", "*/1"): 0.05}. An asterisk
+            stands for the same text in both names, here for every placement.
     """
 
     fit_frame: bool = False

@@ -275,8 +275,8 @@ def check_touched_base(measurements: Measurements, name: str, rms: float, reach:
         return
     counts = ", ".join(f"{(measurements.touch_axis or ()).count(axis)} along {axis}" for axis in "xyz")
     raise IdentificationError(
-        f"the touches of frame '{name}' ({counts}) do not determine its pose (the best fit has an RMS error of "
-        f"{rms * 1e3:.3g} mm)",
+        f"the touches of frame '{name}' ({counts}) do not determine its pose: the best fit has an RMS error of "
+        f"{rms * 1e3:.3g} mm",
         value=name,
         at=Place(measurements.source),
         remedy="check that all touches belong to this frame, or give the approximate base of the robot in it, "

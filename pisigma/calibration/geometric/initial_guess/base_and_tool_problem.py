@@ -219,7 +219,7 @@ def build_base_and_tool_problem(
     frames = sorted(set(measurements.frame))
     if len(frames) > 1:
         raise IdentificationError(
-            f"expected one measuring frame, got {len(frames)} ({', '.join(frames)})",
+            f"expected one measuring frame, got {len(frames)}: {', '.join(frames)}",
             expected="one measuring frame",
             value=len(frames),
             at=Place(measurements.source),

@@ -270,7 +270,7 @@ def check_program(path: Path, robot: Robot, cartesian: bool, config: str | None)
         if config is not None:
             endings = " or ".join(suffix for suffix, other in LANGUAGES.items() if other.configuration)
             raise OutputError(
-                f"applies only to {endings} files with --targets cartesian",
+                f"the option applies only to {endings} files with --targets cartesian",
                 option="--config",
                 value=config,
                 remedy="omit it",

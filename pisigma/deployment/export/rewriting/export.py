@@ -55,7 +55,7 @@ def check_rewriting(request: ExportRequest) -> None:
     for name, value in (("targets", request.targets), ("config", request.config)):
         if value is not None:
             raise OutputError(
-                "applies only with --poses, because the poses of a --program remain poses",
+                "the option applies only to --poses, because the poses of a program remain poses",
                 option=f"--{name}",
                 value=value,
                 remedy="omit it",
@@ -77,10 +77,10 @@ def rewrite_program(request: ExportRequest) -> Exported:
     if not scanned.targets:
         named = (
             _listed([f"line {line}: {reason}" for line, reason in scanned.left])
-            or "only joint values, if any"
+            or "it contains no poses, or only joint values"
         )
         raise OutputError(
-            f"the program has no pose that can be rewritten ({named})",
+            f"the program has no pose that can be rewritten: {named}",
             at=Place(request.program),
             value=len(scanned.left),
         )

@@ -77,7 +77,7 @@ def dictionary_of(board: Board) -> cv2.aruco.Dictionary:
             option="dictionary",
             expected=f"a dictionary with {needed} markers for board '{board.name}'",
             value=Phrase(f"{board.dictionary} with {there}"),
-            remedy="choose another",
+            remedy="choose a dictionary with more markers",
         )
     return dictionary
 

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 from scipy.ndimage import label, median_filter
 
-from pisigma.files.errors import MeasurementError, Phrase, Place
+from pisigma.files.errors import MeasurementError, Place
 from pisigma.files.input_file import read_input
 from pisigma.measurement.camera.detection.detected_board import Image
 
@@ -67,10 +67,10 @@ def still_frames(path: str | os.PathLike[str]) -> tuple[StillFrame, ...]:
             stops.append(StillFrame(best, float(times[best])))
     if not stops:
         raise MeasurementError(
-            expected=f"a video in which the arm rests for {_MIN_STILL:g} s or more at every pose",
-            value=Phrase("no such pause"),
+            f"the arm never rests for {_MIN_STILL:g} s or more in the video",
+            expected=f"an arm that rests for {_MIN_STILL:g} s or more at every pose",
             at=Place(path),
-            remedy="let the arm rest for a second at every pose, and fix the phone",
+            remedy="let it rest for a second at every pose, and mount the phone rigidly",
         )
     return tuple(stops)
 

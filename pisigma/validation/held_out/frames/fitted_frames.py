@@ -100,7 +100,7 @@ def errors_in_fitted_frames(
     if measurements.position is None:
         given = " and ".join(sorted(measurements.kinds)) or "none"
         raise MeasurementError(
-            f"expected positions to fit the {' and the '.join(fitted)} to, got {given}",
+            f"expected measured positions, to which the {' and the '.join(fitted)} can be fitted, got {given}",
             expected="positions",
             value=given,
             at=Place(measurements.source),

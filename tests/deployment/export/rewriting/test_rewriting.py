@@ -149,7 +149,7 @@ def test_a_pose_of_several_tools_is_unchanged(arm, tmp_path):
         ({"out": Path("new.src")}, {"option": "--out", "value": ".script and .src"}),
         ({"targets": "joints"}, {"option": "--targets", "value": "joints"}),
         ({"tolerance_mm": 0.0}, {"option": "--tolerance-mm", "value": 0.0}),
-        ({"poses": Path("poses.csv")}, {"option": "--poses", "remedy": "give one of them"}),
+        ({"poses": Path("poses.csv")}, {"option": "--poses", "remedy": "give only one of them"}),
         ({"program": None}, {"option": "--poses", "remedy": "give --poses, or a --program with poses"}),
         ({"program": None, "poses": Path("x.csv")}, {"option": "--tolerance-mm"}),
     ],
