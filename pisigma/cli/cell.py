@@ -236,7 +236,8 @@ def event(
 
     if (kind == "controller") is (export is None) or (export is not None and by):
         raise typer.BadParameter(
-            "--export FILE or none applies to the event controller only", param_hint="'--export'"
+            "the option is required for the event controller, applies to no other event, and excludes --by",
+            param_hint="'--export'",
         )
     opened = Cell.open(cell)
     if export is not None:

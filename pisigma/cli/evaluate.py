@@ -58,7 +58,7 @@ def evaluate(
     folders = [path for path in paths[:-1] if path not in workflow.REFERENCES]
     if sha256 and len(sha256) != len(folders):
         raise typer.BadParameter(
-            f"expected one for each of the {len(folders)} model folders, got {len(sha256)}",
+            f"expected one hash for each of the {len(folders)} model folders, got {len(sha256)}",
             param_hint="'--sha256'",
         )
     for folder, expected in zip(folders, sha256 or (), strict=False):

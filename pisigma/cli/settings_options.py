@@ -111,9 +111,9 @@ def _stated(values: dict[str, Any], known: Mapping[str, Setting], running: Any) 
         if running.get_parameter_source(_name(setting)).name != "COMMANDLINE":
             continue
         if key in stated:
-            problem = f"stated twice, by {setting.name} and by --set"
+            problem = f"the setting is stated twice, by {setting.name} and by --set"
             raise SettingError(
-                problem, expected="one value", value=stated[key], option=key, remedy="omit one"
+                problem, expected="one value", value=stated[key], option=key, remedy="omit one of them"
             )
         stated[key] = value
     return stated

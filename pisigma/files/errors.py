@@ -292,7 +292,7 @@ _NOT_IN_IK = {
 def system_fault(problem: BaseException) -> str:
     """Describe a file that cannot be used, or a lack of memory; return "" for every other problem."""
     if isinstance(problem, OSError) and problem.filename is not None:
-        return f"{problem.filename}: cannot be used ({problem.strerror}); check the path."
+        return f"{problem.filename} cannot be used: {problem.strerror}; check the path."
     if isinstance(problem, MemoryError):
         return "there is not enough memory; give fewer or smaller inputs."
     return ""

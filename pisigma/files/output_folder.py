@@ -77,11 +77,11 @@ def _check_content(
     if others:
         also = f" and {len(others) - 1} more" if len(others) > 1 else ""
         raise OutputError(
-            f"the output contains a model, but also '{others[0]}'{also}, not written by pisigma",
+            f"the output contains a model, but also '{others[0]}'{also}, which pisigma did not write",
             expected="a folder with a model only",
             value=others[0],
             at=Place(folder),
-            remedy="move that file away or choose another --out",
+            remedy="move other files away or choose another --out",
         )
     if not overwrite:
         raise OutputError(

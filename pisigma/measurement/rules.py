@@ -272,7 +272,7 @@ def _touch_faults(
         yield row, Fault("", column, expected, "", "write x, y or z")
     for row in rows_where(axis & ~touch):
         problem = f"the touch along {axes[row]} has no coordinate"
-        yield row, Fault(problem, labels("touch"), remedy="give it, or remove the axis too")
+        yield row, Fault(problem, labels("touch"), remedy="add the coordinate, or remove the axis too")
     for row in rows_where(touch & ~_named(data.text("frame"))):
         remedy = "write the name of the placement of the jig that was touched, such as left"
         yield row, Fault("", labels("frame"), "the frame of the touch", "", remedy)
@@ -292,7 +292,7 @@ def _distance_faults(
                 column,
                 "a distance of 0 or more",
                 labels.format_value("distance", values[row]),
-                "correct it",
+                "correct the distance",
             ),
         )
     for row in rows_where(distance & ~anchor & ~pair):
@@ -303,7 +303,7 @@ def _distance_faults(
         yield row, Fault(problem, of_anchor, remedy="keep one of them")
     for row in rows_where((anchor | pair) & ~distance):
         problem = f"the distance of '{anchors[row] or pairs[row]}' is missing"
-        yield row, Fault(problem, column, remedy="give it")
+        yield row, Fault(problem, column, remedy="add the distance")
     missing = np.isnan(data.array("anchor_place", 3))
     for row in rows_where(missing.any(1) & ~missing.all(1)):
         expected = "x, y and z of the anchor, or none of them"

@@ -186,7 +186,7 @@ def holdout(
     if not 0 < share < 1:
         raise MeasurementError(
             option="hold_out",
-            expected="a share between 0 and 1",
+            expected="a fraction between 0 and 1",
             value=float(share),
             at=Place(measurements.source),
         )

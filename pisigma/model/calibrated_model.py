@@ -285,12 +285,12 @@ def known_names(
     for row, name in enumerate(names):
         if name not in known:
             crossed = (measurements.target if what == "frame" else measurements.frame)[row] in known
-            hint = " (check --fixed-camera if it is a camera)" if name and crossed else ""
+            hint = "check --fixed-camera if it is a camera; " if name and crossed else ""
             raise MeasurementError(
-                f"the model was not calibrated for {what} '{name}'{hint}",
+                f"the model was not calibrated for {what} '{name}'",
                 value=name,
                 at=measurements.place_of(row, what),
-                remedy=nearest_choice(name, known),
+                remedy=f"{hint}{nearest_choice(name, known)}",
             )
     return names
 

@@ -225,11 +225,11 @@ def _check_row(row: Row, place: str) -> None:
     stroke = max((abs(bound) for bound in bounds if math.isfinite(bound)), default=0.0)
     if row.type == "prismatic" and stroke > MAX_MAGNITUDE / 1e3:
         expected = f"limits up to {MAX_MAGNITUDE / 1e3:.0e} m"
-        problem, remedy = f"{place}: expected {expected}, got {stroke:g} m", "correct them or leave both out"
+        problem, remedy = f"{place}: expected {expected}, got {stroke:g} m", "correct the limits or omit both"
         raise RobotError(problem, expected=expected, value=stroke, remedy=remedy)
     if not row.lower < row.upper:
         problem = f"{place}: the lower limit {row.lower:g} is not below the upper limit {row.upper:g}"
-        expected, remedy = "a lower limit below the upper limit", "swap or correct them"
+        expected, remedy = "a lower limit below the upper limit", "swap or correct the limits"
         raise RobotError(problem, expected=expected, value=bounds, remedy=remedy)
 
 

@@ -73,14 +73,17 @@ class MjcfDrawing:
             line = problem.lineno if isinstance(problem, etree.XMLSyntaxError) else None
             expected = "a complete MJCF file"
             raise RobotError(
-                expected=expected, value=str(problem), at=Place(path, line), option="--like"
+                f"the file is truncated or not valid XML: {problem}",
+                expected=expected,
+                at=Place(path, line),
+                option="--like",
             ) from None
         if root.tag != "mujoco":
             expected = "an MJCF file, which starts with <mujoco>, or a .urdf"
             raise RobotError(expected=expected, value=f"<{root.tag}>", at=Place(path), option="--like")
         for element in root.iter("include", "frame", "replicate", "attach"):
             raise RobotError(
-                expected="a model in one file, of bodies in bodies",
+                expected="a model of nested bodies in one file",
                 value=f"<{element.tag}>",
                 at=Place(path, element.sourceline),
                 option="--like",

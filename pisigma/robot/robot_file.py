@@ -68,7 +68,7 @@ class RowSection(ParameterSection):
                 f"row '{self.name}': the lower limit {limits[0]:g} is not below the upper limit {limits[1]:g}",
                 expected="a lower limit below the upper limit",
                 value=limits,
-                remedy="swap or correct them",
+                remedy="swap or correct the limits",
             )
         return self
 

@@ -36,7 +36,7 @@ class BranchSection(Section):
         if (self.name is None) == (self.near_deg is None):
             raise ValueError("expected either the name of the branch or near_deg (with near_mm)")
         if self.name is not None and self.near_mm:
-            raise ValueError("near_mm is only for near_deg, not for name; remove it")
+            raise ValueError("near_mm applies only to near_deg, not to name; remove it")
         return self
 
     def start(self, robot: Robot, T: Float64[Tensor, "poses 4 4"]) -> Float64[Tensor, "poses dof"]:

@@ -141,7 +141,7 @@ class CellScene:
         """
         models, in_use = cell.history.models(), cell.history.in_use
         if not models:
-            raise ModelError("there is no model yet", remedy="calibrate")
+            raise ModelError("there is no model yet", remedy="calibrate the robot first")
         name = models[-1].name if in_use is None else in_use.name
         if self._predicted is None or self._predicted[0] != name:
             self._predicted = name, predicted_errors(load_model(cell.model_folder(name)))

@@ -99,7 +99,7 @@ def stated_pose(values: Sequence[float]) -> Float64[np.ndarray, "1 4 4"]:
     for name, value in zip(FRAME_COLUMNS, values, strict=True):
         if not abs(value) <= MAX_MAGNITUDE:
             raise PoseError(
-                expected=f"a length [mm] or angle [deg] of a pose for {name}",
+                expected=f"a finite length [mm] or angle [deg] as {name} of the pose",
                 value=value,
                 option="--pose",
                 remedy="give X Y Z ROLL PITCH YAW",

@@ -80,7 +80,7 @@ def ik(
     _check_options(pose, poses, out, branch, all_branches)
     for name, given in (("--accuracy", accuracy), ("--path", path)):
         if given and poses is None:
-            raise typer.BadParameter("use it with --poses", param_hint=f"'{name}'")
+            raise typer.BadParameter("the option applies only to --poses", param_hint=f"'{name}'")
     from pisigma.files.output_file import check_output
     from pisigma.lifetime.cell.controller import checked_model_folder
     from pisigma.model.inverse.corrected_ik import load
@@ -190,4 +190,6 @@ def _check_options(
     if (poses is None) != (out is None):
         raise typer.BadParameter("expected --poses and --out together", param_hint="'--out'")
     if all_branches and (pose is None or branch is not None):
-        raise typer.BadParameter("use it with --pose and without --branch", param_hint="'--all-branches'")
+        raise typer.BadParameter(
+            "the option requires --pose and cannot be combined with --branch", param_hint="'--all-branches'"
+        )

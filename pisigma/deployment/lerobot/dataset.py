@@ -127,7 +127,11 @@ def _json(path: Path, text: str, line: int | None = None) -> dict[str, Any]:
     try:
         document = json.loads(text)
     except ValueError as problem:
-        raise MeasurementError(expected="JSON", value=str(problem), at=Place(path, line)) from None
+        raise MeasurementError(
+            f"the file is not valid JSON: {getattr(problem, 'msg', problem)}",
+            expected="JSON",
+            at=Place(path, line),
+        ) from None
     if not isinstance(document, dict):
         raise MeasurementError(expected="a JSON object", value=type(document).__name__, at=Place(path, line))
     return document

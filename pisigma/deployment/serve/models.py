@@ -246,7 +246,8 @@ class ServedModels:
         self._models = _loadable(folders, self.problems)
         if not self._models:
             raise ModelError(
-                f"none of the model folders can be served: {' '.join(self.problems)}", at=Place(within)
+                f"none of the model folders can be served: {' '.join(self.problems).rstrip('.')}",
+                at=Place(within),
             )
 
     def __len__(self) -> int:

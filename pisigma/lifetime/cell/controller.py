@@ -304,9 +304,9 @@ def record_controller(history: History, sha256: str, day: str, note: str) -> Con
     if sha256 and sha256 not in exports:
         raise MeasurementError(
             expected="an unchanged file written by `pisigma export CELL`, or none",
-            value=Phrase(f"SHA-256 {sha256[:16]}"),
+            value=Phrase(f"a file with the SHA-256 {sha256[:16]}..."),
             option="--export",
-            remedy="export it again",
+            remedy="export the model again",
         )
     if sha256 and exports[sha256].contains not in ON_CONTROLLER:
         raise MeasurementError(

@@ -187,16 +187,16 @@ class Camera:
         matrix, coefficients = document.camera_matrix.data, document.distortion_coefficients.data
         if len(matrix) != 9 or matrix[0] <= 0 or matrix[4] <= 0 or any(matrix[k] for k in (1, 3, 6, 7)):
             raise MeasurementError(
-                expected="fx, 0, cx, 0, fy, cy, 0, 0, 1",
+                expected="a matrix fx, 0, cx, 0, fy, cy, 0, 0, 1",
                 value=matrix,
                 at=Place(source, column="camera_matrix.data"),
             )
         if len(coefficients) < 4 or any(coefficients[5:]):
             raise MeasurementError(
-                expected="k1, k2, p1, p2 and k3",
+                expected="the coefficients k1, k2, p1, p2 and k3 only",
                 value=coefficients,
                 at=Place(source, column="distortion_coefficients.data"),
-                remedy="calibrate the camera with that model",
+                remedy="calibrate the camera with these coefficients",
             )
         size = (document.camera_name, document.image_width, document.image_height)
         k1, k2, p1, p2, k3 = (*coefficients, 0.0)[:5]

@@ -187,7 +187,7 @@ class _Layout:
             if not np.isfinite(_number(cell)):
                 return Fault("", name, "a finite number", shown, "write one such as -12.5")
             if abs(_number(cell)) > MAX_MAGNITUDE:
-                return Fault("", name, f"a value of up to {MAX_MAGNITUDE:g}", shown, "correct it")
+                return Fault("", name, f"a value of up to {MAX_MAGNITUDE:g}", shown, "correct the value")
         return None
 
     def poses(

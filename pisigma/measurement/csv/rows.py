@@ -110,7 +110,9 @@ def _numbers(cells: Sequence[str], column: Column, faults: Faults) -> Float64[np
     with np.errstate(invalid="ignore"):
         large = rows_where(np.abs(values) > MAX_MAGNITUDE)
     expected = f"a value of up to {MAX_MAGNITUDE:g} {column.unit}".rstrip()
-    faults.add((row, Fault("", column.name, expected, float(values[row]), "correct it")) for row in large)
+    faults.add(
+        (row, Fault("", column.name, expected, float(values[row]), "correct the value")) for row in large
+    )
     return values
 
 

@@ -64,8 +64,13 @@ class LeRobotDataset:
         except (ValueError, KeyError, TypeError) as problem:
             if isinstance(problem, MeasurementError):
                 raise
+            reason = (
+                f"{problem} is missing" if isinstance(problem, KeyError) else getattr(problem, "msg", problem)
+            )
             raise MeasurementError(
-                expected="codebase_version, fps and features of a LeRobot data set", value=str(problem), at=at
+                f"the file does not describe a LeRobot data set: {reason}",
+                expected="codebase_version, fps and features of a LeRobot data set",
+                at=at,
             ) from None
         if version not in _VERSIONS:
             raise MeasurementError(

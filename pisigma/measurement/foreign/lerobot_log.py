@@ -74,10 +74,11 @@ def read_joint_log(
     """
     if units is None:
         raise MeasurementError(
-            "values of LeRobot are degrees or -100 to 100 over the range of a motor, which the values do not show",
+            "LeRobot stores degrees, or -100 to 100 over the range of a motor, and the values do not show which",
             option="lerobot_units",
             expected="degrees or normalized",
-            remedy="state --set lerobot_units=degrees if it was recorded with use_degrees=true, else normalized",
+            remedy="state --set lerobot_units=degrees if they were recorded with use_degrees=true, otherwise "
+            "--set lerobot_units=normalized",
         )
     source = LeRobotDataset.open(dataset)
     if STATE not in source.names:

@@ -59,7 +59,9 @@ def read_motors(path: str | os.PathLike[str]) -> dict[str, Motor]:
         document = json.loads(text)
     except ValueError as problem:
         raise MeasurementError(
-            expected=expected, value=str(problem), at=Place(path, getattr(problem, "lineno", None))
+            f"the file is not valid JSON: {getattr(problem, 'msg', problem)}",
+            expected=expected,
+            at=Place(path, getattr(problem, "lineno", None)),
         ) from None
     if not isinstance(document, dict) or not document:
         raise MeasurementError(expected=expected, value=type(document).__name__, at=Place(path))

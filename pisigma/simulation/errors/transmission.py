@@ -52,7 +52,7 @@ class Harmonic(Section):
                 "expected either harmonic (of the joint's angle) or joints (a multiple per joint)"
             )
         if self.lead_mm is not None and self.harmonic is None:
-            raise ValueError("lead_mm is only for harmonic; remove it")
+            raise ValueError("lead_mm applies only to harmonic; remove it")
         return self
 
 

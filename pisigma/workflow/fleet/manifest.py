@@ -170,14 +170,19 @@ def _cell(rows: list[_Row], common: NewCell) -> NewCell:
             )
         if fields.get("date") and not is_date(fields["date"]):
             place = replace(at, column="date")
-            raise FleetError(expected=EXPECTED_DATE, value=fields["date"], at=place, remedy="correct it")
+            raise FleetError(
+                expected=EXPECTED_DATE, value=fields["date"], at=place, remedy="correct the date"
+            )
     at = rows[0][0]
     stated = {key: [one for one in dict.fromkeys(f.get(key, "") for _, f in rows) if one] for key in COLUMNS}
     for key in ("robot", *COLUMNS[4:]):
         if len(stated[key]) > 1:
             place = replace(at, column=key)
             raise FleetError(
-                "one robot has different entries", value=stated[key][1], at=place, remedy="state one"
+                "the rows of one robot have different entries",
+                value=stated[key][1],
+                at=place,
+                remedy="state the same in every row",
             )
     robot, model, options, camera, board = ((stated[key] or [""])[0] for key in ("robot", *COLUMNS[4:]))
     if not (robot or common.robot or model):
@@ -186,7 +191,9 @@ def _cell(rows: list[_Row], common: NewCell) -> NewCell:
         raise FleetError("the robot is not stated", at=place, remedy=remedy)
     if bool(camera) != bool(board):
         place = replace(at, column="board" if camera else "camera")
-        raise FleetError("the columns 'camera' and 'board' belong together", at=place, remedy="fill both")
+        raise FleetError(
+            "the columns 'camera' and 'board' belong together", at=place, remedy="fill both or neither"
+        )
     parts = [part.strip() for part in options.split(";") if part.strip()]
     try:
         settings = read_assignments(parts, by_key(CalibrationSettings))

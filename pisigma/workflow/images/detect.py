@@ -121,7 +121,7 @@ def detect(
     videos = [path for path in map(Path, images) if is_video(path)]
     if timed and videos and settings.video_start is None:
         raise MeasurementError(
-            "the joint values have time stamps, which a video cannot be compared with",
+            "the joint values have time stamps, but the start of the video on their clock is not stated",
             expected="the time at which the video starts, by the clock of the joint values",
             value="none",
             at=Place(videos[0]),
@@ -148,6 +148,6 @@ def detect(
             "the images with a board have no joint values",
             expected="joint values of the images",
             at=None if joints is None else Place(joints),
-            remedy="complete the file",
+            remedy="add the joint values of every image",
         )
     return result

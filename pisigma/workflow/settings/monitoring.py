@@ -49,7 +49,7 @@ class MonitorSettings:
         for date in self.dates:
             if not is_date(date):
                 raise MeasurementError(
-                    expected=EXPECTED_DATE, value=date, option="dates", remedy="correct it"
+                    expected=EXPECTED_DATE, value=date, option="dates", remedy="correct the date"
                 )
         if self.limit_mm is not None and not self.limit_mm > 0:
             raise IdentificationError(expected="an RMS error > 0 mm", value=self.limit_mm, option="limit_mm")

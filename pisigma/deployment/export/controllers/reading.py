@@ -71,7 +71,7 @@ def read_controller_file(path: Path, nominal: Robot, max_change: float = MAX_CHA
     suffix = path.suffix.lower()
     if suffix not in _READERS:
         raise RobotError(
-            expected=f"a file of a controller with the suffix {', '.join(_READERS)}",
+            expected=f"a controller's file with the suffix {' or '.join(_READERS)}",
             value=suffix,
             at=Place(path),
         )

@@ -172,7 +172,7 @@ def detect_boards(
     reasons = [f"{one.name}: {one.board.reason}" for one in images if isinstance(one.board, NoBoard)]
     if len(reasons) == len(files):
         raise MeasurementError(
-            f"none of {len(files)} images can be used; {reasons[0]}",
+            f"none of {len(files)} images can be used ({reasons[0]})",
             value=len(files),
             remedy="check the board's rows and columns and the light",
         )
