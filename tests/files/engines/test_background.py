@@ -107,7 +107,7 @@ def test_an_interrupted_call_ends_the_process(monkeypatch):
         patch.setattr(process, "_receive", interrupted)
         with pytest.raises(KeyboardInterrupt):
             process.compute(partial(math.hypot, 3, 4))
-    with pytest.raises(EndedError, match="ended before"):
+    with pytest.raises(EndedError):
         process.compute(partial(math.hypot, 6, 8))
     process.close()
 
