@@ -61,7 +61,7 @@ class Inputs:
             meaning = (function if factors else name, tuple(factors))
             if meaning in meanings:
                 problem = f"the network inputs '{meanings[meaning]}' and '{name}' are the same"
-                raise RecipeError(problem, value=name, remedy="omit one")
+                raise RecipeError(problem, value=name, remedy="omit one of them")
             meanings[meaning] = name
             if function:
                 _check_angle(robot, name, factors)

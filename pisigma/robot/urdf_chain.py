@@ -122,7 +122,7 @@ def _check_tree(urdf: Any, place: Callable[[str], Place]) -> None:
                 f"'{parents[joint.child]}' and '{joint.name}', but a URDF is a tree",
                 value=joint.child,
                 at=place(joint.name),
-                remedy="remove one",
+                remedy="remove one of the joints",
             )
         parents[joint.child] = joint.name
 

@@ -149,7 +149,7 @@ def _copy_joint(element: Any, copied: Any, path: str | os.PathLike[str]) -> None
         tag = etree.QName(child).localname
         if copied.find(tag) is not None:
             problem = f"joint '{name}': <{tag}> appears twice"
-            raise RobotError(problem, value=tag, at=at, remedy="remove one")
+            raise RobotError(problem, value=tag, at=at, remedy="remove one of them")
         part = etree.SubElement(copied, tag)
         for key in _KEPT[tag]:
             if child.get(key) is not None:

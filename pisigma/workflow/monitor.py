@@ -341,7 +341,7 @@ def _date_of_file(source: str) -> str:
             expected=f"{EXPECTED_DATE} as the file's modification time",
             value=date,
             at=Place(source),
-            remedy="give --dates",
+            remedy="state the date with --dates",
         )
     return date
 

@@ -259,7 +259,7 @@ class HybridCalibrator:
                     f"'{growing[0].name}' and '{name}' both have several sizes, but only one such feature can be tried",
                     option="features",
                     value=(growing[0].name, name),
-                    remedy="omit one",
+                    remedy="omit one of them",
                 )
             else:
                 growing += tried

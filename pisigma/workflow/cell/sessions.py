@@ -367,7 +367,7 @@ def _checked_day(rows: Measurements, day: str) -> str:
             expected=f"the first day of the rows, {_day_of(rows)}",
             value=day,
             option="--date",
-            remedy="omit it",
+            remedy="omit --date",
         )
     if not is_date(day := day or _day_of(rows)):
         raise MeasurementError(expected=EXPECTED_DATE, value=day, option="--date")

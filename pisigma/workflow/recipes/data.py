@@ -129,7 +129,7 @@ def simulate_at(recipe: Recipe, poses: str | os.PathLike[str]) -> tuple[Robot, M
     tracker = data.training
     if not isinstance(tracker, SimulatedMeasurements):
         raise RecipeError(
-            expected="a recipe that simulates a tracker", value=recipe.name, option="--at", remedy="omit it"
+            expected="a recipe that simulates a tracker", value=recipe.name, option="--at", remedy="omit --at"
         )
     q, noise = read_joints(poses, robot), tracker.noise
     if noise is not None:  # other poses have different noise

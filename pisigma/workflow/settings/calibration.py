@@ -168,7 +168,7 @@ class CalibrationSettings:
                 f"{self.hold_out:g} cannot be combined with folds {self.folds}",
                 value=self.hold_out,
                 option="hold_out",
-                remedy="omit one",
+                remedy="omit one of them",
             )
         if not 0 <= self.seed < 2**63:
             raise MeasurementError(expected="an integer from 0 to 2^63 - 1", value=self.seed, option="seed")
