@@ -169,5 +169,5 @@ def _print(exported: "Exported", form: str, out: Path, contents: str, as_json: b
         print_line(f"{what} written to {out}{exported.details}.")
     if exported.failure:
         exit_with_error(exported.failure)
-    if exported.shortfall:
-        exit_with_error(exported.shortfall, NOT_ACCEPTED)
+    if exported.missed_limit:
+        exit_with_error(exported.missed_limit, NOT_ACCEPTED)

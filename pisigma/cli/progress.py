@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from pisigma.files.errors import make_printable
-from pisigma.files.progress import TimeLeft, share_done, step_name
+from pisigma.files.progress import TimeLeft, completed_fraction, step_name
 
 if TYPE_CHECKING:
     from rich.status import Status
@@ -58,7 +58,7 @@ class _Shown:
         self._stop_timer()
         now = time.monotonic()
         is_due = now - self.printed >= QUIET_S or (
-            share_done(what) is not None and now - self.begun >= QUIET_S
+            completed_fraction(what) is not None and now - self.begun >= QUIET_S
         )
         if step_name(what) != self.step and is_due:
             self._print()

@@ -29,7 +29,7 @@ _STEP = re.compile(r"\b[a-z]+ (\d[\d,]*) of (\d+(?:,\d+)*)")
 """Pattern of a numbered step, such as "fold 2 of 5"."""
 
 
-def share_done(what: str) -> float | None:
+def completed_fraction(what: str) -> float | None:
     """Return the share of nested steps that are complete: 0.1 for "half 1 of 2, fold 2 of 5"; None without steps."""
     steps = [tuple(int(number.replace(",", "")) for number in one) for one in _STEP.findall(what)]
     share, width = 0.0, 1.0
@@ -54,7 +54,7 @@ class TimeLeft:
 
     def after(self, what: str) -> str:
         """Return the text of the current step, with the estimated time left if the steps are numbered."""
-        share, now = share_done(what), time.monotonic()
+        share, now = completed_fraction(what), time.monotonic()
         if share is None:
             return what
         left = ""

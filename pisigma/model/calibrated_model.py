@@ -93,8 +93,8 @@ class CalibratedModel:
         hybrid_bases: bases that belong to the hybrid's geometry, with the names of `bases`.
         hybrid_tools: tools that belong to the hybrid's geometry, with the names of `tools`.
         uncertainty: uncertainty of predicted positions, or None.
-        made_of: joint values and readings of the training rows, by which repeated rows are recognised; None if they
-            were not stored. See `pisigma.model.training_rows`.
+        training_values: joint values and readings of the training rows, by which repeated rows are recognised; None if
+            they were not stored. See `pisigma.model.training_rows`.
         conditions: payload [kg] and temperature [deg C] at which the model is evaluated, by name; empty for the mean
             conditions of the calibration rows. See `pisigma.model.stated_conditions`.
         measured_conditions: lowest and highest calibrated value of every condition in `conditions` that was stated.
@@ -116,7 +116,7 @@ class CalibratedModel:
     hybrid_bases: dict[str, Float64[np.ndarray, " 6"]] = field(default_factory=dict)
     hybrid_tools: dict[str, Float64[np.ndarray, " 6"]] = field(default_factory=dict)
     uncertainty: PositionUncertainty | None = None
-    made_of: RowValues | None = None
+    training_values: RowValues | None = None
     conditions: dict[str, float] = field(default_factory=dict)
     measured_conditions: dict[str, tuple[float, float]] = field(default_factory=dict)
     provenance: Provenance = field(default_factory=Provenance)

@@ -143,7 +143,7 @@ def _with_frames(model: CalibratedModel, fit: FrameFit, rows: Measurements) -> C
         robot=robot,
         branches=branches_of(robot, model.starts),
         calibrated=model.calibrated and _with_first(model.calibrated, own),
-        made_of=stored_training_rows(model.robot, rows, model.made_of),
+        training_values=stored_training_rows(model.robot, rows, model.training_values),
         provenance=Provenance(
             data_source=rows.file_names,
             data_sha256=rows.content_hash(),

@@ -36,7 +36,7 @@ def model_of_calibration(
         measurements: rows with which the robot was calibrated.
         recipe: name and SHA-256 of the recipe; empty texts if there is none.
     """
-    made_of = stored_training_rows(nominal, measurements)
+    training_values = stored_training_rows(nominal, measurements)
     provenance = Provenance(
         recipe=recipe[0],
         recipe_sha256=recipe[1],
@@ -59,7 +59,7 @@ def model_of_calibration(
         calibrated=result.robot,
         bases=dict(result.bases),
         tools=dict(result.tools),
-        made_of=made_of,
+        training_values=training_values,
         provenance=provenance,
     )
 

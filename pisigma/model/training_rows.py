@@ -28,10 +28,10 @@ def stored_training_rows(robot: Robot, rows: Measurements, before: RowValues | N
 
 def known_rows(model: CalibratedModel, rows: Measurements) -> Bool[Tensor, " rows"]:
     """Return the mask of the model's training rows, even if these are rounded, reordered or only some of them."""
-    if model.made_of is None:
+    if model.training_values is None:
         whole = bool(model.provenance.data_sha256) and model.provenance.data_sha256 == rows.content_hash()
         return torch.full((rows.rows,), whole)
-    return copies_of_known(rows.as_fields(), model.robot, model.made_of)
+    return copies_of_known(rows.as_fields(), model.robot, model.training_values)
 
 
 def without_known_rows(model: CalibratedModel, rows: Measurements) -> tuple[Measurements, tuple[str, ...]]:
@@ -79,8 +79,8 @@ def training_row_warnings(
         file: all rows of the file, if `rows` are only some of them.
         consequence: clause of the warning that states the consequence.
     """
-    made_of = model.provenance.data_sha256
-    if made_of and made_of in (whole.content_hash() for whole in (rows, file or rows)):
+    training_hash = model.provenance.data_sha256
+    if training_hash and training_hash in (whole.content_hash() for whole in (rows, file or rows)):
         return (f"{model.name} was calibrated with these rows, so {consequence}.",)
     known = known_rows(model, rows)
     if bool(known.any()):

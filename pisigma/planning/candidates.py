@@ -42,7 +42,7 @@ class Candidates:
     Attributes:
         q: joint values [rad or m].
         number: number of every candidate in the file, or among the drawn poses, from 1.
-        looked_at: number of poses that were drawn or read.
+        considered: number of poses that were drawn or read.
         refused: number of refused poses by reason.
         workspace: joint values at which the robot must be accurate, and which may be waypoints [rad or m]. These are
             the candidates or, with a camera, which sees its board only from a small part of the workspace, poses that
@@ -51,7 +51,7 @@ class Candidates:
 
     q: Float64[Tensor, "candidates dof"]
     number: Int64[Tensor, " candidates"]
-    looked_at: int
+    considered: int
     refused: Counter[str]
     workspace: Float64[Tensor, "poses dof"]
 
@@ -59,7 +59,7 @@ class Candidates:
     def sentence(self) -> str:
         """Sentence with the number of allowed poses, and of refused poses by reason."""
         reasons = "; ".join(f"{count:,}: {reason}" for reason, count in self.refused.most_common())
-        return f"{len(self.q):,} of {self.looked_at:,} poses are allowed" + (
+        return f"{len(self.q):,} of {self.considered:,} poses are allowed" + (
             f" ({reasons})." if reasons else "."
         )
 

@@ -14,7 +14,7 @@ from pisigma.files.input_file import read_input
 from pisigma.robot.description import Robot
 from pisigma.robot.row import Row
 from pisigma.robot.urdf_frames import Frame, rotation, translation
-from pisigma.robot.urdf_rows import turned_to
+from pisigma.robot.urdf_rows import rotation_from_z_to
 
 _TYPES = {"hinge": "revolute", "slide": "prismatic"}
 """Type of the DH row by type of the MJCF joint."""
@@ -158,7 +158,7 @@ class MjcfDrawing:
             )
         axis = row.direction * np.array(numbers(joint.get("axis", "0 0 1")))
         place = translation(*numbers(joint.get("pos", "0 0 0")))
-        attached = place @ turned_to(axis / np.linalg.norm(axis))
+        attached = place @ rotation_from_z_to(axis / np.linalg.norm(axis))
         return MovedBody(body, joint, row.name, between, self.pose(body), attached)
 
     def _attributes(self, joint: Any) -> dict[str, str]:

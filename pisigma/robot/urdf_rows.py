@@ -124,11 +124,11 @@ def _first_frame(joint: ChainJoint, axis: Vector) -> Frame:
     upright = math.hypot(z[0], z[1]) <= ROUNDING
     if upright and (joint.type == "prismatic" or math.hypot(point[0], point[1]) <= ROUNDING):
         return np.eye(4) if z[2] > 0 else rotation(0, math.pi)
-    T: Frame = joint.origin @ turned_to(axis)
+    T: Frame = joint.origin @ rotation_from_z_to(axis)
     return T
 
 
-def turned_to(axis: Vector) -> Frame:
+def rotation_from_z_to(axis: Vector) -> Frame:
     """Return a rotation about y and then x that maps the z axis to a given one."""
     x, y, z = (float(value) for value in axis)
     about_x, about_y = math.atan2(-y, z), math.atan2(x, math.hypot(y, z))

@@ -238,7 +238,7 @@ def check_rows(cell: Cell, form: Form, progress: Progress) -> tuple[Outcome, Ses
 def follow_file(
     cell: Cell,
     path: Path,
-    arrived: Callable[[Measurements], None],
+    on_new_rows: Callable[[Measurements], None],
     show: Callable[[SessionState], None],
     progress: Progress,
 ) -> Outcome:
@@ -248,7 +248,7 @@ def follow_file(
     growing = growing_file(path, session.plan.arm.robot, session.plan.settings)
     rest, waiting = remaining_poses_file(plan, path, None), f"waiting for rows in {path.name}"
     with contextlib.suppress(StoppedError):
-        for step in follow(session, growing, tick=lambda: progress(waiting), arrived=arrived):
+        for step in follow(session, growing, tick=lambda: progress(waiting), on_new_rows=on_new_rows):
             show(step.state)
             if step.replanned:
                 session.write_remaining(rest, [])
@@ -297,7 +297,7 @@ def export(cell: Cell, form: Form, files: Mapping[str, Path]) -> Outcome:
     text = ResultText(
         verdict, exported.warnings, tuple(one for one in blocks if one.rows or one.what == "remarks")
     )
-    return Outcome(text, exported.failure or exported.shortfall or "")
+    return Outcome(text, exported.failure or exported.missed_limit or "")
 
 
 def side_by_side(diff: str) -> list[tuple[str, str, str]]:

@@ -26,7 +26,7 @@ from pisigma.validation.held_out.frames.row_errors import fitted_points_remark
 from pisigma.validation.held_out.model_comparison import ModelComparison, ModelFigures, compare_models
 from pisigma.validation.held_out.pose_statistics import image_remark
 from pisigma.validation.held_out.reference_models import geometric_model, nominal_model
-from pisigma.validation.setup_faults.setup_faults import is_implausible, unexplained
+from pisigma.validation.setup_faults.setup_faults import is_implausible, unexplained_diagnostic
 from pisigma.workflow.settings.evaluation import EvaluationSettings
 
 REFERENCES = ("nominal", "geometric")
@@ -282,7 +282,7 @@ def _diagnostics(
     nominal = nominal_model(model, rows.rotation is not None) if implausible else None
     found = check_rows(rows, model, fitted, nominal=nominal).implausible
     if implausible and not found:
-        found = (unexplained(model),)
+        found = (unexplained_diagnostic(model),)
     for one in found:
         yield one.model_copy(update={"sentence": f"{figures.name}: {one.sentence}"})
 

@@ -45,7 +45,7 @@ def follow(
     file: GrowingFile,
     once: bool = False,
     tick: Callable[[], None] = lambda: None,
-    arrived: Callable[[Measurements], None] = lambda rows: None,
+    on_new_rows: Callable[[Measurements], None] = lambda rows: None,
 ) -> Iterator[SessionStep]:
     """Check the rows of a growing file until the session ends.
 
@@ -54,7 +54,7 @@ def follow(
         file: the growing file.
         once: whether to check only the existing rows and then end.
         tick: called before every read of the file; an exception that it raises ends the session.
-        arrived: called with new rows before they are checked, because a check takes longer the more rows there are.
+        on_new_rows: called with new rows before they are checked, because a check takes longer the more rows there are.
 
     Yields:
         A step at the start and whenever there are new rows, a new accuracy, or a file to wait for.
@@ -76,7 +76,7 @@ def follow(
             tick()
             growth = file.read()
             if growth.rows is not None:
-                arrived(growth.rows)
+                on_new_rows(growth.rows)
             alarms = session.add(growth.rows, growth.left_out)
             worked = work is not None and work.done()
             if work is not None and worked:

@@ -31,7 +31,7 @@ from pisigma.validation.held_out.reference_models import geometric_model, nomina
 from pisigma.validation.resampling import Bootstrap
 from pisigma.validation.setup_faults.cause import length_text
 from pisigma.validation.setup_faults.setup_fault import SetupFault
-from pisigma.validation.setup_faults.setup_faults import is_implausible, unexplained
+from pisigma.validation.setup_faults.setup_faults import is_implausible, unexplained_diagnostic
 from pisigma.workflow.evaluate import test_rows
 from pisigma.workflow.settings.recalibration import RecalibrationSettings
 from pisigma.workflow.settings.verification import VerificationSettings
@@ -340,5 +340,5 @@ def _warnings(
             "are left out."
         )
     if not faults and motion is None and is_implausible(corrected, model):
-        warnings.append(unexplained(model).sentence)
+        warnings.append(unexplained_diagnostic(model).sentence)
     return warnings

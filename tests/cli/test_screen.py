@@ -5,7 +5,7 @@ import pytest
 from pisigma.cli import progress
 from pisigma.cli.progress import progress_of
 from pisigma.cli.screen import MAX_LINES, print_screen
-from pisigma.files.progress import share_done, step_name
+from pisigma.files.progress import completed_fraction, step_name
 from pisigma.reporting.result_text import MAX_ALIKE, Block, merge_alike_warnings, numbers_as_ranges
 from pisigma.reporting.verdict import Verdict, rounded, uncapitalised
 
@@ -87,7 +87,7 @@ def test_a_sentence_continues_another():
     ],
 )
 def test_steps_of_a_long_computation(what, share, step):
-    assert share_done(what) == share
+    assert completed_fraction(what) == share
     assert step_name(what) == step
 
 

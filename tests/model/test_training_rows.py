@@ -69,7 +69,7 @@ def rounded(rows: Measurements) -> Measurements:
 @pytest.mark.parametrize("change", [lambda rows: rows, rounded], ids=["exact", "rounded"])
 def test_repeated_rows_are_recognised_by_their_readings(made, change, tmp_path):
     model, own, others = made
-    save_model(replace(model, made_of=stored_training_rows(model.robot, own)), tmp_path)
+    save_model(replace(model, training_values=stored_training_rows(model.robot, own)), tmp_path)
     model = load_model(tmp_path)
     again = change(own.select(torch.tensor([7, 3, 5, 30])))
     assert known_rows(model, again).all()
@@ -84,7 +84,7 @@ def test_repeated_rows_are_recognised_by_their_readings(made, change, tmp_path):
 
 def test_poses_that_were_measured_again_are_new_rows(made):
     model, own, _ = made
-    model = replace(model, made_of=stored_training_rows(model.robot, own))
+    model = replace(model, training_values=stored_training_rows(model.robot, own))
     later = replace(own, position=own.position + 1e-5 * torch.ones(3))
     assert not known_rows(model, later).any()
     assert len(training_row_warnings(model, later)) == 1

@@ -14,7 +14,7 @@ from pisigma.calibration.frames.undetermined import (
     FrameDirections,
     Frames,
     hold_undetermined,
-    values_before,
+    initial_parameters,
 )
 from pisigma.calibration.frames.whitened_values import WhitenedValues
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
@@ -156,7 +156,7 @@ class FrameFit:
     @property
     def before(self) -> Float64[np.ndarray, " frames"]:
         """Values of `parameters` before the fit [m or rad]."""
-        values = values_before(self.solved.problem.space, self.bases, self.tools)
+        values = initial_parameters(self.solved.problem.space, self.bases, self.tools)
         before: np.ndarray = values.numpy()[self.frames]
         return before
 

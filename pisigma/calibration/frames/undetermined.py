@@ -115,7 +115,7 @@ def hold_undetermined(
     """
     found, space = FrameDirections.at_solution(solved, frames), solved.problem.space
     unknown = int(torch.isinf(found.deviation).sum())
-    before, rows = values_before(space, bases, tools), solved.problem.rows
+    before, rows = initial_parameters(space, bases, tools), solved.problem.rows
     distance = found.distances(solved, before).abs()
     plausible = distance <= _IMPROBABLE * found.deviation + rows * found.deviation**2 / _LEVER
     # The least determined directions come first, so once one is not held, none of the following are.
@@ -128,7 +128,7 @@ def hold_undetermined(
     return solved
 
 
-def values_before(space: ParameterSpace, bases: Frames, tools: Frames) -> Float64[Tensor, " parameters"]:
+def initial_parameters(space: ParameterSpace, bases: Frames, tools: Frames) -> Float64[Tensor, " parameters"]:
     """Return the parameters before the fit, in the user's coordinates; see `hold_undetermined` for bases and tools."""
     return space.values(
         np.stack([bases.get(name, space.robot.base) for name in space.frames]),

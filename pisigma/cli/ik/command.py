@@ -150,7 +150,7 @@ def _print_pose(
         print_json({"solutions": solution_records(solution, solver), "warnings": solver.warnings})
     else:
         print_result(solution_text(solution, solver), verbose=False)
-    if problem := failure(solution, places, any_will_do=all_branches):
+    if problem := failure(solution, places, one_suffices=all_branches):
         exit_with_error(problem)
 
 

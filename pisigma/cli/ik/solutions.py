@@ -39,17 +39,17 @@ def solution_records(solution: Solution, solver: CorrectedIK) -> list[dict[str, 
     return records
 
 
-def failure(solution: Solution, places: Sequence[str], any_will_do: bool) -> str | None:
+def failure(solution: Solution, places: Sequence[str], one_suffices: bool) -> str | None:
     """Return a sentence about poses that the robot cannot reach as requested; None if it reaches all.
 
     Args:
         solution: the solutions.
         places: name of the pose of every solution.
-        any_will_do: whether one solution that reaches the pose is enough (all branches of one pose).
+        one_suffices: whether one solution that reaches the pose is enough (all branches of one pose).
     """
     statuses = statuses_of(solution)
     failed = [row for row, status in enumerate(statuses) if status in FAILURES]
-    if not failed or (any_will_do and len(failed) < len(statuses)):
+    if not failed or (one_suffices and len(failed) < len(statuses)):
         return None
     others = failed[1:]
     more = "; ".join(

@@ -112,7 +112,7 @@ class Exported:
         summary: sentence about the written file, up to its name; "" for the contents of the format.
         details: remainder of this sentence after the file's name.
         failure: fault of the input, although the file was written; None if there is none.
-        shortfall: sentence about a missed limit, although the file was written; None if no limit is missed.
+        missed_limit: sentence about a missed limit, although the file was written; None if no limit is missed.
         shown: text that is printed first, such as a diff.
     """
 
@@ -123,7 +123,7 @@ class Exported:
     summary: str = ""
     details: str = ""
     failure: str | None = None
-    shortfall: str | None = None
+    missed_limit: str | None = None
     shown: str = ""
 
 

@@ -185,7 +185,7 @@ def new_rows(
         if one.rows_sha256 == sha256 and one.date != date
     ]
     others = [*(one for one in earlier if one.rows_sha256 != sha256), *judged]
-    those = [(model.made_of, f"training rows of {model.name}")]
+    those = [(model.training_values, f"training rows of {model.name}")]
     those += [(one.values, f"rows of {one.file} of {one.date}") for one in others]
     for values, of in those:
         if values is not None and rows.rows:

@@ -80,7 +80,7 @@ def recalibrated_model(model: CalibratedModel, adaptation: Adaptation, rows: Mea
         hybrid_bases=geometry.bases if hybrid else {},
         hybrid_tools=geometry.tools if hybrid else {},
         uncertainty=uncertainty.with_rounded_root(rows),
-        made_of=stored_training_rows(nominal, rows, model.made_of),
+        training_values=stored_training_rows(nominal, rows, model.training_values),
         provenance=Provenance(
             data_source=rows.file_names,
             data_sha256=rows.content_hash(),

@@ -34,7 +34,7 @@ from pisigma.measurement.foreign.units import (
     UNITS,
     UnitKind,
     ambiguous_unit,
-    is_certain,
+    is_unit_certain,
     reason_to_doubt,
     stated_units,
     unit_symbol,
@@ -90,8 +90,10 @@ class FileMapping:
     def likely_units(self) -> dict[UnitKind, str]:
         """Likely units of the columns without a unit, by kind of unit."""
         kinds = {one.target.missing_unit_kind for one in self.without_unit}
-        small_angles = is_certain("rad", largest_value(self.file, joint_columns(self.columns)))
-        length = "m" if is_certain("m", largest_value(self.file, position_columns(self.columns))) else "mm"
+        small_angles = is_unit_certain("rad", largest_value(self.file, joint_columns(self.columns)))
+        length = (
+            "m" if is_unit_certain("m", largest_value(self.file, position_columns(self.columns))) else "mm"
+        )
         likely = (length, "rad" if small_angles else "deg", "kg", "c")
         return {UNITS[symbol].kind: symbol for symbol in likely if UNITS[symbol].kind in kinds}
 
@@ -249,7 +251,7 @@ def _units_of_maker(
     return {
         kind: symbol
         for kind, symbol, group in kinds
-        if symbol and is_certain(symbol, largest_value(file, group))
+        if symbol and is_unit_certain(symbol, largest_value(file, group))
     }
 
 

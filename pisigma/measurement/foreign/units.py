@@ -165,7 +165,7 @@ def reason_to_doubt(symbol: str, largest: float, rows: int) -> str:
     return f"values up to {largest:.6g} {symbol}, which look like {other}" if doubted else ""
 
 
-def is_certain(symbol: str, largest: float) -> bool:
+def is_unit_certain(symbol: str, largest: float) -> bool:
     """Return whether values cannot be in the other usual unit of the same kind (see `reason_to_doubt`)."""
     bounds = {"deg": largest > 4 * math.pi, "rad": 0.2 < largest <= 2 * math.pi + 0.1}
     return bounds.get(symbol, {"mm": largest > 200, "m": 0.05 < largest < 20}.get(symbol, False))

@@ -52,7 +52,7 @@ class AnchorSensor(AbstractSensor):
     name = "distance"
     unit = "m"
     components = 1
-    holds_frame = False
+    determines_frame = False
     anchor: Int64[Tensor, " rows"]
     measured: Float64[Tensor, " rows"]
     present: Bool[Tensor, " rows"]

@@ -203,7 +203,7 @@ class IntrinsicsSensor(AbstractSensor):
     unit = "m"
     components = NUMBERS
     certain = True
-    holds_frame = False
+    determines_frame = False
     owner: Int64[Tensor, " rows"]
     root: Float64[Tensor, "9 9 rows"]
     mean: Float64[Tensor, "9 rows"]
@@ -285,7 +285,7 @@ class BoardScaleSensor(AbstractSensor):
     unit = "m"
     components = 1
     certain = True
-    holds_frame = False
+    determines_frame = False
     owner: Int64[Tensor, " rows"]
     weight: Float64[Tensor, " rows"]
     present: Bool[Tensor, " rows"]

@@ -40,7 +40,7 @@ class PairSensor(AbstractSensor):
     unit = "m"
     components = 1
     paired = True
-    holds_frame = False
+    determines_frame = False
     measured: Float64[Tensor, " rows"]
     present: Bool[Tensor, " rows"]
     sigma: Float64[Tensor, " rows"] | None

@@ -164,7 +164,7 @@ class AbstractSensor(ABC):
         certain: whether the values are stated rather than measured, so that their standard deviation is not estimated
             and they are never outliers.
         paired: whether a value belongs to a row and the next one.
-        holds_frame: whether the values determine the position of the frame in which the sensor measures.
+        determines_frame: whether the values determine the position of the frame in which the sensor measures.
         readings: columns that the sensor adds to measurement files; None for a sensor whose values are fields of
             `Measurements`.
         present: mask of the rows with a value.
@@ -177,7 +177,7 @@ class AbstractSensor(ABC):
     turning: ClassVar[bool] = False
     certain: ClassVar[bool] = False
     paired: ClassVar[bool] = False
-    holds_frame: ClassVar[bool] = True
+    determines_frame: ClassVar[bool] = True
     readings: ClassVar[SensorReadings | None] = None
     present: Bool[Tensor, " rows"]
     sigma: Float64[Tensor, " rows"] | None

@@ -51,7 +51,7 @@ class SocketSensor(AbstractSensor):
     name = "socket"
     unit = "m"
     components = 3
-    holds_frame = False
+    determines_frame = False
     socket: Int64[Tensor, " rows"]
     present: Bool[Tensor, " rows"]
     sigma: Float64[Tensor, " rows"] | None
@@ -138,7 +138,7 @@ class SocketDistanceSensor(AbstractSensor):
     unit = "m"
     components = 1
     certain = True
-    holds_frame = False
+    determines_frame = False
     first: Int64[Tensor, " rows"]
     second: Int64[Tensor, " rows"]
     measured: Float64[Tensor, " rows"]

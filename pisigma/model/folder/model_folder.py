@@ -150,7 +150,7 @@ def load_model(folder: str | os.PathLike[str]) -> CalibratedModel:
 
 def _tensors(model: CalibratedModel) -> dict[str, Tensor]:
     tensors = {"starts": model.starts, **hybrid_tensors(model)}
-    if (rows := model.made_of) is not None:
+    if (rows := model.training_values) is not None:
         there = torch.isfinite(rows.numbers)
         values = torch.where(there, rows.numbers, 0.0), there.to(torch.uint8), rows.steps
         tensors |= dict(zip(_ROWS, values, strict=True))
@@ -248,14 +248,16 @@ def _build_model(
         calibrated=_calibrated_robot(document, robot),
         bases=bases,
         tools=tools,
-        made_of=_made_of(robot, *(tensors[name] for name in _ROWS)) if _ROWS[0] in tensors else None,
+        training_values=_training_values(robot, *(tensors[name] for name in _ROWS))
+        if _ROWS[0] in tensors
+        else None,
         provenance=Provenance(**document.provenance.model_dump()),
         metrics=document.metrics,
     )
     return with_hybrid(model, document, tensors)
 
 
-def _made_of(robot: Robot, numbers: Tensor, measured: Tensor, steps: Tensor) -> RowValues:
+def _training_values(robot: Robot, numbers: Tensor, measured: Tensor, steps: Tensor) -> RowValues:
     if not len(numbers) == len(measured) == len(steps):
         raise MisfitError("the training rows have no numbers or steps", file=WEIGHTS, value=_ROWS[0])
     return RowValues.stored_values(torch.where(measured.bool(), numbers, torch.nan), steps, robot)

@@ -22,7 +22,7 @@ from pisigma.robot.kinematics.joint_limits import nearest_turn, wrap_into_limits
 from pisigma.robot.kinematics.numeric import solve_numeric
 from pisigma.robot.kinematics.status import Status
 from pisigma.robot.kinematics.task_axes import TaskAxes, default_axes
-from pisigma.robot.kinematics.task_error import task_error, tolerated
+from pisigma.robot.kinematics.task_error import is_within_tolerances, task_error
 from pisigma.robot.se3 import check_transforms, pose_error, transform_faults
 
 NUMERIC = "numeric"
@@ -279,7 +279,7 @@ class NumericIK:
         status = torch.where(singular < tolerances.SINGULAR_TOLERANCE, int(Status.SINGULAR), status)
         status = torch.where(inside, status, int(Status.OUTSIDE_JOINT_LIMITS))
         error = self._error(T, self.model.forward(commanded))
-        reached = reached & tolerated(self.task_axes, error.nan_to_num())
+        reached = reached & is_within_tolerances(self.task_axes, error.nan_to_num())
         error = torch.where(torch.tensor(self.task_axes.free), 0.0 * error, error)
         left = error[:, :3].norm(dim=-1), error[:, 3:].norm(dim=-1)
         rank = self._rank(T, commanded, branch, near) + torch.where(inside, 0.0, _OUTSIDE)

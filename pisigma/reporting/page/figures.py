@@ -227,7 +227,7 @@ def draw_correction(curve: CorrectionCurve) -> Drawing:
             shown = np.where(where, curve.correction, np.nan)
             axes.plot(curve.values, shown, line, color=AFTER, linewidth=1.3, label=label)
         axes.axhline(0.0, color="black", linewidth=0.6)
-        axes.set(xlabel=f"{curve.joint} [{curve.unit}]", ylabel=f"correction [{curve.small_unit}]")
+        axes.set(xlabel=f"{curve.joint} [{curve.unit}]", ylabel=f"correction [{curve.correction_unit}]")
     return Drawing(f"correction_{curve.joint}", curve.joint, curve_text(curve), figure)
 
 

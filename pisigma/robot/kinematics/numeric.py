@@ -21,7 +21,7 @@ from pisigma.robot.kinematics.jacobian import (
 from pisigma.robot.kinematics.joint_limits import wrap_into_limits
 from pisigma.robot.kinematics.status import Status
 from pisigma.robot.kinematics.task_axes import WHOLE, TaskAxes
-from pisigma.robot.kinematics.task_error import task_error, tolerated
+from pisigma.robot.kinematics.task_error import is_within_tolerances, task_error
 from pisigma.robot.se3 import check_transforms, pose_error
 
 Motion = Callable[[Tensor], tuple[Tensor, Tensor]]
@@ -307,7 +307,7 @@ def solve_within_tolerances(
             robot, T, q, tolerance=tolerances.HYBRID_TOLERANCE, motion=motion, axes=axes, weights=exact
         )
         q, met = last.q, last.status != Status.NOT_CONVERGED
-    return q, met & tolerated(axes, task_error(axes, T, motion(q)[0])[0])
+    return q, met & is_within_tolerances(axes, task_error(axes, T, motion(q)[0])[0])
 
 
 def approach_preferred(

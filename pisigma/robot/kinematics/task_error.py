@@ -54,7 +54,7 @@ def task_error(
     return error, matrix
 
 
-def tolerated(axes: TaskAxes, error: Float[Tensor, "*batch 6"]) -> Bool[Tensor, "*batch"]:
+def is_within_tolerances(axes: TaskAxes, error: Float[Tensor, "*batch 6"]) -> Bool[Tensor, "*batch"]:
     """Return whether errors in the tool axes are within all tolerances."""
     allowed = [abs(value) * (1 + 1e-9) if value else math.inf for value in axes.tolerance]
     within: Tensor = (error.abs() <= error.new_tensor(allowed)).all(-1)

@@ -214,15 +214,15 @@ def _two_sizes(checked: CheckedCalibration) -> Iterator[Diagnostic]:
         if len(residuals) < MIN_ROWS_OF_TWO or not (fit := two_populations(residuals)).are_distinct:
             continue
         unit = "mm" if SENSORS[sensor].unit == "m" else "mrad"
-        size, scatter = fit.off * 1e3, fit.scatter * 1e3
+        size, scatter = fit.offset * 1e3, fit.scatter * 1e3
         yield Diagnostic(
             kind="two_populations",
             severity="warning",
-            sentence=f"{100 * fit.share:.0f} % of the values of {sensor} are off by about {size:.2g} {unit}, while the "
-            f"others scatter by {scatter:.2g} {unit} per axis: many rows are wrong, or were measured under "
-            "different conditions; check whether a target or an instrument was moved or hit.",
+            sentence=f"{100 * fit.population_share:.0f} % of the values of {sensor} are off by about {size:.2g} "
+            f"{unit}, while the others scatter by {scatter:.2g} {unit} per axis: many rows are wrong, or were measured "
+            "under different conditions; check whether a target or an instrument was moved or hit.",
             cause="sizes",
-            values={"sensor": sensor, "share": fit.share},
+            values={"sensor": sensor, "share": fit.population_share},
         )
 
 

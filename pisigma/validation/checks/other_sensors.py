@@ -24,7 +24,7 @@ from pisigma.validation.setup_faults.cause import Cause, length_text
 from pisigma.validation.setup_faults.hypothesis import COLLAPSED
 from pisigma.validation.setup_faults.joint_faults import joint_causes, signs_and_swaps
 from pisigma.validation.setup_faults.setup_fault import SetupFault, fault_of_cause
-from pisigma.validation.setup_faults.setup_faults import unexplained
+from pisigma.validation.setup_faults.setup_faults import unexplained_diagnostic
 
 FAR, _STRETCHED = 3.0, 0.01
 """Limits for a stated distance, which is wrong if it is off by more than the first times the RMS error of the rows plus
@@ -101,7 +101,7 @@ def diagnose_lengths(
         if fault is not None and not moves.issuperset(fault.kinds):
             return (fault.diagnostic(),), faults
         if left > limit:
-            return (unexplained(model),), faults
+            return (unexplained_diagnostic(model),), faults
         return (), faults
     return (), ()
 

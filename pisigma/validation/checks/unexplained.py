@@ -14,7 +14,7 @@ from pisigma.robot.robot_class import SERVO, plausible_share
 from pisigma.validation.checks.check import FITTED_PARAMETERS, CheckedCalibration, RowsUnderModel
 from pisigma.validation.checks.rounding import joint_rounding
 from pisigma.validation.held_out.diagnostic import Diagnostic
-from pisigma.validation.setup_faults.setup_faults import unexplained
+from pisigma.validation.setup_faults.setup_faults import unexplained_diagnostic
 
 _LARGE = 1e-3
 """Size of errors, as a share of the reach, above which calibration must have reduced them; measured arms (UR5, UR10,
@@ -73,7 +73,7 @@ def check_unexplained_rows(judged: RowsUnderModel) -> Iterator[Diagnostic]:
     """Fit all joint zeros, a base and a tool to rows whose errors are too large for a calibrated robot."""
     limit = plausible_share(judged.model.robot) * judged.model.robot.reach
     if judged.has_large_errors and not judged.setup_faults and _left(judged) > limit:
-        yield unexplained(judged.model)
+        yield unexplained_diagnostic(judged.model)
 
 
 def _left(judged: RowsUnderModel) -> float:

@@ -17,7 +17,7 @@ from pisigma.measurement.sensors.socket import PairOfSockets
 from pisigma.model.calibrated_model import CalibratedModel, poses_of_rows
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.validation.held_out.frames.fitted_frames import FrameKind, errors_in_fitted_frames
-from pisigma.validation.held_out.frames.row_errors import has_position, other_lengths
+from pisigma.validation.held_out.frames.row_errors import has_position, rows_with_only_length
 from pisigma.validation.held_out.pose_statistics import axis_statistics, error_statistics
 from pisigma.validation.held_out.rank_tests import SignedRank, signed_rank
 from pisigma.validation.held_out.trained_calibrations import DistanceErrors, distance_figures
@@ -258,7 +258,7 @@ def compare_models(
     """
     bootstrap = bootstrap or Bootstrap()
     vectors = {name: errors_in_fitted_frames(model, measurements, fitted) for name, model in models.items()}
-    measured, others = has_position(measurements), other_lengths(measurements)
+    measured, others = has_position(measurements), rows_with_only_length(measurements)
     if not bool((measured | others).any()):
         raise MeasurementError(
             expected="positions, balls in sockets, wires, pairs or touches",

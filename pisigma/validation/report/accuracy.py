@@ -176,7 +176,7 @@ class AccuracyLimit:
         error: RMS length of the position error [mm]; 0 if no position was judged.
         residual_sigma: standard deviation of the residuals of the geometric calibration per coordinate [mm]; None
             without one.
-        of_parent: whether the model approximates another model, whose errors add to its errors.
+        is_approximation: whether the model approximates another model, whose errors add to its errors.
         limitations: limitations that such a model states, one sentence each.
     """
 
@@ -184,7 +184,7 @@ class AccuracyLimit:
     source: Literal["repeats", "hybrid", ""] = ""
     error: float = 0.0
     residual_sigma: float | None = None
-    of_parent: bool = False
+    is_approximation: bool = False
     limitations: tuple[str, ...] = ()
 
     @property
@@ -206,7 +206,7 @@ def limit_of(
 ) -> AccuracyLimit:
     """Compare the error with the scatter of repeated rows, or with the noise that a hybrid calibration identified."""
     if accuracy is not None and accuracy.origin == "poses":
-        return AccuracyLimit(of_parent=True, limitations=tuple(model.metrics.get("limitations", ())))
+        return AccuracyLimit(is_approximation=True, limitations=tuple(model.metrics.get("limitations", ())))
     scatter = None if rows is None else rows.scatter
     identified = identified_scatter(summary)
     noise = scatter if scatter is not None or identified is None else math.sqrt(3) * identified

@@ -93,17 +93,17 @@ class CorrectionCurve:
     Attributes:
         joint: name of the joint.
         unit: unit of the joint values, "deg" or "mm".
-        small_unit: unit of the correction, "mdeg" or "µm".
+        correction_unit: unit of the correction, "mdeg" or "µm".
         values: joint values [`unit`].
-        correction: correction at these values [`small_unit`].
+        correction: correction at these values [`correction_unit`].
         measured: whether each value was measured for the calibration.
-        dots: corrections at the measured rows that the model stores [`small_unit`].
+        dots: corrections at the measured rows that the model stores [`correction_unit`].
         dot_values: joint values of these rows [`unit`].
     """
 
     joint: str
     unit: str
-    small_unit: str
+    correction_unit: str
     values: Float64[np.ndarray, " points"]
     correction: Float64[np.ndarray, " points"]
     measured: Bool[np.ndarray, " points"]
@@ -112,12 +112,12 @@ class CorrectionCurve:
 
     @property
     def rms(self) -> float:
-        """RMS correction at the measured rows [`small_unit`]."""
+        """RMS correction at the measured rows [`correction_unit`]."""
         return float(np.sqrt((self.dots**2).mean()))
 
     @property
     def largest(self) -> float:
-        """Largest absolute correction at the measured rows [`small_unit`]."""
+        """Largest absolute correction at the measured rows [`correction_unit`]."""
         return float(np.abs(self.dots).max())
 
     @property
@@ -147,12 +147,12 @@ def correction_curves(model: CalibratedModel) -> tuple[CorrectionCurve, ...]:
         curve = correction_at(model, at)[:, j]
         if not (bool((curve != 0).any()) or bool((at_rows[:, j] != 0).any())):
             continue
-        unit, factor, small_unit, small = JOINT_UNITS[robot.joints[j].type]
+        unit, factor, correction_unit, small = JOINT_UNITS[robot.joints[j].type]
         curves.append(
             CorrectionCurve(
                 joint=robot.joints[j].name,
                 unit=unit,
-                small_unit=small_unit,
+                correction_unit=correction_unit,
                 values=at[:, j].numpy() * factor,
                 correction=curve.numpy() * small,
                 measured=measured.numpy(),

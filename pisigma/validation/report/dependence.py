@@ -71,7 +71,7 @@ class OrderTest:
         ordered_joint: number, from 1, of a joint whose values follow the order of the rows, so that order and position
             cannot be distinguished; None if there is no such joint.
         joint_correlation: absolute rank correlation of that joint with the order.
-        of_training: whether signed errors are residuals of rows with which the model was calibrated.
+        are_training_residuals: whether signed errors are residuals of rows with which the model was calibrated.
     """
 
     component: Literal["x", "y", "z", "length"]
@@ -80,7 +80,7 @@ class OrderTest:
     change: float
     ordered_joint: int | None = None
     joint_correlation: float = 0.0
-    of_training: bool = False
+    are_training_residuals: bool = False
 
     @property
     def significant(self) -> bool:

@@ -93,7 +93,7 @@ def reversed_signs(dof: int) -> JointMaps:
     return JointMaps.scaled(torch.tensor(choices, dtype=torch.float64))
 
 
-def other_orders(dof: int) -> JointMaps:
+def joint_order_maps(dof: int) -> JointMaps:
     """Return maps for all orders of the joints; for more than seven joints, for all swaps of two."""
     orders = torch.arange(dof).repeat(math.comb(dof, 2), 1)
     pairs = torch.combinations(torch.arange(dof))
@@ -113,7 +113,7 @@ def coupled_joints(dof: int) -> JointMaps:
     return replace(maps, matrix=maps.matrix.index_put((torch.arange(len(pairs)), *pairs.T), sign))
 
 
-def other_units(robot: Robot) -> JointMaps:
+def joint_unit_maps(robot: Robot) -> JointMaps:
     """Return maps that swap units: degrees and radians (or gradians), and mm and m for prismatic joints."""
     turning = [1.0 if turns else 0.0 for turns in robot.revolute]
     rows = [[_GRADIANS ** (sign * turns) for turns in turning] for sign in (1, -1) if any(turning)]
@@ -256,9 +256,9 @@ def likely_maps(arm: PredictingArm, measurements: Measurements, measured: Measur
         return arm.screened_errors(some, maps.apply(some.q), few, modes)
 
     kinds = (
-        other_units(robot),
+        joint_unit_maps(robot),
         reversed_signs(robot.dof),
-        other_orders(robot.dof),
+        joint_order_maps(robot.dof),
         coupled_joints(robot.dof),
         quarter_turned_zeros(robot, inner=arm.model is None),
     )

@@ -299,16 +299,16 @@ class Mixture:
     """Mixture of two normal populations of residuals.
 
     Attributes:
-        share: share of the population with the larger scatter, or of the smaller population if both scatter equally
-            [1].
-        off: RMS distance of that population from the mean of the other, per component [m or rad].
+        population_share: share of the population with the larger scatter, or of the smaller population if both scatter
+            equally [1].
+        offset: RMS distance of that population from the mean of the other, per component [m or rad].
         scatter: RMS distance of the other population from its mean, per component [m or rad].
         log_bayes_factor: logarithm of the odds against one population, by the Bayesian information criterion (Schwarz
             1978, Annals of Statistics 6, 461-464).
     """
 
-    share: float
-    off: float
+    population_share: float
+    offset: float
     scatter: float
     log_bayes_factor: float
 
@@ -317,8 +317,8 @@ class Mixture:
         """Whether there are two populations, not one with an unusual shape."""
         return (
             self.log_bayes_factor > math.log(100.0)
-            and min(self.share, 1 - self.share) >= MIN_SHARE
-            and self.off > _APART * self.scatter
+            and min(self.population_share, 1 - self.population_share) >= MIN_SHARE
+            and self.offset > _APART * self.scatter
         )
 
 
@@ -352,8 +352,8 @@ def two_populations(residuals: Float64[np.ndarray, "rows components"]) -> Mixtur
     alike = abs(determinants[1] - determinants[0]) < 2 * components * math.log(2.0)
     far = int(np.argmin(counts) if alike else np.argmax(determinants))
     return Mixture(
-        share=float(counts[far] / rows),
-        off=float(np.average(np.square(off[1 - far]).mean(1), weights=members[far])) ** 0.5,
+        population_share=float(counts[far] / rows),
+        offset=float(np.average(np.square(off[1 - far]).mean(1), weights=members[far])) ** 0.5,
         scatter=float(np.trace(covariances[1 - far]) / components) ** 0.5,
         log_bayes_factor=float(gain) - (components + 1) * (components + 2) / 4 * math.log(rows),
     )

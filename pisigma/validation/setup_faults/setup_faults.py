@@ -130,7 +130,7 @@ def is_implausible(figures: ModelFigures, model: CalibratedModel) -> bool:
     return figures.position.statistics["rms"] * 1e-3 > limit > 0 or turn > plausible_turn(model.robot)
 
 
-def unexplained(model: CalibratedModel) -> Diagnostic:
+def unexplained_diagnostic(model: CalibratedModel) -> Diagnostic:
     """Return the finding that no setup fault explains implausible errors of a model, with advice on what to check."""
     robot = model.robot
     limit, turn = plausible_share(robot) * robot.reach * 1e3, np.rad2deg(plausible_turn(robot))

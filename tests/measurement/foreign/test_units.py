@@ -7,7 +7,7 @@ from testing.refusals import refused
 
 from pisigma.files.errors import MeasurementError
 from pisigma.measurement.foreign.units import (
-    is_certain,
+    is_unit_certain,
     parse_units,
     reason_to_doubt,
     stated_units,
@@ -85,7 +85,7 @@ def test_values_that_cannot_be_in_a_unit():
     assert not any(
         reason_to_doubt(*case, 20) for case in (("rad", 6.2), ("deg", 170.0), ("m", 2.9), ("mm", 2103.0))
     )
-    assert is_certain("deg", 170.0)
-    assert not is_certain("deg", math.pi)
-    assert is_certain("mm", 2103.0)
-    assert not is_certain("mm", 2.9)
+    assert is_unit_certain("deg", 170.0)
+    assert not is_unit_certain("deg", math.pi)
+    assert is_unit_certain("mm", 2103.0)
+    assert not is_unit_certain("mm", 2.9)

@@ -313,7 +313,7 @@ def test_a_distilled_model_is_compared_with_its_parent(tmp_path):
     assert list(content.accuracies[0].models) == ["nominal", "full", "distilled"]
     first = content.accuracies[0]
     assert (first.origin, first.rows, first.source) == ("poses", 77, "whole")
-    assert content.limit.of_parent
+    assert content.limit.is_approximation
     assert content.verdict.limit == "Reach: less."
     assert content.joints == ()
 

@@ -42,9 +42,9 @@ def test_wrong_rows_are_distinguished_from_correct_ones(same):
     residuals[:80] += [3.0, 0, 0] if same else 1.7 * rng.normal(size=(80, 3))
     mixture = two_populations(residuals)
     assert mixture.are_distinct
-    assert_close(mixture.share, 0.4, atol=0.02)
+    assert_close(mixture.population_share, 0.4, atol=0.02)
     assert_close(mixture.scatter, 0.1, rtol=0.15)
-    assert_close(mixture.off, 1.7, rtol=0.15)
+    assert_close(mixture.offset, 1.7, rtol=0.15)
 
 
 def populations(robot: Robot, rows: Measurements) -> list[Diagnostic]:

@@ -9,9 +9,9 @@ from pisigma.validation.setup_faults.joint_faults import (
     JointMaps,
     coupled_joints,
     joint_causes,
+    joint_order_maps,
+    joint_unit_maps,
     moved_zeros,
-    other_orders,
-    other_units,
     quarter_turned_zeros,
     reversed_signs,
 )
@@ -33,11 +33,11 @@ def test_every_fault_appears_once_and_changes_something():
     scara, arm = Robot.load("kiro3"), Robot.load("ur5")
     counts = {
         "signs": (reversed_signs(6), 2**6 - 1),
-        "orders": (other_orders(6), 719),
-        "orders of many": (other_orders(8), 28),
+        "orders": (joint_order_maps(6), 719),
+        "orders of many": (joint_order_maps(8), 28),
         "pairs": (coupled_joints(6), 2 * 6 * 5),
-        "units": (other_units(arm), 2 * (2**6 - 1) + 2),
-        "units with a sliding joint": (other_units(scara), 2 * (2**3 - 1) + 2 + 2),
+        "units": (joint_unit_maps(arm), 2 * (2**6 - 1) + 2),
+        "units with a sliding joint": (joint_unit_maps(scara), 2 * (2**3 - 1) + 2 + 2),
         "zeros": (quarter_turned_zeros(arm), 4**6 - 1),
     }
     for name, (maps, count) in counts.items():

@@ -313,9 +313,9 @@ def _touched_frames(setup: CalibrationSetup) -> list[CalibrationWarning]:
 def floating_frames(setup: CalibrationSetup) -> list[str]:
     """Return the frames without a measurement at a stated position, in which everything may move together."""
     data, sensors = setup.measurements, setup.problem.sensors
-    if all(sensor.holds_frame for sensor in sensors):
+    if all(sensor.determines_frame for sensor in sensors):
         return []
-    held = torch.stack([sensor.present & sensor.holds_frame for sensor in sensors]).any(0)
+    held = torch.stack([sensor.present & sensor.determines_frame for sensor in sensors]).any(0)
     if data.anchor_place is not None:
         held |= torch.isfinite(data.anchor_place).all(-1)
     holding = {frame for frame, holds in zip(data.frame, held.tolist(), strict=True) if holds}

@@ -95,7 +95,7 @@ class ControllerFile:
         source: sentence on the source of the format and its tests; see `untested_on_controller`.
         convention: function that returns the controller's description of a robot, or raises a `PisigmaError` if there
             is none.
-        relies: sentences on what the file requires of the controller.
+        requirements: sentences on what the file requires of the controller.
         text: function that returns the text of a file.
         read: function of text, file name and nominal robot that returns the robot of a file; None if the file includes
             base and tool and is loaded as a robot file.
@@ -110,7 +110,7 @@ class ControllerFile:
     contents: str
     suffixes: tuple[str, ...]
     source: str
-    relies: tuple[str, ...]
+    requirements: tuple[str, ...]
     text: Callable[[FileContent], str]
     read: Callable[[str, str, Robot], Robot] | None
     check: Callable[[Robot], None]
@@ -162,7 +162,7 @@ class ControllerFile:
                 "It does not include a learned joint correction: its geometry is the nearest approximation of the "
                 "whole model."
             )
-        sentences += [*self.relies, *condition_remarks(model), *frame_remarks(model)]
+        sentences += [*self.requirements, *condition_remarks(model), *frame_remarks(model)]
         facts = {"off_the_whole_model": asdict(lost), "robot_as_drawn": asdict(of_nominal)}
         facts |= {part: in_file_units(FRAME_COLUMNS, getattr(held, part)) for part in ("base", "tool")}
         if convention.frames:

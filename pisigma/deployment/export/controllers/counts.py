@@ -124,7 +124,7 @@ def _file(name: str, contents: str, source: str, meaning: str) -> ControllerFile
         contents=contents,
         suffixes=(".csv",),
         source=untested_on_controller(source),
-        relies=(meaning, *_SIGN),
+        requirements=(meaning, *_SIGN),
         text=write_counts,
         read=read_offsets,
         check=check_robot,

@@ -128,7 +128,7 @@ FILE = ControllerFile(
     contents="the dhOffset of a Staubli arm.cfx",
     suffixes=(".cfx",),
     source=untested_on_controller("github.com/ros-industrial/staubli_experimental/issues/35"),
-    relies=(
+    requirements=(
         "The controller adds these differences to its nominal DH parameters, which have to be those of this robot's "
         "description. Its order of multiplication is not published; RotZ(theta) Trans(a, b, d) RotX(alpha) RotY(beta) "
         "is assumed. Compare the controller's position with that of pisigma at several joint values before you use it.",

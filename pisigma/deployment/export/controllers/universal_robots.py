@@ -123,7 +123,7 @@ FILE = ControllerFile(
     contents="the calibration.conf of a Universal Robots controller",
     suffixes=(".conf",),
     source=untested_on_controller("forum.universal-robots.com/t/18921 and /t/1638"),
-    relies=(
+    requirements=(
         "The controller adds these differences to its own nominal DH parameters, which are in urcontrol.conf.",
         "The file includes neither base nor tool. The line 'base' below is the pose of the controller's frame 'base' "
         "in the frame of the model's poses (set its inverse as a feature), the line 'tool' that of the tool on the "

@@ -154,7 +154,7 @@ FILE = ControllerFile(
     source=untested_on_controller(
         "github.com/UniversalRobots/Universal_Robots_ROS2_Driver, ur_calibration/doc/algorithm.rst"
     ),
-    relies=(
+    requirements=(
         "The driver warns if the hash is not that of the connected robot; it is the hash of the calibration.conf that "
         "--format ur-calibration writes for the same model.",
         ORDER,

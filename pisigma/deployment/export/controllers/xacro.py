@@ -49,7 +49,7 @@ FILE = ControllerFile(
     contents="a xacro overlay",
     suffixes=(".xacro",),
     source="Written from the published description (wiki.ros.org/xacro), and expanded with the package xacro 2.1.1.",
-    relies=(
+    requirements=(
         "The origins of the joints are properties, so one calibration can be replaced by another; `xacro FILE` "
         "expands it. The link calibrated_frame is the frame of the poses, calibrated_tool the tool.",
     ),

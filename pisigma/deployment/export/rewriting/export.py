@@ -140,7 +140,7 @@ def _exported(
         ),
         summary=f"Program with {reached} corrected targets (by {shift:.3f} mm at most) "
         f"and {corrected.waypoints} waypoints",
-        shortfall=_shortfall(corrected, str(request.program)),
+        missed_limit=_shortfall(corrected, str(request.program)),
         shown=diff,
     )
 

@@ -36,7 +36,7 @@ def errors_of_rows(T: Float64[Tensor, "rows 4 4"], measurements: Measurements) -
         poses = replace(measurements, position=nowhere)
         errors = ErrorVectors.from_prediction(poses, T)
     rows = (
-        _whole_pairs(measurements, torch.isfinite(T).flatten(1).all(-1)) & other_lengths(measurements)
+        _whole_pairs(measurements, torch.isfinite(T).flatten(1).all(-1)) & rows_with_only_length(measurements)
     ).nonzero()[:, 0]
     if not len(rows):
         return errors
@@ -51,7 +51,7 @@ def errors_of_rows(T: Float64[Tensor, "rows 4 4"], measurements: Measurements) -
     return replace(errors, position=position)
 
 
-def other_lengths(measurements: Measurements) -> Bool[Tensor, " rows"]:
+def rows_with_only_length(measurements: Measurements) -> Bool[Tensor, " rows"]:
     """Return the mask of rows that have a length from another sensor but no position."""
     kinds = [kind for kind in measurements.kinds if kind in SENSORS and SENSORS[kind].unit == "m"]
     there = torch.zeros(measurements.rows, dtype=torch.bool)
@@ -69,7 +69,7 @@ def has_position(measurements: Measurements) -> Bool[Tensor, " rows"]:
 
 def fitted_points_remark(measurements: Measurements) -> tuple[str, ...]:
     """Write a remark on errors of rows to which positions of sockets or anchors are fitted; empty if there are none."""
-    rows = other_lengths(measurements).nonzero()[:, 0]
+    rows = rows_with_only_length(measurements).nonzero()[:, 0]
     groups = unknown_groups(measurements.select(rows))
     if not groups:
         return ()

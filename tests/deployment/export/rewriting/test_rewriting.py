@@ -56,7 +56,7 @@ def test_the_real_tool_reaches_the_programmed_poses(language, arm, tmp_path):
     assert line
     (unreached,) = exported.facts["unreached"]
     assert unreached["status"] == "unreachable"
-    assert str(exported.shortfall).startswith(f"{request.program}, line {unreached['line']}: unreachable")
+    assert str(exported.missed_limit).startswith(f"{request.program}, line {unreached['line']}: unreachable")
 
 
 @pytest.mark.parametrize("language", LANGUAGES, ids=lambda language: language.suffix)
