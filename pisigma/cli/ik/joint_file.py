@@ -27,7 +27,7 @@ _BAD_ROW = "bad_row"
 """Status of a row that is not a pose."""
 
 FAR = 50.0
-"""Multiple of the reach beyond which a position is refused; with a wrong length unit, positions are 1000 times too
+"""Multiple of the reach beyond which a position is refused; with a wrong length unit, positions are 1,000 times too
 large."""
 
 _LISTED = 10
