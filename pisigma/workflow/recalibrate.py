@@ -140,7 +140,7 @@ def recalibrate(
     progress("what has moved")
     elsewhere = _moved_frames(parent, posterior, rows, settings)
     every = rows
-    rows, adaptation, outliers = _adapted(parent, posterior, rows, elsewhere, right.numbers)
+    rows, adaptation, outliers = _adapted(parent, posterior, rows, elsewhere, right.indices)
     calibrator = HybridCalibrator(nominal)
     choice = choose_candidate(
         parent, adaptation, elsewhere, rows, calibrator, with_stage(progress, "cross-validation")

@@ -62,7 +62,7 @@ def parameter_table(
     setup: CalibrationSetup,
     problem: CalibrationProblem,
     findings: RankFindings,
-    here: Linearisation[Tensor],
+    linearisation: Linearisation[Tensor],
     geometry: IdentifiedGeometry,
     covariance: Float64[np.ndarray, "parameters parameters"],
 ) -> tuple[ParameterEstimate, ...]:
@@ -72,7 +72,7 @@ def parameter_table(
         setup: the problem at its start.
         problem: the problem with its free parameters.
         findings: result of the rank analysis.
-        here: linearisation of the problem at the solution.
+        linearisation: linearisation of the problem at the solution.
         geometry: the solution in the user's coordinates.
         covariance: covariance of all parameters in the user's coordinates.
     """
@@ -84,9 +84,9 @@ def parameter_table(
     angle = torch.tensor([parameter.unit == "rad" for parameter in space.parameters])
     change = torch.where(angle, wrap_to_pi(change), change)
     errors = np.sqrt(np.maximum(covariance.diagonal(), 0))
-    held = errors * np.sqrt(_prior_precision(problem, here)) > _HELD
+    held = errors * np.sqrt(_prior_precision(problem, linearisation)) > _HELD
     active = set(problem.active.tolist())
-    silent = _without_rows(problem, here.normal.cpu(), findings)
+    silent = _without_rows(problem, linearisation.normal.cpu(), findings)
     undetermined = (geometry.coordinate_jacobian[:, silent] != 0).any(1).tolist()
     sums = _sums_with_bases(problem, findings, geometry)
     rows = []
@@ -163,10 +163,10 @@ def _determines_all(information: Float64[Tensor, "own own"]) -> bool:
     return float(torch.linalg.eigvalsh(information * scale * scale[:, None])[0]) >= LOST
 
 
-def _prior_precision(problem: CalibrationProblem, here: Linearisation[Tensor]) -> np.ndarray:
+def _prior_precision(problem: CalibrationProblem, linearisation: Linearisation[Tensor]) -> np.ndarray:
     """Return the prior precision (1 / variance) of all parameters; 0 for parameters that are not free."""
     full = torch.zeros_like(problem.precision)
-    full[problem.active] = sensor_view_of(here).scaled_precision(
+    full[problem.active] = sensor_view_of(linearisation).scaled_precision(
         problem.precision[problem.active], problem.prior_group
     )
     precision: np.ndarray = full.cpu().numpy()

@@ -42,16 +42,20 @@ class PriorRatio:
         return self.lower_bound * self.prior
 
 
-def prior_ratios_of(problem: CalibrationProblem, here: Linearisation[Tensor]) -> tuple[PriorRatio, ...]:
+def prior_ratios_of(
+    problem: CalibrationProblem, linearisation: Linearisation[Tensor]
+) -> tuple[PriorRatio, ...]:
     """Return the ratios of all groups of parameters with a prior.
 
     Args:
         problem: the problem with its free parameters.
-        here: the problem linearised at its solution.
+        linearisation: the problem linearised at its solution.
     """
-    view = sensor_view_of(here)
+    view = sensor_view_of(linearisation)
     precision, group = problem.precision[problem.active], problem.prior_group
-    effective = effective_parameters(precision, group, view.prior_scale, covariance_of(here.normal)).tolist()
+    effective = effective_parameters(
+        precision, group, view.prior_scale, covariance_of(linearisation.normal)
+    ).tolist()
     ratios = []
     for number in sorted(set(group[precision > 0].tolist())):
         if effective[number] > 0:

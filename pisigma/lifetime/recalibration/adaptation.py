@@ -100,7 +100,7 @@ class Adaptation:
     @cached_property
     def root(self) -> Float64[Tensor, "unknowns directions"]:
         """Root of the posterior covariance of all unknowns in the user's coordinates, parameters first."""
-        root = torch.cat([self.update.root(), self.problem.standing], 1)
+        root = torch.cat([self.update.root(), self.problem.fixed_root], 1)
         active = self.problem.design.active
         return torch.cat([self.problem.change @ root[:active], root[active:]])
 

@@ -72,7 +72,7 @@ class RecalibrationProblem:
         root: root of the prior covariance of the unknowns, with parameters relative to the anchors of the setup.
         change: derivative of the parameters in the user's coordinates with respect to the problem's parameters.
         groups: groups that may drift, with size 0, and moved bases and tools.
-        standing: root of the covariance of unknowns that are held fixed.
+        fixed_root: root of the covariance of unknowns that are held fixed.
     """
 
     posterior: ModelPosterior
@@ -82,7 +82,7 @@ class RecalibrationProblem:
     root: Float64[Tensor, "unknowns directions"]
     change: Float64[Tensor, "parameters parameters"]
     groups: tuple[DriftGroup, ...]
-    standing: Float64[Tensor, "unknowns _directions"]
+    fixed_root: Float64[Tensor, "unknowns _directions"]
 
     @cached_property
     def configuration(self) -> Int64[Tensor, " rows"]:
@@ -97,7 +97,7 @@ class RecalibrationProblem:
     def with_fixed_arm(self) -> "RecalibrationProblem":
         """Return the problem with the arm held fixed, in which only moved bases and tools are unknown."""
         relocated = tuple(group for group in self.groups if group.fixed_size)
-        return replace(self, root=self.standing, groups=relocated, standing=self.root)
+        return replace(self, root=self.fixed_root, groups=relocated, fixed_root=self.root)
 
 
 def recalibration_problem(

@@ -61,7 +61,7 @@ class ArmInSurroundings:
         surroundings: surroundings of the robot.
         capsules: capsules along the links.
         capsule_pairs: pairs of capsules that may touch each other.
-        room: distance to keep between the capsules of each pair [m].
+        pair_clearance: distance to keep between the capsules of each pair [m].
         beam_blockers: capsules that may block the tracker's beam, without those of the link that carries the reflector
             and those so near to the reflector that they touch every beam.
         limits: limits of the controller's values including margins [rad or m].
@@ -72,7 +72,7 @@ class ArmInSurroundings:
     surroundings: Surroundings
     capsules: Capsules
     capsule_pairs: Int64[Tensor, "pairs 2"]
-    room: Float64[Tensor, " pairs"]
+    pair_clearance: Float64[Tensor, " pairs"]
     beam_blockers: Int64[Tensor, " pieces"]
     limits: Float64[Tensor, "axes 2"]
 
@@ -99,11 +99,11 @@ class ArmInSurroundings:
         Args:
             q: joint values of measured poses [rad or m].
         """
-        room = self.room
+        pair_clearance = self.pair_clearance
         for chunk in torch.split(q, POSES_PER_CHUNK):
             apart = self._apart(self.capsules.segments(chunk))
-            room = torch.minimum(room, apart.amin(0) - _ROUNDING)
-        return replace(self, room=room)
+            pair_clearance = torch.minimum(pair_clearance, apart.amin(0) - _ROUNDING)
+        return replace(self, pair_clearance=pair_clearance)
 
     @property
     def unseparated_links(self) -> tuple[str, ...]:
@@ -190,7 +190,11 @@ class ArmInSurroundings:
         """Return the distances between the links and every obstacle, minus the clearance [m], by reason."""
         clearance, radius = self.surroundings.clearance, self.capsules.radius
         infinite = segments.new_full((len(segments), 1), torch.inf)
-        gaps = {"links of the robot touch each other": _least(self._apart(segments) - self.room, infinite)}
+        gaps = {
+            "links of the robot touch each other": _least(
+                self._apart(segments) - self.pair_clearance, infinite
+            )
+        }
         moving = ~self.capsules.carrier
         if self.surroundings.floor_mm is not None:
             height = segments[:, moving, 1, 2] - radius[moving] - self.surroundings.floor_mm / 1e3

@@ -39,12 +39,12 @@ class FilteredRows:
     Attributes:
         rows: the remaining rows; all rows if none is wrong.
         warnings: warnings about wrong rows and the sizes of their errors; empty if no row is wrong.
-        numbers: indices of the wrong rows, from 0.
+        indices: indices of the wrong rows, from 0.
     """
 
     rows: Measurements
     warnings: tuple[str, ...] = ()
-    numbers: tuple[int, ...] = ()
+    indices: tuple[int, ...] = ()
 
 
 def without_wrong_rows(

@@ -41,4 +41,4 @@ def test_the_prior_is_the_posterior_of_the_model():
     still = problem.with_fixed_arm()
     assert still.root.shape[1] == 0
     assert still.groups == ()
-    assert_close(still.standing, problem.root)
+    assert_close(still.fixed_root, problem.root)

@@ -62,7 +62,9 @@ def observability_of(gram: Float64[Tensor, "chosen chosen"], poses: int) -> Obse
     )
 
 
-def find_weak_directions(problem: CalibrationProblem, here: Linearisation[Tensor]) -> tuple[str, ...]:
+def find_weak_directions(
+    problem: CalibrationProblem, linearisation: Linearisation[Tensor]
+) -> tuple[str, ...]:
     """Return a sentence for every direction of the free arm parameters that the prior determines better than the data.
 
     Base and tool are marginalised. The directions are eigenvectors of the data's information in units of the prior
@@ -70,12 +72,12 @@ def find_weak_directions(problem: CalibrationProblem, here: Linearisation[Tensor
 
     Args:
         problem: the problem with its free parameters.
-        here: linearisation of the problem at the solution.
+        linearisation: linearisation of the problem at the solution.
     """
-    view, stated = sensor_view_of(here), problem.precision[problem.active]
+    view, stated = sensor_view_of(linearisation), problem.precision[problem.active]
     precision = view.scaled_precision(stated, problem.prior_group)
     held = bool((precision > 0).any())
-    data = here.normal - torch.diag(precision)
+    data = linearisation.normal - torch.diag(precision)
     wide = replace(view, prior_scale=view.prior_scale.clamp(min=1.0))
     precision = wide.scaled_precision(stated, problem.prior_group)
     usual = torch.where(precision > 0, precision.clamp(min=1e-30).rsqrt(), problem.step_scale)

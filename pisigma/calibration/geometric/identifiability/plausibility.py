@@ -27,21 +27,23 @@ _OFF_SHARE = 0.2
 """Share of a frame's rows that must not fit before a warning is given."""
 
 
-def refuse_implausible(problem: CalibrationProblem, here: Linearisation[Tensor], source: str) -> None:
+def refuse_implausible(
+    problem: CalibrationProblem, linearisation: Linearisation[Tensor], source: str
+) -> None:
     """Refuse a fit of the arm if most positions or distances have large residuals, or if links are impossible.
 
     If no parameter of the arm is free (only base and tool), nothing is refused. Touches and corners are not tested.
 
     Args:
         problem: the problem with its free parameters.
-        here: linearisation of the problem at the solution.
+        linearisation: linearisation of the problem at the solution.
         source: name of the measurements in error messages.
 
     Raises:
         ImplausibleError: the median residual of positions, balls in sockets or distances is more than 1 % of the
             reach, or a long link changed by more than half of its length.
     """
-    _refuse_ruined_links(problem, here.point, source)
+    _refuse_ruined_links(problem, linearisation.point, source)
     robot = problem.space.robot
     judged = [
         sensor.present
@@ -50,7 +52,7 @@ def refuse_implausible(problem: CalibrationProblem, here: Linearisation[Tensor],
     ]
     if not judged or robot.reach == 0 or not bool((problem.active < problem.space.arm_size).any()):
         return
-    sizes = residual_sizes(problem, here)[torch.stack(judged).any(0)]
+    sizes = residual_sizes(problem, linearisation)[torch.stack(judged).any(0)]
     size = float(sizes.median()) if len(sizes) else 0.0
     if size > plausible_share(robot) * robot.reach:
         raise ImplausibleError(
@@ -88,18 +90,18 @@ def _refuse_ruined_links(problem: CalibrationProblem, point: Tensor, source: str
 
 
 def misfitting_frames(
-    problem: CalibrationProblem, here: Linearisation[Tensor]
+    problem: CalibrationProblem, linearisation: Linearisation[Tensor]
 ) -> tuple[CalibrationWarning, ...]:
     """Return warnings about frames whose residuals are far larger than those of the other frames.
 
     Args:
         problem: the problem with its free parameters.
-        here: linearisation of the problem at the solution.
+        linearisation: linearisation of the problem at the solution.
     """
     frames = problem.space.frames
     if len(frames) < 2:
         return ()
-    sizes = residual_sizes(problem, here)
+    sizes = residual_sizes(problem, linearisation)
     off, others = [], []
     for number in range(len(frames)):
         theirs = sizes[(problem.frame == number) & torch.isfinite(sizes)]
@@ -123,10 +125,12 @@ def misfitting_frames(
     )
 
 
-def residual_sizes(problem: CalibrationProblem, here: Linearisation[Tensor]) -> Float64[Tensor, " rows"]:
+def residual_sizes(
+    problem: CalibrationProblem, linearisation: Linearisation[Tensor]
+) -> Float64[Tensor, " rows"]:
     """Compute the length of every row's residual per component [m]; NaN if no length was measured."""
     sizes = problem.q.new_full((problem.rows,), torch.nan)
-    for sensor, part in zip(problem.sensors, sensor_view_of(here).contributions, strict=True):
+    for sensor, part in zip(problem.sensors, sensor_view_of(linearisation).contributions, strict=True):
         if sensor.unit == "m" and not sensor.certain:
             size = part.residual.norm(dim=0) / sensor.components**0.5
             sizes = torch.where(sensor.present, size, sizes)

@@ -18,7 +18,7 @@ _TOLERANCE = 1e-4
 
 @torch.no_grad()
 def joint_scatter_factor(
-    problem: CalibrationProblem, here: Linearisation[Tensor], corners: CornerSensor
+    problem: CalibrationProblem, linearisation: Linearisation[Tensor], corners: CornerSensor
 ) -> float:
     """Estimate the factor on the repeatability of the joints, relative to the noise of the corners.
 
@@ -31,14 +31,14 @@ def joint_scatter_factor(
 
     Args:
         problem: the problem, with images weighted by corners and joints.
-        here: the problem linearised at its solution.
+        linearisation: the problem linearised at its solution.
         corners: the images weighted by their corners only.
 
     Returns:
         `sqrt(b / a)`; 1 if the rows are too few to distinguish both.
     """
     number = next(k for k, sensor in enumerate(problem.sensors) if isinstance(sensor, CornerSensor))
-    sensor, view = problem.sensors[number], sensor_view_of(here)
+    sensor, view = problem.sensors[number], sensor_view_of(linearisation)
     assert isinstance(sensor, CornerSensor)
     part, scale = view.contributions[number], view.noise[number]
     rows = sensor.present.nonzero()[:, 0]
@@ -47,7 +47,7 @@ def joint_scatter_factor(
     share, axes = torch.linalg.eigh(root @ root.mT)
     share = share.clamp(0.0, 1.0)
     square = (axes.mT @ part.residual[:, rows].t()[..., None])[..., 0].square() / scale.square()
-    absorbed = _absorbed(problem, here, number, rows, axes) / scale.square()
+    absorbed = _absorbed(problem, linearisation, number, rows, axes) / scale.square()
     weight = problem.loss.weight(part.distance[rows] / scale, sensor.components)[:, None]
     left = weight * (1 - absorbed).clamp(min=0.0)
     shares = torch.stack([share, 1 - share])
@@ -67,16 +67,16 @@ def joint_scatter_factor(
 
 def _absorbed(
     problem: CalibrationProblem,
-    here: Linearisation[Tensor],
+    linearisation: Linearisation[Tensor],
     number: int,
     rows: Tensor,
     axes: Float64[Tensor, "images 6 6"],
 ) -> Float64[Tensor, "images 6"]:
     """Compute the variances of the predicted values in given directions [m²]."""
     every = slice(0, problem.rows)
-    motion = problem.motion(here.point, every, problem.active)
-    unknowns = problem.space.sensor_unknowns(here.point)
+    motion = problem.motion(linearisation.point, every, problem.active)
+    unknowns = problem.space.sensor_unknowns(linearisation.point)
     J = problem.derivative(problem.sensors[number], motion, unknowns, every, problem.active)[..., rows]
     along = torch.einsum("pin,nik->nkp", J, axes)
-    variances: Tensor = torch.einsum("nkp,pq,nkq->nk", along, covariance_of(here.normal), along)
+    variances: Tensor = torch.einsum("nkp,pq,nkq->nk", along, covariance_of(linearisation.normal), along)
     return variances
