@@ -220,7 +220,7 @@ def test_robots_that_a_file_cannot_describe(name, robot, expected):
         (".conf", "delta_theta = [0, 0, 0, 0, 0, 0]\n" * 2, "'delta_theta = .* 6 .*, got 2 "),
         (".cfx", "<a>", "XML"),
         (".cfx", '<DhArray name="dhOffset"><DH b="1"/></DhArray>', " 6 .*'ur10'.* 1 "),
-        (".csv", "part,name\njoint,theta_1\n", "theta_1, theta_2.*, got 'theta_1'"),
+        (".csv", "part,name\njoint,theta_1\n", "theta_1, theta_2.*, got theta_1"),
         (".yaml", "kinematics:\n  shoulder: {x: 0}\n", "upper_arm"),
         (".yaml", "joints: 3\n", "'joints'"),
         (".txt", "", "'.txt'"),
