@@ -194,7 +194,7 @@ def test_refusals(refuses, run, folder):
     refuses("evaluate", "nominal", "geometric", rows, error=ModelError, value="nominal geometric")
     alone = run("evaluate", hybrid)
     assert alone.exit_code == 2
-    assert "measurements" in alone.stderr
+    assert "measurement file" in alone.stderr
 
 
 def test_models_with_the_same_name_are_distinguished(run, folder, tmp_path):

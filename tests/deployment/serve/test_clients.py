@@ -86,7 +86,7 @@ def test_urscript_gets_joint_values(ik, repository):
 def test_the_programs_of_controllers_parse(name):
     text = (CLIENTS / name).read_text()
     assert parse(name, text) > 25
-    assert "not tried" in " ".join(text.split())
+    assert "not tested" in " ".join(text.split())
     for broken in (text.replace("THEN", "", 1), text + "\n?\n", text[: 4 * len(text) // 5]):
         with pytest.raises(ValueError, match=name):
             parse(name, broken)
