@@ -21,7 +21,7 @@ from pisigma.calibration.hybrid.calibrator import HybridCalibrator
 from pisigma.measurement.camera.camera_files import IntrinsicsChoice
 from pisigma.measurement.camera.image_rows import image_measurements
 from pisigma.measurement.dataset import Measurements, join
-from pisigma.model.accuracy import deviation_of_rows
+from pisigma.model.accuracy import sigma_of_rows
 from pisigma.model.calibrated_model import poses_of_rows
 from pisigma.model.geometric_model import model_of_hybrid
 from pisigma.robot import Robot
@@ -44,7 +44,7 @@ def inside(cell: Cell, draw: Draw, choice: IntrinsicsChoice) -> Tensor:
     model = model_of_hybrid("ur5", cell.nominal, result, rows)
     at = Measurements(q=q, frame=rows.frame[:1] * len(q), target=rows.target[:1] * len(q))
     error = poses_of_rows(model, at)[:, :3, 3] - positions(draw.true, q)
-    return error.abs() < WITHIN_95 * deviation_of_rows(model, at)
+    return error.abs() < WITHIN_95 * sigma_of_rows(model, at)
 
 
 def in_sockets(nominal: Robot, true: Robot, rng: np.random.Generator) -> Measurements:

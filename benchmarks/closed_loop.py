@@ -30,7 +30,7 @@ import pisigma
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.files.errors import AcceptanceError
 from pisigma.measurement.dataset import Measurements
-from pisigma.model.accuracy import deviation_of_rows
+from pisigma.model.accuracy import sigma_of_rows
 from pisigma.planning.candidates import draw_candidates
 from pisigma.workflow.cell.cell import Cell
 
@@ -243,7 +243,7 @@ def rms(errors: np.ndarray) -> float:
 
 def predicted_p95(model: Any, q: np.ndarray) -> float:
     """Return the 95 % quantile of the position errors [mm] that a model predicts at joint values."""
-    deviation = deviation_of_rows(
+    deviation = sigma_of_rows(
         model, Measurements(q=torch.from_numpy(q), position=torch.zeros(len(q), 3, dtype=torch.float64))
     )
     drawn = np.random.default_rng(0).standard_normal((200, *deviation.shape))

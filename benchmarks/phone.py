@@ -37,7 +37,7 @@ from pisigma.measurement.camera.camera import Camera
 from pisigma.measurement.camera.camera_files import CameraFiles
 from pisigma.measurement.camera.detection.markers import dictionary_of
 from pisigma.measurement.dataset import Measurements
-from pisigma.model.accuracy import deviation_of_rows
+from pisigma.model.accuracy import sigma_of_rows
 from pisigma.model.calibrated_model import poses_of_rows
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
@@ -234,7 +234,7 @@ def judge(arm: Arm, cameras: CameraFiles, corners: Path) -> dict[str, float]:
         "model": error,
         "ratio": rms(estimated - really) / rms(really - true),
         "zeros": float(np.rad2deg(np.abs(model.identified.dh - arm.true.dh))[IDENTIFIABLE, 0].max()),
-        "predicted": rms(deviation_of_rows(model, at).numpy()) / error,
+        "predicted": rms(sigma_of_rows(model, at).numpy()) / error,
     }
 
 

@@ -17,7 +17,7 @@ HAMPEL_VARIANCE = {1: 0.990933, 2: 0.995409, 3: 0.996914, 6: 0.998435}
 """Weighted variance of standard normal noise under Hampel's weights: `E[w d²] / (components · E[w])`."""
 
 
-Figure = Float[Tensor, ""] | float
+Scalar = Float[Tensor, ""] | float
 
 
 class AbstractLoss(ABC):
@@ -32,7 +32,7 @@ class AbstractLoss(ABC):
         """Return the least-squares weight of every row: half the derivative of the cost divided by the distance."""
 
     @abstractmethod
-    def scale(self, distance: Float[Tensor, " rows"], components: int, used: Figure) -> Float[Tensor, ""]:
+    def scale(self, distance: Float[Tensor, " rows"], components: int, used: Scalar) -> Float[Tensor, ""]:
         """Estimate the standard deviation of one value without an initial scale.
 
         Args:
@@ -43,7 +43,7 @@ class AbstractLoss(ABC):
 
     @abstractmethod
     def deviation(
-        self, distance: Float[Tensor, " rows"], components: int, used: Figure, scale: Figure
+        self, distance: Float[Tensor, " rows"], components: int, used: Scalar, scale: Scalar
     ) -> Float[Tensor, ""]:
         """Estimate the standard deviation of one value from all good rows.
 
@@ -67,12 +67,12 @@ class SquaredLoss(AbstractLoss):
         """Return 1 for every row."""
         return torch.ones_like(distance)
 
-    def scale(self, distance: Float[Tensor, " rows"], components: int, used: Figure) -> Float[Tensor, ""]:
+    def scale(self, distance: Float[Tensor, " rows"], components: int, used: Scalar) -> Float[Tensor, ""]:
         """Return the root mean square of the distances, corrected for the parameters."""
         return self.deviation(distance, components, used, 1.0)
 
     def deviation(
-        self, distance: Float[Tensor, " rows"], components: int, used: Figure, scale: Figure
+        self, distance: Float[Tensor, " rows"], components: int, used: Scalar, scale: Scalar
     ) -> Float[Tensor, ""]:
         """Return the root mean square of the distances, corrected for the parameters."""
         return (distance.square().sum() / _left(distance, components, used)).sqrt()
@@ -103,13 +103,13 @@ class HampelLoss(AbstractLoss):
         falling: Tensor = torch.rsub(distance, c).div_(c - b).clamp_(0, 1)
         return falling.mul_(a).div_(distance.clamp(min=a))
 
-    def scale(self, distance: Float[Tensor, " rows"], components: int, used: Figure) -> Float[Tensor, ""]:
+    def scale(self, distance: Float[Tensor, " rows"], components: int, used: Scalar) -> Float[Tensor, ""]:
         """Return the median distance divided by that of a standard normal vector, corrected for the parameters."""
         factor = math.sqrt(len(distance) * components) / MEDIAN_DISTANCE[components]
         return distance.median() * _left(distance, components, used).rsqrt() * factor
 
     def deviation(
-        self, distance: Float[Tensor, " rows"], components: int, used: Figure, scale: Figure
+        self, distance: Float[Tensor, " rows"], components: int, used: Scalar, scale: Scalar
     ) -> Float[Tensor, ""]:
         """Return the weighted root mean square, corrected for the parameters and the weights."""
         weight = self.weight(distance / scale, components)
@@ -117,7 +117,7 @@ class HampelLoss(AbstractLoss):
         return ((weight * distance.square()).sum() / left / HAMPEL_VARIANCE[components]).sqrt()
 
 
-def _left(distance: Float[Tensor, " rows"], components: int, used: Figure) -> Float[Tensor, ""]:
+def _left(distance: Float[Tensor, " rows"], components: int, used: Scalar) -> Float[Tensor, ""]:
     """Return the degrees of freedom that the estimated parameters leave, at least one."""
     values = len(distance) * components
     if isinstance(used, float | int):

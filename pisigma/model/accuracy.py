@@ -51,11 +51,11 @@ def position_accuracy(
             temperature=temperature,
             approach=sides,
         )
-        result[rows] = deviation_of_rows(model, at).norm(dim=-1)
+        result[rows] = sigma_of_rows(model, at).norm(dim=-1)
     return result.reshape(q.shape[:-1])
 
 
-def deviation_of_rows(model: CalibratedModel, measurements: Measurements) -> Float64[Tensor, "rows 3"]:
+def sigma_of_rows(model: CalibratedModel, measurements: Measurements) -> Float64[Tensor, "rows 3"]:
     """Compute the standard deviation of every row's target position along the axes of its frame [m].
 
     It includes the posterior and the effect of conditions that the rows do not state, such as directions of approach,

@@ -88,9 +88,10 @@ def describe_as_arrays(model: CalibratedModel) -> tuple[arrays.Description, tupl
     solver = closed_form_solver(model.robot)
     if solver is None and not len(model.starts):
         raise ModelError(
-            f"the robot of model '{model.name}' has no closed-form inverse, and the model has no initial joint values",
+            f"the robot of model '{model.name}' has no closed-form inverse kinematics, and the model stores no initial "
+            "joint values",
             value="starts",
-            remedy="calibrate it again",
+            remedy="calibrate the robot again",
         )
     correction, features = _correction(model)
     stored = StoredStarts(model.identified, model.starts.double().cpu())

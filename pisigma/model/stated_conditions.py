@@ -114,8 +114,8 @@ def under_stated_torques(model: CalibratedModel, torques_nm: Sequence[float]) ->
     if len(beyond) and len(model.starts):
         joint = int(beyond[0])
         raise ModelError(
-            expected=f"a torque of joint {joint + 1} up to {largest[joint]:.3g} Nm, {_MAX_TORQUE_RATIO:g} times the "
-            "largest of the calibration",
+            expected=f"a torque of at most {largest[joint]:.3g} Nm at joint {joint + 1}, {_MAX_TORQUE_RATIO:g} "
+            "times the largest in the calibration",
             value=float(values[joint]),
             option="torques_nm",
             remedy="give torques in Nm (forces in N for prismatic joints)",

@@ -106,7 +106,9 @@ def _error_lines(comparison: ModelComparison, full: bool) -> _Lines:
         for quantity, first in models[0].quantities.items():
             for where in ("inside", "outside"):
                 cells = [
-                    _domain(getattr(model.quantities[quantity], where), getattr(model, f"rows_{where}_domain"))
+                    _domain(
+                        getattr(model.quantities[quantity], where), getattr(model, f"rows_{where}_domain")
+                    )
                     for model in models
                 ]
                 lines.append((f"{quantity}, RMS {where} its domain [{first.unit}]", cells))

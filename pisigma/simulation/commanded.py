@@ -34,7 +34,7 @@ class BranchSection(Section):
     @model_validator(mode="after")
     def _one_way(self) -> "BranchSection":
         if (self.name is None) == (self.near_deg is None):
-            raise ValueError("expected either the name of the branch or near_deg (with near_mm)")
+            raise ValueError("expected either name or near_deg (optionally with near_mm)")
         if self.name is not None and self.near_mm:
             raise ValueError("near_mm applies only to near_deg, not to name; remove it")
         return self

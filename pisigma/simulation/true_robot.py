@@ -67,9 +67,9 @@ def register_error_source(source: type[Source]) -> type[Source]:
     if len(kinds) != 1:
         raise RecipeError(
             option=source.__name__,
-            expected="a Literal of one kind",
+            expected="a `kind` that is a Literal with exactly one value",
             value=len(kinds),
-            remedy='declare it, such as kind: Literal["backlash"] = "backlash"',
+            remedy='declare it, for example kind: Literal["backlash"] = "backlash"',
         )
     if ERROR_SOURCES.setdefault(kinds[0], source) is not source:
         raise RecipeError(

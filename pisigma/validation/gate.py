@@ -16,7 +16,7 @@ from pisigma.validation.checks.check import CheckedCalibration, Move, RowsUnderM
 from pisigma.validation.checks.other_robot import other_robot_diagnostics
 from pisigma.validation.checks.other_sensors import diagnose_lengths
 from pisigma.validation.checks.registry import ROW_CHECKS, diagnostics_of_rows
-from pisigma.validation.checks.row_order import new_setup_refusal
+from pisigma.validation.checks.row_order import instrument_moved_error
 from pisigma.validation.checks.setup_fault import check_position_size, joint_columns, setup_diagnostics
 from pisigma.validation.checks.unexplained import check_residual
 from pisigma.validation.held_out.diagnostic import Diagnostic
@@ -166,7 +166,7 @@ def _against_robot(rows: Measurements, robot: Robot) -> Iterator[Iterable[Diagno
 
 def _moved_setup(rows: Measurements, robot: Robot) -> tuple[Diagnostic, ...]:
     """Return a finding that names the row before which instrument or tool was moved too far for a calibration."""
-    if (moved := new_setup_refusal(robot, rows)) is None:
+    if (moved := instrument_moved_error(robot, rows)) is None:
         return ()
     return (
         Diagnostic(

@@ -308,7 +308,7 @@ def _warnings(model: CalibratedModel, choice: CandidateChoice, rows: Measurement
 
 
 def may_move(settings: RecalibrationSettings) -> frozenset[Move]:
-    """Return what may have moved without a statement: a joint zero, and base and tool if `moved` is None."""
+    """Return what may move although the settings do not state it: a joint zero; base and tool if `moved` is None."""
     return MOVES if settings.moved is None else frozenset({"joint_zero"})
 
 

@@ -18,7 +18,7 @@ from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.joint_correction.gravity_torques import GravityTorques
 from pisigma.joint_correction.shared_features import ScaledJoints
 from pisigma.measurement.dataset import Measurements
-from pisigma.model.accuracy import deviation_of_rows
+from pisigma.model.accuracy import sigma_of_rows
 from pisigma.model.calibrated_model import CalibratedModel, poses_of_rows
 from pisigma.model.folder.model_folder import save_model
 from pisigma.model.geometric_model import model_of_hybrid
@@ -97,7 +97,7 @@ def test_the_accuracy_is_that_of_the_conditions() -> None:
     model = model_of_hybrid("hybrid", arm.true.nominal, arm.result, arm.measurements)
     q = joints_in(arm.true.nominal, 30, seed=7)
     rows = Measurements(q=q, payload=torch.full((30,), 20.0, dtype=torch.float64))
-    expected = deviation_of_rows(model, rows).norm(dim=-1)
+    expected = sigma_of_rows(model, rows).norm(dim=-1)
     solver, learned = CorrectedIK(model), learned_conditions(arm.result.learned.correction)
     assert learned is not None
     assert learned.measured == ((0.0, 20.0),)

@@ -40,7 +40,7 @@ class WhitenedValues:
 
         Args:
             solved: the calibration.
-            parameters: indices of the parameters.
+            parameters: indices of the parameters with respect to which to differentiate.
         """
         problem, here = solved.problem.with_active(list(parameters)), solved.refined
         deviation = sensor_view_of(here).variances.sqrt()

@@ -228,21 +228,22 @@ class FeatureSearch:
         return best
 
     def try_derived_feature(
-        self, best: FeatureFit, feature: AbstractFeature | None, odds: float = 0.0
+        self, best: FeatureFit, feature: AbstractFeature | None, log_odds_against: float = 0.0
     ) -> FeatureChoice:
         """Finish the search, after trying a feature that was derived from its result.
 
         Args:
             best: the best fit so far.
             feature: feature that was chosen by its gain on the same rows; None for no feature.
-            odds: logarithm of the prior odds against the feature, which the gain of log evidence must exceed.
+            log_odds_against: logarithm of the prior odds against the feature, which the gain of log evidence must
+                exceed.
         """
         if feature is not None:
             largest = [*best.design.features, feature]
             design = Design(self.rows.problem, tuple(largest))
             self._regression = extend_regression(self._regression, design, self.rows)
             self._order = [one.name for one in largest]
-            best = self._tried(largest, best, odds=odds)
+            best = self._tried(largest, best, odds=log_odds_against)
         same = self._regression.design.features == best.design.features
         return FeatureChoice(
             self.rows, self.geometry, best, tuple(self.trials), self._regression if same else None

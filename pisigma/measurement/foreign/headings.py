@@ -31,7 +31,7 @@ class Heading:
         unit: symbol of the unit, or "".
         unknown_unit: text in brackets that is not a unit.
         side: "commanded" or "measured" if the heading states it, otherwise "".
-        is_column: whether the heading is the name of a column of measurement files, in upper or lower case.
+        is_column_name: whether the heading is the name of a column of measurement files, in upper or lower case.
     """
 
     text: str
@@ -39,7 +39,7 @@ class Heading:
     unit: str
     unknown_unit: str = ""
     side: str = ""
-    is_column: bool = False
+    is_column_name: bool = False
 
 
 def parse_heading(text: str) -> Heading:
@@ -48,7 +48,7 @@ def parse_heading(text: str) -> Heading:
         return Heading(text, "", "")
     column = find_column(text.strip().lower())
     if column is not None:
-        return Heading(text, column.quantity, column.unit, is_column=True)
+        return Heading(text, column.quantity, column.unit, is_column_name=True)
     name, unit, unknown = _unit_apart(text.strip())
     words = [word for word in re.split(r"[\W_]+", name.casefold()) if word]
     side = next(filter(None, (_SIDE_OF.get(word) for word in words)), "")
@@ -165,5 +165,7 @@ def is_recognised(text: str) -> bool:
     heading = parse_heading(text)
     patterns = (*(f"{name}#" for name in JOINT_NAMES), *(maker.joints for maker in MAKERS if maker.joints))
     return (
-        heading.is_column or heading.name in _OTHERS or any(joint_of(heading.name, one) for one in patterns)
+        heading.is_column_name
+        or heading.name in _OTHERS
+        or any(joint_of(heading.name, one) for one in patterns)
     )

@@ -117,7 +117,7 @@ def propose_quantities(proposal: Proposal, rotation: str | None) -> None:
     if not proposal.file.has_header:
         _take_by_order(proposal, rotation)
     for index, heading in enumerate(proposal.headings):
-        if heading.is_column and index not in proposal.columns:
+        if heading.is_column_name and index not in proposal.columns:
             proposal.set_quantity(index, heading.name, "heading")
     _take_joints(proposal)
     _take_position(proposal)

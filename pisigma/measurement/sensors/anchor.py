@@ -164,7 +164,7 @@ def anchor_from_distances(
         distance: measured distances [m].
 
     Returns:
-        x, y, z, zero [m].
+        Position of the anchor in the base of the robot and zero offset: x, y, z, zero [m].
     """
     centre, middle = (
         points.mean(-2),

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from pisigma.files.errors import ModelError
 from pisigma.measurement.dataset import Measurements
-from pisigma.model.accuracy import deviation_of_rows
+from pisigma.model.accuracy import sigma_of_rows
 from pisigma.model.calibrated_model import CalibratedModel, poses_of_rows
 from pisigma.model.folder.model_folder import load_model, save_model
 from pisigma.model.inverse.corrected_ik import CorrectedIK, load
@@ -46,7 +46,7 @@ def check_written(model: CalibratedModel, folder: Path) -> None:
     with torch.no_grad():
         _check("poses", poses_of_rows(model, rows), poses_of_rows(loaded, rows), TOLERANCE)
         T = model.forward(rows.q)
-    _check("predicted deviations", deviation_of_rows(model, rows), deviation_of_rows(loaded, rows), TOLERANCE)
+    _check("predicted deviations", sigma_of_rows(model, rows), sigma_of_rows(loaded, rows), TOLERANCE)
     _check("prior scales of weights", _prior_scales(model), _prior_scales(loaded), 0.0)
     finite = T[torch.isfinite(T).flatten(1).all(1)].numpy()
     before, after = CorrectedIK(model)(finite, throw=False), ik(finite, throw=False)

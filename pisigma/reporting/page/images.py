@@ -77,29 +77,29 @@ def draw_photo(file: Path, size: tuple[int, int]) -> tuple[Figure, Axes]:
     return figure, axes
 
 
-def draw_image(one: BoardImage, detection: DetectedBoards, scale: float) -> Drawing:
+def draw_image(image: BoardImage, detection: DetectedBoards, scale: float) -> Drawing:
     """Return an image with magnified arrows from predicted to detected corners.
 
     Args:
-        one: image to draw.
+        image: image to draw.
         detection: detected boards, with the residuals of corners if the image was used.
         scale: magnification of the arrows.
     """
     with drawing_style():
-        figure, axes = draw_photo(Path(one.file), one.size)
-        residual = detection.residuals.get(one.name)
+        figure, axes = draw_photo(Path(image.file), image.size)
+        residual = detection.residuals.get(image.name)
         if residual is None:
-            return Drawing(one.name, one.name, f"Left out: {detection.left_out[one.name]}.", figure)
-        u, v = detection.predicted[one.name].T
+            return Drawing(image.name, image.name, f"Left out: {detection.left_out[image.name]}.", figure)
+        u, v = detection.predicted[image.name].T
         axes.scatter(u, v, s=9, color=AFTER, linewidths=0)
         tips = residual * scale
         axes.quiver(u, v, *tips.T, color=BEFORE, angles="xy", scale_units="xy", scale=1.0, width=0.006)
     largest = float(np.linalg.norm(residual, axis=1).max())
     alt = (
         f"{len(residual)} corners, RMS {rms_of(residual):.3f} px, largest residual {largest:.3f} px, blur "
-        f"{one.blur:.2f} px; arrows are magnified {scale:g} times."
+        f"{image.blur:.2f} px; arrows are magnified {scale:g} times."
     )
-    return Drawing(one.name, one.name, alt, figure)
+    return Drawing(image.name, image.name, alt, figure)
 
 
 def _thumbnail(file: Path) -> np.ndarray:

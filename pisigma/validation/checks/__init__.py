@@ -4,7 +4,7 @@
 |---|---|---|---|
 | Does a fault of setup or file explain all errors? | `setup_fault` | `setup_fault` | `setup_fault`, `other_sensors` |
 | Was another robot measured? | `other_robot` | `other_robot` | `other_robot` |
-| Did frame or tool move while the rows were measured? | `row_order.new_setup_refusal` | `row_order` | `mixed_rows` |
+| Did frame or tool move during the session? | `row_order.instrument_moved_error` | `row_order` | `mixed_rows` |
 | Are rows of two setups mixed? | | `mixed_rows.check_two_populations` | `mixed_rows` |
 | Are single rows wrong? | | robust loss of the calibration | `wrong_rows` |
 | Were joint values logged too early, or rounded? | | `lag`, `rounding` | |

@@ -16,7 +16,7 @@ from pisigma.calibration.geometric.result import CalibrationResult
 from pisigma.calibration.hybrid.noise import CalibrationNoise
 from pisigma.calibration.hybrid.result import HybridResult
 from pisigma.measurement.dataset import Measurements
-from pisigma.model.accuracy import deviation_of_rows
+from pisigma.model.accuracy import sigma_of_rows
 from pisigma.model.calibrated_model import CalibratedModel, poses_of_rows
 from pisigma.robot.description import Robot
 from pisigma.robot.frame_fits import LEVER_SHARE, MeasuredPoses
@@ -206,7 +206,7 @@ class RowsUnderModel:
     @cached_property
     def predicted_deviation(self) -> Float64[Tensor, " rows"]:
         """Predicted standard deviation of every row's error [m], including noise; NaN if the model has none."""
-        deviation = deviation_of_rows(self.model, self.renamed_rows).square().sum(-1)
+        deviation = sigma_of_rows(self.model, self.renamed_rows).square().sum(-1)
         known = self.model.uncertainty
         noise = torch.as_tensor(math.nan if known is None else _position_noise(known.noise))
         if known is not None and self.rows.sigma_position is not None:

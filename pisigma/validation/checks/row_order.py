@@ -109,7 +109,7 @@ def _texts(motion: Motion, rows: Measurements) -> tuple[str, str]:
 
 def explain_refusal(refusal: IdentificationError, robot: Robot, rows: Measurements) -> IdentificationError:
     """Return a refusal that names the setup fault that explains the errors; otherwise the unchanged refusal."""
-    if moved := new_setup_refusal(robot, rows):
+    if moved := instrument_moved_error(robot, rows):
         return moved
     causes = setup_diagnostics(robot, rows)
     if not causes:
@@ -117,7 +117,7 @@ def explain_refusal(refusal: IdentificationError, robot: Robot, rows: Measuremen
     return IdentificationError(causes[0].sentence.removesuffix("."), at=Place(rows.source))
 
 
-def new_setup_refusal(robot: Robot, measurements: Measurements) -> IdentificationError | None:
+def instrument_moved_error(robot: Robot, measurements: Measurements) -> IdentificationError | None:
     """Find the row before which the instrument was moved so far that no calibration of all rows is possible.
 
     Base and tool are fitted to the first and to the last third of the rows. The row found is the one up to which (or

@@ -14,7 +14,7 @@ from pisigma.files.errors import MeasurementError, ModelError, Place
 from pisigma.measurement.copies import copy_warnings
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import groups_of_equal_joints, numbers_of_names
-from pisigma.model.accuracy import deviation_of_rows
+from pisigma.model.accuracy import sigma_of_rows
 from pisigma.model.calibrated_model import CalibratedModel, nominal_poses_of_rows, poses_of_rows
 from pisigma.model.training_rows import known_rows, training_row_warnings
 from pisigma.robot.kinematics.forward import forward_kinematics
@@ -166,7 +166,7 @@ def predicted_at(model: CalibratedModel, rows: Measurements) -> Float64[Tensor, 
     chosen = torch.linspace(0, rows.rows - 1, min(rows.rows, MAX_PREDICTED)).round().long()
     if model.uncertainty is not None and len(chosen):
         with suppress(MeasurementError):  # a frame or target that the model does not have
-            predicted[chosen] = deviation_of_rows(model, rows.select(chosen)).norm(dim=-1)
+            predicted[chosen] = sigma_of_rows(model, rows.select(chosen)).norm(dim=-1)
     return predicted
 
 

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 import torch
 
 from pisigma.measurement.dataset import Measurements
-from pisigma.model.accuracy import deviation_of_rows
+from pisigma.model.accuracy import sigma_of_rows
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.stated_conditions import learned_range
 from pisigma.validation.held_out.calibration_summary import CalibrationSummary, NoiseFigures
@@ -76,7 +76,7 @@ def parameter_component(model: CalibratedModel, poses: Measurements | None, wher
         return (
             "parameters of the model: the model stores no posterior, or there are no poses to compute it for."
         )
-    deviation = deviation_of_rows(model, poses)
+    deviation = sigma_of_rows(model, poses)
     u = float(deviation[torch.isfinite(deviation)].square().mean().sqrt())
     if math.isnan(u):
         return "parameters of the model: the posterior predicts no position of these poses."

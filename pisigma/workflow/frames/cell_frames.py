@@ -16,7 +16,7 @@ def calibrate_frame_of_cell(
 ) -> tuple[FrameCalibration, ModelEntry | None]:
     """Calibrate base, tool or both with the newest session and the arm of the model in use, and store the model.
 
-    If no model is in use, the newest model of the cell is used, or if there is none, its nominal robot. `verify` puts
+    If no model is in use, the newest model of the cell is used or, if there is none, its nominal robot. `verify` puts
     the new model into use.
 
     Args:

@@ -93,7 +93,7 @@ class EvaluationSettings:
     """Settings of an evaluation.
 
     Attributes:
-        limits: limits of acceptance of every model, except the references.
+        limits: acceptance limits for every model except the references.
         fit_frame: fit the frame of the sensor to these rows, for example after it was moved. Requires 6 poses or more.
         fit_tool: fit the position of the reflector to these rows, for example after it was replaced. Requires 6 poses
             or more.

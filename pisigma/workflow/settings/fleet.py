@@ -21,7 +21,7 @@ class FleetSettings:
             the calibrations are then ignored, and every row is cross-validated.
 
     Raises:
-        FleetError: a setting is not a valid choice, or there are no jobs.
+        FleetError: a setting is not a valid choice, or `jobs` is less than 1.
     """
 
     engine: EngineName = "processes"

@@ -44,7 +44,7 @@ class ImportSettings:
         units: units of the columns for which the file states none, such as mm,deg or m,rad.
         rotation: maker whose rotation convention applies, such as kuka or ur, or none to skip rotations. None: from the
             headings.
-        decimal: decimal separator, point or comma on a command line. None: from the cells.
+        decimal: decimal separator, point or comma on a command line. None: detected from the values in the file.
         join: how to join joint values of one file with measurements of another: by point, order or time. None:
             the files are concatenated.
         within: maximum difference between joined time stamps [s].

@@ -22,7 +22,7 @@ class TrainSettings:
             None: threads of one process.
 
     Raises:
-        RecipeError: there are no jobs.
+        RecipeError: `jobs` is less than 1.
     """
 
     checkpoints: Annotated[Path | None, HIDDEN] = None

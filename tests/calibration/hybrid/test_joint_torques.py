@@ -22,7 +22,7 @@ from pisigma.joint_correction.joint_torques import JointTorques
 from pisigma.measurement.conditions import JointState, repeat_key
 from pisigma.measurement.dataset import Measurements, join
 from pisigma.measurement.joint_range import row_warnings
-from pisigma.model.accuracy import deviation_of_rows
+from pisigma.model.accuracy import sigma_of_rows
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import load_model, save_model
 from pisigma.model.geometric_model import model_of_hybrid
@@ -86,7 +86,7 @@ def test_rows_without_torques_are_predicted_with_the_mean_load_and_a_larger_devi
     unstated = dataclasses.replace(test, torque=None)
     stated_error, error = rms(calibrated(), test), rms(calibrated(), unstated)
     assert error > 2 * stated_error
-    predicted = float(deviation_of_rows(model(), unstated).square().sum(1).mean().sqrt())
+    predicted = float(sigma_of_rows(model(), unstated).square().sum(1).mean().sqrt())
     assert 0.6 < predicted / error < 1.6
     assert len(condition_warnings(model(), unstated)) == len(condition_warnings(model())) == 1
 
@@ -115,7 +115,7 @@ def test_a_folder_keeps_the_feature(tmp_path):
     save_model(model(), tmp_path)
     loaded = load_model(tmp_path)
     rows = measured(20, 3)
-    assert_close(deviation_of_rows(loaded, rows), deviation_of_rows(model(), rows), atol=1e-12)
+    assert_close(sigma_of_rows(loaded, rows), sigma_of_rows(model(), rows), atol=1e-12)
 
 
 def test_a_file_keeps_the_torques_and_names_other_units(tmp_path):

@@ -15,7 +15,7 @@ from pisigma.calibration.hybrid.uncertainty import ROUNDING_TOLERANCE
 from pisigma.estimation.covariance_root import CovarianceRoot
 from pisigma.files.errors import MeasurementError, ModelError, PoseError
 from pisigma.measurement.dataset import Measurements
-from pisigma.model.accuracy import deviation_of_rows, parameter_posterior, position_accuracy
+from pisigma.model.accuracy import parameter_posterior, position_accuracy, sigma_of_rows
 from pisigma.model.calibrated_model import hybrid_motion, hybrid_poses, nominal_poses_of_rows, poses_of_rows
 from pisigma.model.folder.model_folder import load_model, save_model
 from pisigma.model.geometric_model import model_of_hybrid
@@ -90,7 +90,7 @@ def test_deviations_are_those_of_the_calibration(hybrid):
     own = replace(arm.measurements, q=everywhere(arm, len(arm.measurements.q)), position=None)
     rounding = 1e-5 if model.uncertainty.covariance_root.rounded is None else 1.5 * ROUNDING_TOLERANCE
     expected = arm.result.deviation(own)
-    assert_close(deviation_of_rows(model, own), expected, atol=1e-12, rtol=rounding)
+    assert_close(sigma_of_rows(model, own), expected, atol=1e-12, rtol=rounding)
     rows = [i for i in range(own.rows) if (own.frame[i], own.target[i]) == (own.frame[0], own.target[0])]
     found = position_accuracy(model, own.q[rows].reshape(1, len(rows), -1))
     expected = arm.result.deviation(replace(own, payload=None))  # under the usual conditions
@@ -100,7 +100,7 @@ def test_deviations_are_those_of_the_calibration(hybrid):
 def test_rows_without_a_name_use_the_only_frame():
     arm, model = model_of("additive")
     rows = Measurements(q=everywhere(arm, 3), frame=("anything",) * 3)
-    assert_close(deviation_of_rows(model, rows), deviation_of_rows(model, replace(rows, frame=())))
+    assert_close(sigma_of_rows(model, rows), sigma_of_rows(model, replace(rows, frame=())))
     assert_close(poses_of_rows(model, rows), model.forward(rows.q), atol=1e-12)
 
 
@@ -130,9 +130,7 @@ def test_a_folder_predicts_the_same_to_the_last_bit(hybrid, tmp_path):
     q = everywhere(arm)
     assert torch.equal(loaded.forward(q), model.forward(q))
     assert torch.equal(poses_of_rows(loaded, arm.measurements), poses_of_rows(model, arm.measurements))
-    assert torch.equal(
-        deviation_of_rows(loaded, arm.measurements), deviation_of_rows(model, arm.measurements)
-    )
+    assert torch.equal(sigma_of_rows(loaded, arm.measurements), sigma_of_rows(model, arm.measurements))
     posterior, kept = parameter_posterior(model), parameter_posterior(loaded)
     assert (kept.names, kept.weight_count) == (posterior.names, posterior.weight_count)
     assert torch.equal(kept.mean, posterior.mean)
@@ -161,9 +159,7 @@ def test_a_folder_with_a_rounded_root(tmp_path):
     assert torch.equal(loaded.forward(q), exact.forward(q))
     assert torch.equal(position_accuracy(loaded, q), position_accuracy(rounded, q))
     assert_close(position_accuracy(loaded, q), position_accuracy(exact, q), rtol=0.015)
-    assert_close(
-        deviation_of_rows(loaded, arm.measurements), deviation_of_rows(exact, arm.measurements), rtol=0.01
-    )
+    assert_close(sigma_of_rows(loaded, arm.measurements), sigma_of_rows(exact, arm.measurements), rtol=0.01)
     sizes = []
     for model in (exact, rounded):
         folder = tmp_path / str(len(sizes))
@@ -187,7 +183,7 @@ def test_without_a_correction_it_is_the_geometric_model(tmp_path):
     assert torch.equal(loaded.forward(q), forward_kinematics(arm.result.geometric.robot, q))
     assert torch.equal(position_accuracy(loaded, q), position_accuracy(model, q))
     assert_close(
-        deviation_of_rows(model, arm.measurements), result.deviation(arm.measurements), rtol=1e-3, atol=0
+        sigma_of_rows(model, arm.measurements), result.deviation(arm.measurements), rtol=1e-3, atol=0
     )
 
 

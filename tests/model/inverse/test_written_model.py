@@ -38,7 +38,7 @@ from pisigma.measurement.sensors.anchor import ANCHOR_COLUMNS
 from pisigma.measurement.sensors.intrinsics import CAMERA_UNITS
 from pisigma.measurement.sensors.sensor import UnknownGroup
 from pisigma.measurement.sensors.socket import SOCKET_COLUMNS
-from pisigma.model.accuracy import deviation_of_rows, parameter_posterior
+from pisigma.model.accuracy import parameter_posterior, sigma_of_rows
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import load_model, save_model
 from pisigma.model.folder.upgrade import upgrade_folder
@@ -244,7 +244,7 @@ def test_an_earlier_folder_is_read_in_the_order_in_which_it_was_written(tmp_path
     assert [one.name for one in loaded.uncertainty.features] == list(chosen)
     assert [group.name for group in loaded.uncertainty.space.unknowns] == [group.name for group in GROUPS]
     rows = Measurements(q=model.starts, frame=("wall",) * len(model.starts))
-    there = deviation_of_rows(loaded, rows) / deviation_of_rows(model, rows)
+    there = sigma_of_rows(loaded, rows) / sigma_of_rows(model, rows)
     assert float((there - 1).abs().max()) < 1e-5
 
 

@@ -14,7 +14,7 @@ from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.calibration.hybrid.calibrator import HybridCalibrator
 from pisigma.measurement.conditions import approach_by_order, motions_between_rows
 from pisigma.measurement.dataset import Measurements, join
-from pisigma.model.accuracy import deviation_of_rows
+from pisigma.model.accuracy import sigma_of_rows
 from pisigma.model.geometric_model import model_of_calibration, with_hybrid
 from pisigma.model.inverse.corrected_ik import CorrectedIK
 from pisigma.robot import Robot
@@ -170,8 +170,8 @@ def test_the_predicted_accuracy_contains_the_play_if_no_side_is_stated():
     robot, rows, _ = with_backlash("scara", 3)
     result = HybridCalibrator(robot, features=("backlash",), products=False).fit(sided(rows))
     model = with_hybrid(model_of_calibration("scara", robot, result.geometric, rows), result, sided(rows))
-    stated = deviation_of_rows(model, sided(rows).select(torch.arange(20, 60)))
-    unstated = deviation_of_rows(model, rows.select(torch.arange(20, 60)))
+    stated = sigma_of_rows(model, sided(rows).select(torch.arange(20, 60)))
+    unstated = sigma_of_rows(model, rows.select(torch.arange(20, 60)))
     halves = result.learned.correction.linear[0][:, 0].detach()
     J = OrderedRows.from_result(result.geometric).joint_derivative[20:60] * result.geometric.noise[0].sigma
     play = torch.from_numpy(J[:, :3]) * halves
@@ -185,7 +185,7 @@ def test_the_predicted_accuracy_contains_the_play_if_no_side_is_stated():
         assert_close(solution.select(0).accuracy, solution.accuracy[0], rtol=1e-12)
     first = ik(T[0], near=q[0], approach=approach[0])
     row = replace(sided(rows).select(torch.tensor([20])), q=torch.from_numpy(first.q)[None])
-    assert_close(first.accuracy, deviation_of_rows(model, row).norm(), rtol=1e-9)
+    assert_close(first.accuracy, sigma_of_rows(model, row).norm(), rtol=1e-9)
     assert float(first.accuracy) < float(ik(T[0], near=q[0]).accuracy)
 
 

@@ -13,7 +13,7 @@ from pisigma.files.errors import IdentificationError
 from pisigma.measurement.dataset import Measurements, with_new_frames
 from pisigma.robot import Robot
 from pisigma.robot.se3 import transform_from_xyzrpy
-from pisigma.validation.checks.row_order import new_setup_refusal
+from pisigma.validation.checks.row_order import instrument_moved_error
 from pisigma.workflow.calibrate import calibrate
 from pisigma.workflow.settings.calibration import CalibrationSettings
 
@@ -34,7 +34,7 @@ def two_setups(first: int, wrong: float = 0.0) -> tuple[Robot, Measurements]:
 @pytest.mark.parametrize("first", [15, 30, 45])
 @pytest.mark.parametrize("wrong", [0.0, 0.05])
 def test_the_first_row_after_the_instrument_was_moved_is_named(first: int, wrong: float) -> None:
-    problem = new_setup_refusal(*two_setups(first, wrong))
+    problem = instrument_moved_error(*two_setups(first, wrong))
     assert problem is not None
     assert (problem.file, problem.line) == ("tracker.csv", first + 2)
 
@@ -51,6 +51,6 @@ def test_a_refusal_names_the_line_and_a_new_frame_there_helps() -> None:
 def test_rows_that_fit_no_setup_are_not_a_new_setup() -> None:
     arm = simulate("ur5", rows=ROWS, noise=5e-5)
     assert arm.measurements.position is not None
-    assert new_setup_refusal(arm.nominal, arm.measurements) is None
+    assert instrument_moved_error(arm.nominal, arm.measurements) is None
     shuffled = arm.measurements.position[torch.randperm(ROWS, generator=torch.Generator().manual_seed(0))]
-    assert new_setup_refusal(arm.nominal, replace(arm.measurements, position=shuffled)) is None
+    assert instrument_moved_error(arm.nominal, replace(arm.measurements, position=shuffled)) is None

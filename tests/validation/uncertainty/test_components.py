@@ -12,7 +12,7 @@ from testing.models import no_type_checker
 from testing.simulated_arm import BASE, TOOL, dh_errors, draw_joints
 
 from pisigma.measurement.dataset import Measurements
-from pisigma.model.accuracy import deviation_of_rows
+from pisigma.model.accuracy import sigma_of_rows
 from pisigma.model.calibrated_model import poses_of_rows
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.validation.iso9283.pose import position_repeatability
@@ -78,7 +78,7 @@ def test_the_repeatability_of_the_maker_is_that_of_its_axes():
 def test_the_parameters_are_those_of_the_posterior():
     rows = rows_after_change(12, 3)
     found = parameter_component(original_model(), rows, "session a")
-    deviation = deviation_of_rows(original_model(), rows)
+    deviation = sigma_of_rows(original_model(), rows)
     assert_close(found.standard_uncertainty, float(deviation.square().mean().sqrt()))
     assert found.degrees_of_freedom is None or found.degrees_of_freedom > 1
     assert isinstance(parameter_component(original_model(), None, ""), str)

@@ -196,8 +196,8 @@ def tools_from_distances(
         off = int((residual.abs() > limit).sum())
         if off > _MAX_WRONG_SHARE * len(residual):
             raise ImplausibleError(
-                f"expected distances of robot '{space.robot.name}' at these joint values, got {off} of {len(residual)} "
-                f"that are off by more than {limit * 1e3:.3g} mm for any tool",
+                f"{off} of {len(residual)} distances differ by more than {limit * 1e3:.3g} mm from those of robot "
+                f"'{space.robot.name}' at these joint values, whatever the tool",
                 expected="distances of this robot",
                 value=off,
                 at=Place(measurements.source),

@@ -160,8 +160,8 @@ def controller_geometry(described: Robot) -> ControllerGeometry:
         f"average {distance * 1e3:.3g} mm from that of a {own.model}",
         expected="an arm of Universal Robots",
         value=described.name,
-        remedy="for another of their arms give a robot file in the maker's DH parameters (theta 0, a negative, "
-        "alpha 90, 0, 0, 90, -90, 0 deg)",
+        remedy="for another arm of Universal Robots, give a robot file with the maker's DH parameters (theta 0, a "
+        "negative, alpha 90, 0, 0, 90, -90, 0 deg)",
     )
 
 
