@@ -23,7 +23,7 @@ def test_candidates_are_allowed_and_the_same_at_every_draw():
     assert len(candidates.q) == 20
     assert bool(ARM.faults(candidates.q).allowed.all())
     assert_close(again.q, candidates.q)
-    assert candidates.looked_at == int(candidates.number[-1]) == 20 + candidates.refused.total()
+    assert candidates.considered == int(candidates.number[-1]) == 20 + candidates.refused.total()
     assert "turned away" in candidates.sentence
 
 

@@ -37,7 +37,7 @@ def test_rows_are_checked_as_they_are_measured_until_the_plan_is_done(tmp_path, 
     seen, waited, arrived = [], [], []
     with no_type_checker():
         for step in follow(
-            session(), GrowingFile(file, ROBOT), arrived=lambda rows: arrived.extend(rows.line)
+            session(), GrowingFile(file, ROBOT), on_new_rows=lambda rows: arrived.extend(rows.line)
         ):
             waited.append(step.growth.waiting)
             seen += [] if step.growth.rows is None else step.growth.rows.line
