@@ -14,7 +14,7 @@ from pisigma.files.errors import ModelError, Place, PoseError
 from pisigma.files.model_files import COMPILED, compiled_model_hash, model_hash
 from pisigma.model.inverse.joint_input import Postures, as_array, checked_approach, pose_array
 from pisigma.model.inverse.solution import AbstractInverse, Solution
-from pisigma.robot.kernels.array_kinematics import call_with_tensors, is_tensor
+from pisigma.robot.kernels.array_kinematics import call_model, is_tensor
 from pisigma.robot.kinematics.task_axes import TaskAxes, task_axes
 
 if TYPE_CHECKING:  # run-time type checkers resolve the full names without these imports
@@ -212,7 +212,8 @@ class CorrectedIK(AbstractInverse):
         """Compute poses T_base_tool `(*batch, 4, 4)` of the calibrated arm at commanded joint values `(*batch, dof)`.
 
         Args:
-            q: joint values [rad or m]; arrays are evaluated by kernels, tensors by torch with gradients.
+            q: joint values [rad or m]; arrays are evaluated by kernels. Tensors are evaluated by torch on the CPU;
+                results have their dtype and device, and gradients.
             approach: see `__call__`; accepted only for arrays.
 
         Raises:
@@ -229,7 +230,7 @@ class CorrectedIK(AbstractInverse):
                 remedy="give q as an array",
             )
         if kernels is None:
-            return call_with_tensors(self.model.forward, q)
+            return call_model(self.model.forward, q)
         values = np.asarray(q, dtype=np.float64)
         sides = None if approach is None else np.reshape(approach, (-1, np.shape(approach)[-1]))
         T = kernels.forward(values.reshape(-1, values.shape[-1]), approach=sides)[0]
@@ -244,7 +245,7 @@ class CorrectedIK(AbstractInverse):
             return self.controller.jacobian(q)
         kernels = self._kernels_of(q, forward=False)
         if kernels is None:
-            return call_with_tensors(self.model.jacobian, q)
+            return call_model(self.model.jacobian, q)
         values = np.asarray(q, dtype=np.float64)
         J = kernels.forward(values.reshape(-1, values.shape[-1]))[1]
         return J.reshape(*values.shape[:-1], 6, values.shape[-1])
@@ -276,7 +277,7 @@ class CorrectedIK(AbstractInverse):
         approach = checked_approach(approach)
         if self.controller is not None:
             return self.controller.accuracy(q, approach)
-        return call_with_tensors(partial(position_accuracy, self.model, approach=approach), q)
+        return call_model(partial(position_accuracy, self.model, approach=approach), q)
 
     def to_pytorch_kinematics(self) -> "pytorch_kinematics.SerialChain":
         """Return the geometry as a chain of pytorch-kinematics; see `CalibratedModel.to_pytorch_kinematics`."""

@@ -191,8 +191,8 @@ def _switches(ik: AbstractInverse, T: Array, q: Array, solution: Any) -> tuple[P
             int(after[place]),
             step[place],
             bool(jump),
-            branch_index[before[place]],
-            branch_index[after[place]],
+            int(branch_index[before[place]]),
+            int(branch_index[after[place]]),
         )
     return tuple(sorted(result, key=lambda switch: switch.index))
 

@@ -94,6 +94,15 @@ def call_with_tensors(function: Callable[[Any], Any], q: Any) -> Any:
     return function(torch.from_numpy(np.array(q, dtype=np.float64))).numpy()
 
 
+def call_model(function: Callable[[Any], Any], q: Any) -> Any:
+    """Call a function of a model, which lies on the CPU in float64; tensors keep their dtype, device and gradients."""
+    if not is_tensor(q):
+        return call_with_tensors(function, q)
+    import torch
+
+    return function(q.to("cpu", torch.float64)).to(q)
+
+
 class _Chain:
     """A robot packed for the kernels; several threads may use it."""
 

@@ -88,6 +88,13 @@ def test_float32_poses_have_float32_joint_values(ik, name):
     assert_close(of_array.q, exact.q, atol=3e-5)
 
 
+def test_float32_joint_values_have_float32_results(ik, name):
+    q = joints_around(name, 6)
+    for compute in (ik.forward, ik.jacobian):
+        assert compute(q.float()).dtype == torch.float32
+        assert_close(compute(q.float()).double(), compute(q), atol=1e-5)
+
+
 def test_a_scara_with_a_tilted_base_accepts_float32_poses():
     robot = Robot.load("kiro3").with_geometry(base=np.array([0.1, 0.2, 0.3, 0.4, 0.5, 0.6]))
     ik = CorrectedIK(hand_made_model("kiro3", robot=robot))

@@ -58,7 +58,7 @@ def test_corrected_inverse_and_its_gradients(folder):
     results = []
     for device in ("cpu", "cuda"):
         T = ik.forward(q).detach().to(device).requires_grad_()
-        solution = ik(T, near=q.numpy())
+        solution = ik(T, near=q.to(device))
         (torch.nan_to_num(solution.q) ** 2).sum().backward()
         results.append((solution, T.grad))
     (on_cpu, gradient), (on_device, gradient_on_device) = results
@@ -68,15 +68,14 @@ def test_corrected_inverse_and_its_gradients(folder):
         there = getattr(on_device, field)
         assert there.is_cuda
         assert torch.equal(there.cpu(), getattr(on_cpu, field))
-    every = ik.all_branches(T.detach())
-    assert every.q.is_cuda
+    assert ik.all_branches(T.detach()).q.is_cuda
 
 
 def test_single_precision():
     ik = pisigma.load(MODELS / "ur10_landgraf")
     q = joint_values(ik.model.robot, 4)
     T = ik.forward(q).detach()
-    solution = ik(T.float().cuda(), near=q.numpy())
+    solution = ik(T.float().cuda(), near=q.float().cuda(), approach=torch.ones(q.shape[-1]).cuda())
     assert solution.q.dtype == torch.float32
     assert solution.q.is_cuda
     torch.testing.assert_close(solution.q.cpu().double(), q, rtol=0, atol=1e-4)
