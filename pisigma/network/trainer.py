@@ -35,6 +35,7 @@ _HARMLESS = (
     "Checkpoint directory .* exists and is not empty",
     "Experiment logs directory .* exists and is not empty",
     "smaller than the logging interval",
+    "GPU available but not used",
 )
 
 
