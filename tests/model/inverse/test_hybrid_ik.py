@@ -134,9 +134,11 @@ def test_batches_and_types(batch, dtype):
     solution = ik(T)
     assert solution.q.shape == (*batch, 6)
     assert solution.q.dtype == dtype
-    for values in (solution.position_residual, solution.rotation_residual, solution.accuracy):
+    for values in (solution.position_residual, solution.rotation_residual):
         assert values.shape == batch
         assert values.dtype == torch.float64
+    assert solution.accuracy.shape == batch
+    assert solution.accuracy.dtype == dtype
     assert len(solution.sentences) == int(np.prod(batch))
     every = ik.all_branches(T)
     assert every.position_residual.shape == (*batch, len(ik.branches))
