@@ -3,6 +3,7 @@
 import statistics
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -108,11 +109,17 @@ def rms_interval(errors: RowErrors, share: float = 0.95) -> tuple[float, float]:
 def _samples(several: list[RowErrors]) -> tuple[Array, list[Array]]:
     """Return the number of rows of every bootstrap sample, and the sums of squared errors of every method."""
     number = np.unique(several[0].group, return_inverse=True)[1].ravel()
-    groups = int(number.max()) + 1
-    draws = np.random.default_rng(0).multinomial(groups, np.full(groups, 1 / groups), DRAWS)
+    draws = _draws(int(number.max()) + 1)
     return draws @ np.bincount(number), [
         draws @ np.bincount(number, np.square(one.error).sum(1)) for one in several
     ]
+
+
+@lru_cache(maxsize=4)
+def _draws(groups: int) -> Array:
+    """Return how often every bootstrap sample contains every group; as floats, which are multiplied by BLAS."""
+    draws = np.random.default_rng(0).multinomial(groups, np.full(groups, 1 / groups), DRAWS)
+    return draws.astype(float)
 
 
 def _fitted(T: Array, rows: Rows, series: Series) -> Array:
