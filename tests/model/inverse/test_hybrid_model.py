@@ -1,5 +1,7 @@
 """Models of hybrid calibrations: predictions, their folder, and inconsistent folders."""
 
+import functools
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -35,6 +37,7 @@ SET_UPS = {
 }
 
 
+@functools.cache
 def model_of(set_up: str):
     arm = hybrid_of(**SET_UPS[set_up])
     return arm, model_of_hybrid("hybrid", arm.true.nominal, arm.result, arm.measurements, ("recipe", "ab"))
@@ -214,9 +217,17 @@ def test_the_jacobian_agrees_with_differences(set_up):
     assert float((joint_jacobian(model.calibrated, q)[1] - J).abs().max()) > 1e-5
 
 
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory) -> Path:
+    """A model folder, saved once."""
+    path = tmp_path_factory.mktemp("saved")
+    save_model(model_of("products")[1], path)
+    return path
+
+
 @pytest.fixture
-def folder(tmp_path) -> Path:
-    save_model(model_of("products")[1], tmp_path)
+def folder(saved, tmp_path) -> Path:
+    shutil.copytree(saved, tmp_path, dirs_exist_ok=True)
     return tmp_path
 
 
