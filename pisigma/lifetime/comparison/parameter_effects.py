@@ -26,6 +26,8 @@ _MIN_DISTINCT_SHARE = 0.01
 """Share of a parameter's effect that is distinct from other effects, below which the parameter is unobservable."""
 _ALIKE = 1 - _MIN_DISTINCT_SHARE**2
 """Correlation of effects above which parameters are exchangeable."""
+_ROUND_OFF = 1e-9
+"""Share of the variance below which it is round-off."""
 _FRAME_UNITS = ("m", "m", "m", "rad", "rad", "rad")
 _FRAME_MOTIONS = ("along x", "along y", "along z", "about x", "about y", "about z")
 
@@ -145,7 +147,7 @@ class ParameterEffects:
         square = float(self._without(self._y, given).square().sum())
         M = self._without(self._without(self._M, given).t(), given)
         mean, half_variance = float(M.trace()), float(M.square().sum())
-        if half_variance == 0.0:
+        if mean <= _ROUND_OFF * float(self._M.trace()):  # the given parameters explain all that is uncertain
             return float(square <= len(self._y))
         of_both = torch.tensor([mean**2, square * mean], dtype=torch.float64) / half_variance / 2
         return float(torch.special.gammaincc(of_both[0], of_both[1]))

@@ -212,8 +212,7 @@ class CorrectedIK(AbstractInverse):
         """Compute poses T_base_tool `(*batch, 4, 4)` of the calibrated arm at commanded joint values `(*batch, dof)`.
 
         Args:
-            q: joint values [rad or m]; arrays are evaluated by kernels. Tensors are evaluated by torch on the CPU;
-                results have their dtype and device, and gradients.
+            q: joint values [rad or m]. Arrays use kernels; tensors use torch, with gradients, their dtype and device.
             approach: see `__call__`; accepted only for arrays.
 
         Raises:

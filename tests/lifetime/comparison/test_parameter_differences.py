@@ -10,6 +10,7 @@ from testing.compared import COLLISION, after_collision, model_of
 
 from pisigma.lifetime.comparison.model_pair import ModelPair
 from pisigma.lifetime.comparison.parameter_differences import parameter_differences
+from pisigma.lifetime.comparison.parameter_effects import ParameterEffects
 from pisigma.lifetime.recalibration.movement import NORMAL_95
 from pisigma.validation.held_out.reference_models import nominal_model
 
@@ -67,6 +68,14 @@ def test_a_nominal_robot_has_no_uncertainty():
     differences = parameter_differences(ModelPair.from_models(model, nominal_model(model, True), "fitted"))
     assert differences.differing
     assert all(one.deviations[1] == 0.0 for one in differences.parameters)
+
+
+def test_a_displacement_that_is_explained_completely_is_due_to_chance():
+    """The variance that is left is a rounding error."""
+    model = model_of(50)
+    effects = ParameterEffects(ModelPair.from_models(model, nominal_model(model, True), "fitted"))
+    effects._M, effects._y = effects._W @ effects._W.t(), effects._W.sum(1, keepdim=True)
+    assert effects.unexplained_probability(range(len(effects.standard_scores([])) - 12)) == 1.0
 
 
 def test_a_model_without_posterior_is_compared_without_tests():
