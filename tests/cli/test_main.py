@@ -73,7 +73,7 @@ def test_robots(run):
 
 
 def test_problem_in_a_process_of_its_own(tmp_path):
-    done = command("evaluate", tmp_path / "nothing", "data.csv")
+    done = command("status", tmp_path / "nothing")  # which imports no torch
     assert done.returncode == 2
     assert done.stdout == ""
     (line,) = done.stderr.splitlines()
@@ -130,18 +130,19 @@ def test_a_full_disk_for_the_standard_output(arguments):
     )
 
 
-def test_a_full_disk_for_the_standard_error(models, tmp_path):
+def with_full_stderr(*arguments: object) -> int:
+    """Return the exit status of a command that cannot write to stderr."""
     with open("/dev/full", "w") as full:
-        arguments = ("export", models / "kiro3", "--format", "onnx", "--out", tmp_path / "x.onnx")
-        done = subprocess.run(
-            [sys.executable, "-c", START, *map(str, arguments)],
-            stdout=subprocess.PIPE,
-            stderr=full,
-            text=True,
-            check=False,
-        )
-    assert (tmp_path / "x.onnx").is_file()
-    assert done.returncode == 0
+        command = [sys.executable, "-c", START, *map(str, arguments)]
+        return subprocess.run(command, stdout=subprocess.PIPE, stderr=full, check=False).returncode
+
+
+def test_a_full_disk_for_the_standard_error(models, tmp_path):
+    (tmp_path / "poses.csv").write_text("x_mm,y_mm,z_mm,roll_deg,pitch_deg,yaw_deg\n300,300,300,0,0,0\n")
+    arguments = ("ik", models / "kiro3", "--poses", tmp_path / "poses.csv", "--out", tmp_path / "x.csv")
+    assert with_full_stderr(*arguments) == 0
+    assert (tmp_path / "x.csv").is_file()
+    assert with_full_stderr("status", tmp_path / "nothing") == 2
 
 
 def test_nobody_reads_what_is_printed():
@@ -260,20 +261,15 @@ def test_tables_fit_80_columns(capsys):
     assert lines[5].strip() == "products"
 
 
-def test_a_missing_extra_is_named_in_one_sentence(tmp_path):
+def test_a_missing_extra_is_named_in_one_sentence(refuses, tmp_path, monkeypatch):
     """Without lightning, training says how to get it and writes nothing."""
     (tmp_path / "kiro3.yaml").write_text(small_recipe_text("kiro3"))
-    script = (
-        "import sys\nsys.modules['lightning'] = None  # importing it fails\n"
-        "from pisigma.cli.main import run\nsys.argv = ['pisigma', 'train', 'kiro3.yaml', '--out', 'model']\nrun()\n"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True, check=False
-    )
-    assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr == (
-        "pisigma: this needs the package lightning, which is not installed; install it with "
-        '`pip install "pisigma[train]"`.\n'
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(sys.modules, "lightning", None)  # importing it fails
+    monkeypatch.delitem(sys.modules, "pisigma.network.networks", raising=False)
+    assert refuses("train", "kiro3.yaml", "--out", "model") == (
+        "this needs the package lightning, which is not installed; install it with "
+        '`pip install "pisigma[train]"`.'
     )
     assert [path.name for path in tmp_path.iterdir()] == ["kiro3.yaml"]
 
