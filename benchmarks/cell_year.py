@@ -49,9 +49,9 @@ class Year:
             (today - datetime.timedelta(days=30 * (12 - month) + 1)).isoformat() for month in range(13)
         ]
         earlier = (today - datetime.timedelta(days=400)).isoformat()
-        self.cell.take_in(self.rows(80, 1), day=earlier)
+        self.cell.add_session(self.rows(80, 1), day=earlier)
         self.cell.calibrate(folds=0)
-        self.cell.take_in(self.rows(10, 2), day=self.days[0])
+        self.cell.add_session(self.rows(10, 2), day=self.days[0])
         self.cell.verify()
         self.since = [earlier, self.days[0]]
 
@@ -87,7 +87,7 @@ class Year:
         rows = self.rows(10, 100 + month)
         before = self.cell.model
         assert before is not None
-        entry = self.cell.take_in(rows, day=self.days[month])
+        entry = self.cell.add_session(rows, day=self.days[month])
         self.since.append(entry.day)
         self.wrong_steps += self.cell.status().step.state != "session_not_judged"
         found = self.cell.monitor().sessions[-1]
@@ -110,7 +110,7 @@ class Year:
     def refuses(self, path: Path, day: str) -> bool:
         """Return whether a wrong session is refused."""
         try:
-            self.cell.take_in(path, day=day)
+            self.cell.add_session(path, day=day)
         except PisigmaError:
             return True
         return False

@@ -170,10 +170,10 @@ class Loop:
         file = self.folder / f"{name}.csv"
         rows.write_csv(file, self.robot)
         try:
-            self.cell.take_in(file)
+            self.cell.add_session(file)
         except AcceptanceError:
             self.was_refused = True
-            self.cell.take_in(file, accept_implausible=True)
+            self.cell.add_session(file, accept_implausible=True)
         return rows
 
 

@@ -201,7 +201,7 @@ def find_bumped(
                 images = measured(free, there, later[number], rng)
                 now.append(frames_of_model(models[number], images, "base"))
             found = find_moved_bases([ArmBefore(*one) for one in zip(known, T, now, strict=True)])
-            text = " or ".join(one.name for one in found.named) or "nothing"
+            text = " or ".join(one.name for one in found.likely_bodies) or "nothing"
             named[body, text if found.is_one_body else f"more than {text}"] += 1
             counts[body] += 1
     for (body, text), count in sorted(named.items()):

@@ -268,7 +268,7 @@ def run_fuzz(browser: Browser, simulated: Path, work: Path, seed: int) -> None:
     """Send hostile requests, reload the page during a calibration, and open it in two browsers."""
     folder, chosen = work / "fuzz", random.Random(seed)
     cell = Cell.create(folder, simulated / "kr10.urdf")
-    cell.take_in(measured(import_simulator(simulated), "kr10", ROWS, 1, work / "2026-11-01.csv"))
+    cell.add_session(measured(import_simulator(simulated), "kr10", ROWS, 1, work / "2026-11-01.csv"))
     shutil.copytree(folder, work / "same")
     before, said = digests(folder), io.StringIO()
     handler = logging.StreamHandler(said)

@@ -31,7 +31,7 @@ def measure(number, count, seed):
 
 shutil.rmtree("cells", ignore_errors=True)
 for number in range(1, 6):
-    Cell.create(f"cells/rb5_{number}", "rb5").take_in(measure(number, 50, number))
+    Cell.create(f"cells/rb5_{number}", "rb5").add_session(measure(number, 50, number))
 prior = estimate_fleet_prior("cells")
 few, new = measure(6, 8, 20), measure(6, 300, 21)
 models = {

@@ -93,7 +93,7 @@ CountsPerTurn = Annotated[
 ]
 PresentCounts = Annotated[
     str | None,
-    typer.Option(help="With --format epson or fanuc-mastering, present encoder counts of the controller."),
+    typer.Option(help="With --format epson or fanuc-mastering, current encoder counts of the controller."),
 ]
 
 

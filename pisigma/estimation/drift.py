@@ -177,20 +177,20 @@ class DriftSearch:
         return self.values.deviation(self._noise)
 
     def estimate_shift(
-        self, number: int, held: bool = True
+        self, number: int, with_prior: bool = True
     ) -> tuple[Float64[Tensor, " members"], Float64[Tensor, "members members"]]:
         """Estimate how far the unknowns of a group have moved, with the sizes of all other groups unchanged.
 
         Args:
             number: index of the group.
-            held: whether to use the prior of the group; if not, its unknowns are unconstrained.
+            with_prior: whether to use the prior of the group; if not, its unknowns are unconstrained.
 
         Returns:
             The shifts [m or rad] and their covariance.
         """
         group, (_, a, W) = self._groups[number], self._whitened(number, reduced=False)
         normal = W.t() @ W
-        if held:
+        if with_prior:
             normal.diagonal().add_(group.size**-2)
         covariance = torch.linalg.pinv(normal, rtol=1e-9, hermitian=True)
         return (covariance @ (W.t() @ a)) * group.scale, covariance * group.scale * group.scale[:, None]

@@ -32,25 +32,27 @@ class AbstractLoss(ABC):
         """Return the least-squares weight of every row: half the derivative of the cost divided by the distance."""
 
     @abstractmethod
-    def scale(self, distance: Float[Tensor, " rows"], components: int, used: Scalar) -> Float[Tensor, ""]:
+    def scale(
+        self, distance: Float[Tensor, " rows"], components: int, effective_parameters: Scalar
+    ) -> Float[Tensor, ""]:
         """Estimate the standard deviation of one value without an initial scale.
 
         Args:
             distance: distances of the measured rows, in the sensor's unit.
             components: number of values per row.
-            used: effective number of values that the estimated parameters absorb.
+            effective_parameters: effective number of values that the estimated parameters absorb.
         """
 
     @abstractmethod
     def deviation(
-        self, distance: Float[Tensor, " rows"], components: int, used: Scalar, scale: Scalar
+        self, distance: Float[Tensor, " rows"], components: int, effective_parameters: Scalar, scale: Scalar
     ) -> Float[Tensor, ""]:
         """Estimate the standard deviation of one value from all good rows.
 
         Args:
             distance: distances of the measured rows, in the sensor's unit.
             components: number of values per row.
-            used: effective number of values that the estimated parameters absorb.
+            effective_parameters: effective number of values that the estimated parameters absorb.
             scale: initial estimate, to distinguish good rows from outliers.
         """
 
@@ -67,15 +69,17 @@ class SquaredLoss(AbstractLoss):
         """Return 1 for every row."""
         return torch.ones_like(distance)
 
-    def scale(self, distance: Float[Tensor, " rows"], components: int, used: Scalar) -> Float[Tensor, ""]:
-        """Return the root mean square of the distances, corrected for the parameters."""
-        return self.deviation(distance, components, used, 1.0)
-
-    def deviation(
-        self, distance: Float[Tensor, " rows"], components: int, used: Scalar, scale: Scalar
+    def scale(
+        self, distance: Float[Tensor, " rows"], components: int, effective_parameters: Scalar
     ) -> Float[Tensor, ""]:
         """Return the root mean square of the distances, corrected for the parameters."""
-        return (distance.square().sum() / _left(distance, components, used)).sqrt()
+        return self.deviation(distance, components, effective_parameters, 1.0)
+
+    def deviation(
+        self, distance: Float[Tensor, " rows"], components: int, effective_parameters: Scalar, scale: Scalar
+    ) -> Float[Tensor, ""]:
+        """Return the root mean square of the distances, corrected for the parameters."""
+        return (distance.square().sum() / _left(distance, components, effective_parameters)).sqrt()
 
 
 @dataclass(frozen=True)
@@ -103,17 +107,19 @@ class HampelLoss(AbstractLoss):
         falling: Tensor = torch.rsub(distance, c).div_(c - b).clamp_(0, 1)
         return falling.mul_(a).div_(distance.clamp(min=a))
 
-    def scale(self, distance: Float[Tensor, " rows"], components: int, used: Scalar) -> Float[Tensor, ""]:
+    def scale(
+        self, distance: Float[Tensor, " rows"], components: int, effective_parameters: Scalar
+    ) -> Float[Tensor, ""]:
         """Return the median distance divided by that of a standard normal vector, corrected for the parameters."""
         factor = math.sqrt(len(distance) * components) / MEDIAN_DISTANCE[components]
-        return distance.median() * _left(distance, components, used).rsqrt() * factor
+        return distance.median() * _left(distance, components, effective_parameters).rsqrt() * factor
 
     def deviation(
-        self, distance: Float[Tensor, " rows"], components: int, used: Scalar, scale: Scalar
+        self, distance: Float[Tensor, " rows"], components: int, effective_parameters: Scalar, scale: Scalar
     ) -> Float[Tensor, ""]:
         """Return the weighted root mean square, corrected for the parameters and the weights."""
         weight = self.weight(distance / scale, components)
-        left = (weight.sum() * components - used).clamp(min=1.0)
+        left = (weight.sum() * components - effective_parameters).clamp(min=1.0)
         return ((weight * distance.square()).sum() / left / HAMPEL_VARIANCE[components]).sqrt()
 
 

@@ -30,7 +30,7 @@ class Posterior:
         determined: effective number of unknowns of every group that the data determine; the prior determines the
             others.
         misfit: `Σ (y - X x)²` for every sensor.
-        used: effective number of values of every sensor that the unknowns absorb.
+        effective_parameters: effective number of values of every sensor that the unknowns absorb.
     """
 
     x: Float64[Tensor, " unknowns"]
@@ -40,7 +40,7 @@ class Posterior:
     square: Float64[Tensor, " groups"]
     determined: Float64[Tensor, " groups"]
     misfit: tuple[float, ...]
-    used: tuple[float, ...]
+    effective_parameters: tuple[float, ...]
 
     @property
     def effective_unknowns(self) -> float:
@@ -92,7 +92,9 @@ class AbstractRegression(ABC):
         noise = list(posterior.noise)
         for k, sensor in enumerate(self.sensors):
             if not sensor.exact and sensor.values > 0.5:  # the noise of a sensor without values is unchanged
-                sigma = math.sqrt(posterior.misfit[k] / max(sensor.values - posterior.used[k], 1.0))
+                sigma = math.sqrt(
+                    posterior.misfit[k] / max(sensor.values - posterior.effective_parameters[k], 1.0)
+                )
                 noise[k] = max(sigma, 1.0 if sensor.stated else SMALLEST_NOISE)
         return tuple(noise)
 

@@ -74,25 +74,27 @@ class RoundedRoot:
 
 
 def round_root(
-    root: Float64[Tensor, "unknowns directions"], probes: Float64[Tensor, "probes unknowns"], tolerance: float
+    root: Float64[Tensor, "unknowns directions"],
+    combinations: Float64[Tensor, "probes unknowns"],
+    tolerance: float,
 ) -> RoundedRoot | None:
     """Round a root with the largest unit that keeps the standard deviations of given combinations of the unknowns.
 
     Args:
         root: root of the covariance.
-        probes: combinations of the unknowns.
+        combinations: combinations of the unknowns.
         tolerance: largest relative change of the standard deviation of a combination.
 
     Returns:
         The rounded root; None if even the smallest unit changes a standard deviation by more.
     """
-    exact = torch.linalg.vector_norm(probes @ root, dim=1)
+    exact = torch.linalg.vector_norm(combinations @ root, dim=1)
     # R^T = Q U gives R R^T = U^T U without forming it, which would lose half of the digits of small directions
     triangular: Tensor = torch.linalg.qr(root.t(), mode="r")[1].t()
     lower = torch.nn.functional.pad(triangular, (0, len(root) - triangular.shape[1]))
     for step in STEPS:
         rounded = _rounded(lower, step)
-        change = torch.linalg.vector_norm(probes @ rounded.as_matrix, dim=1) - exact
+        change = torch.linalg.vector_norm(combinations @ rounded.as_matrix, dim=1) - exact
         if bool((change.abs() <= tolerance * exact).all()):
             return rounded
     return None

@@ -51,7 +51,8 @@ class JointRange:
         more = f" and {len(self.rows) - _MAX_NAMED} more" if len(self.rows) > _MAX_NAMED else ""
         gross = bool(far_beyond_limits(self.q, axis).any())
         meaning = (
-            "This is too far for an inaccurate limit: the values belong to another joint or are in another unit."
+            "An inaccurate limit does not explain so large an excess: the values belong to another joint or are in "
+            "another unit."
             if gross
             else "The arm reached these values, so a calibration widens the limits to them; check the limits in the "
             "robot file, and the order and unit of the joints."

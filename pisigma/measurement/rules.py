@@ -188,9 +188,9 @@ def row_faults(data: MeasuredFields, labels: FieldLabels) -> Iterator[RowAndFaul
         )
 
 
-def rows_where(bad: Bool[np.ndarray, " rows"]) -> list[int]:
+def rows_where(mask: Bool[np.ndarray, " rows"]) -> list[int]:
     """Return the indices of the rows in which a mask is true."""
-    rows: list[int] = np.flatnonzero(bad).tolist()
+    rows: list[int] = np.flatnonzero(mask).tolist()
     return rows
 
 
@@ -299,7 +299,7 @@ def _distance_faults(
         remedy = "name its anchor, or the pair of rows between which it was measured"
         yield row, Fault("the distance has neither an anchor nor a pair", of_anchor, remedy=remedy)
     for row in rows_where(anchor & pair):
-        problem = f"the distance has both '{of_anchor}' and '{of_pair}'"
+        problem = f"the distance has both an '{of_anchor}' and a '{of_pair}'"
         yield row, Fault(problem, of_anchor, remedy="keep one of them")
     for row in rows_where((anchor | pair) & ~distance):
         problem = f"the distance of '{anchors[row] or pairs[row]}' is missing"
@@ -323,19 +323,19 @@ def _distance_faults(
 
 
 def group_faults(
-    data: MeasuredFields, labels: FieldLabels, sound: Bool[np.ndarray, " rows"], place: Callable[[int], str]
+    data: MeasuredFields, labels: FieldLabels, valid: Bool[np.ndarray, " rows"], place: Callable[[int], str]
 ) -> Iterator[RowAndFault]:
     """Yield the faults of rows that contradict other rows of the same pair, anchor or socket.
 
     Args:
         data: the rows.
         labels: names of fields in messages.
-        sound: mask of the rows that have no fault by themselves.
+        valid: mask of the rows that have no fault by themselves.
         place: function that returns the place of a row for messages.
     """
     frame, anchor_place = data.text("frame"), data.array("anchor_place", 3)
     for name, rows in _groups(data.text("pair")).items():
-        if fault := _pair_fault(data, labels, name, rows, sound, place):
+        if fault := _pair_fault(data, labels, name, rows, valid, place):
             yield from ((row, fault) for row in rows)
     for kind in ("anchor", "socket"):
         for name, rows in _groups(data.text(kind)).items():

@@ -49,13 +49,13 @@ class Splitting:
     hold_out: float | None
 
     def split(
-        self, measurements: Measurements, times: int | None, train_rows: int | None
+        self, measurements: Measurements, repeats: int | None, train_rows: int | None
     ) -> Sequence[Sequence[TrainTest]]:
         """Return training and held-out rows of every fold, per repeat; empty without a validation.
 
         Args:
             measurements: the rows.
-            times: see `repeats`.
+            repeats: see `repeats`.
             train_rows: number of training rows that are sampled in every fold; None for all rows.
 
         Raises:
@@ -76,7 +76,7 @@ class Splitting:
                     at=Place(measurements.source),
                     remedy="measure more (about 50 for a good calibration), or do not cross-validate (--folds 0)",
                 )
-            splits = repeated_k_folds(measurements, folds, self.seed, self.by, times)
+            splits = repeated_k_folds(measurements, folds, self.seed, self.by, repeats)
         if train_rows is None:
             return splits
         return [with_fewer_training_rows(measurements, folds, train_rows, self.seed) for folds in splits]
@@ -126,7 +126,11 @@ def k_folds(
 
 
 def repeated_k_folds(
-    measurements: Measurements, folds: int | None, seed: int, by: SplitBy = "joints", times: int | None = None
+    measurements: Measurements,
+    folds: int | None,
+    seed: int,
+    by: SplitBy = "joints",
+    repeats: int | None = None,
 ) -> tuple[tuple[TrainTest, ...], ...]:
     """Split the measurements into folds several times, differently each time.
 
@@ -138,7 +142,7 @@ def repeated_k_folds(
         folds: number of folds, 2 or more; None for as many as there are groups.
         seed: random seed of the first repeat; the seeds of the other repeats follow from it.
         by: see `k_folds`.
-        times: number of repeats; None for the number that holds out `_HELD_OUT_GROUPS` groups, limited to
+        repeats: number of repeats; None for the number that holds out `_HELD_OUT_GROUPS` groups, limited to
             `_MAX_REPEATS`, or for one repeat if groups are held out one by one or are not assigned at random by joints.
 
     Returns:
@@ -151,19 +155,19 @@ def repeated_k_folds(
     first = k_folds(measurements, folds, generator, by)
     groups = len(_groups(measurements, by)[1])
     differ = by in _RANDOM_SPLITS and len(first) < groups
-    if times is None:
+    if repeats is None:
         usual = min(_HELD_OUT_GROUPS // groups, _MAX_REPEATS)
-        times = max(usual, 1) if by == "joints" and differ else 1
-    if times > 1 and not differ:
+        repeats = max(usual, 1) if by == "joints" and differ else 1
+    if repeats > 1 and not differ:
         what = f"{groups} folds of {groups} {_kind(by)}" if by in _RANDOM_SPLITS else f"folds by {by}"
         raise MeasurementError(
             option="repeats",
             expected=f"one repeat, because {what} are the same every time",
-            value=times,
+            value=repeats,
             at=Place(measurements.source),
             remedy="choose one repeat, or fewer folds by joints or placement",
         )
-    return first, *(k_folds(measurements, folds, generator, by) for _ in range(times - 1))
+    return first, *(k_folds(measurements, folds, generator, by) for _ in range(repeats - 1))
 
 
 def holdout(

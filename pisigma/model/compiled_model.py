@@ -174,7 +174,9 @@ def _coverage(model: CalibratedModel) -> arrays.Coverage:
             np.zeros(0, dtype=np.int64), none, none, angle_per_joint_value(model.identified)
         )
     own = model.hybrid.coverage
-    return arrays.Coverage(own.joint.numpy(), own.middle.numpy(), own.half.numpy(), own.rate.numpy())
+    return arrays.Coverage(
+        own.joint.numpy(), own.middle.numpy(), own.half.numpy(), own.angle_per_value.numpy()
+    )
 
 
 def _closed_form(model: CalibratedModel, solver: AbstractClosedForm | None) -> arrays.ClosedForm:

@@ -52,14 +52,16 @@ def without_known_rows(model: CalibratedModel, rows: Measurements) -> tuple[Meas
     return rows.select(~known), repeated_row_warnings(rows, known, f"training rows of {model.name}")
 
 
-def repeated_row_warnings(rows: Measurements, known: Bool[Tensor, " rows"], of: str) -> tuple[str, ...]:
+def repeated_row_warnings(
+    rows: Measurements, known: Bool[Tensor, " rows"], model_name: str
+) -> tuple[str, ...]:
     """Return a warning that names repeated rows, which are left out; empty if there are none."""
     count = int(known.sum())
     if not count:
         return ()
     verbs = "repeats {}, and counts" if count == 1 else "repeat {}, and count"
     places = places_text(rows.as_fields(), known)
-    return (f"{count} of {rows.rows} rows {verbs.format(of)} only once: {places}.",)
+    return (f"{count} of {rows.rows} rows {verbs.format(model_name)} only once: {places}.",)
 
 
 def training_row_warnings(

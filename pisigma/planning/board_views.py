@@ -93,7 +93,7 @@ class BoardViews:
         chunks = [self._faults(arm, chunk) for chunk in torch.split(q, POSES_PER_CHUNK)]
         return {reason: torch.cat([chunk[reason] for chunk in chunks]) for reason in chunks[0]}
 
-    def obliqueness(
+    def incidence_angles(
         self, arm: ArmInSurroundings, q: Float64[Tensor, "poses dof"]
     ) -> Float64[Tensor, " poses"]:
         """Compute the angle of the board's normal to the line of sight to its centre [rad]; > π / 2 from behind."""

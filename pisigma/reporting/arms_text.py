@@ -14,19 +14,19 @@ COLUMNS = ("arm", "in the base of", "coordinate", "unit", "value", "standard err
 AXES = ("x", "y", "z", "roll", "pitch", "yaw")
 
 
-def base_rows(one: ArmBaseFigures) -> list[tuple[str, ...]]:
+def base_rows(figures: ArmBaseFigures) -> list[tuple[str, ...]]:
     """Return the rows of the table of one base: values, and standard errors of shifts along x, y, z.
 
     Standard errors of rotations are about x, y, z and not of roll, pitch and yaw, so they have rows of their own.
     """
     units = ("mm",) * 3 + ("deg",) * 3
-    values = (one.x_mm, one.y_mm, one.z_mm, one.roll_deg, one.pitch_deg, one.yaw_deg)
+    values = (figures.x_mm, figures.y_mm, figures.z_mm, figures.roll_deg, figures.pitch_deg, figures.yaw_deg)
     rows: list[tuple[str, ...]] = []
     for number, (axis, unit, value) in enumerate(zip(AXES, units, values, strict=True)):
-        error = one.standard_errors[number] if number < 3 else max(one.standard_errors[3:])
+        error = figures.standard_errors[number] if number < 3 else max(figures.standard_errors[3:])
         digits = min(max(1 - math.floor(math.log10(max(error, 1e-6))), 1), 6)
-        shown = f"{one.standard_errors[number]:.{digits}f}" if number < 3 else ""
-        rows.append((one.arm, one.in_base_of, axis, unit, f"{value:.{digits}f}", shown))
+        shown = f"{figures.standard_errors[number]:.{digits}f}" if number < 3 else ""
+        rows.append((figures.arm, figures.in_base_of, axis, unit, f"{value:.{digits}f}", shown))
     return rows
 
 

@@ -38,7 +38,7 @@ _BINS = 8
 
 
 def draw_residuals(
-    residuals: Mapping[str, Float64[np.ndarray, "rows 3"]], path: Path, under: str = ""
+    residuals: Mapping[str, Float64[np.ndarray, "rows 3"]], path: Path, calibration: str = ""
 ) -> None:
     """Draw the residuals per coordinate over the rows.
 
@@ -46,14 +46,14 @@ def draw_residuals(
         residuals: measured minus predicted values of the calibration rows by sensor [m or rad]; NaN where nothing was
             measured.
         path: PNG file to write.
-        under: calibration to which the residuals belong, for the title.
+        calibration: calibration to which the residuals belong, for the title.
     """
     shown = [name for name in _UNITS if name in residuals]
     count = max(len(shown), 1)
     figure = Figure(figsize=(7.6, 3.3 * count))
     panels = figure.subplots(count, 1, squeeze=False)[:, 0]
     for axes, name in zip(panels, shown, strict=False):
-        _draw_over_rows(axes, name, residuals[name], under)
+        _draw_over_rows(axes, name, residuals[name], calibration)
     set_margins(figure, left=0.8, right=0.05, bottom=0.5, top=0.35, up=0.85)
     save_figure(figure, path)
 

@@ -80,7 +80,7 @@ class Coupling:
 
     Attributes:
         axes: axes that the controller commands, with the limits of its values.
-        turning: whether each joint is revolute.
+        revolute: whether each joint is revolute.
         matrix: `(dof, axes)`: C, [rad or m] of a joint per [rad or m] of an axis.
         offset: `(dof,)`: b [rad or m].
         driven: `(dof, axes)`: mask of the axes named in the file's entry of a coupled joint, possibly with the factor
@@ -90,7 +90,7 @@ class Coupling:
     """
 
     axes: tuple[Row, ...]
-    turning: tuple[bool, ...]
+    revolute: tuple[bool, ...]
     matrix: Float64[np.ndarray, "dof axes"]
     offset: Float64[np.ndarray, " dof"]
     driven: Bool[np.ndarray, "dof axes"]
@@ -189,7 +189,7 @@ class Coupling:
         """Return all combinations of -1, 0 or 1 full turns [rad] of the coupled revolute joints."""
         shared = (self.matrix != 0).sum(0) > 1
         coupled = ((self.matrix != 0).sum(1) > 1) | (self.matrix[:, shared] != 0).any(1)
-        choices = [(-1, 0, 1) if both else (0,) for both in np.logical_and(coupled, self.turning).tolist()]
+        choices = [(-1, 0, 1) if both else (0,) for both in np.logical_and(coupled, self.revolute).tolist()]
         return np.array(list(itertools.product(*choices)), dtype=np.float64)
 
     def _by_four_bars(self, values: Any, change: Any) -> Any:

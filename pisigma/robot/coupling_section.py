@@ -96,7 +96,7 @@ def rows_and_coupling(
     pairs = list(zip(joints, stated, strict=True))
     coupling = Coupling(
         axes=tuple(axes),
-        turning=tuple(joint.type == "revolute" for joint in joints),
+        revolute=tuple(joint.type == "revolute" for joint in joints),
         matrix=np.array([[_factor(section, joint, axis) for axis in axes] for joint, section in pairs]),
         offset=np.array([_offset(joint, section) for joint, section in pairs]),
         driven=np.array([[s.joint in by_name and axis.name in s.factors for axis in axes] for s in stated]),

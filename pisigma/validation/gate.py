@@ -60,7 +60,7 @@ class RowVerdict:
 
 def check_rows(
     rows: Measurements,
-    against: Robot | CalibratedModel,
+    reference: Robot | CalibratedModel,
     fitted: Collection[FrameKind] = (),
     may_move: Collection[Move] = (),
     nominal: CalibratedModel | None = None,
@@ -74,7 +74,7 @@ def check_rows(
 
     Args:
         rows: the rows.
-        against: a calibrated model, or the nominal robot.
+        reference: a calibrated model, or the nominal robot.
         fitted: frames and tools that are known to have moved since the model was made.
         may_move: what else may have moved since then without this being a fault of the rows.
         nominal: the nominal robot with base and tool fitted; only used to report its errors after a correction.
@@ -83,11 +83,15 @@ def check_rows(
         MeasurementError: the model does not have a frame or a target of the rows.
         PoseError: the joint values do not fit the robot.
     """
-    if isinstance(against, CalibratedModel) and against.kind == FLEET_PRIOR and against.nominal is not None:
-        against = against.nominal
-    if isinstance(against, Robot):
-        return RowVerdict(_until_implausible(_against_robot(rows, against)))
-    return check_rows_by_model(rows, against, fitted, may_move, nominal)
+    if (
+        isinstance(reference, CalibratedModel)
+        and reference.kind == FLEET_PRIOR
+        and reference.nominal is not None
+    ):
+        reference = reference.nominal
+    if isinstance(reference, Robot):
+        return RowVerdict(_until_implausible(_against_robot(rows, reference)))
+    return check_rows_by_model(rows, reference, fitted, may_move, nominal)
 
 
 def check_rows_by_model(
@@ -108,7 +112,7 @@ def check_rows_by_model(
 
 
 def check_rows_of_frames(
-    rows: Measurements, against: Robot | CalibratedModel, found: FittedFrames
+    rows: Measurements, reference: Robot | CalibratedModel, fitted: FittedFrames
 ) -> tuple[Diagnostic, ...]:
     """Check rows to which base, tool or both were fitted, leaving out those that the others contradict.
 
@@ -117,27 +121,27 @@ def check_rows_of_frames(
 
     Args:
         rows: the rows.
-        against: the nominal robot or the model whose arm was used.
-        found: the fitted frames.
+        reference: the nominal robot or the model whose arm was used.
+        fitted: the fitted frames.
 
     Returns:
         The findings; those that make the rows implausible come first.
     """
-    used = torch.tensor(found.fit.used_rows)
-    result, some = found.fit.solved.result(), rows.select(used)
+    used = torch.tensor(fitted.fit.used_rows)
+    result, some = fitted.fit.solved.result(), rows.select(used)
     results = {"nominal": result, "geometric": result}
     kinds: dict[str, tuple[FrameKind, ...]] = {
         "tool": ("tool",),
         "base": ("base",),
         "hand-eye": ("base", "tool"),
     }
-    checked = CheckedCalibration(GeometricCalibrator(result.robot), found.fit.rows.select(used), results)
+    checked = CheckedCalibration(GeometricCalibrator(result.robot), fitted.fit.rows.select(used), results)
 
     def findings() -> Iterator[Iterable[Diagnostic]]:
-        if isinstance(against, Robot):
-            yield check_rows(some, against).diagnostics
-        model = found.model if isinstance(against, Robot) else against
-        yield check_rows_by_model(some, model, kinds[found.fit.only]).diagnostics
+        if isinstance(reference, Robot):
+            yield check_rows(some, reference).diagnostics
+        model = fitted.model if isinstance(reference, Robot) else reference
+        yield check_rows_by_model(some, model, kinds[fitted.fit.only]).diagnostics
         yield check_residual(checked)
 
     return _until_implausible(findings())

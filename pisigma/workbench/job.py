@@ -73,7 +73,7 @@ class Job:
     what: str = ""
     stopped_by: str = ""
     started: str = field(default_factory=lambda: _clock())
-    left: TimeLeft = field(default_factory=TimeLeft)
+    time_left: TimeLeft = field(default_factory=TimeLeft)
 
     def progress(self, what: str) -> None:
         """Record the current activity, or end the step if a person stopped it.
@@ -83,7 +83,7 @@ class Job:
         """
         if self.stopped_by:
             raise StoppedError
-        self.what = self.left.after(what)
+        self.what = self.time_left.after(what)
 
 
 class Jobs:

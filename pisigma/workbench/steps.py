@@ -209,7 +209,7 @@ def import_session(incoming: IncomingRows, form: Form) -> Outcome:
     return Outcome(ResultText(verdict, remarks))
 
 
-def take_back(cell: Cell, form: Form, progress: Progress) -> Outcome:
+def restore_session(cell: Cell, form: Form, progress: Progress) -> Outcome:
     """Add a session that was set aside to the cell again, as the import of its file would."""
     progress("reading the rows")
     known = {one.name: one for one in cell.history.sessions() if one.set_aside and one.rows}
@@ -248,7 +248,7 @@ def follow_file(
     growing = growing_file(path, session.plan.arm.robot, session.plan.settings)
     rest, waiting = remaining_poses_file(plan, path, None), f"waiting for rows in {path.name}"
     with contextlib.suppress(StoppedError):
-        for step in follow(session, growing, tick=lambda: progress(waiting), on_new_rows=on_new_rows):
+        for step in follow(session, growing, before_read=lambda: progress(waiting), on_new_rows=on_new_rows):
             show(step.state)
             if step.replanned:
                 session.write_remaining(rest, [])

@@ -83,11 +83,11 @@ class TimelineEntry:
     alarm: bool = False
 
 
-def ticks(top: float) -> list[float]:
+def ticks(maximum: float) -> list[float]:
     """Return round numbers for an axis from 0: multiples of 1, 2 or 5 times a power of ten, 3 to 6 of them."""
-    power = 10.0 ** math.floor(math.log10(top))
-    step = next(one * power for one in (0.2, 0.5, 1, 2) if top < 5.5 * one * power)
-    return [round(number * step, 9) for number in range(int(top / step + 1e-9) + 1)]
+    power = 10.0 ** math.floor(math.log10(maximum))
+    step = next(one * power for one in (0.2, 0.5, 1, 2) if maximum < 5.5 * one * power)
+    return [round(number * step, 9) for number in range(int(maximum / step + 1e-9) + 1)]
 
 
 class Tabs:
@@ -183,19 +183,19 @@ class Tabs:
             numbers=numbers,
         )
 
-    def findings(self, incoming: IncomingRows, found: Sequence[Diagnostic], problem: str = "") -> str:
+    def findings(self, incoming: IncomingRows, diagnostics: Sequence[Diagnostic], problem: str = "") -> str:
         """Return HTML with the findings of the check of uploaded rows next to the rows, with repairs.
 
         Args:
             incoming: the files.
-            found: the findings.
+            diagnostics: the findings.
             problem: reason why the rows cannot be read; "" if they can.
         """
-        repairs = {one.sentence: incoming.repair(one) for one in found if one.severity == "implausible"}
+        repairs = {one.sentence: incoming.repair(one) for one in diagnostics if one.severity == "implausible"}
         fields = {
             sentence: repaired_fields(incoming, repair) for sentence, repair in repairs.items() if repair
         }
-        lines = {line for one in found for line in line_numbers_in(" ".join(one.rows))}
+        lines = {line for one in diagnostics for line in line_numbers_in(" ".join(one.rows))}
         tables = []
         for mapping in () if problem else incoming.proposal.mappings:
             rows = sorted(
@@ -205,7 +205,7 @@ class Tabs:
             tables.append((mapping, rows[: _FIRST_ROWS + min(len(lines), _MAX_ROWS)]))
         template = self._environment.get_template("findings.html.j2")
         return template.render(
-            found=found, repairs=repairs, fields=fields, problem=problem, tables=tables, lines=lines
+            found=diagnostics, repairs=repairs, fields=fields, problem=problem, tables=tables, lines=lines
         )
 
 

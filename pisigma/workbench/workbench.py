@@ -379,6 +379,6 @@ STEPS: dict[str, Callable[[Workbench, Cell, Form, Progress], Outcome]] = {
     "controller": lambda _, *given: steps.set_active_export(*given),
     "use": lambda _, *given: steps.use(*given),
     "session": lambda _, *given: steps.set_aside(*given),
-    "take_back": lambda _, *given: steps.take_back(*given),
+    "restore_session": lambda _, *given: steps.restore_session(*given),
 }
 """Functions of steps by the names of their commands."""

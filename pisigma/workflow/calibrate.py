@@ -166,7 +166,7 @@ def calibrate(
         "Validated on rows of the same measurement only, not on other days, payloads or temperatures.",
     )
     calibration = compose_calibration(
-        calibrator, result, rows, summary, texts, validation, test, training, found=backlash
+        calibrator, result, rows, summary, texts, validation, test, training, diagnostics=backlash
     )
     return replace(calibration, settings=settings, seconds=time.perf_counter() - started)
 
@@ -181,7 +181,7 @@ def compose_calibration(
     test: CalibrationValidation | None = None,
     held_out: Measurements | None = None,
     recipe: tuple[str, str] = ("", ""),
-    found: tuple[Diagnostic, ...] = (),
+    diagnostics: tuple[Diagnostic, ...] = (),
 ) -> Calibration:
     """Check a calibration, and build its model and summary.
 
@@ -195,7 +195,7 @@ def compose_calibration(
         test: errors of the rows of the set "test".
         held_out: rows of the validation whose errors the model folder stores; None to store no errors.
         recipe: name and SHA-256 of the recipe; empty without a recipe.
-        found: findings before the calibration.
+        diagnostics: findings before the calibration.
 
     Raises:
         IdentificationError: the measurements cannot come from this robot.
@@ -203,7 +203,7 @@ def compose_calibration(
     checked = CheckedCalibration(
         geometric_of(calibrator), rows, fit_compared_calibrations(calibrator, rows, result=result), validation
     )
-    diagnostics, nominal = (*diagnostics_of(checked), *found), checked.robot
+    diagnostics, nominal = (*diagnostics_of(checked), *diagnostics), checked.robot
     warnings = tuple(one.sentence for one in diagnostics if one.severity == "warning")
     summary = summary.with_figures(
         calibrated=checked.figures,

@@ -58,7 +58,7 @@ class ComparedModels:
     seconds: float
 
     @property
-    def better(self) -> str | None:
+    def better_model(self) -> str | None:
         """Name of the model that predicts the rows significantly better; None if there is none, or untrusted rows."""
         difference = self._difference
         interval = None if difference is None else difference.intervals["rms"]
@@ -95,7 +95,7 @@ class ComparedModels:
             "frames_moved": [one.to_json() for one in differences.frames],
             "remainder": None if differences.remainder is None else vars(differences.remainder),
             "workspace": self.workspace.to_json(first.robot),
-            "rows": None if self.rows is None else {**self.rows.to_json(), "better": self.better},
+            "rows": None if self.rows is None else {**self.rows.to_json(), "better": self.better_model},
             "diagnostics": [one.model_dump() for one in self.diagnostics],
             "program": None if self.program is None else self.program.to_json(first.robot),
             "summary": list(self.sentences),
@@ -149,8 +149,8 @@ class ComparedModels:
             doubts = " ".join(one.sentence for one in self.diagnostics)
             return (f"The RMS error of {self.rows.rows} rows is {errors}, which is not conclusive: {doubts}",)
         which = (
-            f"{self.better} predicts them better"
-            if self.better
+            f"{self.better_model} predicts them better"
+            if self.better_model
             else "neither predicts them significantly better"
         )
         return (

@@ -126,7 +126,7 @@ def distill(
     every = draw_solved_poses(CorrectedIK(parent), region, total, generator, progress)
     fitted, chosen_by = slice(settings.poses), slice(settings.poses, settings.poses + choosing)
     network, sizes_tried = choose_network(
-        parent, every, (fitted, chosen_by), sizes, (settings.seed, settings.epochs), progress
+        parent, every, (fitted, chosen_by), sizes, settings.seed, settings.epochs, progress
     )
     held_out = every.select(slice(settings.poses + choosing, None))
     solver = closed_form_solver(parent.robot)
@@ -219,7 +219,7 @@ def _summary(
         sizes=sizes,
         held_out=held_out,
         joints=_joint_errors(parent.robot, poses.correction, predicted),
-        warnings=_warnings(held_out, len(region.q), parent.robot.dof),
+        warnings=_warnings(held_out, len(region.joint_values), parent.robot.dof),
         limitations=_limitations(parent, held_out.distilled, sizes),
     )
 
@@ -295,7 +295,7 @@ def _region(region: Region, poses: SolvedPoses, robot: Robot) -> RegionFigures:
     bounds = torch.stack(poses.T[:, :3, 3].aminmax(dim=0), 1).flatten().tolist()
     return RegionFigures(
         kind="joints" if region.box is None else "box",
-        rows=len(region.q),
+        rows=len(region.joint_values),
         box_mm=tuple(value * 1e3 for value in region.box or bounds),
         joints=tuple(
             JointRange(

@@ -95,7 +95,8 @@ def choose_network(
     poses: SolvedPoses,
     chosen: tuple[slice, slice],
     sizes: tuple[NetworkSize, ...],
-    search: tuple[int, int],
+    seed: int,
+    max_iterations: int,
     progress: Progress,
 ) -> tuple[CorrectionNetwork, tuple[SizeFigures, ...]]:
     """Return the smallest network that is about as good as the best one, and the figures of all candidates.
@@ -105,14 +106,15 @@ def choose_network(
         poses: poses with the full solutions of the model.
         chosen: slices of the poses to fit and of the poses for model selection.
         sizes: sizes to fit, in ascending order.
-        search: random seed, and maximum number of iterations per joint.
+        seed: random seed.
+        max_iterations: maximum number of iterations per joint.
         progress: called with the current step.
     """
     pairs = _pairs(poses, chosen[0])
     fits: list[tuple[CorrectionNetwork, NetworkSize, float]] = []
     for size in sizes:
         of_size = with_stage(progress, f"orders {size.orders}, harmonics {size.harmonics}")
-        network = _fit_size(parent.robot, size, pairs, *search, of_size)
+        network = _fit_size(parent.robot, size, pairs, seed, max_iterations, of_size)
         T, q = poses.T[chosen[1]], poses.q_nominal[chosen[1]]
         with torch.no_grad():
             reached = parent.forward(q + network(T, q))

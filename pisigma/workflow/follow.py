@@ -44,7 +44,7 @@ def follow(
     session: MeasuringSession,
     file: GrowingFile,
     once: bool = False,
-    tick: Callable[[], None] = lambda: None,
+    before_read: Callable[[], None] = lambda: None,
     on_new_rows: Callable[[Measurements], None] = lambda rows: None,
 ) -> Iterator[SessionStep]:
     """Check the rows of a growing file until the session ends.
@@ -53,7 +53,7 @@ def follow(
         session: the session.
         file: the growing file.
         once: whether to check only the existing rows and then end.
-        tick: called before every read of the file; an exception that it raises ends the session.
+        before_read: called before every read of the file; an exception that it raises ends the session.
         on_new_rows: called with new rows before they are checked, because a check takes longer the more rows there are.
 
     Yields:
@@ -73,7 +73,7 @@ def follow(
     yield SessionStep(FileGrowth(), (), state)
     with ThreadPoolExecutor(1) as pool, session.in_background():
         while True:
-            tick()
+            before_read()
             growth = file.read()
             if growth.rows is not None:
                 on_new_rows(growth.rows)

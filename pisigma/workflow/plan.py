@@ -353,7 +353,7 @@ class _Problem:
         if self.views is None:
             return ()
         q = self.candidates.q[chosen]
-        found = view_warnings(self.views.obliqueness(self.arm, q), q, self.arm.robot)
+        found = view_warnings(self.views.incidence_angles(self.arm, q), q, self.arm.robot)
         return tuple(one.sentence for one in found)
 
     def _curve(self, chosen: Int64[Tensor, " chosen"], counts: list[int]) -> tuple[ExpectedAccuracy, ...]:

@@ -39,11 +39,11 @@ class Region:
     """Region in which random poses are drawn.
 
     Attributes:
-        q: joint values [rad or m]; poses are drawn between a row and its neighbours.
-        box: bounds of the tool's position, with orientations from joint values around `q`; None for no bounds.
+        joint_values: joint values [rad or m]; poses are drawn between a row and its neighbours.
+        box: bounds of the tool's position, with orientations from nearby joint values; None for no bounds.
     """
 
-    q: Float64[Tensor, "rows dof"]
+    joint_values: Float64[Tensor, "rows dof"]
     box: Box | None = None
 
 
@@ -144,7 +144,7 @@ def _solve(
 ) -> tuple[tuple[Tensor, ...], dict[str, int]]:
     """Draw `count` poses; return the solved poses and the number of refused poses by reason."""
     robot = ik.model.robot
-    q = draw_between(robot, region.q, count, generator)
+    q = draw_between(robot, region.joint_values, count, generator)
     T = forward_kinematics(robot, q)
     if region.box is None:
         solution = ik(T, near=q)

@@ -71,7 +71,7 @@ def test_a_size_has_the_highest_evidence():
 def test_a_shift_is_that_of_least_squares():
     looked_at = search(MOVED, stated=True)
     number = [group.size > 0 for group in estimated(looked_at).groups].index(True)
-    shift, covariance = looked_at.estimate_shift(number, held=False)
+    shift, covariance = looked_at.estimate_shift(number, with_prior=False)
     x = looked_at.values.X[:, 4]
     V = looked_at._K + NOISE**2 * torch.eye(50).double()
     weight = torch.linalg.solve(V, x)

@@ -39,9 +39,9 @@ class KilledCell:
     def __init__(self, folder: Path) -> None:
         """Calibrate and verify a first model."""
         self.folder, self.cell = folder, Cell.create(folder / "cell", "ur10", limit_mm=0.5)
-        self.cell.take_in(measured(60, 1), day=day(90))
+        self.cell.add_session(measured(60, 1), day=day(90))
         self.cell.calibrate(folds=0)
-        self.cell.take_in(measured(12, 2), day=day(80))
+        self.cell.add_session(measured(12, 2), day=day(80))
         self.cell.verify()
         self._before, self._entries = self.files(), self.entries()
 

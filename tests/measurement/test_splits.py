@@ -252,6 +252,6 @@ def test_few_poses_get_several_repeats(groups: int, folds: int | None, by: Split
 @pytest.mark.parametrize(("folds", "by"), [(4, "time"), (4, "interleaved"), (12, "joints")])
 def test_refuses_repeats_that_would_be_equal(folds: int, by: SplitBy):
     measurements = repeated(list(range(12)))
-    assert len(repeated_k_folds(measurements, folds, seed=0, by=by, times=1)) == 1
+    assert len(repeated_k_folds(measurements, folds, seed=0, by=by, repeats=1)) == 1
     with refused(MeasurementError, option="repeats", value=3):
-        repeated_k_folds(measurements, folds, seed=0, by=by, times=3)
+        repeated_k_folds(measurements, folds, seed=0, by=by, repeats=3)

@@ -46,7 +46,7 @@ def test_views_cover_all_angles_distances_and_branches(settings: PlanSettings, d
     arm = arm_before_board()
     views = views_of(settings, arm)
     assert views is not None
-    oblique = views.obliqueness(arm, drawn.q).rad2deg()
+    oblique = views.incidence_angles(arm, drawn.q).rad2deg()
     assert float(oblique.min()) < 10
     assert float(oblique.max()) > 0.8 * OBLIQUE
     solver = closed_form_solver(arm.robot)

@@ -80,7 +80,7 @@ class DenseRegression(AbstractDesignRegression):
             square=prior.sum_by_group(prior.base * x.square()),
             determined=prior.sum_by_group(1 - precision * covariance.diagonal()),
             misfit=self._by_sensor(residual.square()),
-            used=self._by_sensor(used),
+            effective_parameters=self._by_sensor(used),
         )
 
     def covariance_root(self, posterior: Posterior) -> CovarianceRoot:

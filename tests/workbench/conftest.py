@@ -15,7 +15,7 @@ def cell(tmp_path_factory):
     with no_type_checker():
         made = Cell.create(tmp_path_factory.mktemp("cells") / "welder7", "ur10", limit_mm=0.5)
         for number, ago in enumerate((20, 10)):
-            made.take_in(measured(20, number), day=day(ago))
+            made.add_session(measured(20, number), day=day(ago))
         made.sessions.set_aside(day(10), HOSTILE)
         made.history.record("firmware", note=HOSTILE)
     return made

@@ -192,8 +192,8 @@ def test_an_empty_folder_becomes_a_cell_once(tmp_path):
 def test_a_session_that_was_set_aside_is_taken_back(browser_with_link, bench, cell):
     (before,) = (one for one in cell.history.sessions() if one.set_aside)
     for name in ("", "../cell", day(20), HOSTILE):
-        assert ended(browser_with_link, bench, "take_back", session=name).refusal
-    assert ended(browser_with_link, bench, "take_back", session=before.name).refusal == ""
+        assert ended(browser_with_link, bench, "restore_session", session=name).refusal
+    assert ended(browser_with_link, bench, "restore_session", session=before.name).refusal == ""
     sessions = {one.name: one for one in cell.history.sessions()}
     taken_in = sessions[before.name].taken_in
     assert sessions[before.name] == replace(before, set_aside="", taken_in=taken_in)
@@ -331,9 +331,9 @@ def test_results_are_those_of_the_commands(tmp_path):
     """The page of a cell and the commands on a copy of the cell show the same figures and states."""
     with no_type_checker():
         made = Cell.create(tmp_path / "page", "ur10", limit_mm=0.5)
-        made.take_in(measured(40, 0), day=day(20))
+        made.add_session(measured(40, 0), day=day(20))
         made.calibrate(folds=0)
-        made.take_in(measured(15, 1, zero=0.2), day=day(10))
+        made.add_session(measured(15, 1, zero=0.2), day=day(10))
         shutil.copytree(made.folder, tmp_path / "commands")
         with Workbench(made.folder, port=0) as bench:
             browser = visitor(bench.url)

@@ -123,7 +123,7 @@ def test_from_an_empty_folder_to_a_corrected_pose(browser, simulated, tmp_path, 
         page_cell, command_cell = Cell.open(folder), Cell.open(command_cell.folder)
         command_cell.plan(count=12, check=2)
         for rows in (first, second):
-            command_cell.take_in(rows)
+            command_cell.add_session(rows)
             if rows is first:
                 command_cell.calibrate()
         command_cell.verify()

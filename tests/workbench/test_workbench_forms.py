@@ -30,7 +30,7 @@ def cell(tmp_path, blank_pictures):
     """A cell with a space in its path, a session, one that was set aside, and a plan."""
     made = Cell.create(tmp_path / "my cell", "ur10", limit_mm=0.5)
     for number, ago in enumerate((20, 10)):
-        made.take_in(measured(20, number), day=day(ago))
+        made.add_session(measured(20, number), day=day(ago))
     made.sessions.set_aside(day(10), "loose reflector")
     made.plan(count=4, check=0, candidates=50)
     return made

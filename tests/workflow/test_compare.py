@@ -28,7 +28,7 @@ def compared(tmp_path_factory):
 
 
 def test_the_model_of_the_robot_as_it_is_predicts_its_rows_better(compared):
-    assert compared.better == "rows_61"
+    assert compared.better_model == "rows_61"
 
 
 def test_a_program_misses_about_what_the_joint_moved_by(compared):

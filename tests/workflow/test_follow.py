@@ -67,7 +67,7 @@ def test_a_stop_does_not_wait_for_the_calculation(tmp_path):
             raise InterruptedError
 
     with no_type_checker(), pytest.raises(InterruptedError):
-        list(follow(following, GrowingFile(file, ROBOT), tick=stop))
+        list(follow(following, GrowingFile(file, ROBOT), before_read=stop))
     assert time.monotonic() - stopped[0] < 1
     assert following.state.accuracy is None
 

@@ -72,7 +72,7 @@ class ArmBases:
     system: tuple[Tensor, Tensor, Tensor]
 
     @property
-    def root(self) -> Float64[Tensor, "arms 6 directions"]:
+    def covariance_root(self) -> Float64[Tensor, "arms 6 directions"]:
         """Root of the covariance of the bases, as shifts along and rotations about the axes of the first base."""
         found = self.conditioned.x_root
         return torch.cat([found.new_zeros(6, found.shape[1]), found]).view(len(self.arms), 6, -1)
@@ -90,9 +90,11 @@ class ArmBases:
         """
         T = invert(self.T_first_base[first]) @ self.T_first_base[second]
         away = self.T_first_base[second, :3, 3] - self.T_first_base[first, :3, 3]
-        moved = self.root[second] - self.root[first]
+        moved = self.covariance_root[second] - self.covariance_root[first]
         # A rotation of the first base also shifts the second base relative to it.
-        moved[:3] += torch.linalg.cross(away[:, None].expand(3, moved.shape[1]), self.root[first, 3:], dim=0)
+        moved[:3] += torch.linalg.cross(
+            away[:, None].expand(3, moved.shape[1]), self.covariance_root[first, 3:], dim=0
+        )
         turned = (self.T_first_base[first, :3, :3].mT @ moved.view(2, 3, -1)).flatten(0, 1)
         return T, turned @ turned.mT
 

@@ -45,14 +45,14 @@ class WeakDirection:
     """A combination of coordinates that the rows determine poorly.
 
     Attributes:
-        words: the combination as text, in units of 1 mm and 1 mrad (0.057 deg).
+        combination: the combination as text, in units of 1 mm and 1 mrad (0.057 deg).
         deviation: its standard deviation in these units; infinite if the rows contain no information on it.
-        held: whether it keeps its previous value, because the rows do not determine it.
+        is_held: whether it keeps its previous value, because the rows do not determine it.
     """
 
-    words: str
+    combination: str
     deviation: float
-    held: bool
+    is_held: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,9 +92,9 @@ class FrameFit:
     def basis(self) -> Float64[Tensor, "active fitted"]:
         """Fitted directions, in the coordinates of the problem: all except those that were held."""
         problem = self.solved.problem
-        if problem.held is None:
+        if problem.held_directions is None:
             return torch.diag(problem.step_scale)
-        V = problem.held.directions
+        V = problem.held_directions.directions
         orthonormal: Tensor = torch.linalg.qr(V, mode="complete")[0][:, V.shape[1] :]
         return problem.step_scale[:, None] * orthonormal
 
@@ -130,13 +130,16 @@ class FrameFit:
     @property
     def _held(self) -> int:
         """Number of directions that were held."""
-        held = self.solved.problem.held
+        held = self.solved.problem.held_directions
         return 0 if held is None else held.directions.shape[1]
 
     @cached_property
     def _directions(self) -> tuple[Float64[Tensor, "frames frames"], Float64[Tensor, " frames"]]:
         """Return unit vectors in the user's coordinates, with standard deviations in mm and mrad, weakest first."""
-        found, held = FrameDirections.at_solution(self.solved, self.frames), self.solved.problem.held
+        found, held = (
+            FrameDirections.at_solution(self.solved, self.frames),
+            self.solved.problem.held_directions,
+        )
         if held is not None:  # with the deviation that was judged
             found = replace(found, deviation=torch.cat([held.deviation, found.deviation[self._held :]]))
         vectors, length = found.in_user_coordinates(self.solved)

@@ -52,7 +52,7 @@ def _tool_root(bases: ArmBases, number: int, postures: Postures) -> Float64[Tens
     T = forward_kinematics(known.geometry.robot, postures.q_moved)
     T_base = transform_from_xyzrpy(torch.from_numpy(known.geometry.robot.base.copy()))
     away = (R @ (invert(T_base) @ T)[:, :3, 3, None])[..., 0]
-    shift, turn = bases.root[number, :3], bases.root[number, 3:]
+    shift, turn = bases.covariance_root[number, :3], bases.covariance_root[number, 3:]
     return R @ in_base + shift - skew(away) @ turn
 
 

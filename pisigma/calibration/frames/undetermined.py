@@ -111,7 +111,7 @@ def hold_undetermined(
         tools: previous tools by target; other targets use the tool of the robot.
 
     Returns:
-        The fit; `problem.held` contains the held directions, if any.
+        The fit; `problem.held_directions` contains the held directions, if any.
     """
     found, space = FrameDirections.at_solution(solved, frames), solved.problem.space
     unknown = int(torch.isinf(found.deviation).sum())
@@ -147,9 +147,9 @@ def _with_held(
         found = FrameDirections.at_solution(solved, frames)
         held = HeldDirections(found.directions[:, : len(deviation)], deviation)
         missing = found.distances(solved, before)[: len(deviation)]
-        if solved.problem.held is not None and float(missing.abs().max()) < _SMALL:
+        if solved.problem.held_directions is not None and float(missing.abs().max()) < _SMALL:
             break
-        problem = replace(solved.problem, held=held)
+        problem = replace(solved.problem, held_directions=held)
         step = problem.step_scale * (held.directions @ missing)
         start = problem.apply_step(solved.solution.linearisation.point, step)
         solution = solved.solution.continued_by(levenberg_marquardt(problem, start))

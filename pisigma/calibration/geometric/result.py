@@ -52,7 +52,7 @@ class SensorNoise:
         sigma: standard deviation of one value [m or rad], or the factor on the standard deviations that the rows state.
         unit: "m" or "rad", or "stated" for a factor.
         values: number of measured values.
-        used: effective number of parameters that are estimated from the values.
+        effective_parameters: effective number of parameters that are estimated from the values.
         rms: root mean square length of the residuals of all rows [m or rad].
         quantity: "m" for lengths, "rad" for angles.
         components: number of values per row.
@@ -62,7 +62,7 @@ class SensorNoise:
     sigma: float
     unit: str
     values: int
-    used: float
+    effective_parameters: float
     rms: float
     quantity: Literal["m", "rad"]
     components: int
@@ -126,7 +126,7 @@ class SolvedCalibration:
         """Return the covariance of the estimated directions, and a root of the covariance of the held directions."""
         estimated, held, scale = (
             covariance_of(self.refined.normal).cpu(),
-            self.problem.held,
+            self.problem.held_directions,
             self.problem.step_scale,
         )
         return estimated, scale.new_zeros(len(scale), 0).cpu() if held is None else held.root(scale.cpu())
@@ -361,7 +361,7 @@ def _noise(solved: SolvedCalibration) -> tuple[SensorNoise, ...]:
                 sigma=sigma,
                 unit=unit,
                 values=problem.values_measured[k],
-                used=used[k],
+                effective_parameters=used[k],
                 rms=float(part.rms),
                 quantity=sensor.unit,
                 components=sensor.components,

@@ -26,15 +26,15 @@ class JointCoverage:
         joint: index of the joint of every range.
         middle: middle of every range [rad].
         half: half the length of every range [rad].
-        rate: angle per joint value, per joint [rad/rad or rad/m].
-        turning: whether values of a joint that differ by 2π are equivalent, per joint.
+        angle_per_value: angle per joint value, per joint [rad/rad or rad/m].
+        is_periodic: whether values of a joint that differ by 2π are equivalent, per joint.
     """
 
     joint: Int64[Tensor, " stretches"]
     middle: Float64[Tensor, " stretches"]
     half: Float64[Tensor, " stretches"]
-    rate: Float64[Tensor, " dof"]
-    turning: tuple[bool, ...]
+    angle_per_value: Float64[Tensor, " dof"]
+    is_periodic: tuple[bool, ...]
 
     @staticmethod
     def from_joints(robot: Robot, q: Float64[Tensor, "rows dof"]) -> "JointCoverage":
@@ -53,19 +53,19 @@ class JointCoverage:
     def with_rows(self, q: Float64[Tensor, "rows dof"]) -> "JointCoverage":
         """Return the ranges that are covered by these and further measured joint values."""
         angles = []
-        for j in range(len(self.turning)):
-            of_joint = [(q[:, j] * self.rate[j]).cpu()]
+        for j in range(len(self.is_periodic)):
+            of_joint = [(q[:, j] * self.angle_per_value[j]).cpu()]
             for middle, half in zip(self.middle[self.joint == j], self.half[self.joint == j], strict=True):
                 steps = 2 + int(2 * float(half) / _LARGEST_GAP)
                 of_joint.append(middle + half * torch.linspace(-1, 1, steps, dtype=torch.float64))
             angles.append(torch.cat(of_joint))
-        return JointCoverage._around(angles, self.rate, self.turning)
+        return JointCoverage._around(angles, self.angle_per_value, self.is_periodic)
 
     def distance_outside(self, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch dof"]:
         """Compute the angle from every joint value to the nearest measured range [rad]; 0 within one."""
-        angle = q * self.rate.to(q)
+        angle = q * self.angle_per_value.to(q)
         columns = []
-        for j, turns in enumerate(self.turning):
+        for j, turns in enumerate(self.is_periodic):
             here = self.joint == j
             off = angle[..., j, None] - self.middle[here].to(q)
             if turns:

@@ -62,8 +62,8 @@ _TOO_FEW_ROWS = (
 )
 
 _NOTHING_HELPS = (
-    "No joint correction predicts held-out rows of every sensor at least as well as the geometry alone, and those of "
-    "one sensor clearly better, so the geometric calibration is kept."
+    "No joint correction predicts held-out rows of one sensor clearly better without predicting those of another "
+    "worse, so the geometric calibration is kept."
 )
 
 

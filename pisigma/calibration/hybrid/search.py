@@ -159,13 +159,16 @@ class FeatureSearch:
         self._note(self.geometry, 1.0, began, True)
 
     def fit_features(
-        self, features: Sequence[AbstractFeature], near: FeatureFit | None = None, sizes: Tensor | None = None
+        self,
+        features: Sequence[AbstractFeature],
+        start: FeatureFit | None = None,
+        sizes: Tensor | None = None,
     ) -> tuple[FeatureFit, float]:
         """Fit geometry and features, starting with the noise and prior scales of another fit.
 
         Args:
             features: the features.
-            near: another fit; None to start with noise and prior scales of the geometric calibration.
+            start: another fit; None to start with noise and prior scales of the geometric calibration.
             sizes: start values of the prior scales of the last feature.
 
         Returns:
@@ -173,8 +176,8 @@ class FeatureSearch:
         """
         design = Design(self.rows.problem, tuple(features))
         noise, prior = self.noise, design.prior(self.prior_scale)
-        if near is not None:
-            noise, prior = near.posterior.noise, design.prior_like(near.design, near.posterior.prior)
+        if start is not None:
+            noise, prior = start.posterior.noise, design.prior_like(start.design, start.posterior.prior)
         if sizes is not None:
             prior = replace(prior, sizes=torch.cat([prior.sizes[: -len(sizes)], sizes]))
         chosen = self._regression.select(design)

@@ -101,7 +101,7 @@ def write_joint_file(
     poses: Path,
     out: Path,
     branch: str | None,
-    tell: Callable[[str], None],
+    report_progress: Callable[[str], None],
     accuracy: bool = False,
     path: bool = False,
 ) -> PoseFileResult:
@@ -116,7 +116,7 @@ def write_joint_file(
         poses: the file of poses.
         out: the file of joint values.
         branch: name of the branch to use instead of the default.
-        tell: callback for progress, such as "40,000 rows, 4%, 9,000 rows/s".
+        report_progress: callback for progress, such as "40,000 rows, 4%, 9,000 rows/s".
         accuracy: whether to predict the standard deviations, which takes most of the time with a hybrid.
         path: whether the poses are a path, which is solved as a whole and in memory; see `CorrectedIK.path`.
 
@@ -135,7 +135,7 @@ def write_joint_file(
             writer.writerows(cells + [""] * (len(header) - len(cells)) for cells in chunk_rows)
             rate = outcome.rows / max(time.monotonic() - begun, 1e-3)
             share = "" if math.isnan(chunk.read_fraction) else f", {100 * chunk.read_fraction:.0f} %"
-            tell(f"{outcome.rows:,} rows{share}, {rate:,.0f} rows/s")
+            report_progress(f"{outcome.rows:,} rows{share}, {rate:,.0f} rows/s")
     return outcome
 
 
@@ -158,7 +158,7 @@ def _solved_rows(
     too_far = _too_far(chunk, solver.model.robot)
     near = [line for line, far in zip(chunk.line, too_far, strict=True) if not far]
     bad = [
-        *chunk.bad,
+        *chunk.invalid_rows,
         *(UnusableRow(line, far) for line, far in zip(chunk.line, too_far, strict=True) if far),
     ]
     rows = [(row.line, [str(row.line), _BAD_ROW]) for row in bad]

@@ -117,7 +117,7 @@ def _verdict(compared: "ComparedModels") -> Verdict:
     """Return the verdict: how much two models differ, and which is better."""
     first, second = compared.models
     errors = compared.workspace.errors.figures.figures_by_name
-    count, better = len(compared.parameters.differing), compared.better
+    count, better = len(compared.parameters.differing), compared.better_model
     which = (
         f"the arms differ in {count_text(count, 'parameter')}"
         if count

@@ -25,19 +25,19 @@ class JointOffsets:
         values: offset of every axis of the controller [rad or m], in the direction of the axis: the real robot
             commanded to q is where the nominal robot is at q + offset.
         unobservable: joints whose offset is set to 0 because base or tool have the same effect.
-        lost: remaining deviation from the whole model.
+        departure: remaining deviation from the whole model.
         nominal: deviation of the nominal robot with the model's base and tool, for comparison.
     """
 
     robot: Robot
     values: Float64[np.ndarray, " axes"]
     unobservable: tuple[str, ...]
-    lost: Departure
+    departure: Departure
     nominal: Departure
 
     def departures(self) -> dict[str, object]:
         """Return both deviations, by their keys in files."""
-        return {"off_the_whole_model": asdict(self.lost), "robot_as_drawn": asdict(self.nominal)}
+        return {"off_the_whole_model": asdict(self.departure), "robot_as_drawn": asdict(self.nominal)}
 
 
 def fit_joint_offsets(model: CalibratedModel) -> JointOffsets:
@@ -55,7 +55,7 @@ def fit_joint_offsets(model: CalibratedModel) -> JointOffsets:
         unobservable=tuple(
             j.name for j, free in zip(nominal.joints, fit.observable, strict=True) if not free
         ),
-        lost=fit.deviation_of(fit.robot),
+        departure=fit.deviation_of(fit.robot),
         nominal=fit.deviation_of(nominal),
     )
 
@@ -96,19 +96,19 @@ _MEANING = (
 )
 
 
-def departure_sentence(what: str, lost: Departure, nominal: Departure) -> str:
+def departure_sentence(what: str, departure: Departure, nominal: Departure) -> str:
     """Return a sentence on the deviation from the whole model, compared with that of the nominal robot."""
     return (
-        f"{what} from the whole model by {lost.mean_mm:.4g} mm on average, {lost.p95_mm:.4g} mm at the 95 % quantile, "
-        f"{lost.max_mm:.4g} mm at most, and {lost.mean_mrad:.4g} mrad on average (the nominal robot with the model's "
-        f"base and tool: {nominal.mean_mm:.4g}, {nominal.p95_mm:.4g}, {nominal.max_mm:.4g} mm and "
-        f"{nominal.mean_mrad:.4g} mrad)."
+        f"{what} from the whole model by {departure.mean_mm:.4g} mm on average, {departure.p95_mm:.4g} mm at the 95 % "
+        f"quantile, {departure.max_mm:.4g} mm at most, and {departure.mean_mrad:.4g} mrad on average (the nominal "
+        f"robot with the model's base and tool: {nominal.mean_mm:.4g}, {nominal.p95_mm:.4g}, {nominal.max_mm:.4g} mm "
+        f"and {nominal.mean_mrad:.4g} mrad)."
     )
 
 
 def offset_sentences(offsets: JointOffsets) -> tuple[str, ...]:
     """Return sentences on the meaning of the offsets and their loss of accuracy."""
-    sentences = [_MEANING, departure_sentence("Offsets alone deviate", offsets.lost, offsets.nominal)]
+    sentences = [_MEANING, departure_sentence("Offsets alone deviate", offsets.departure, offsets.nominal)]
     if offsets.unobservable:
         sentences.append(
             f"Offsets of {', '.join(offsets.unobservable)} are 0 because the base or the tool has the same effect."

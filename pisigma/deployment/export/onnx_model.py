@@ -128,15 +128,15 @@ def add_joint_correction(graph: OnnxGraph, correction: JointCorrection, q: str) 
 def add_distance_outside(graph: OnnxGraph, coverage: JointCoverage, q: str) -> str:
     """Add the largest angle of any joint from its measured values, `(batch, 1)` [rad]; see `JointCoverage`."""
     node, joint = graph.add_node, coverage.joint.numpy()
-    angle = node("Mul", graph.columns(q, joint.tolist()), coverage.rate.numpy()[joint])
+    angle = node("Mul", graph.columns(q, joint.tolist()), coverage.angle_per_value.numpy()[joint])
     off = node("Sub", angle, coverage.middle.numpy())
-    turning = np.array(coverage.turning)[joint].astype(np.float64)
+    turning = np.array(coverage.is_periodic)[joint].astype(np.float64)
     turns = node("Round", node("Div", off, 2 * math.pi))
     off = node("Sub", off, node("Mul", turns, 2 * math.pi * turning))
     beyond = node("Max", node("Sub", node("Abs", off), coverage.half.numpy()), 0.0)
     per_joint = [
         node("ReduceMin", graph.columns(beyond, np.flatnonzero(joint == j).tolist()), axes=[1], keepdims=1)
-        for j in range(len(coverage.turning))
+        for j in range(len(coverage.is_periodic))
     ]
     return node("ReduceMax", node("Concat", *per_joint, axis=1), axes=[1], keepdims=1)
 
@@ -282,7 +282,7 @@ def _domain(model: CalibratedModel) -> dict[str, Any]:
         intervals: list[list[list[float]]] = [[] for _ in range(model.robot.dof)]
         columns = (coverage.joint.tolist(), coverage.middle.tolist(), coverage.half.tolist())
         for j, middle, half in zip(*columns, strict=True):
-            rate = float(coverage.rate[j])
+            rate = float(coverage.angle_per_value[j])
             intervals[j].append([(middle - half) / rate, (middle + half) / rate])
         domain["measured"] = intervals
     return domain

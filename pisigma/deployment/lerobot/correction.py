@@ -41,7 +41,7 @@ class LeRobotCorrection:
         joints: index of the value of every joint of the robot in a frame.
         scale: rotation [rad] per unit of the value, for every joint.
         offset: offset of every value of a frame [in its unit], 0 for values that are not joints.
-        lost: the joint offsets, with the deviation that they leave.
+        offsets: the joint offsets, with the deviation that they leave.
         prefix: start of the names of this arm, such as "left_".
         motors: motors in the arm's calibration file, by name; None if it is not known.
         version: name, SHA-256 and offsets of the model, as written to the metadata of data sets.
@@ -53,7 +53,7 @@ class LeRobotCorrection:
     joints: tuple[int, ...]
     scale: Float64[np.ndarray, " axes"]
     offset: Float64[np.ndarray, " values"]
-    lost: JointOffsets
+    offsets: JointOffsets
     prefix: str
     motors: Mapping[str, Motor] | None
     version: dict[str, Any]

@@ -332,7 +332,7 @@ def _near(model: ServedModel, request: dict[str, Any]) -> list[float] | None:
         raise RequestError(
             f"a value is more than a full turn (or 1 m) outside the joint limits of model '{model.name}'",
             option=_NEAR[model.joints_key != "q_deg"],
-            remedy=f"give the present joint values of the robot in {_units(model)}",
+            remedy=f"give the current joint values of the robot in {_units(model)}",
         )
     return near
 

@@ -56,9 +56,9 @@ class AbstractProtocol(ABC):
         """Return the answer to a token."""
 
 
-def tokens_match(given: bytes | None, wanted: bytes) -> bool:
+def tokens_match(received: bytes | None, expected: bytes) -> bool:
     """Return whether tokens are equal, in a time that does not depend on where they first differ."""
-    return given is not None and hmac.compare_digest(given, wanted)
+    return received is not None and hmac.compare_digest(received, expected)
 
 
 _MAX_NUMBER = 1e9

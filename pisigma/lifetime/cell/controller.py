@@ -170,7 +170,7 @@ class Controller:
         command: str,
         model: ModelEntry | None,
         sessions: tuple[SessionEntry, ...],
-        at: dict[Contents, ActiveExport] | None = None,
+        active: dict[Contents, ActiveExport] | None = None,
     ) -> "Findings":
         """Apply `RULES` to a command.
 
@@ -178,9 +178,9 @@ class Controller:
             command: a key of `RULES`.
             model: the model that the command uses; None if the command uses none.
             sessions: all sessions of the cell.
-            at: exports that were active when the rows were measured; None for the exports that are active now.
+            active: exports that were active when the rows were measured; None for the exports that are active now.
         """
-        present = self.active() if at is None else at
+        present = self.active() if active is None else active
         behind = present if model is None else self.active_when_fitted(model, sessions)
         which: dict[Situation, str] = {}
         if "kinematics" in present:

@@ -172,14 +172,14 @@ class Database:
         path: path of the file, which is created with the first row.
         tables: table of every class.
         version: version of the schema, which the file states as `PRAGMA user_version`.
-        take_over: function that adds data that an earlier version stored elsewhere, within the transaction that
-            upgrades the file; it returns the files to remove after the transaction.
+        import_earlier_data: function that adds data that an earlier version stored in other files, within the
+            transaction that upgrades the file; it returns the files to remove after the transaction.
     """
 
     path: Path
     tables: Mapping[type, Table]
     version: int
-    take_over: Callable[[sqlite3.Connection], Sequence[Path]]
+    import_earlier_data: Callable[[sqlite3.Connection], Sequence[Path]]
     _snapshot: list[sqlite3.Connection] = field(default_factory=list, repr=False, compare=False)
 
     def add(self, rows: Sequence[Any]) -> None:
@@ -321,7 +321,7 @@ class Database:
                 stored = [row[1] for row in database.execute(f"PRAGMA table_info({table.name})")]
                 for name in [name for name in columns if name not in stored]:
                     database.execute(f"ALTER TABLE {table.name} ADD COLUMN {columns[name]}")
-            moved = self.take_over(database)
+            moved = self.import_earlier_data(database)
             database.execute(f"PRAGMA user_version = {self.version}")
         for file in moved:
             file.unlink(missing_ok=True)

@@ -52,23 +52,23 @@ class ModelInUse:
         self.findings.checked_warnings(cell)
         load(self.folder)
 
-    def check(self, always: bool = False) -> None:
+    def check(self, retry: bool = False) -> None:
         """Load the model in use if it has changed.
 
         Args:
-            always: whether to also retry a model that could not be loaded before, and reload the same model if it was
+            retry: whether to also retry a model that could not be loaded before, and reload the same model if it was
                 changed.
         """
         with self._lock:
             state = self._state()
-            if state is not None and state == self._seen and not always:
+            if state is not None and state == self._seen and not retry:
                 return
             is_settled = state is None or time.time_ns() - state[1] > SETTLED * 1e9
             try:
                 self.findings = self._find()
                 self._seen = state if is_settled else None  # without findings, the next check tries again
                 folder = model_folder(self.cell)
-                if always or folder != self.folder:
+                if retry or folder != self.folder:
                     self._load(folder)
                 self.folder, self.problem = folder, ""
             except (PisigmaError, OSError) as problem:

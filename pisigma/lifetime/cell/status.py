@@ -200,7 +200,7 @@ def _not_calibrated(facts: CellFacts) -> Step | None:
 
 
 def _calibrate(facts: CellFacts, state: State, reason: str) -> Step:
-    """Return the step "calibrate", or a step that measures more rows if the present rows must not be trusted."""
+    """Return the step "calibrate", or a step that measures more rows if the current rows must not be trusted."""
     last = _last_calibration(facts)
     newest = [one.taken_in for one in facts.valid_sessions]
     newest += [one.recorded for one in facts.events if one.kind in CHANGING_EVENTS]

@@ -191,7 +191,10 @@ def _difference(one: Robot, other: Robot) -> tuple[str, str]:
         return "joints", f"one has {one.dof} joints and the other {other.dof}"
     types = [[row.type for row in robot.rows] for robot in (one, other)]
     if types[0] != types[1]:
-        return "rows", f"their rows are {', '.join(types[0])} and {', '.join(types[1])}"
+        return (
+            "rows",
+            f"the rows of the first are {', '.join(types[0])}, those of the second {', '.join(types[1])}",
+        )
     if tuple(one.directions) != tuple(other.directions):
         return "directions", "a joint has the opposite direction"
     if not _coupled_alike(one, other):
@@ -206,7 +209,11 @@ def _difference(one: Robot, other: Robot) -> tuple[str, str]:
     name = ("theta", "d", "a", "alpha", "beta")[int(column)]
     unit, factor = ("mm", 1e3) if name in ("d", "a") else ("deg", float(np.rad2deg(1.0)))
     values = [f"{robot.dh[row, column] * factor:.6g}" for robot in (one, other)]
-    return name, f"the nominal {name} of row '{one.rows[row].name}' is {values[0]} and {values[1]} {unit}"
+    return (
+        name,
+        f"the nominal {name} of row '{one.rows[row].name}' is {values[0]} {unit} in the first and {values[1]} "
+        f"{unit} in the second",
+    )
 
 
 def _coupled_alike(one: Robot, other: Robot) -> bool:
@@ -225,7 +232,7 @@ class Displacement:
         source: description of the poses.
         q: joint values of poses that both models predict [rad or m].
         number: number of every pose among all poses of the source, from 1.
-        place: position of the tool in the robot's base frame under the first model [m].
+        position: position of the tool in the robot's base frame under the first model [m].
         errors: distance [m] and angle [rad] between the poses of both models.
         not_predicted: number of poses that are left out because a model does not predict them.
     """
@@ -233,7 +240,7 @@ class Displacement:
     source: str
     q: Float64[Tensor, "poses dof"]
     number: Int64[Tensor, " poses"]
-    place: Float64[Tensor, "poses 3"]
+    position: Float64[Tensor, "poses 3"]
     errors: PoseErrors
     not_predicted: int
 
@@ -281,7 +288,7 @@ class Displacement:
             "poses_not_predicted": self.not_predicted,
             **self.errors.figures.figures_by_name,
             "largest_at_pose": int(self.number[self.largest]),
-            "largest_at_mm": (self.place[self.largest] * 1e3).tolist(),
+            "largest_at_mm": (self.position[self.largest] * 1e3).tolist(),
             "largest_at_joints": [
                 axis.in_file_unit(value) for axis, value in zip(robot.axes, values, strict=True)
             ],

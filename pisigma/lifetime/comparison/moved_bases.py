@@ -27,36 +27,36 @@ class ArmBefore:
     Attributes:
         posterior: posterior of its model.
         T_first_base: its base relative to the base of the first arm, when its model was made.
-        now: its current bases, fitted with the arm of the model.
+        current: its current bases, fitted with the arm of the model.
     """
 
     posterior: ArmPosterior
     T_first_base: Float64[Tensor, "4 4"]
-    now: FittedFrames
+    current: FittedFrames
 
     @property
     def frames(self) -> tuple[str, ...]:
         """Frames in which the base was determined both before and now."""
         return tuple(
             name
-            for name in self.now.fit.solved.geometry.bases
+            for name in self.current.fit.solved.geometry.bases
             if ("frame", name) in self.posterior.shared_objects and is_determined(self._noise(name))
         )
 
     def _rows(self, frame: str) -> list[int]:
         """Return the indices of the base in a frame among the fitted coordinates."""
-        parameters = self.now.fit.parameters
+        parameters = self.current.fit.parameters
         return [k for k, one in enumerate(parameters) if one.group == "base" and one.owner == frame]
 
     def _noise(self, frame: str) -> Float64[Tensor, "6 directions"]:
         """Return a root of the covariance of the current base due to the noise of the rows."""
-        fit = self.now.fit
+        fit = self.current.fit
         return fit.solved.root[[fit.frames[k] for k in self._rows(frame)]]
 
     @property
-    def freedom(self) -> float:
+    def degrees_of_freedom(self) -> float:
         """Number of values from which the current noise was estimated, minus the parameters fitted to them."""
-        return sum(one.values - one.used for one in self.now.fit.solved.result().noise)
+        return sum(one.values - one.effective_parameters for one in self.current.fit.solved.result().noise)
 
     def displacement(self, frame: str) -> tuple[Float64[Tensor, " 6"], Float64[Tensor, "6 directions"]]:
         """Return the displacement of the base relative to a frame, with a root of its covariance.
@@ -67,7 +67,7 @@ class ArmBefore:
             of the root of the model, followed by those of the current noise.
         """
         before = self.posterior.values[list(self.posterior.base_rows(frame))]
-        now = torch.from_numpy(self.now.fit.solved.geometry.bases[frame].copy())
+        now = torch.from_numpy(self.current.fit.solved.geometry.bases[frame].copy())
         T_first_frame = self.T_first_base @ invert(transform_from_xyzrpy(before))
 
         def motion(bases: Tensor) -> Tensor:
@@ -77,7 +77,7 @@ class ArmBefore:
 
         both = torch.stack([now, before])
         J = torch.func.jacrev(motion)(both)
-        arm = J[:, 0] @ self.now.arm_root[self._rows(frame)]
+        arm = J[:, 0] @ self.current.arm_root[self._rows(frame)]
         arm = arm + J[:, 1] @ self.posterior.root[list(self.posterior.base_rows(frame))]
         noise = J[:, 0] @ self._noise(frame)
         return motion(both), torch.cat([arm, noise], 1)
@@ -119,7 +119,7 @@ class MovedBases:
     is_one_body: bool
 
     @cached_property
-    def named(self) -> tuple[MovedBody, ...]:
+    def likely_bodies(self) -> tuple[MovedBody, ...]:
         """The body whose motion explains the differences best; several if these cannot be distinguished, or none."""
         if self.probability >= _FALSE_ALARMS:
             return ()
@@ -147,7 +147,7 @@ def find_moved_bases(arms: Sequence[ArmBefore]) -> MovedBases:
             raise IdentificationError(
                 expected=f"rows of arm '{arm.posterior.name}' that determine its base in a named frame of its "
                 "calibration",
-                value=Phrase(", ".join(arm.now.fit.solved.geometry.bases)),
+                value=Phrase(", ".join(arm.current.fit.solved.geometry.bases)),
                 remedy="use the same name in the column 'frame', and measure 6 different poses or more",
             )
         for frame in arm.frames:
@@ -159,7 +159,7 @@ def find_moved_bases(arms: Sequence[ArmBefore]) -> MovedBases:
     y = torch.cat(motions)
     L = torch.linalg.cholesky(covariance)
     white = torch.linalg.solve_triangular(L, y[:, None], upper=False)[:, 0]
-    freedom = min(arm.freedom for arm in arms)
+    freedom = min(arm.degrees_of_freedom for arm in arms)
     square = float(white.square().sum())
     probability = float(fisher.sf(square / len(y), len(y), freedom))
     bodies = [

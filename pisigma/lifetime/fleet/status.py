@@ -80,9 +80,9 @@ class FleetStatus:
         }
 
 
-def urgency(one: CellStatus) -> tuple[int, str]:
+def urgency(status: CellStatus) -> tuple[int, str]:
     """Return a sort key: first cells that need attention, then cells with steps that can be carried out."""
-    state = one.step.state
+    state = status.step.state
     if state in ATTENTION:
         return ATTENTION.index(state), state
-    return len(ATTENTION) + (0 if one.is_due else 2 if state == "up_to_date" else 1), state
+    return len(ATTENTION) + (0 if status.is_due else 2 if state == "up_to_date" else 1), state

@@ -24,16 +24,16 @@ class Event:
 
     Attributes:
         number: index of the first value after the change.
-        alone: whether only this value is changed, rather than also all later values.
+        is_single: whether only this value is changed, rather than also all later values.
     """
 
     number: int
-    alone: bool
+    is_single: bool
 
     def column(self, count: int) -> Float64[Tensor, " count"]:
         """Return the column of the event: 1 for changed values, 0 for other values."""
         order = torch.arange(count)
-        return (order == self.number if self.alone else order >= self.number).double()
+        return (order == self.number if self.is_single else order >= self.number).double()
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +65,7 @@ class Series:
         """Append the columns of events."""
         return torch.cat([columns, *(one.column(len(self.values))[:, None] for one in events)], 1)
 
-    def events(self, steady: Tensor, drift: Tensor) -> tuple[tuple[Event, ...], bool]:
+    def events(self, base_columns: Tensor, drift: Tensor) -> tuple[tuple[Event, ...], bool]:
         """Find the events, and whether there is also a drift.
 
         Both with and without a drift, events are added one by one, each time the event that explains most, as long as
@@ -73,11 +73,11 @@ class Series:
         information criterion (Schwarz 1978, Annals of Statistics 6, 461-464).
 
         Args:
-            steady: columns of every fit.
+            base_columns: columns of every fit.
             drift: columns of a drift.
         """
-        steady_events, left = self._added(steady)
-        drift_events, left_with_drift = self._added(torch.cat([steady, drift], 1))
+        steady_events, left = self._added(base_columns)
+        drift_events, left_with_drift = self._added(torch.cat([base_columns, drift], 1))
         drifts = left_with_drift + drift.shape[1] * math.log(len(self.values)) < left
         return (drift_events, True) if drifts else (steady_events, False)
 

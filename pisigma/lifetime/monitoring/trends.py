@@ -33,14 +33,14 @@ class Trend:
 
     Attributes:
         what: quantity that drifts, such as "joint 2".
-        over: "month" or "kelvin".
+        per: "month" or "kelvin".
         unit: unit of the change per month or kelvin.
         slope: change per month or kelvin [`unit`].
         deviation: standard deviation of the slope [`unit`].
     """
 
     what: str
-    over: Literal["month", "kelvin"]
+    per: Literal["month", "kelvin"]
     unit: ShownUnit
     slope: float
     deviation: float
@@ -60,11 +60,11 @@ class Trend:
     def sentence(self) -> str:
         """Sentence that states the drift."""
         half = NORMAL_95 * self.deviation
-        return f"{self.what} drifts by {self.slope:.4f} ± {half:.4f} {self.unit} per {self.over}"
+        return f"{self.what} drifts by {self.slope:.4f} ± {half:.4f} {self.unit} per {self.per}"
 
     def to_json(self) -> dict[str, Any]:
         """Return slope and interval as plain values."""
-        slope = {f"{self.unit}_per_{self.over}": self.slope}
+        slope = {f"{self.unit}_per_{self.per}": self.slope}
         return {
             "what": self.what,
             **slope,
@@ -218,7 +218,7 @@ def jumps_of(revolute: Sequence[bool], records: Sequence[Record]) -> tuple[Jump,
                     records[zero.sessions[number]].date for number in (event.number - 1, event.number)
                 )
                 what, sizes_of = f"joint {joint + 1}", (size * factor, deviation * factor)
-                jumps.append(Jump(what, unit, *sizes_of, before, after, event.alone))
+                jumps.append(Jump(what, unit, *sizes_of, before, after, event.is_single))
     return tuple(jumps)
 
 

@@ -74,7 +74,7 @@ def session_diagnostics(
     limit = plausible_share(model.robot) * model.robot.reach
     if session.rms_after > limit:
         sentence = (
-            f"{rows.source}: the RMS error is {session.rms * 1e3:.4g} mm, and no movement explains it to less than "
+            f"{rows.source}: the RMS error is {session.rms * 1e3:.4g} mm, and no movement reduces it to less than "
             f"{limit * 1e3:.3g} mm: a robot other than that of model '{model.name}' was measured, or a column or unit "
             "is wrong; run `pisigma verify` on these rows."
         )

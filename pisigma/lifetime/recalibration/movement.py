@@ -104,7 +104,7 @@ def significant_movements(adaptation: Adaptation) -> tuple[Movement, ...]:
     moved: list[Movement] = []
     for number, group in enumerate(adaptation.drift.groups):
         if group.size and group.what.split()[0] in ("base", "tool", "joint", "lengths", "angles"):
-            estimate = adaptation.search.estimate_shift(number, held=not group.what.startswith("joint"))
+            estimate = adaptation.search.estimate_shift(number, with_prior=not group.what.startswith("joint"))
             moved += movements_of_group(adaptation.problem, adaptation.arm.geometry, group, *estimate)
     return tuple(one for one in moved if one.is_significant)
 

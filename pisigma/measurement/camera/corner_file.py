@@ -181,8 +181,8 @@ def _are_corners(table: Table) -> list[bool]:
             header.
     """
     for row, fields in enumerate(table.records):
-        if row in table.broken:
-            fault = Fault(f"the row is not valid CSV: {table.broken[row]}", remedy="check the quotes")
+        if row in table.invalid_rows:
+            fault = Fault(f"the row is not valid CSV: {table.invalid_rows[row]}", remedy="check the quotes")
             raise fault.error(table.place_of(row))
         if len(fields) != len(table.header):
             raise MeasurementError(
@@ -199,7 +199,7 @@ def _some(table: Table, chosen: Sequence[bool]) -> Table:
     """Return the chosen rows of a table."""
     rows = np.flatnonzero(chosen).tolist()
     records, lines = [table.records[row] for row in rows], tuple(table.lines[row] for row in rows)
-    return replace(table, records=records, lines=lines, broken={})
+    return replace(table, records=records, lines=lines, invalid_rows={})
 
 
 def _without_corners(table: Table, is_corner: Sequence[bool]) -> Table:

@@ -39,13 +39,13 @@ class PoseChunk:
     Attributes:
         T: T_base_tool [m] of the valid rows.
         line: line numbers of the valid rows.
-        bad: invalid rows, with their faults.
+        invalid_rows: invalid rows, with their faults.
         read_fraction: fraction of the file that has been read, 0 to 1; NaN if the length of the file is unknown.
     """
 
     T: Float64[Tensor, "rows 4 4"]
     line: tuple[int, ...]
-    bad: tuple[UnusableRow, ...]
+    invalid_rows: tuple[UnusableRow, ...]
     read_fraction: float
 
 
@@ -58,11 +58,11 @@ def read_poses(path: str | os.PathLike[str]) -> PoseChunk:
     T: list[Tensor] = []
     lines: list[int] = []
     for chunk in read_pose_chunks(path):
-        for bad in chunk.bad:
+        for bad in chunk.invalid_rows:
             raise bad.error(str(path))
         T.append(chunk.T)
         lines.extend(chunk.line)
-    return PoseChunk(torch.cat(T), tuple(lines), bad=(), read_fraction=1.0)
+    return PoseChunk(torch.cat(T), tuple(lines), invalid_rows=(), read_fraction=1.0)
 
 
 def read_pose_chunks(path: str | os.PathLike[str], rows: int = CHUNK_ROWS) -> Iterator[PoseChunk]:
@@ -98,7 +98,9 @@ def _chunks(file: TextIO, source: str, rows: int) -> Iterator[PoseChunk]:
         yield PoseChunk(
             T=T[sound],
             line=tuple(number for (number, _), good in zip(some, sound.tolist(), strict=True) if good),
-            bad=tuple(UnusableRow.from_fault(some[row][0], fault) for row, fault in sorted(faults.items())),
+            invalid_rows=tuple(
+                UnusableRow.from_fault(some[row][0], fault) for row, fault in sorted(faults.items())
+            ),
             read_fraction=file.buffer.tell() / length if length else float("nan"),
         )
     if not any_row:

@@ -269,7 +269,7 @@ def import_hint(path: str | os.PathLike[str]) -> str:
     if is_measurement_file(path):
         return ""
     try:
-        mapping = map_columns(read_export(path, most=_MAX_BYTES), {}, None, {})
+        mapping = map_columns(read_export(path, max_bytes=_MAX_BYTES), {}, None, {})
     except MeasurementError:
         return ""
     is_half = (mapping.has_joints or mapping.has_measured) and set(KEYS) & set(mapping.quantities)

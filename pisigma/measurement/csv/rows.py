@@ -56,7 +56,7 @@ def check_cells(table: Table, layout: Layout, robot: Robot | None) -> CheckedRow
         layout: its columns.
         robot: robot against which the limits of the joints are checked; None for no check.
     """
-    faults = Faults(table.broken)
+    faults = Faults(table.invalid_rows)
     cells = _cells(table, faults)
     values = np.stack([_numbers(cells[i], column, faults) for i, column in enumerate(layout.columns)], axis=1)
     _check_joints(values, layout, robot, faults)

@@ -28,7 +28,7 @@ class Table:
         header_line: line number of the header.
         records: the fields of every row; empty for rows that are not valid CSV.
         lines: line numbers of the rows.
-        broken: faults of the rows that are not valid CSV, by row.
+        invalid_rows: faults of the rows that are not valid CSV, by row.
     """
 
     source: str
@@ -36,7 +36,7 @@ class Table:
     header_line: int
     records: list[list[str]]
     lines: tuple[int, ...]
-    broken: dict[int, str]
+    invalid_rows: dict[int, str]
 
     @property
     def header_place(self) -> Place:
@@ -82,7 +82,7 @@ def table_of(text: str, source: str) -> Table:
         header_line=header_line,
         records=[fields for fields, _ in split],
         lines=tuple(number for number, _ in content),
-        broken={row: problem for row, (_, problem) in enumerate(split) if problem},
+        invalid_rows={row: problem for row, (_, problem) in enumerate(split) if problem},
     )
 
 

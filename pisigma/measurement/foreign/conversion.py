@@ -317,7 +317,7 @@ def measurement_table(rows: ConvertedRows) -> MeasurementTable:
         header_line=1,
         records=[record for record, used in zip(records, filled, strict=True) if used],
         lines=tuple(line for line, used in zip(rows.lines, filled, strict=True) if used),
-        broken={},
+        invalid_rows={},
     )
     fields_of(table)
     places = list(zip(rows.row_places, filled, strict=True))

@@ -83,21 +83,21 @@ class ExportFile:
 
 
 def read_export(
-    path: str | os.PathLike[str], decimal: Decimal | None = None, most: int = MAX_BYTES
+    path: str | os.PathLike[str], decimal: Decimal | None = None, max_bytes: int = MAX_BYTES
 ) -> ExportFile:
     """Read an export, recognising encoding, separator, decimal sign, headings, unit row and comments.
 
     Args:
         path: the file.
         decimal: the decimal sign, if it is stated.
-        most: largest size of the file [bytes].
+        max_bytes: largest size of the file [bytes].
 
     Raises:
         MeasurementError: the file cannot be read, is not text, does not contain a table of numbers, or the number of
             cells of a row differs from that of the other rows.
     """
     source = make_printable(str(path), cut=False)
-    lines = _lines_of(decode_text(read_input(path, MeasurementError, most), source), source)
+    lines = _lines_of(decode_text(read_input(path, MeasurementError, max_bytes), source), source)
     dialect = detect_dialect(lines, source, decimal)
     cells = [dialect.split(line) for _, line in lines]
     width = Counter(len(row) for row in cells if dialect.is_row(row)).most_common(1)[0][0]

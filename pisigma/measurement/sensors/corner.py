@@ -95,7 +95,7 @@ class CornerSensor(AbstractSensor):
         weight: noise times W for errors in the frame of the base's anchor [1, and m/rad].
         present: mask of the rows from images.
         camera: index of the camera among those whose intrinsics are estimated, -1 in rows without one.
-        at: intrinsics with which the poses were solved.
+        intrinsics: intrinsics with which the poses were solved.
         intrinsics_jacobian: derivative of the weighted measured pose with respect to the intrinsics.
         board: index of the board, -1 in rows without one.
         scale_derivative: derivative of the weighted measured pose with respect to the scale of the board [m].
@@ -117,7 +117,7 @@ class CornerSensor(AbstractSensor):
     weight: Float64[Tensor, "6 6 rows"]
     present: Bool[Tensor, " rows"]
     camera: Int64[Tensor, " rows"]
-    at: Float64[Tensor, "9 rows"]
+    intrinsics: Float64[Tensor, "9 rows"]
     intrinsics_jacobian: Float64[Tensor, "6 9 rows"]
     board: Int64[Tensor, " rows"]
     scale_derivative: Float64[Tensor, "6 rows"]
@@ -139,7 +139,7 @@ class CornerSensor(AbstractSensor):
         rotated = torch.where(present[:, None, None], rotated, 0.0)
         images = ImageIntrinsics.from_texts(texts_of(data, INTRINSICS_COLUMN))
         of_camera, of_board = cameras(data), boards(data)
-        at, by = (torch.from_numpy(values).to(R) for values in (images.at, images.pose_jacobian))
+        at, by = (torch.from_numpy(values).to(R) for values in (images.intrinsics, images.pose_jacobian))
         scale_derivative = torch.where(
             present, torch.einsum("nij,nj->in", weight[..., :3], data.position), 0.0
         )
@@ -149,7 +149,7 @@ class CornerSensor(AbstractSensor):
             rotated.permute(1, 2, 0),
             present,
             camera=rows.numbers(of_camera, distinct_names(of_camera)),
-            at=at.t(),
+            intrinsics=at.t(),
             intrinsics_jacobian=(weight @ by).permute(1, 2, 0),
             board=rows.numbers(of_board, distinct_names(of_board)),
             scale_derivative=scale_derivative,
@@ -160,7 +160,7 @@ class CornerSensor(AbstractSensor):
         error = torch.cat([self.position[:, rows] - motion.position, self._rotation_error(motion, rows)])
         residual: Tensor = torch.einsum("ijn,jn->in", self.weight[..., rows], error)
         if "camera" in unknowns:
-            moved = unknowns["camera"][:, self.camera[rows]] - self.at[:, rows]
+            moved = unknowns["camera"][:, self.camera[rows]] - self.intrinsics[:, rows]
             residual += torch.einsum("ijn,jn->in", self.intrinsics_jacobian[..., rows], moved)
         if "board" in unknowns:
             residual += self.scale_derivative[:, rows] * unknowns["board"][:, self.board[rows]]
@@ -232,7 +232,7 @@ def as_poses(
     moved = np.zeros((measurements.rows, NUMBERS))
     scale = np.ones(measurements.rows)
     for row, camera in enumerate(cameras(measurements) or ()):
-        moved[row] = unknowns.get("camera", {}).get(camera, images.at[row]) - images.at[row]
+        moved[row] = unknowns.get("camera", {}).get(camera, images.intrinsics[row]) - images.intrinsics[row]
     for row, board in enumerate(boards(measurements) or ()):
         scale[row] += float(unknowns.get("board", {}).get(board, np.zeros(1))[0])
     change = torch.from_numpy(np.einsum("nij,nj->ni", images.pose_jacobian, moved)).to(position)

@@ -48,14 +48,14 @@ paper."""
 
 @dataclass(frozen=True, eq=False)
 class ImageIntrinsics:
-    """Information of the corners of images on their camera's intrinsics k, linearised at `at`.
+    """Information of the corners of images on their camera's intrinsics k, linearised at `intrinsics`.
 
     Attributes:
         pose_jacobian: derivative of the measured position and rotation vector, in the axes of the row's frame, with
             respect to k.
         root: matrix of the equations of k with the poses eliminated, `root (k - at) = residual` with unit variances.
         residual: right-hand side of the equations of `root`.
-        at: intrinsics at which the images were linearised.
+        intrinsics: intrinsics at which the images were linearised.
         stated: intrinsics of the camera file, the prior mean.
         sigma: prior standard deviations; 0 for fixed intrinsics.
     """
@@ -63,7 +63,7 @@ class ImageIntrinsics:
     pose_jacobian: Float64[np.ndarray, "*rows 6 9"]
     root: Float64[np.ndarray, "*rows 9 9"]
     residual: Float64[np.ndarray, "*rows 9"]
-    at: Float64[np.ndarray, "*rows 9"]
+    intrinsics: Float64[np.ndarray, "*rows 9"]
     stated: Float64[np.ndarray, "*rows 9"]
     sigma: Float64[np.ndarray, "*rows 9"]
 
@@ -74,7 +74,7 @@ class ImageIntrinsics:
     @property
     def texts(self) -> tuple[str, ...]:
         """Cells of the column of intrinsics: all numbers of an image as text, separated by spaces."""
-        blocks = [getattr(self, item.name).reshape(len(self.at), -1) for item in fields(self)]
+        blocks = [getattr(self, item.name).reshape(len(self.intrinsics), -1) for item in fields(self)]
         return tuple(" ".join(f"{value:.17g}" for value in row) for row in np.concatenate(blocks, 1))
 
     @staticmethod
@@ -98,12 +98,12 @@ def intrinsics_information(
         U [1/px; 1 for distortion], where `U^T U` is the information (0 for fixed intrinsics), and the mean [px; 1 for
         distortion].
     """
-    sigma, at = images.sigma[0], images.at[0]
+    sigma, at = images.sigma[0], images.intrinsics[0]
     free = np.flatnonzero(sigma > 0)
     # in units of the prior standard deviations, in which the information of the prior is the identity
     scaled = images.root[:, :, free] * sigma[free]
     information = np.eye(len(free)) + np.einsum("nij,nik->jk", scaled, scaled)
-    residual = images.residual + np.einsum("nij,nj->ni", images.root, images.at - at)
+    residual = images.residual + np.einsum("nij,nj->ni", images.root, images.intrinsics - at)
     pull = np.einsum("nij,ni->j", scaled, residual) + (images.stated[0] - at)[free] / sigma[free]
     U, mean = np.zeros((NUMBERS, NUMBERS)), at.copy()
     U[np.ix_(free, free)] = np.linalg.cholesky(information).T / sigma[free]
@@ -111,25 +111,27 @@ def intrinsics_information(
     return U, mean
 
 
-def without_stated_priors(measurements: Measurements, counted: Mapping[str, Collection[str]]) -> Measurements:
+def without_stated_priors(
+    measurements: Measurements, included: Mapping[str, Collection[str]]
+) -> Measurements:
     """Return rows of images without the priors of some cameras and boards.
 
     Args:
         measurements: measurements with or without rows of images.
-        counted: cameras and boards, by group, whose priors a model already includes.
+        included: cameras and boards, by group, whose priors a model already includes.
     """
     if CAMERA_COLUMN not in measurements.readings:
         return measurements
     stated, scales = (texts_of(measurements, name) for name in (INTRINSICS_COLUMN, SCALE_COLUMN))
     images, names = ImageIntrinsics.from_texts(stated), cameras(measurements) or ("",) * len(stated)
-    is_counted = np.array([name in counted.get("camera", ()) for name in names])
+    is_counted = np.array([name in included.get("camera", ()) for name in names])
     images = replace(images, sigma=np.where(is_counted[:, None], _UNINFORMATIVE, 1.0) * images.sigma)
     texts = {
         INTRINSICS_COLUMN: tuple(
             text if name else "" for name, text in zip(names, images.texts, strict=True)
         ),
         SCALE_COLUMN: tuple(
-            "1" if board in counted.get("board", ()) else text
+            "1" if board in included.get("board", ()) else text
             for board, text in zip(boards(measurements) or (), scales, strict=True)
         ),
     }

@@ -72,7 +72,11 @@ def _images(table: Table) -> list[Table]:
             table,
             records=[table.records[row] for row in rows],
             lines=tuple(table.lines[row] for row in rows),
-            broken={number: table.broken[row] for number, row in enumerate(rows) if row in table.broken},
+            invalid_rows={
+                number: table.invalid_rows[row]
+                for number, row in enumerate(rows)
+                if row in table.invalid_rows
+            },
         )
         for rows in groups.values()
     ]

@@ -185,4 +185,4 @@ def is_wrong(judgement: RowJudgement) -> Tensor:
     """Return the mask of rows that are contradicted by the others."""
     if judgement.errors is None:
         return torch.zeros_like(judgement.counts)
-    return ~judgement.counts & (judgement.errors.chance < FALSE_ALARMS)
+    return ~judgement.counts & (judgement.errors.p_value < FALSE_ALARMS)

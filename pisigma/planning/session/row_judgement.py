@@ -61,14 +61,15 @@ class LeaveOneOutErrors:
     """Errors of rows that are each predicted from the others.
 
     Attributes:
-        chance: probability that a correct row has an error at least as improbable; NaN for rows that cannot be checked.
+        p_value: probability that a correct row has an error at least as improbable; NaN for rows that cannot be
+            checked.
         length: size of the error of the measured length [m]; NaN for rows that cannot be checked.
         angle: size of the error of the measured orientation [rad]; NaN for rows that cannot be checked.
         position: measured minus predicted position in the frame of the row [m]; NaN for rows that cannot be checked.
         scale: ratio of this robot's errors to the errors of its class, at least 1.
     """
 
-    chance: Float64[Tensor, " rows"]
+    p_value: Float64[Tensor, " rows"]
     length: Float64[Tensor, " rows"]
     angle: Float64[Tensor, " rows"]
     position: Float64[Tensor, "rows 3"]
@@ -327,11 +328,11 @@ def judge_rows(
         errors = model.leave_one_out()
         while (wrong := _contradicted(robot, rows, sigma, model, errors, few)) is not None:
             model, errors = wrong
-        right = ~(errors.chance < FALSE_ALARMS) & ~model.kept
+        right = ~(errors.p_value < FALSE_ALARMS) & ~model.kept
         if bool(right.any()):
             model = RowModel.from_rows(robot, rows, sigma, model.kept | right)
             again = model.leave_one_out()
-            errors = replace(again, chance=errors.chance)
+            errors = replace(again, p_value=errors.p_value)
         return RowJudgement(model.kept, model, errors)
     except IdentificationError:  # too few rows for base and tool
         return RowJudgement(torch.ones_like(trusted))
@@ -350,7 +351,7 @@ def _contradicted(
     A wrong row among few moves base and tool so far that it can only be found by leaving out every row once.
     """
     counts = model.kept
-    chance = torch.where(counts, errors.chance, torch.nan)
+    chance = torch.where(counts, errors.p_value, torch.nan)
     suspects = [int(chance.nan_to_num(nan=1.0).argmin())] if bool((chance < FALSE_ALARMS).any()) else []
     if few and (suspects or errors.scale > _CONTRADICTORY_FACTOR):
         suspects = counts.nonzero()[:, 0].tolist()
@@ -368,6 +369,6 @@ def _contradicted(
         others[row] = False
         model = RowModel.from_rows(robot, rows, sigma, others)
         errors = model.leave_one_out()
-        if float(errors.chance[row]) < FALSE_ALARMS:
+        if float(errors.p_value[row]) < FALSE_ALARMS:
             return model, errors
     return None

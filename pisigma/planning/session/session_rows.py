@@ -166,7 +166,7 @@ def _steps(known: int, count: int) -> Iterator[int]:
 
 
 def setup_sentence(
-    rows: Measurements, counts: Bool[Tensor, " rows"], against: Robot | CalibratedModel
+    rows: Measurements, counts: Bool[Tensor, " rows"], reference: Robot | CalibratedModel
 ) -> str:
     """Return a sentence about a fault that all rows have in common; "" if there is none.
 
@@ -175,10 +175,10 @@ def setup_sentence(
     Args:
         rows: all usable rows.
         counts: rows that are not contradicted by others.
-        against: the nominal robot, or the planned model.
+        reference: the nominal robot, or the planned model.
     """
     some = rows.select(counts) if counts.double().mean() > 1 - MIN_WRONG_SHARE else rows
-    found = check_rows(some, against, may_move=MOVES).implausible
+    found = check_rows(some, reference, may_move=MOVES).implausible
     return found[0].sentence if found else ""
 
 
@@ -279,7 +279,7 @@ def stopping_advice(
     least_gain_mm: float,
     reached: Sequence[AccuracyPoint],
     expected: Sequence[AccuracyPoint],
-    left: int,
+    remaining: int,
 ) -> Advice:
     """Return advice on whether to continue measuring or to stop, with the reason.
 
@@ -289,7 +289,7 @@ def stopping_advice(
         reached: accuracy so far. The limit is reached when the last two points are below it, because estimates from few
             rows scatter and the first point below the limit is often there by chance.
         expected: expected accuracy after the remaining poses.
-        left: number of remaining poses.
+        remaining: number of remaining poses.
     """
     limit = "" if limit_mm is None else f"; the limit is {limit_mm:g} mm"
     if reached:
@@ -306,8 +306,10 @@ def stopping_advice(
         if ahead is not None and gain < least_gain_mm:
             more = f"{ahead.poses - point.poses} more poses would lower this by only {max(gain, 0.0):.4f} mm"
             return Advice("stop", f"Stop: {now}{limit}; {more}.")
-    if not left:
+    if not remaining:
         return Advice("stop", f"Stop: all poses of the plan have been measured{limit}.")
     if not reached:
-        return Advice("measure", f"{left} poses remain; there are too few rows to estimate the accuracy.")
-    return Advice("measure", f"{left} poses remain; {now}{limit}{confirm}.")
+        return Advice(
+            "measure", f"{remaining} poses remain; there are too few rows to estimate the accuracy."
+        )
+    return Advice("measure", f"{remaining} poses remain; {now}{limit}{confirm}.")

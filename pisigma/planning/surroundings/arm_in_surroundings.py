@@ -195,7 +195,7 @@ class ArmInSurroundings:
                 self._apart(segments) - self.pair_clearance, infinite
             )
         }
-        moving = ~self.capsules.carrier
+        moving = ~self.capsules.carries_robot
         if self.surroundings.floor_mm is not None:
             height = segments[:, moving, 1, 2] - radius[moving] - self.surroundings.floor_mm / 1e3
             gaps["the robot touches the floor"] = _least(height, infinite) - clearance

@@ -41,7 +41,7 @@ class Capsules:
         point: position of each end in that frame [m].
         link: number of the joint that moves each piece; 0 for fixed pieces.
         radius: radius of each piece [m].
-        carrier: whether each piece carries the robot, because the piece is before the first joint or on its axis.
+        carries_robot: whether each piece carries the robot, because the piece is before the first joint or on its axis.
     """
 
     robot: Robot
@@ -49,7 +49,7 @@ class Capsules:
     point: Float64[Tensor, "pieces 2 3"]
     link: Int64[Tensor, " pieces"]
     radius: Float64[Tensor, " pieces"]
-    carrier: Bool[Tensor, " pieces"]
+    carries_robot: Bool[Tensor, " pieces"]
 
     @staticmethod
     def from_robot(
@@ -86,14 +86,14 @@ class Capsules:
             torch.from_numpy(np.array([piece.point for piece in pieces])),
             torch.from_numpy(link),
             torch.from_numpy(sizes),
-            torch.tensor([piece.carrier for piece in pieces]),
+            torch.tensor([piece.carries_robot for piece in pieces]),
         )
         segments = capsules.segments(capsules.random_joints())
         return capsules._of((segments[:, :, 1] - segments[:, :, 0]).norm(dim=-1).amax(0) > _MIN_LENGTH)
 
     def _of(self, kept: Bool[Tensor, " pieces"]) -> "Capsules":
         """Return only the capsules of the kept pieces."""
-        values = (self.frame, self.point, self.link, self.radius, self.carrier)
+        values = (self.frame, self.point, self.link, self.radius, self.carries_robot)
         return Capsules(self.robot, *(value[kept] for value in values))
 
     def segments(self, q: Float64[Tensor, "*batch dof"]) -> Float64[Tensor, "*batch pieces 2 3"]:
@@ -138,13 +138,13 @@ class _Piece(NamedTuple):
 
     Attributes:
         row: row to whose link the piece belongs.
-        carrier: see `Capsules`.
+        carries_robot: see `Capsules`.
         frame: frames to which the ends are fixed.
         point: positions of the ends in these frames [m].
     """
 
     row: int
-    carrier: bool
+    carries_robot: bool
     frame: tuple[int, int]
     point: tuple[Float64[np.ndarray, " 3"], Float64[np.ndarray, " 3"]]
 
@@ -163,8 +163,8 @@ def _pieces_of_rows(robot: Robot, tip: Float64[np.ndarray, " 3"]) -> Iterator[_P
         elif not has_seats:
             corners.insert(1, (i + 1, _behind(robot, i, np.array([0.0, 0.0, robot.dh[i, 1]]))))
         for number, (start, end) in enumerate(itertools.pairwise(corners)):
-            carrier = i < first or (i == first and number == 0 and len(corners) > 2)
-            yield _Piece(i, carrier, (start[0], end[0]), (start[1], end[1]))
+            carries_robot = i < first or (i == first and number == 0 and len(corners) > 2)
+            yield _Piece(i, carries_robot, (start[0], end[0]), (start[1], end[1]))
     if not has_seats:
         yield _Piece(i, False, (i + 1, i + 1), (np.zeros(3), tip))
 

@@ -188,7 +188,7 @@ def draw_figures(content: ReportContent) -> ReportFigures:
     points = (content.summary.learning_curve if content.summary else None) or ()
     return ReportFigures(
         map=draw_map(
-            "error_map", "map", "Errors over the workspace", content.map.place, content.map.layers[:3]
+            "error_map", "map", "Errors over the workspace", content.map.position, content.map.layers[:3]
         ),
         dependences=tuple(map(draw_dependence, content.dependences)),
         correlations=draw_correlations(content.correlations.tables),
@@ -277,7 +277,7 @@ def draw_learning_curve(points: Sequence[LearningPoint]) -> Drawing:
 
 
 def draw_map(
-    key: str, title: str, what: str, place: Float64[np.ndarray, "points 3"], layers: Sequence[Layer]
+    key: str, title: str, what: str, position: Float64[np.ndarray, "points 3"], layers: Sequence[Layer]
 ) -> Drawing:
     """Draw quantities at points in space from above and from the side, for printing and without JavaScript.
 
@@ -285,7 +285,7 @@ def draw_map(
         key: key of the drawing.
         title: title of the drawing.
         what: subject of the drawing, at the start of its text alternative.
-        place: position of every point [mm].
+        position: position of every point [mm].
         layers: quantities, drawn side by side.
     """
     with drawing_style():
@@ -295,7 +295,7 @@ def draw_map(
             finite = np.isfinite(layer.values)
             order = np.argsort(layer.values[finite], kind="stable")
             order = np.concatenate([order[:-_MAX_MAP_DOTS:4], order[-_MAX_MAP_DOTS:]])[-2 * _MAX_MAP_DOTS :]
-            values, at = layer.values[finite][order], place[finite][order]
+            values, at = layer.values[finite][order], position[finite][order]
             top = max(float(values.max(initial=0.0)), 1e-12)
             for axes, (a, b) in zip(grid[:, column], ((0, 1), (0, 2)), strict=True):
                 dots = axes.scatter(

@@ -306,4 +306,6 @@ def draw_displacement(what: str, displacement: Displacement) -> Drawing:
     if errors.rotation is not None:
         layers.append(Layer("turn", "deg", np.rad2deg(errors.rotation.numpy())))
     seen = f"Distance and rotation between the poses of both models, {what},"
-    return draw_map(f"displacement_{what}", _sentence(what), seen, displacement.place.numpy() * 1e3, layers)
+    return draw_map(
+        f"displacement_{what}", _sentence(what), seen, displacement.position.numpy() * 1e3, layers
+    )

@@ -99,7 +99,7 @@ def script_json(value: Any) -> Markup:
 def map_data(error_map: ErrorMap, robot: Robot) -> dict[str, Any]:
     """Pack the data of the viewer; arrays as base64 of little-endian float32."""
     return {
-        "place": _packed(error_map.place),
+        "place": _packed(error_map.position),
         "layers": [
             {
                 "key": layer.key,

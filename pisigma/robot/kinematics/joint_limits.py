@@ -84,10 +84,10 @@ joint, be in another unit, or be relative to another zero."""
 
 
 def beyond_limits(
-    q: Float64[np.ndarray, " rows"], axis: Row, slack: float = LIMIT_TOLERANCE
+    q: Float64[np.ndarray, " rows"], axis: Row, tolerance: float = LIMIT_TOLERANCE
 ) -> Bool[np.ndarray, " rows"]:
-    """Return the mask of values [rad or m] that exceed the limits of an axis by more than `slack`."""
-    outside: np.ndarray = (q < axis.lower - slack) | (q > axis.upper + slack)
+    """Return the mask of values [rad or m] that exceed the limits of an axis by more than `tolerance`."""
+    outside: np.ndarray = (q < axis.lower - tolerance) | (q > axis.upper + tolerance)
     return outside
 
 

@@ -92,7 +92,7 @@ def identification_jacobian(
     J = flat.new_empty((flat.shape[0], 6, len(order)))
     for start in range(0, flat.shape[0], JACOBIAN_CHUNK):
         part = slice(start, start + JACOBIAN_CHUNK)
-        motion = tool_motion(robot, robot.dh, base, tool, flat[part], turning=True)
+        motion = tool_motion(robot, robot.dh, base, tool, flat[part], with_rotation=True)
         T[part, :3, :3] = motion.rotation.permute(2, 0, 1)
         T[part, :3, 3] = motion.position.t()
         J[part] = motion.derivative[order].permute(2, 1, 0)
@@ -105,7 +105,7 @@ def tool_motion(
     base: Float[Tensor, "6 bases"],
     tool: Float[Tensor, "6 tools"],
     q: Float[Tensor, "poses dof"],
-    turning: bool,
+    with_rotation: bool,
     frame: Int64[Tensor, " poses"] | None = None,
     target: Int64[Tensor, " poses"] | None = None,
 ) -> ToolMotion:
@@ -117,7 +117,7 @@ def tool_motion(
         base: x, y, z [m], roll, pitch, yaw [rad] of the base; one for all poses, or one per measuring frame.
         tool: x, y, z [m], roll, pitch, yaw [rad] of the tool; one for all poses, or one per target.
         q: joint values [rad or m].
-        turning: whether to also compute the derivative of the rotation.
+        with_rotation: whether to also compute the derivative of the rotation.
         frame: index of the base for every pose, if there are several.
         target: index of the tool for every pose, if there are several.
     """
@@ -132,7 +132,7 @@ def tool_motion(
     tool_steps = _behind(_last(frames), tool_axes)
     position = tool_steps[_ORIGIN]
     shifts = 3 * frames.shape[0] + 3
-    J = q.new_empty((5 * len(robot.rows) + 15, 6 if turning else 3, poses))
+    J = q.new_empty((5 * len(robot.rows) + 15, 6 if with_rotation else 3, poses))
     turns = frames[:, ::3]
     u, v = turns.unbind(2), (position - frames[:, 5])[:, None].unbind(2)
     of_turns = J[: shifts - 3].view(-1, 3, J.shape[1], poses)
@@ -142,7 +142,7 @@ def tool_motion(
     base_steps = base_axes[3:6, :3].expand(-1, -1, poses)
     torch.cat([frames[1:-1, 6], frames[2:, 0], base_steps, tool_steps[3:6]], out=J[shifts:, :3])
     J[shifts - 3 : shifts, :3] = 0
-    if turning:
+    if with_rotation:
         of_turns[:, :, 3:] = turns
         J[shifts - 3 : shifts, 3:] = tool_steps[:3]
         J[shifts:, 3:] = 0

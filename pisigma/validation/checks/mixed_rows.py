@@ -230,8 +230,9 @@ def _differ(found: Populations) -> bool:
     """Return whether the rows are two populations rather than one arm with unmodelled errors."""
     return (
         found.log_bayes_factor > _CERTAIN
-        and found.factor > _LARGE[found.differing] * max((1 - _HARDLY_USED) / (1 - found.used), 1.0)
-        and int(found.second.sum()) >= MIN_SHARE * found.tried
+        and found.factor
+        > _LARGE[found.differing_part] * max((1 - _HARDLY_USED) / (1 - found.absorbed_share), 1.0)
+        and int(found.second.sum()) >= MIN_SHARE * found.evaluated_rows
     )
 
 
@@ -250,15 +251,16 @@ def _two_populations(rows: Measurements, found: Populations) -> Diagnostic:
             "are in a different frame from the others, because the instrument or the robot was moved",
             "Name another frame in these rows (column 'frame'), or leave them out",
         ),
-    }[found.differing]
-    implausible = found.differing == "arm" or found.factor > _IMPLAUSIBLE
+    }[found.differing_part]
+    implausible = found.differing_part == "arm" or found.factor > _IMPLAUSIBLE
     return Diagnostic(
         kind="two_populations",
         severity="implausible" if implausible else "warning",
-        sentence=f"Two populations are mixed: {size} of {found.tried} rows {difference} ({distinction.clause}); the "
-        f"errors of all rows together are {found.factor:.2g} times as large as separately. {advice}.",
+        sentence=f"Two populations are mixed: {size} of {found.evaluated_rows} rows {difference} "
+        f"({distinction.clause}); the errors of all rows together are {found.factor:.2g} times as large as "
+        f"separately. {advice}.",
         rows=tuple(rows.place(row) for row in second.nonzero()[:, 0].tolist()),
-        cause=found.differing,
+        cause=found.differing_part,
         values={
             "factor": found.factor,
             "log_odds": found.log_bayes_factor,

@@ -106,26 +106,26 @@ class ArmsSummary(Section):
         return self.model_dump(mode="json")
 
 
-def base_figures(found: ArmBases, first: int, second: int, postures: tuple[Postures, ...]) -> ArmBaseFigures:
+def base_figures(bases: ArmBases, first: int, second: int, postures: tuple[Postures, ...]) -> ArmBaseFigures:
     """Return the base of the second arm relative to that of the first; `postures` are those of every arm."""
-    T, covariance = found.relative(first, second)
+    T, covariance = bases.relative(first, second)
     shown = np.array([1e3] * 3 + [math.degrees(1)] * 3)
     in_mm_and_deg = covariance.numpy() * shown * shown[:, None]
     names = ("x_mm", "y_mm", "z_mm", "roll_deg", "pitch_deg", "yaw_deg")
     values = dict(zip(names, (xyzrpy_from_transform(T).numpy() * shown).tolist(), strict=True))
     return ArmBaseFigures(
-        arm=found.arms[second].name,
-        in_base_of=found.arms[first].name,
+        arm=bases.arms[second].name,
+        in_base_of=bases.arms[first].name,
         standard_errors=tuple(np.sqrt(in_mm_and_deg.diagonal()).tolist()),
         covariance=tuple(map(tuple, in_mm_and_deg.tolist())),
-        tool_to_tool_mm=tool_to_tool_deviation(found, first, second, postures) * 1e3,
+        tool_to_tool_mm=tool_to_tool_deviation(bases, first, second, postures) * 1e3,
         **values,
     )
 
 
-def disagreement_diagnostic(found: ArmBases, one: Disagreement) -> Diagnostic:
+def disagreement_diagnostic(bases: ArmBases, disagreement: Disagreement) -> Diagnostic:
     """Return the finding that arms disagree on the location of a shared object."""
-    names = " and ".join(f"'{found.arms[number].name}'" for number in one.shared.arms)
+    names = " and ".join(f"'{bases.arms[number].name}'" for number in disagreement.shared.arms)
     remedy = (
         "check that it was not moved between the measurements of the arms, that its name is right in all rows, and "
         "the rows of both arms"
@@ -133,12 +133,17 @@ def disagreement_diagnostic(found: ArmBases, one: Disagreement) -> Diagnostic:
     return Diagnostic(
         kind="arms",
         severity="implausible",
-        cause=one.shared.kind,
+        cause=disagreement.shared.kind,
         sentence=(
-            f"Arms {names} place {one.shared.kind} '{one.shared.name}' {one.distance * 1e3:.3g} mm apart, which is "
-            f"improbable (probability {one.probability:.1g}); {remedy}."
+            f"Arms {names} place {disagreement.shared.kind} '{disagreement.shared.name}' "
+            f"{disagreement.distance * 1e3:.3g} mm apart, which is improbable "
+            f"(probability {disagreement.probability:.1g}); {remedy}."
         ),
-        values={"name": one.shared.name, "distance_mm": one.distance * 1e3, "probability": one.probability},
+        values={
+            "name": disagreement.shared.name,
+            "distance_mm": disagreement.distance * 1e3,
+            "probability": disagreement.probability,
+        },
         remedy=remedy,
     )
 
@@ -157,21 +162,21 @@ def sums_with_tool(arm: str, result: CalibrationResult) -> tuple[str, ...]:
 
 
 def arms_summary(
-    found: ArmBases, robots: tuple[str, ...], postures: tuple[Postures, ...], sums: tuple[str, ...]
+    bases: ArmBases, robots: tuple[str, ...], postures: tuple[Postures, ...], sums: tuple[str, ...]
 ) -> ArmsSummary:
     """Collect the figures of several arms.
 
     Args:
-        found: the arms with their bases.
+        bases: the arms with their bases.
         robots: names of their robots.
         postures: postures of every arm.
         sums: sentences of `sums_with_tool` of all arms.
     """
-    names = [arm.name for arm in found.arms]
+    names = [arm.name for arm in bases.arms]
     count = len(names)
     return ArmsSummary(
         arms=tuple(ModelFile(name=name, robot=robot) for name, robot in zip(names, robots, strict=True)),
-        bases=tuple(base_figures(found, a, b, postures) for b in range(count) for a in range(b)),
+        bases=tuple(base_figures(bases, a, b, postures) for b in range(count) for a in range(b)),
         shared=tuple(
             SharedFigures(
                 kind=one.kind,
@@ -179,11 +184,11 @@ def arms_summary(
                 arms=tuple(names[number] for number in one.arms),
                 distance_mm=distance * 1e3,
             )
-            for one, distance in zip(found.shared, found.distances, strict=True)
+            for one, distance in zip(bases.shared, bases.distances, strict=True)
         ),
-        misfit=found.conditioned.misfit,
-        redundancy=found.conditioned.redundancy,
-        probability=found.probability,
-        diagnostics=tuple(disagreement_diagnostic(found, one) for one in found.disagreements),
+        misfit=bases.conditioned.misfit,
+        redundancy=bases.conditioned.redundancy,
+        probability=bases.probability,
+        diagnostics=tuple(disagreement_diagnostic(bases, one) for one in bases.disagreements),
         sums=sums,
     )

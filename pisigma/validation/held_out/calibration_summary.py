@@ -271,7 +271,13 @@ def summarise(result: Result) -> CalibrationSummary:
         condition_number=_or_none(geometric.condition_number),
         observability=geometric.observability,
         noise=tuple(
-            noise_figures(one.sensor, one.sigma, one.unit, values=one.values, used_by_parameters=one.used)
+            noise_figures(
+                one.sensor,
+                one.sigma,
+                one.unit,
+                values=one.values,
+                used_by_parameters=one.effective_parameters,
+            )
             for one in geometric.noise
         ),
         parameters=_parameters(geometric),

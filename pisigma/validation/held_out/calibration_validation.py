@@ -57,7 +57,7 @@ class CalibrationValidation:
             predicted position of the ball.
         not_judged: number of held-out rows that could not be evaluated, because no training row has their target or
             anchor.
-        again: validations with other folds (repeats), whose errors are included in the figures.
+        further_repeats: validations with other folds (repeats), whose errors are included in the figures.
     """
 
     folds: int
@@ -67,12 +67,12 @@ class CalibrationValidation:
     frames_fitted: int = 0
     sockets_held_out: int = 0
     not_judged: int = 0
-    again: tuple["CalibrationValidation", ...] = ()
+    further_repeats: tuple["CalibrationValidation", ...] = ()
 
     @property
     def repeats(self) -> tuple["CalibrationValidation", ...]:
         """The validations of all repeats."""
-        return (replace(self, again=()), *self.again)
+        return (replace(self, further_repeats=()), *self.further_repeats)
 
     @property
     def all_errors(self) -> dict[str, PoseErrors]:
@@ -98,7 +98,7 @@ class CalibrationValidation:
         last = list(self.models.values())[-1]
         figures: dict[str, object] = {"folds": self.folds} if self.folds else {}
         figures["rows"] = int(torch.isfinite(last.position).sum())
-        if self.again:
+        if self.further_repeats:
             figures["repeats"] = len(self.repeats)
             figures["rms_mm_of_repeats"] = {
                 name: tuple(_rms_mm(one.models[name].position) for one in self.repeats)
@@ -236,7 +236,7 @@ def joined_repeats(
 ) -> CalibrationValidation:
     """Combine the evaluated folds of all repeats, in the order of `fold_tasks`."""
     first, *again = [_joined(measurements, [next(judged) for _ in splits], len(splits)) for splits in repeats]
-    return replace(first, again=tuple(again))
+    return replace(first, further_repeats=tuple(again))
 
 
 def _judged_fold(

@@ -79,7 +79,7 @@ def _helps(
     ratio = distinct_values(result.solved.problem) / max(result.solved.findings.estimated, 1)
     if ratio >= _MIN_RATIO:
         return True
-    if any(noise.used > _USED_UP * noise.values for noise in result.noise):
+    if any(noise.effective_parameters > _USED_UP * noise.values for noise in result.noise):
         return False
     if ratio < _MIN_RATIO_HELD_OUT:
         return distinct_rows(result.solved.problem) >= _MIN_POSES and _evident(calibrator, result, rows)
@@ -98,9 +98,11 @@ def _evident(calibrator: GeometricCalibrator, result: CalibrationResult, rows: M
     """
     nominal = base_and_tool(calibrator).fit(rows).noise
     pairs = list(zip(result.noise, nominal, strict=True))
-    left = sum(noise.values - noise.used for noise, _ in pairs)
-    more = sum(noise.used - before.used for noise, before in pairs)
-    before = sum((one.values - one.used) * (one.sigma / noise.sigma) ** 2 for noise, one in pairs)
+    left = sum(noise.values - noise.effective_parameters for noise, _ in pairs)
+    more = sum(noise.effective_parameters - before.effective_parameters for noise, before in pairs)
+    before = sum(
+        (one.values - one.effective_parameters) * (one.sigma / noise.sigma) ** 2 for noise, one in pairs
+    )
     return more > 0 and bool(fdtrc(more, left, (before - left) / more) < _CHANCE)
 
 

@@ -116,10 +116,10 @@ def coordinate_figures(fit: FrameFit, arm_variance: tuple[float, ...]) -> tuple[
 def weak_direction_sentences(fit: FrameFit) -> tuple[str, ...]:
     """Return a sentence for every direction that the rows hardly determine."""
     return tuple(
-        f"the rows do not determine {one.words} (in mm and mrad; {_deviation_text(one.deviation)}); it keeps its "
+        f"the rows do not determine {one.combination} (in mm and mrad; {_deviation_text(one.deviation)}); it keeps its "
         "previous value; measure other orientations"
-        if one.held
-        else f"the rows determine {one.words} (in mm and mrad) only to {one.deviation:.2g}"
+        if one.is_held
+        else f"the rows determine {one.combination} (in mm and mrad) only to {one.deviation:.2g}"
         for one in fit.weak_directions
     )
 
@@ -172,7 +172,13 @@ def frame_summary(
         coordinates=coordinate_figures(fit, arm_variance),
         weak_directions=weak_direction_sentences(fit),
         noise=tuple(
-            noise_figures(one.sensor, one.sigma, one.unit, values=one.values, used_by_parameters=one.used)
+            noise_figures(
+                one.sensor,
+                one.sigma,
+                one.unit,
+                values=one.values,
+                used_by_parameters=one.effective_parameters,
+            )
             for one in result.noise
         ),
         outliers=contradicting_rows(result, fit.rows, fit.wrong_rows),

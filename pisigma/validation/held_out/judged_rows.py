@@ -37,14 +37,14 @@ class JudgedRows:
         origin: "held_out": errors under calibrations without the row; "training": errors of training rows of the model;
             "other": errors of other rows.
         measurements: the rows; only joint values and names for held-out rows that a model stores.
-        place: position of the tool in the robot's base frame [m].
+        position: position of the tool in the robot's base frame [m].
         models: errors of every row by model, "nominal" first and the model last.
         residual: measured minus predicted position in the row's frame under the model [m]; NaN if there is none.
         residual_origin: origin of the residuals, in the form of `origin`.
         predicted: standard deviation of the predicted position [m]; NaN if there is none.
         inside: whether every joint value is in the range measured for the model.
         left_out: number of rows of the file that are marked as training rows and are not included.
-        again: warnings about duplicate rows and training rows of the model.
+        repeated_row_warnings: warnings about duplicate rows and training rows of the model.
         nominal: origin of base and tool of "nominal": "fitted" to the model's poses, "given" for a model that was not
             calibrated, or those of the "model" if it stores too few poses; None for held-out rows.
         unknown: number of rows without a position error.
@@ -53,14 +53,14 @@ class JudgedRows:
 
     origin: str
     measurements: Measurements
-    place: Float64[Tensor, "rows 3"]
+    position: Float64[Tensor, "rows 3"]
     models: Mapping[str, PoseErrors]
     residual: Float64[Tensor, "rows 3"]
     residual_origin: str
     predicted: Float64[Tensor, " rows"]
     inside: Bool[Tensor, " rows"]
     left_out: int = 0
-    again: tuple[str, ...] = ()
+    repeated_row_warnings: tuple[str, ...] = ()
     nominal: Literal["fitted", "given", "model"] | None = None
     unknown: int = 0
     repeats: int = 1
@@ -136,7 +136,7 @@ def rows_of_file(
     return replace(
         _judged(model, rows, models, residual, (origin, origin)),
         left_out=left_out,
-        again=(*copy_warnings(rows.left_out), *again),
+        repeated_row_warnings=(*copy_warnings(rows.left_out), *again),
         nominal="model" if not own_frames else "given" if model.calibrated is None else "fitted",
         unknown=int((~torch.isfinite(errors.position)).sum()),
     )
@@ -187,7 +187,7 @@ def _judged(
     return JudgedRows(
         origin=origins[0],
         measurements=replace(rows, source=rows.file_names),
-        place=tool_positions(model, rows.q),
+        position=tool_positions(model, rows.q),
         models=models,
         residual=residual,
         residual_origin=origins[1],

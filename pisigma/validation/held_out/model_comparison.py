@@ -86,11 +86,11 @@ def confidence_intervals(
 
 
 def statistics(
-    errors: Float64[np.ndarray, " rows"], times: Int64[np.ndarray, "*resamples rows"]
+    errors: Float64[np.ndarray, " rows"], multiplicity: Int64[np.ndarray, "*resamples rows"]
 ) -> Float64[np.ndarray, "statistics *resamples"]:
     """Compute mean, RMS and 95 % quantile of errors with given multiplicities, in the order of `STATISTICS`."""
     order = np.argsort(errors)
-    errors, times = errors[order], times[..., order]
+    errors, times = errors[order], multiplicity[..., order]
     last = times.cumsum(-1)
     count = last[..., -1]
     place = _QUANTILE * (count - 1)

@@ -85,10 +85,10 @@ class PoseErrors:
         return ErrorVectors.from_prediction(measurements, expected).sizes
 
     @staticmethod
-    def all_nan(rows: int, turned: bool) -> "PoseErrors":
+    def all_nan(rows: int, with_orientation: bool) -> "PoseErrors":
         """Make errors that are all NaN, with orientations or without."""
         nothing = torch.full((rows,), torch.nan, dtype=torch.float64)
-        return PoseErrors(nothing, nothing.clone() if turned else None)
+        return PoseErrors(nothing, nothing.clone() if with_orientation else None)
 
     def set_rows(self, rows: Int64[Tensor, " some"], errors: "PoseErrors") -> None:
         """Set the errors of some rows in place; rotations are set only if both objects have them."""

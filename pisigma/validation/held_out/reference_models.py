@@ -11,7 +11,7 @@ from pisigma.model.calibrated_model import CalibratedModel, poses_of_rows
 from pisigma.validation.held_out.trained_calibrations import base_and_tool
 
 
-def nominal_model(model: CalibratedModel, turned: bool) -> CalibratedModel:
+def nominal_model(model: CalibratedModel, with_orientation: bool) -> CalibratedModel:
     """Return a model of the nominal robot, with base and tool fitted to the predictions of a model.
 
     Base and tool of an identified geometry belong to that geometry and would increase the errors of the nominal arm.
@@ -20,7 +20,7 @@ def nominal_model(model: CalibratedModel, turned: bool) -> CalibratedModel:
 
     Args:
         model: a model of any kind.
-        turned: whether orientations are compared, and therefore also fitted.
+        with_orientation: whether orientations are compared, and therefore also fitted.
 
     Raises:
         ModelError: the model does not store enough joint values to fit base and tool.
@@ -28,7 +28,7 @@ def nominal_model(model: CalibratedModel, turned: bool) -> CalibratedModel:
     if model.calibrated is None:
         return replace(model, network=None, domain=None)
     try:
-        fitted = base_and_tool(GeometricCalibrator(model.robot)).fit(_predicted(model, turned))
+        fitted = base_and_tool(GeometricCalibrator(model.robot)).fit(_predicted(model, with_orientation))
     except IdentificationError as problem:
         raise ModelError(
             f"model '{model.name}': the base and tool of the nominal robot cannot be fitted to the "

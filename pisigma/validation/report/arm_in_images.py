@@ -157,7 +157,7 @@ def arm_in_images(
     assert measured.position is not None
     assert measured.rotation is not None
     T_measured = transform(measured.rotation, measured.position)
-    nominal = nominal_model(model, turned=True)
+    nominal = nominal_model(model, with_orientation=True)
     T_nominal, T_calibrated = poses_of_rows(nominal, rows), poses_of_rows(model, rows)
     links = [_links(one, rows, T) for one, T in ((nominal, T_nominal), (model, T_calibrated))]
     known = {one.name: one for one in map(Camera.load, cameras.cameras)}

@@ -53,7 +53,7 @@ class ErrorMap:
     """Points in the robot's base frame, with quantities at every point.
 
     Attributes:
-        place: position of the tool in the robot's base frame [mm].
+        position: position of the tool in the robot's base frame [mm].
         layers: quantities that can be shown, at least one.
         row: line of every point's row in the file, or else the number of the row from 1; 0 for samples.
         q: joint values [deg or mm].
@@ -66,7 +66,7 @@ class ErrorMap:
         random: number of points that were drawn at random.
     """
 
-    place: Float64[np.ndarray, "points 3"]
+    position: Float64[np.ndarray, "points 3"]
     layers: tuple[Layer, ...]
     row: Int64[np.ndarray, " points"]
     q: Float64[np.ndarray, "points dof"]
@@ -213,7 +213,7 @@ def largest_errors(rows: JudgedRows) -> LargestErrors | None:
     finite = np.isfinite(after)
     if not finite.any():
         return None
-    place, errors = rows.place.numpy()[finite], after[finite]
+    place, errors = rows.position.numpy()[finite], after[finite]
     worst = int(errors.argmax())
     row = int(np.flatnonzero(finite)[worst])
     return LargestErrors(
@@ -221,19 +221,21 @@ def largest_errors(rows: JudgedRows) -> LargestErrors | None:
     )
 
 
-def worst_region(place: Float64[np.ndarray, "rows 3"], errors: Float64[np.ndarray, " rows"]) -> Region | None:
+def worst_region(
+    position: Float64[np.ndarray, "rows 3"], errors: Float64[np.ndarray, " rows"]
+) -> Region | None:
     """Find the cell of a grid over the measured space with the largest errors.
 
     Args:
-        place: position of every row [m].
+        position: position of every row [m].
         errors: lengths of the errors, all finite.
 
     Returns:
         The cell; None if there are too few rows, or all are in one cell.
     """
-    low, high = (place.min(0), place.max(0)) if len(place) else (np.zeros(3), np.zeros(3))
+    low, high = (position.min(0), position.max(0)) if len(position) else (np.zeros(3), np.zeros(3))
     width = np.where(high > low, (high - low) / CELLS, 1.0)
-    cell = np.clip(((place - low) / width).astype(int), 0, CELLS - 1)
+    cell = np.clip(((position - low) / width).astype(int), 0, CELLS - 1)
     number = (cell * [CELLS * CELLS, CELLS, 1]).sum(1)
     least = max(MIN_ROWS, len(errors) // 100)
     cells = [(int(k), errors[number == k]) for k in np.unique(number)]

@@ -119,10 +119,10 @@ def measured_intervals(
     coverage = model.hybrid.coverage if model.hybrid else JointCoverage.from_joints(model.robot, q)
     result = []
     for j, limits in enumerate(map(tuple, model.robot.limits.tolist())):
-        of_joint, rate = coverage.joint == j, float(coverage.rate[j])
+        of_joint, rate = coverage.joint == j, float(coverage.angle_per_value[j])
         middle, half = coverage.middle[of_joint].tolist(), coverage.half[of_joint].tolist()
         ends = [((m - h) / rate, (m + h) / rate) for m, h in zip(middle, half, strict=True)]
-        result.append(_in_range(ends, limits, 2 * math.pi / rate if coverage.turning[j] else None))
+        result.append(_in_range(ends, limits, 2 * math.pi / rate if coverage.is_periodic[j] else None))
     return result
 
 

@@ -74,18 +74,20 @@ def plausible_turn(robot: Robot) -> float:
     return plausible_share(robot) / LEVER_SHARE
 
 
-def explanation_limit(here: Hypothesis, robot: Robot) -> float:
+def explanation_limit(as_stated: Hypothesis, robot: Robot) -> float:
     """Return the largest error [m] that an explanation may leave."""
-    return min(COLLAPSED * here.error, plausible_share(robot) * robot.reach)
+    return min(COLLAPSED * as_stated.error, plausible_share(robot) * robot.reach)
 
 
-def choose_simplest(fault_hypotheses: Sequence[Hypothesis], most: float) -> list[Hypothesis]:
-    """Return the simplest hypothesis among those that explain the errors, up to `most` [m], about equally well.
+def choose_simplest(fault_hypotheses: Sequence[Hypothesis], max_error: float) -> list[Hypothesis]:
+    """Return the simplest hypothesis among those that explain the errors, up to `max_error` [m], about equally well.
 
     The remaining errors must also be small relative to the spread of the poses, which a wrong unit can shrink.
     """
     explaining = [
-        other for other in fault_hypotheses if other.error <= min(most, COLLAPSED * other.measured.spread)
+        other
+        for other in fault_hypotheses
+        if other.error <= min(max_error, COLLAPSED * other.measured.spread)
     ]
     best = min((other.error for other in explaining), default=0.0)
     explaining = [other for other in explaining if other.error <= AS_GOOD * best]
@@ -97,10 +99,10 @@ def choose_simplest(fault_hypotheses: Sequence[Hypothesis], most: float) -> list
 
 
 def fault_hypotheses(
-    arm: PredictingArm, some: Measurements, here: Hypothesis, most: float
+    arm: PredictingArm, some: Measurements, as_stated: Hypothesis, max_error: float
 ) -> Iterator[Hypothesis]:
-    """Yield all hypotheses that may explain the errors up to `most` [m]; the first one is that nothing is wrong."""
-    return frame_hypotheses(arm, some, list(_faults_in_frames(arm, some, here)), most)
+    """Yield the hypotheses that may explain the errors up to `max_error` [m]; the first is that nothing is wrong."""
+    return frame_hypotheses(arm, some, list(_faults_in_frames(arm, some, as_stated)), max_error)
 
 
 def _faults_in_frames(arm: PredictingArm, some: Measurements, here: Hypothesis) -> Iterator[Hypothesis]:
@@ -160,20 +162,20 @@ def _other_corrections(
 
 
 def frame_hypotheses(
-    arm: PredictingArm, some: Measurements, tried: Sequence[Hypothesis], most: float = math.inf
+    arm: PredictingArm, some: Measurements, hypotheses: Sequence[Hypothesis], max_error: float = math.inf
 ) -> Iterator[Hypothesis]:
     """Yield hypotheses unchanged, with another frame, tool, and both; without a model, both are always fitted.
 
-    Both are fitted only if an affine fit, which is a lower bound of the errors, leaves at most `most` [m].
+    Both are fitted only if an affine fit, which is a lower bound of the errors, leaves at most `max_error` [m].
 
     Args:
         arm: the predicting arm.
         some: the rows; not used without a model, because every hypothesis may have other rows.
-        tried: the hypotheses.
-        most: largest error that an explanation may leave [m].
+        hypotheses: the hypotheses.
+        max_error: largest error that an explanation may leave [m].
     """
     if arm.model is None:
-        for here, base, tool in _with_frames_fitted(tried, most):
+        for here, base, tool in _with_frames_fitted(hypotheses, max_error):
             yield replace(here, T=base @ here.T @ tool)
         return
     frames, targets, bases = (
@@ -182,12 +184,12 @@ def frame_hypotheses(
         bases_of_rows(arm.model, some),
     )
     count, tools = int(frames.max()) + 1, int(targets.max()) + 1
-    for here in tried:
+    for here in hypotheses:
         yield here
         X, Y = _per_group(best_base, frames, here), _per_group(best_tool, targets, here)
         yield here.with_cause(_moved("frame", X, bases), X @ here.T, 6 * count)
         yield here.with_cause(_moved("tool", Y), here.T @ Y, here.values_of_tool * tools)
-    for here, base, tool in _with_frames_fitted(tried, most) if count == tools == 1 else ():
+    for here, base, tool in _with_frames_fitted(hypotheses, max_error) if count == tools == 1 else ():
         moved = here.with_cause(_moved("frame", base[None], bases), base @ here.T, 6)
         yield moved.with_cause(_moved("tool", tool[None]), moved.T @ tool, here.values_of_tool)
 

@@ -241,9 +241,9 @@ def largest_group(measurements: Measurements, by_target: bool = True) -> Measure
     return replace(group, pair=None, distance=None)
 
 
-def evenly_spaced_rows(rows: Int64[Tensor, " rows"], most: int) -> Int64[Tensor, " chosen"]:
-    """Return at most `most` of the rows, evenly spaced."""
-    count = min(len(rows), most)
+def evenly_spaced_rows(rows: Int64[Tensor, " rows"], max_rows: int) -> Int64[Tensor, " chosen"]:
+    """Return at most `max_rows` of the rows, evenly spaced."""
+    count = min(len(rows), max_rows)
     return rows[torch.linspace(0, len(rows) - 1, count).round().long()]
 
 

@@ -43,22 +43,22 @@ class Populations:
     """Two populations of rows.
 
     Attributes:
-        differing: what differs between the populations: base, tool or arm.
+        differing_part: what differs between the populations: base, tool or arm.
         second: mask of the measured rows that belong to the smaller population.
-        tried: number of rows that were evaluated.
+        evaluated_rows: number of rows that were evaluated.
         difference: difference of the base, tool or arm parameters of the populations [m or rad].
         factor: ratio of the errors of the rows without and with the difference [1].
-        used: share of the values that all fitted parameters absorb [1].
+        absorbed_share: share of the values that all fitted parameters absorb [1].
         log_bayes_factor: logarithm of the odds against one population, by the Bayesian information criterion (Schwarz
             1978, Annals of Statistics 6, 461-464).
     """
 
-    differing: _Differing
+    differing_part: _Differing
     second: Bool[np.ndarray, " rows"]
-    tried: int
+    evaluated_rows: int
     difference: Float64[np.ndarray, " numbers"]
     factor: float
-    used: float
+    absorbed_share: float
     log_bayes_factor: float
 
 

@@ -123,9 +123,9 @@ def fault_of_cause(cause: Cause, before: float, after: float) -> SetupFault:
     )
 
 
-def fault_from_hypothesis(here: Hypothesis, other: Hypothesis, after_nominal: float) -> SetupFault:
-    """Return the fault of a hypothesis, with errors before (`here`) and after, and of the nominal robot [m]."""
-    (before, before_rotation), (after, after_rotation) = here.rms(), other.rms()
+def fault_from_hypothesis(as_stated: Hypothesis, other: Hypothesis, after_nominal: float) -> SetupFault:
+    """Return the fault of a hypothesis, with errors before (`as_stated`) and after, and of the nominal robot [m]."""
+    (before, before_rotation), (after, after_rotation) = as_stated.rms(), other.rms()
     return SetupFault(
         kinds=tuple(cause.kind for cause in other.causes),
         clause=" and ".join(cause.clause for cause in other.causes),

@@ -25,7 +25,7 @@ _POSITION = "position"
 def uncertainty_budget(
     model: CalibratedModel,
     poses: Measurements | None,
-    where: str,
+    rows_name: str,
     instrument: Instrument,
     temperatures: Mapping[str, float | None],
     made_of: Sequence[str],
@@ -41,7 +41,7 @@ def uncertainty_budget(
     Args:
         model: the model.
         poses: rows with the joint values for which the uncertainty of the model is computed; None if there are none.
-        where: name of these rows.
+        rows_name: name of these rows.
         instrument: the instrument of the cell.
         temperatures: mean temperature of every session [deg C], by name; None if the rows do not state it.
         made_of: names of the sessions to which the model was fitted.
@@ -51,7 +51,7 @@ def uncertainty_budget(
     """
     scatter = scatter_component(model)
     found = (
-        parameter_component(model, poses, where),
+        parameter_component(model, poses, rows_name),
         scatter,
         *([repeatability_component(repeatability_mm)] if isinstance(scatter, str) else []),
         instrument_component(instrument),
@@ -61,7 +61,9 @@ def uncertainty_budget(
     return UncertaintyBudget(components, tuple(one for one in found if isinstance(one, str)))
 
 
-def parameter_component(model: CalibratedModel, poses: Measurements | None, where: str) -> Component | str:
+def parameter_component(
+    model: CalibratedModel, poses: Measurements | None, rows_name: str
+) -> Component | str:
     """Evaluate the uncertainty of the parameters: RMS over poses and axes of the posterior's standard deviation.
 
     `u² = mean(diag(J C Jᵀ))` with the covariance C of all parameters, including base and tool, and the derivatives J of
@@ -70,7 +72,7 @@ def parameter_component(model: CalibratedModel, poses: Measurements | None, wher
     Args:
         model: the model.
         poses: rows with frames and targets of the model.
-        where: name of these rows.
+        rows_name: name of these rows.
     """
     if poses is None or model.uncertainty is None:
         return (
@@ -80,7 +82,7 @@ def parameter_component(model: CalibratedModel, poses: Measurements | None, wher
     u = float(deviation[torch.isfinite(deviation)].square().mean().sqrt())
     if math.isnan(u):
         return "parameters of the model: the posterior predicts no position of these poses."
-    source = f"posterior of model '{model.name}' at {poses.rows} poses of {where}"
+    source = f"posterior of model '{model.name}' at {poses.rows} poses of {rows_name}"
     return Component("parameters of the model", "A", u, _freedom(model), source)
 
 

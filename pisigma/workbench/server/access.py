@@ -54,7 +54,7 @@ class Access:
         """Path of the folder, without a slash at its end."""
         return f"/{self.folder}"
 
-    async def enter(self, request: web.Request) -> web.Response:
+    async def open_link(self, request: web.Request) -> web.Response:
         """Answer the link: set the cookie, and forward the browser to the first page.
 
         A redirect would belong to the navigation from the foreign page with the link, for which browsers send no strict

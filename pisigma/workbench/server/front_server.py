@@ -49,7 +49,7 @@ class FrontServer:
         self._socket = _bound(host, port)
         access = Access()
         app = web.Application(middlewares=[access.guard], client_max_size=MAX_UPLOAD)
-        app.router.add_get("/open/{token}", access.enter)
+        app.router.add_get("/open/{token}", access.open_link)
         for (method, path), handler in pages.items():
             app.router.add_route(method, access.root + path, handler)
         number = self._socket.getsockname()[1]

@@ -32,15 +32,15 @@ RAMP = (
 """Colour ramp "viridis" with even steps of lightness, readable in grey and with colour blindness."""
 
 
-def error_colors(errors: Float64[np.ndarray, " rows"], top: float) -> UInt8[np.ndarray, "rows 3"]:
+def error_colors(errors: Float64[np.ndarray, " rows"], max_error: float) -> UInt8[np.ndarray, "rows 3"]:
     """Return the colour of every row's error.
 
     Args:
         errors: errors [m]; NaN is shown in grey.
-        top: error of the last colour [m].
+        max_error: error of the last colour [m].
     """
     ramp = np.array([[int(color[k : k + 2], 16) for k in (1, 3, 5)] for color in RAMP], dtype=np.float64)
-    at = np.nan_to_num(errors / top).clip(0.0, 1.0) * (len(RAMP) - 1)
+    at = np.nan_to_num(errors / max_error).clip(0.0, 1.0) * (len(RAMP) - 1)
     colors = np.stack([np.interp(at, np.arange(len(RAMP)), channel) for channel in ramp.T], axis=1)
     colors[~np.isfinite(errors)] = UNJUDGED
     return colors.round().astype(np.uint8)

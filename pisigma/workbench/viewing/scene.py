@@ -96,7 +96,7 @@ class SessionScene:
             pose, T = state.next_pose, self._poses(state.next_pose.q)
             self._body.draw(self._scene, "/ghost/robot", pose.q, NEXT, _GHOST)
             self._label("/next/label", f"next: pose {pose.number}", T[:3, 3])
-            draw_sight(self._scene, "/next", self._arm.surroundings, T, self._robot.reach)
+            draw_line_of_sight(self._scene, "/next", self._arm.surroundings, T, self._robot.reach)
             if self._sight is not None and self._sight.is_fixed:
                 self._scene.add_frame("/next/board", show_axes=False, wxyz=_quaternion(T), position=T[:3, 3])
                 draw_board(self._scene, "/next/board", self._sight.board)
@@ -125,12 +125,14 @@ class SessionScene:
         elif self._arm.surroundings.tracker is None:
             self._label("/sensor/label", "frame of the sensor", np.zeros(3))
 
-    def show_rows(self, rows: RowsSoFar, top: float, magnification: float) -> Float64[np.ndarray, "rows 3"]:
+    def show_rows(
+        self, rows: RowsSoFar, max_error: float, magnification: float
+    ) -> Float64[np.ndarray, "rows 3"]:
         """Draw every row as a point in the colour of its error, with the error as an arrow.
 
         Args:
             rows: measured rows; rows that cannot be checked yet are drawn at the tool of the nominal robot.
-            top: error at the end of the colour scale [m].
+            max_error: error at the end of the colour scale [m].
             magnification: ratio of the lengths of the arrows to the lengths of the errors.
 
         Returns:
@@ -141,7 +143,7 @@ class SessionScene:
             return rows.position
         nominal = self._poses(rows.q)[:, :3, 3]
         position = np.where(np.isfinite(rows.position), rows.position, nominal)
-        colors = error_colors(np.linalg.norm(rows.error, axis=1), top)
+        colors = error_colors(np.linalg.norm(rows.error, axis=1), max_error)
         colors[rows.alarmed] = ALARM
         if not rows.check.all():
             self._dots("/rows/measured", position[~rows.check], colors[~rows.check])
@@ -152,16 +154,16 @@ class SessionScene:
         self._arrows(position, rows, colors, magnification)
         return position
 
-    def show_cloud(self, errors: PredictedErrors | None, top: float) -> None:
+    def show_cloud(self, errors: PredictedErrors | None, max_error: float) -> None:
         """Draw predicted errors as one cloud of points.
 
         Args:
             errors: predicted errors; None to draw none.
-            top: error at the end of the colour scale [m].
+            max_error: error at the end of the colour scale [m].
         """
         self._begin("/predicted")
         if errors is not None:
-            colors = error_colors(errors.p95.numpy(), top)
+            colors = error_colors(errors.p95.numpy(), max_error)
             self._dots("/predicted/errors", errors.position.numpy(), colors, _CLOUD_DOT)
 
     def add_rows(self, q: Float64[np.ndarray, "rows dof"]) -> None:
@@ -310,7 +312,7 @@ def _turned(yaw: float) -> tuple[float, float, float, float]:
     return float(np.cos(yaw / 2)), 0.0, 0.0, float(np.sin(yaw / 2))
 
 
-def draw_sight(
+def draw_line_of_sight(
     scene: "viser.SceneApi",
     name: str,
     surroundings: Surroundings,

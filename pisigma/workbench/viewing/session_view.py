@@ -143,15 +143,15 @@ def first_view(arm: ArmInSurroundings) -> tuple[Float64[np.ndarray, " 3"], Float
     return middle + _CLOSER * radius / np.sin(FIELD / 2) * direction / np.linalg.norm(direction), middle
 
 
-def arrow_magnification(top: float, reach: float) -> int:
+def arrow_magnification(max_error: float, reach: float) -> int:
     """Return the magnification with which errors are visible next to a robot.
 
     Args:
-        top: error at the end of the colour scale [m].
+        max_error: error at the end of the colour scale [m].
         reach: reach of the robot [m].
     """
     low, high, step = MAGNIFICATIONS
-    return step * round(float(np.clip(_ERROR_SHARE * reach / top, low + step, high)) / step)
+    return step * round(float(np.clip(_ERROR_SHARE * reach / max_error, low + step, high)) / step)
 
 
 def top_of_scale(rows: RowsSoFar) -> float:
@@ -194,16 +194,16 @@ class SessionPanel:
         self.magnification = gui.add_slider("errors magnified by", *MAGNIFICATIONS, initial_value=0)
         self._rows = gui.add_html("")
 
-    def show_state(self, state: SessionState, top: float) -> None:
+    def show_state(self, state: SessionState, max_error: float) -> None:
         """Show a state of the session.
 
         Args:
             state: the state.
-            top: error at the end of the colour scale [m].
+            max_error: error at the end of the colour scale [m].
         """
         self._advice.content = str(self._text.advice(state, self._robot.axes, self._limit))
         self._rows.content = str(
-            self._text.rows(state, self._robot.axes, state.alarms[: -_MAX_ALARMS - 1 : -1], top, RAMP)
+            self._text.rows(state, self._robot.axes, state.alarms[: -_MAX_ALARMS - 1 : -1], max_error, RAMP)
         )
         points = (*state.expected, *state.reached)
         curves = _curves(points, self._limit)

@@ -209,5 +209,5 @@ def _check_names(names: Sequence[str]) -> None:
     for number, name in enumerate(names):
         if not _NAME.fullmatch(name) or name in names[:number]:
             raise IdentificationError(
-                expected='different names of letters, digits, "_" and "-"', value=name, option="arms"
+                expected='unique names of letters, digits, "_" and "-"', value=name, option="arms"
             )

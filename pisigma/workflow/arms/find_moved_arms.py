@@ -69,12 +69,12 @@ class ArmsMovement:
     """Result of `find_moved_arms`.
 
     Attributes:
-        found: what moved, in SI units.
+        moved_bases: what moved, in SI units.
         bodies: figures of all arms and frames, best explanation first.
         seconds: computing time [s].
     """
 
-    found: MovedBases
+    moved_bases: MovedBases
     bodies: tuple[MovedFigures, ...]
     seconds: float
 
@@ -88,7 +88,7 @@ class ArmsMovement:
             ", which the rows cannot distinguish; measure in a second shared frame" if len(named) > 1 else ""
         )
         text = " or ".join(named)
-        if not self.found.is_one_body:
+        if not self.moved_bases.is_one_body:
             return f"More than one base or frame moved; no single motion explains the rows (best: {text})."
         return f"{text[0].upper()}{text[1:]}{doubt}."
 
@@ -97,8 +97,8 @@ class ArmsMovement:
         return {
             "seconds": round(self.seconds, 3),
             "summary": self.sentence,
-            "probability": self.found.probability,
-            "is_one_body": self.found.is_one_body,
+            "probability": self.moved_bases.probability,
+            "is_one_body": self.moved_bases.is_one_body,
             "bodies": [one.model_dump(mode="json") for one in self.bodies],
         }
 
@@ -133,7 +133,7 @@ def find_moved_arms(
             raise ModelError(f"there is no arm '{name}'", value=name, remedy=nearest_choice(name, poses))
         arms.append(_arm(Path(folder), summary, name, poses[name], rows, (cameras or {}).get(name)))
     found = find_moved_bases(arms)
-    named = {(one.kind, one.name) for one in found.named}
+    named = {(one.kind, one.name) for one in found.likely_bodies}
     bodies = tuple(_figures(one, (one.kind, one.name) in named) for one in found.bodies)
     return ArmsMovement(found, bodies, time.perf_counter() - started)
 

@@ -169,11 +169,11 @@ class Cell:
         """The sessions of the cell."""
         return Sessions(self.folder, self.robot, self.cameras, self.history)
 
-    def take_in(
+    def add_session(
         self, file: str | os.PathLike[str] | Measurements, accept_implausible: bool = False, day: str = ""
     ) -> SessionEntry:
-        """Add a session of measured rows to the cell; see `Sessions.take_in`."""
-        return self.sessions.take_in(file, accept_implausible, day)
+        """Add a session of measured rows to the cell; see `Sessions.add_session`."""
+        return self.sessions.add_session(file, accept_implausible, day)
 
     def calibrate(
         self,

@@ -120,7 +120,7 @@ class IncomingRows:
         """Check the rows as `Sessions.add` does, and return the findings.
 
         Raises:
-            MeasurementError: see `Sessions.take_in`.
+            MeasurementError: see `Sessions.add_session`.
         """
         try:
             return self.cell.sessions.check(self._rows, day).diagnostics
@@ -128,7 +128,7 @@ class IncomingRows:
             return refusal.findings
 
     def add(self, accept_implausible: bool = False, day: str = "") -> SessionEntry:
-        """Add the rows to the cell as a session; see `Sessions.take_in`.
+        """Add the rows to the cell as a session; see `Sessions.add_session`.
 
         Raises:
             MeasurementError: the rows cannot be read, or the cell already contains some of them.
@@ -137,7 +137,7 @@ class IncomingRows:
         options = stated_options(self.settings)
         remark = f"Imported with {options}." if options else ""
         try:
-            entry = self.cell.sessions.take_in(self._rows, accept_implausible, day, remark)
+            entry = self.cell.sessions.add_session(self._rows, accept_implausible, day, remark)
         except AcceptanceError as refusal:
             if not refusal.findings or (repair := self.repair(refusal.findings[0])) is None:
                 raise

@@ -111,10 +111,10 @@ def _of_day(values: Mapping[str, Value], day: str) -> dict[str, Value]:
 
 
 def check_entry(
-    found: MonitoringResult,
+    monitoring: MonitoringResult,
     entry: ModelEntry,
     session: SessionEntry,
-    seen: ModelRows,
+    rows: ModelRows,
     settings: RecalibrationSettings,
 ) -> Check:
     """Return the history entry of a session's monitoring result.
@@ -122,22 +122,22 @@ def check_entry(
     A recalibration is due if something moved, or if the recalibrated model predicts held-out rows better.
 
     Args:
-        found: result of the session.
+        monitoring: result of the session.
         entry: the model with which the session was compared.
         session: the session.
-        seen: rows of the session with the names of the model.
+        rows: rows of the session with the names of the model.
         settings: settings of the recalibration.
     """
     check = Check("monitor", entry.name, session.name, "implausible", "", None, False, now())
-    if found.untrusted:
-        return replace(check, summary=found.untrusted[0].sentence)
-    judged = found.sessions[-1].session
+    if monitoring.untrusted:
+        return replace(check, summary=monitoring.untrusted[0].sentence)
+    judged = monitoring.sessions[-1].session
     check = replace(check, verdict=judged.verdict, summary=judged.sentence, rms_mm=judged.rms * 1e3)
     if judged.recalibrate or judged.verdict == "moved":
         return replace(check, recalibrate=True)
     if session.rows < _MIN_ROWS:
         return check
-    tried = recalibrate(found.model, seen.rows, seen.settings_to_recalibrate(settings))
+    tried = recalibrate(monitoring.model, rows.rows, rows.settings_to_recalibrate(settings))
     if not (tried.trusted and tried.gate.updates):
         return check
     return replace(check, recalibrate=True, summary=f"{judged.sentence} {tried.gate.sentence}")

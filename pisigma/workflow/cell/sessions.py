@@ -69,7 +69,7 @@ class Sessions:
             )
         return path
 
-    def take_in(
+    def add_session(
         self,
         file: str | os.PathLike[str] | Measurements,
         accept_implausible: bool = False,
@@ -123,7 +123,7 @@ class Sessions:
         if not (waiting := unrecorded_files(self.folder, self.history.sessions())):
             return False
         try:
-            self.take_in(self.folder / waiting[0])
+            self.add_session(self.folder / waiting[0])
         except PisigmaError as refusal:
             verdict = "refused" if is_measurement_file(self.folder / waiting[0]) else FOREIGN
             refused = Check("import", "", Path(waiting[0]).stem, verdict, str(refusal), None, False, now())
@@ -134,7 +134,7 @@ class Sessions:
         return True
 
     def check(self, file: str | os.PathLike[str] | Measurements, day: str = "") -> RowVerdict:
-        """Read and check rows without storing them; see `take_in` for exceptions."""
+        """Read and check rows without storing them; see `add_session` for exceptions."""
         rows = self._read(file)
         return self._verdict(rows, _checked_day(rows, day))[0]
 

@@ -59,8 +59,8 @@ def new_cells(source: Path, out: Path, common: NewCell) -> NewCells:
     A manifest has the columns `id` and `data`, and optionally `robot`, `date`, `model`, `options` (settings of
     `pisigma calibrate`, such as `free=joint_offsets; model=geometric`), `camera` and `board` (several as `a.yaml;
     b.yaml`). Several rows with the same id are several sessions. Paths are relative to the folder of the manifest. In a
-    folder, every subfolder with `*.csv` is a robot with its description (`robot.yaml` or `robot.urdf`), and every
-    `*.csv` is a robot that was measured once.
+    folder, every subfolder is a robot, with its description (`robot.yaml` or `robot.urdf`) and one `*.csv` file per
+    session, and every `*.csv` file directly in the folder is a robot with a single session.
 
     Args:
         source: manifest or folder.
@@ -125,8 +125,8 @@ def _in_manifest(path: Path, common: NewCell) -> Iterator[_Row]:
     for number, record in enumerate(table.records):
         at = Place(path, table.lines[number])
         fields = dict(zip(table.header, (field.strip() for field in record), strict=False))
-        if number in table.broken:
-            fields["problem"] = table.broken[number].removesuffix(".")
+        if number in table.invalid_rows:
+            fields["problem"] = table.invalid_rows[number].removesuffix(".")
         elif len(record) != len(table.header):
             fields["problem"] = f"expected {len(table.header)} fields, got {len(record)}"
         if "id" not in fields:

@@ -92,7 +92,7 @@ def test_posterior_is_that_of_one_fit_of_all_rows(sensor):
     covariance = np.linalg.inv(peer.jac.T @ peer.jac)[second, second]
     error = np.sqrt(np.diag(covariance))
     assert_close(peer.x[second] / error, 0.0, atol=0.03)
-    assert_close(found.root[1].norm(dim=1).numpy() / error, 1.0, atol=0.01)
+    assert_close(found.covariance_root[1].norm(dim=1).numpy() / error, 1.0, atol=0.01)
     misfit = peer.fun @ peer.fun - sum(
         np.square(fit.residuals[fit.noise[0].sensor]).sum() / fit.noise[0].sigma ** 2
         for fit in (own_fit(number, 0, sensor) for number in (0, 1))

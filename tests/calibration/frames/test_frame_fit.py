@@ -90,7 +90,7 @@ def test_coordinate_that_no_touch_determines_keeps_its_value(count, noise):
     for seed in range(3):
         fit = fit_frames(TURNED, touches(q, noise * random_noise(count, seed)), "tool")
         (weak,) = fit.weak_directions
-        assert (weak.words, weak.held) == ("tool_x", True)
+        assert (weak.combination, weak.is_held) == ("tool_x", True)
         assert (40 < weak.deviation < np.inf) == bool(
             noise
         )  # noise turns the tip, which looks like information
@@ -121,7 +121,7 @@ def test_base_keeps_its_turn_about_a_line_of_points():
     assert_close(fit.estimates, BASE, atol=1e-8)
     elsewhere = tipped.with_geometry(base=BASE + np.array([0.1, -0.1, 0.1, 0.2, 0.1, -0.2]))
     fit = fit_frames(elsewhere, Measurements(q=q, position=place), "base")
-    assert [one.held for one in fit.weak_directions] == [True]
+    assert [one.is_held for one in fit.weak_directions] == [True]
     assert_close(fit.solved.result().predicted_poses(fit.rows)[:, :3, 3], place, atol=1e-8)
 
 
@@ -138,7 +138,7 @@ def test_value_before_that_the_rows_contradict_is_not_held():
         "base",
     )
     assert fit.weak_directions[0].deviation > 25
-    assert not any(one.held for one in fit.weak_directions)
+    assert not any(one.is_held for one in fit.weak_directions)
     assert_close(fit.solved.geometry.robot.base[3:], BASE[3:], atol=0.2)
 
 
@@ -154,7 +154,7 @@ def test_many_rows_of_similar_orientations_state_the_error_of_the_tool(count, he
     place = forward_kinematics(true, joints)[:, :3, 3] + torch.from_numpy(rng.normal(0, 3e-3, (count, 3)))
     known = UR5.with_geometry(tool=np.array([0.0, 0.0, 0.1, 0.0, 0.0, 0.0]))
     fit = fit_frames(known, Measurements(q=joints, position=place), "hand-eye")
-    assert any(one.held for one in fit.weak_directions) == held
+    assert any(one.is_held for one in fit.weak_directions) == held
     error = fit.estimates[-3:] - true.tool[:3]
     assert (np.abs(error) < 3 * np.sqrt(fit.covariance.diagonal()[-3:])).all()
 

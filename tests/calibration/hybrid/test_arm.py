@@ -32,7 +32,7 @@ def coverage_of(first: Tensor, name: str = "ur5", joint: int = 0) -> JointCovera
 
 def beyond(coverage: JointCoverage, *angles: float) -> Tensor:
     """Of values of the first joint [deg], in degrees."""
-    q = torch.zeros(len(angles), len(coverage.turning), dtype=torch.float64)
+    q = torch.zeros(len(angles), len(coverage.is_periodic), dtype=torch.float64)
     q[:, 0] = torch.tensor(angles, dtype=torch.float64).deg2rad()
     return coverage.distance_outside(q)[:, 0].rad2deg()
 
@@ -72,7 +72,7 @@ def test_values_a_full_turn_apart_are_the_same_for_turning_joints_only() -> None
     q = torch.linspace(-3, 3, 50, dtype=torch.float64)[:, None].expand(50, 6)
     assert_close(found.distance_outside(q + 2 * math.pi), found.distance_outside(q), atol=1e-12)
     sliding = coverage_of(torch.linspace(-0.3, -0.1, 50, dtype=torch.float64), "kiro3", 2)
-    assert sliding.turning == (True, True, False, True)
+    assert sliding.is_periodic == (True, True, False, True)
     travel = float(np.diff(Robot.load("kiro3").limits)[2, 0])
     q = torch.zeros(3, 4, dtype=torch.float64)
     q[:, 2] = torch.tensor([-0.2, -0.1 + 0.05, -0.3 - 2 * travel])

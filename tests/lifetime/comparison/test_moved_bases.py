@@ -54,7 +54,7 @@ def bump(millimetres: float, milliradians: float) -> torch.Tensor:
 
 def test_nothing_is_named_if_nothing_moved():
     found = [moved(seed, STILL, "") for seed in range(12)]
-    assert not any(one.named for one in found)
+    assert not any(one.likely_bodies for one in found)
     assert all(one.is_one_body for one in found)
     # without faults, probabilities are uniform between 0 and 1
     assert 0.2 < sum(one.probability for one in found) / len(found) < 0.8
@@ -63,7 +63,7 @@ def test_nothing_is_named_if_nothing_moved():
 @pytest.mark.parametrize("body", ["left", "right", "hall"])
 def test_bumped_body_is_named_with_its_motion(body):
     found = moved(0, bump(0.5, 0.5), body)
-    (one,) = found.named
+    (one,) = found.likely_bodies
     origin = pose_of({"left": BASES[0], "right": BASES[1], "hall": FRAMES["hall"]}[body])[:3, 3]
     M = bump(0.5, 0.5)
     true = torch.cat(
@@ -79,13 +79,13 @@ def test_bumped_body_is_named_with_its_motion(body):
 def test_shift_of_a_large_motion_is_not_linearised(body):
     M = bump(30.0, 80.0)
     origin = pose_of({"right": BASES[1], "hall": FRAMES["hall"]}[body])[:3, 3]
-    (one,) = moved(0, M, body).named
+    (one,) = moved(0, M, body).likely_bodies
     assert_close(one.shift, M[:3, :3] @ origin + M[:3, 3] - origin, atol=3e-4)
 
 
 def test_larger_motion_is_that_of_one_body_only():
     found = moved(1, bump(30.0, 20.0), "right")
-    (one,) = found.named
+    (one,) = found.likely_bodies
     assert one.name == "right"
     assert found.bodies[1].log_likelihood < one.log_likelihood - 100
 

@@ -43,7 +43,7 @@ def test_a_drift_is_charted_and_measured():
     assert other.alarm is error.alarm is None
     assert bool(other.values[1].isnan())
     clear = [one for one in trends_of(REVOLUTE, drifting) if one.is_significant]
-    assert [(one.what, one.over) for one in clear] == [("joint 1", "month")]
+    assert [(one.what, one.per) for one in clear] == [("joint 1", "month")]
     low, high = clear[0].interval
     assert low < 0.01 < high
 
@@ -95,7 +95,7 @@ def test_a_jump_of_the_error_is_not_extrapolated():
 def test_warming_is_not_a_drift_with_time():
     warmed = records(10, per_kelvin=0.002, warm=lambda month: 20.0 + 8.0 * math.sin(month))
     clear = [one for one in trends_of(REVOLUTE, warmed) if one.is_significant]
-    assert [(one.what, one.over) for one in clear] == [("joint 1", "kelvin")]
+    assert [(one.what, one.per) for one in clear] == [("joint 1", "kelvin")]
     assert_close(clear[0].slope, 0.002, rtol=0.3)
 
 

@@ -114,9 +114,9 @@ def test_chunks_contain_every_row_once_and_in_order(tmp_path, rows):
     path = tmp_path / "poses.csv"
     path.write_text("\n".join([QUATERNION, *ROWS]) + "\n")
     chunks = list(read_pose_chunks(path, rows))
-    assert all(len(chunk.line) + len(chunk.bad) <= rows for chunk in chunks)
+    assert all(len(chunk.line) + len(chunk.invalid_rows) <= rows for chunk in chunks)
     assert [line for chunk in chunks for line in chunk.line] == list(SOUND)
-    assert [bad.line for chunk in chunks for bad in chunk.bad] == list(BAD)
+    assert [bad.line for chunk in chunks for bad in chunk.invalid_rows] == list(BAD)
     only_sound = read(tmp_path, QUATERNION, *(ROWS[line - 2] for line in SOUND))
     assert_close(torch.cat([chunk.T for chunk in chunks]), only_sound.T, atol=0.0)
     shares = [chunk.read_fraction for chunk in chunks]
@@ -128,9 +128,9 @@ def test_chunks_state_the_fault_of_a_row(tmp_path):
     path = tmp_path / "poses.csv"
     path.write_bytes("\n".join([QUATERNION, *ROWS, "0,0,0,0,0,0,ü", ""]).encode("latin-1"))
     (chunk,) = read_pose_chunks(path)
-    faults = [(bad.line, bad.fault.column, bad.fault.value) for bad in chunk.bad]
+    faults = [(bad.line, bad.fault.column, bad.fault.value) for bad in chunk.invalid_rows]
     assert faults == [(5, "qx", 2.0), (7, None, 6), (9, "y_m", "two"), (11, None, None)]
-    assert chunk.bad[3].fault.expected == "UTF-8 text"
+    assert chunk.invalid_rows[3].fault.expected == "UTF-8 text"
 
 
 @pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
@@ -139,14 +139,14 @@ def test_ends_of_lines_and_byte_order_marks(tmp_path, end):
     path.write_bytes(("\ufeff" + end.join([QUATERNION, *ROWS[:3]])).encode())
     (chunk,) = read_pose_chunks(path)
     assert chunk.line == (2, 4)
-    assert not chunk.bad
+    assert not chunk.invalid_rows
 
 
 def test_a_long_cell_is_cut(tmp_path):
     path = tmp_path / "poses.csv"
     path.write_text(f"{QUATERNION}\n{'x' * 100_000},0,0,0,0,0,1\n")
     (chunk,) = read_pose_chunks(path)
-    assert len(chunk.bad[0].reason) < 200
+    assert len(chunk.invalid_rows[0].reason) < 200
 
 
 def test_a_file_without_lines_or_a_silent_pipe_is_refused(tmp_path, monkeypatch):

@@ -25,7 +25,7 @@ def of_right_rows():
 
 
 def test_correct_rows_have_usual_probabilities(of_right_rows):
-    assert float(of_right_rows.chance.min()) > 5e-3
+    assert float(of_right_rows.p_value.min()) > 5e-3
     assert 1.0 <= of_right_rows.scale < 1.5
     assert float(of_right_rows.length.max()) < 3e-3
     assert bool(of_right_rows.angle.isnan().all())
@@ -44,11 +44,11 @@ def test_the_prediction_does_not_depend_on_a_row_that_is_not_kept():
     there, here = leave_one_out(away, kept), leave_one_out(ROWS, kept)
     assert_close(there.position[6] - here.position[6], [0.3, -0.5, 0.2], atol=1e-5)
     assert_close(there.position[kept], here.position[kept], atol=1e-6)
-    assert float(there.chance[6]) < 1e-12
+    assert float(there.p_value[6]) < 1e-12
 
 
 def test_three_positions_cannot_be_predicted_from_each_other():
-    assert bool(leave_one_out(ROWS.select(torch.arange(3)), EVERY[:3]).chance.isnan().all())
+    assert bool(leave_one_out(ROWS.select(torch.arange(3)), EVERY[:3]).p_value.isnan().all())
 
 
 def test_two_positions_are_too_few():

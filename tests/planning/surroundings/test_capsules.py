@@ -31,7 +31,7 @@ def test_links_of_a_urdf_file_lead_from_joint_to_joint(tmp_path: Path):
     drawn = [torch.tensor(pair, dtype=torch.float64) for pair in itertools.pairwise(joints)]
     assert_close(capsules.segments(q), torch.stack(drawn), atol=1e-12)
     assert capsules.link.tolist() == [1, 1, 2, 3, 3]
-    assert capsules.carrier.tolist() == [True, False, False, False, False]
+    assert capsules.carries_robot.tolist() == [True, False, False, False, False]
     assert_close(capsules.radius, [0.04, 0.04, 0.03, 0.04, 0.04])
 
 
@@ -55,7 +55,7 @@ def test_links_of_a_dh_table_lead_along_d_and_a():
         segments[0, :4, :, [0, 2]][:, 0], torch.tensor(corners, dtype=torch.float64)[:4][:, [0, 2]], atol=1e-3
     )
     assert_close(segments[0, -1, 1], [0.64, 0.05, float(segments[0, -1, 0, 2])], atol=1e-12)
-    assert capsules.carrier.tolist() == [True, False, False, False, False, False]
+    assert capsules.carries_robot.tolist() == [True, False, False, False, False, False]
 
 
 def test_a_robot_file_keeps_where_its_joints_are(tmp_path: Path):

@@ -84,8 +84,8 @@ def test_joint_values_measured_again_are_reported(hybrid, tmp_path):
     again = replace(arm.measurements, position=arm.measurements.position + 1e-5)
     content = report_content(model, tmp_path, again)
     assert content.rows.origin == "other"
-    assert any("200 of 200" in line for line in content.rows.again)
-    assert set(content.rows.again) < set(content.remarks)
+    assert any("200 of 200" in line for line in content.rows.repeated_row_warnings)
+    assert set(content.rows.repeated_row_warnings) < set(content.remarks)
 
 
 def test_a_folder_that_keeps_held_out_rows_shows_them(hybrid, tmp_path):
@@ -157,7 +157,7 @@ def test_the_workspace_is_shown_without_rows(hybrid, tmp_path):
     content = report_content(hybrid[1], tmp_path)
     assert content.rows is None
     assert [layer.key for layer in content.map.layers] == ["correction", "predicted"]
-    assert len(content.map.place) == 3000
+    assert len(content.map.position) == 3000
     assert (content.map.rows, content.map.random) == (0, 3000 - len(hybrid[1].starts))
     assert content.missing
     assert content.dependences == ()

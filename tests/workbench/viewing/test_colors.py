@@ -10,7 +10,7 @@ from pisigma.workbench.viewing.colors import RAMP, UNJUDGED, error_colors, round
 
 
 def test_colours_run_from_no_error_to_the_end_of_the_scale():
-    colors = error_colors(np.array([0.0, 1e-3, 5e-3, math.nan]), top=1e-3)
+    colors = error_colors(np.array([0.0, 1e-3, 5e-3, math.nan]), max_error=1e-3)
     expected = [tuple(bytes.fromhex(color[1:])) for color in (RAMP[0], RAMP[-1], RAMP[-1])]
     assert_close(colors, np.array([*expected, UNJUDGED]))
 

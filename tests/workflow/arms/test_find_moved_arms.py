@@ -44,7 +44,7 @@ def test_nothing_is_named_if_nothing_moved(folder):
 def test_bumped_base_is_named_with_shift_and_standard_errors(folder):
     found = find_moved_arms(folder, now("right"))
     (one,) = (one for one in found.bodies if one.is_named)
-    assert (one.kind, one.name, found.found.is_one_body) == ("arm", "right", True)
+    assert (one.kind, one.name, found.moved_bases.is_one_body) == ("arm", "right", True)
     assert_close(one.shift_mm, [0.3, 0.0, -0.4], atol=0.1)
     assert max(one.standard_errors[:3]) < 0.05
 

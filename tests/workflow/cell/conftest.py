@@ -20,9 +20,9 @@ def used(tmp_path_factory):
     folder = tmp_path_factory.mktemp("cells")
     cell = Cell.create(folder / "cell", "ur10")
     with no_type_checker(), no_pictures(), few_choices():
-        cell.take_in(measured(60, 1), day=day(60))
+        cell.add_session(measured(60, 1), day=day(60))
         cell.calibrate(folds=0)
-        cell.take_in(measured(12, 2), day=day(30))
+        cell.add_session(measured(12, 2), day=day(30))
         cell.verify()
         for form, name in (("dh", "dh.csv"), ("offsets", "offsets.csv")):
             export_from_cell(cell, form, ExportRequest(cell.folder, folder / name))

@@ -76,7 +76,7 @@ def test_repeated_poses_after_the_instrument_was_moved_have_no_accuracy(cell):
     )
     cell.sessions.set_aside("2026-08-01", "joint 3 had slipped")
     cell.history.record("instrument", "2026-09-01")
-    cell.take_in(rows, day="2026-09-10")
+    cell.add_session(rows, day="2026-09-10")
     found = acceptance_of(cell)
     assert (found.measured.session, found.measured.fitted) == ("2026-09-10", ("base",))
     assert not found.contradicted

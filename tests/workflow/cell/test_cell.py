@@ -39,11 +39,11 @@ def year(tmp_path_factory):
         return result
 
     then(lambda: cell.plan(candidates=200, count=12, check=2))
-    then(lambda: cell.take_in(measured(60, 1), day=day(60)))
+    then(lambda: cell.add_session(measured(60, 1), day=day(60)))
     calibrated = then(lambda: cell.calibrate(folds=2))
-    then(lambda: cell.take_in(measured(12, 2), day=day(30)))
+    then(lambda: cell.add_session(measured(12, 2), day=day(30)))
     verified = then(cell.verify)
-    then(lambda: cell.take_in(measured(12, 3, zero=0.08), day=day(2)))
+    then(lambda: cell.add_session(measured(12, 3, zero=0.08), day=day(2)))
     return cell, states, calibrated, verified
 
 
@@ -90,11 +90,11 @@ def test_a_move_is_found_and_recalibrated(year):
 
 def test_rows_that_improve_the_model_are_used_without_a_move_and_a_moved_tracker_becomes_an_event(year):
     cell, *_ = year
-    cell.take_in(measured(12, 11, zero=0.088), day=day(1))
+    cell.add_session(measured(12, 11, zero=0.088), day=day(1))
     cell.monitor()
     assert cell.status().step.state in ("moved", "older_than_evidence")
     cell.recalibrate()
-    cell.take_in(measured(12, 12, zero=0.088, base=np.add(BASE, [0.5, 0.2, 0, 0.3, 0, 0])), day=day(0))
+    cell.add_session(measured(12, 12, zero=0.088, base=np.add(BASE, [0.5, 0.2, 0, 0.3, 0, 0])), day=day(0))
     cell.monitor()
     assert cell.status().step.state == "moved"
     assert cell.recalibrate()[0].trusted
@@ -120,14 +120,14 @@ def test_rows_that_the_cell_contains_are_refused(year, again, tmp_path):
         rows.write_csv(tmp_path / "again.csv", ROBOT)
         rows = tmp_path / "again.csv"
     with refused(MeasurementError):
-        cell.take_in(rows, day=day(1))
+        cell.add_session(rows, day=day(1))
 
 
 def test_rows_in_inches_are_refused_and_not_stored(year):
     cell, *_ = year
     before = cell.history.sessions()
     with refused(AcceptanceError):
-        cell.take_in(measured(12, 5, scale=1 / 25.4), day=day(1))
+        cell.add_session(measured(12, 5, scale=1 / 25.4), day=day(1))
     assert cell.history.sessions() == before
     assert cell.status().facts.not_taken_in == ()
 
@@ -165,8 +165,8 @@ def test_a_changed_model_is_named_and_not_used(year, file):
 
 def test_an_event_that_is_recorded_during_a_calibration_asks_for_another(tmp_path):
     cell = Cell.create(tmp_path / "cell", "ur10")
-    cell.take_in(measured(14, 1), day="2026-01-10")
-    cell.take_in(measured(8, 2), day="2026-01-12")
+    cell.add_session(measured(14, 1), day="2026-01-10")
+    cell.add_session(measured(8, 2), day="2026-01-12")
 
     def record(_):
         if not cell.history.events():
@@ -183,27 +183,27 @@ def test_an_event_that_is_recorded_during_a_calibration_asks_for_another(tmp_pat
 def test_sessions_before_and_after_an_event_of_the_instrument_are_in_two_frames(tmp_path):
     cell = Cell.create(tmp_path / "cell", "ur10")
     moved = np.add(BASE, [0.5, 0.2, 0, 0.3, 0, 0])
-    cell.take_in(measured(30, 1), day="2026-01-10")
+    cell.add_session(measured(30, 1), day="2026-01-10")
     cell.history.record("instrument", "2026-01-15")
-    cell.take_in(measured(30, 2, base=moved), day="2026-01-20")
+    cell.add_session(measured(30, 2, base=moved), day="2026-01-20")
     rows = cell.sessions.rows_of(cell.history.sessions())
     assert set(rows.frame) == {"", "since 2026-01-15"}
     calibration, entry = cell.calibrate(model="geometric", folds=0)
     assert calibration.trusted
     assert set(calibration.model.bases) == {"", "since 2026-01-15"}
     assert (entry.frame_day, entry.target_day) == ("2026-01-15", "")
-    cell.take_in(measured(12, 3, base=moved), day="2026-02-01")
+    cell.add_session(measured(12, 3, base=moved), day="2026-02-01")
     verification, _ = cell.verify()
     assert verification.verdict == "better"
     assert not verification.settings.fit_frame
     cell.history.record("instrument", "2026-02-02")
-    cell.take_in(measured(12, 4), day="2026-02-03")
+    cell.add_session(measured(12, 4), day="2026-02-03")
     assert cell.status().step.command.split()[1] == "verify"  # a geometric model has no posterior to monitor
     cell.plan(count=4, candidates=60)
     again, _ = cell.verify()
     assert again.settings.fit_frame
     assert again.verdict == "better"
-    older = cell.take_in(measured(12, 5), day="2026-01-12")
+    older = cell.add_session(measured(12, 5), day="2026-01-12")
     assert cell.sessions.rows_with_model_names(entry, cell.sessions.as_measured(older), older.day).fit_frame
     cell.history.record("mastering", "2026-02-10")
     assert cell.status().step.state == "no_plan"
@@ -214,10 +214,10 @@ def test_sessions_before_and_after_an_event_of_the_instrument_are_in_two_frames(
 def test_the_missing_poses_of_a_plan_are_requested(tmp_path):
     cell = Cell.create(tmp_path / "cell", "ur10")
     cell.plan(count=40, check=0, candidates=100)
-    cell.take_in(measured(20, 1), day=day(2))
+    cell.add_session(measured(20, 1), day=day(2))
     step = cell.status().step
     assert (step.state, step.command.split()[1]) == ("session_incomplete", "import")
-    cell.take_in(measured(16, 2), day=day(1))
+    cell.add_session(measured(16, 2), day=day(1))
     assert cell.status().step.state == "not_calibrated"
 
 
@@ -234,7 +234,7 @@ def test_a_file_in_the_folder_of_sessions_is_taken_in_by_the_next_step(tmp_path)
 
 def test_a_session_is_set_aside_with_a_reason(tmp_path):
     cell = Cell.create(tmp_path / "cell", "ur10")
-    cell.take_in(measured(20, 1), day="2026-01-10")
+    cell.add_session(measured(20, 1), day="2026-01-10")
     with refused(MeasurementError, option="--set-aside"):
         cell.sessions.set_aside("2026-01-10", " ")
     with refused(MeasurementError, option="session", value="2026-01-1"):
@@ -252,13 +252,13 @@ def test_a_folder_with_files_does_not_become_a_cell(tmp_path):
 
 def test_a_new_calibration_goes_into_use_only_where_new_rows_show_that_it_is_better(tmp_path):
     cell = Cell.create(tmp_path / "cell", "ur10")
-    cell.take_in(measured(14, 1), day="2026-01-10")
+    cell.add_session(measured(14, 1), day="2026-01-10")
     cell.calibrate(model="geometric", folds=0)
-    cell.take_in(measured(8, 2), day="2026-01-11")
+    cell.add_session(measured(8, 2), day="2026-01-11")
     cell.verify()
     first = cell.history.in_use
-    cell.take_in(measured(60, 3), day="2026-01-12")
-    cell.take_in(measured(30, 4), day="2026-01-13")
+    cell.add_session(measured(60, 3), day="2026-01-12")
+    cell.add_session(measured(30, 4), day="2026-01-13")
     _, entry = cell.calibrate(model="geometric", folds=0)
     assert first is not None
     assert cell.history.in_use == entry
@@ -290,12 +290,12 @@ def test_a_session_never_replaces_a_file_that_appeared_meanwhile(tmp_path, monke
 def test_rows_before_and_after_an_event_in_one_file_are_refused(tmp_path):
     cell = Cell.create(tmp_path / "cell", "ur10")
     days = ("2026-01-10",) * 15 + ("2026-01-12",) * 15
-    cell.take_in(dataclasses.replace(measured(30, 1), date=days))
+    cell.add_session(dataclasses.replace(measured(30, 1), date=days))
     cell.history.record("instrument", "2026-01-11")
     with refused(MeasurementError, value="instrument"):
         cell.calibrate(model="geometric", folds=0)
     with refused(MeasurementError, option="--date", value="2026-01-12"):
-        cell.take_in(dataclasses.replace(measured(30, 2), date=days), day="2026-01-12")
+        cell.add_session(dataclasses.replace(measured(30, 2), date=days), day="2026-01-12")
 
 
 def test_a_recalibration_with_an_older_session_keeps_the_day_of_the_model(year):

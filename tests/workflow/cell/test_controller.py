@@ -45,7 +45,7 @@ COMMANDS = {
     "verify": lambda cell, folder: cell.verify(),
     "evaluate": lambda cell, folder: cell.evaluate(),
     "measure": lambda cell, folder: model_in_use_warnings(cell.folder, "measure"),
-    "import": lambda cell, folder: cell.take_in(measured(6, 9), day=day(0)),
+    "import": lambda cell, folder: cell.add_session(measured(6, 9), day=day(0)),
     "monitor": lambda cell, folder: cell.monitor(),
     "recalibrate": lambda cell, folder: cell.recalibrate(),
     "use": lambda cell, folder: cell.use(cell.history.models()[0].name, ""),
@@ -115,7 +115,7 @@ def test_joint_zeros_ask_for_a_model_that_was_measured_with_them(cell, used):
     with refused(MeasurementError):
         cell.calibrate()
 
-    session = cell.take_in(measured(14, 3, zero=ZERO), day=day(5))
+    session = cell.add_session(measured(14, 3, zero=ZERO), day=day(5))
     assert (session.judged_by, "offsets.csv" in session.remark) == ("robot", True)
     assert [len(one["controller"]) for one in cell.status().to_json()["sessions"]] == [0, 0, 1]
     assert "offsets.csv" in cell.monitor().warnings[0]
@@ -138,7 +138,7 @@ def test_joint_zeros_ask_for_a_model_that_was_measured_with_them(cell, used):
 
 def test_a_calibration_with_joint_zeros_states_that_it_needs_them(cell, used):
     set_controller(cell, used.folder.parent / "offsets.csv", day(10))
-    cell.take_in(measured(30, 4, zero=ZERO), day=day(5))
+    cell.add_session(measured(30, 4, zero=ZERO), day=day(5))
     result, entry = cell.calibrate(model="geometric", folds=0)
     assert "offsets.csv" in result.warnings[0]
     assert entry.sessions == day(5)
@@ -148,7 +148,7 @@ def test_rows_before_and_after_a_change_of_the_joint_zeros_are_not_one_session(c
     rows = measured(10, 5)
     set_controller(cell, used.folder.parent / "offsets.csv", day(3))
     dates = tuple(day(4) if row < 5 else day(2) for row in range(10))
-    cell.take_in(pisigma.Measurements(q=rows.q, position=rows.position, date=dates))
+    cell.add_session(pisigma.Measurements(q=rows.q, position=rows.position, date=dates))
     with refused(MeasurementError, value="controller"):
         cell.sessions.as_measured(cell.history.sessions()[-1])
 

@@ -19,10 +19,10 @@ def _work(folder, number, start, refusals):
         mine = measured(12, 10 + number)
         start.wait()
         try:
-            cell.take_in(both, day=day(9))
+            cell.add_session(both, day=day(9))
         except MeasurementError:
             refusals.put(number)
-        cell.take_in(mine, day=day(8))
+        cell.add_session(mine, day=day(8))
         start.wait()
         cell.calibrate(folds=0)
         start.wait()
@@ -57,14 +57,14 @@ def test_rows_that_do_not_fit_on_the_disk_are_refused_and_nothing_is_lost(tmp_pa
     import resource
 
     cell = Cell.create(tmp_path / "cell", "ur10")
-    first = cell.take_in(measured(12, 1), day=day(9))
+    first = cell.add_session(measured(12, 1), day=day(9))
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1_000, limits[1]))
     try:
         with pytest.raises(OutputError):
-            cell.take_in(measured(12, 2), day=day(8))
+            cell.add_session(measured(12, 2), day=day(8))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert cell.history.sessions() == (first,)
     assert cell.status().facts.not_taken_in == ()
-    cell.take_in(measured(12, 2), day=day(8))
+    cell.add_session(measured(12, 2), day=day(8))

@@ -162,7 +162,7 @@ def test_the_model_of_a_folder_is_put_into_use(tmp_path, model):
     assert cell.robot.dh == pytest.approx(original_model().robot.dh)
     assert (cell.status().step.state, cell.history.in_use.made_of) == ("no_plan", ())
     rows_after_change(10, 11).write_csv(tmp_path / "new.csv", cell.robot)
-    cell.take_in(tmp_path / "new.csv")
+    cell.add_session(tmp_path / "new.csv")
     assert cell.status().step.state == "session_not_judged"
 
 

@@ -180,11 +180,11 @@ def _base_by_tools(
     return torch.cat([place, rpy_from_rotation(R_base)]).numpy()
 
 
-def randomly_chosen_rows(rows: int, most: int) -> Int64[Tensor, " chosen"]:
-    """Return all rows, or at most `most` of them in a fixed random order."""
-    if rows <= most:
+def randomly_chosen_rows(rows: int, max_rows: int) -> Int64[Tensor, " chosen"]:
+    """Return all rows, or at most `max_rows` of them in a fixed random order."""
+    if rows <= max_rows:
         return torch.arange(rows)
-    return torch.randperm(rows, generator=torch.Generator().manual_seed(0))[:most]
+    return torch.randperm(rows, generator=torch.Generator().manual_seed(0))[:max_rows]
 
 
 def _touched_rows(

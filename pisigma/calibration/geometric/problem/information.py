@@ -62,16 +62,16 @@ class Information:
         parameters = self.parameters[:column] + self.parameters[column + 1 :]
         return replace(self, parameters=parameters, root=np.delete(self.root, column, 1))
 
-    def eliminate(self, nuisance: list[int], silent: Sequence[int] = ()) -> "Information":
+    def eliminate(self, nuisance: list[int], zeroed: Sequence[int] = ()) -> "Information":
         """Eliminate nuisance parameters by projecting the other columns onto the complement of their columns.
 
         Args:
             nuisance: indices of columns that are eliminated and removed.
-            silent: indices of columns that are eliminated and kept as zeros.
+            zeroed: indices of columns that are eliminated and kept as zeros.
         """
-        if not nuisance and not silent:
+        if not nuisance and not zeroed:
             return self
-        taken = self.jacobian[:, [*nuisance, *silent]]
+        taken = self.jacobian[:, [*nuisance, *zeroed]]
         # Columns have different units, so they are scaled before their rank is decided.
         lengths = np.linalg.norm(taken, axis=0)
         U, singular, _ = np.linalg.svd(taken / np.where(lengths > 0, lengths, 1.0), full_matrices=False)
@@ -83,7 +83,7 @@ class Information:
             rest = rest - U @ (U.T @ rest)
         # The remainder of a dependent column is a rounding error, which must not look identifiable.
         rest[:, np.linalg.norm(rest, axis=0) <= _DEPENDENT * sizes] = 0.0
-        rest[:, [kept.index(column) for column in silent]] = 0.0
+        rest[:, [kept.index(column) for column in zeroed]] = 0.0
         root: np.ndarray = np.linalg.qr(rest, mode="r")  # type: ignore[assignment]
         parameters = tuple(self.parameters[i] for i in kept)
         return replace(self, parameters=parameters, root=root, values=self.values - U.shape[1])

@@ -129,7 +129,7 @@ def loss_scale(
     sensors: Sequence[AbstractSensor],
     loss: AbstractLoss,
     view: SensorView,
-    used: Float64[Tensor, " sensors"],
+    effective_parameters: Float64[Tensor, " sensors"],
     refine: bool,
 ) -> Float64[Tensor, " sensors"]:
     """Estimate the standard deviation of every sensor's values, or a factor >= 1 on stated standard deviations.
@@ -138,21 +138,21 @@ def loss_scale(
         sensors: the sensors.
         loss: loss function, which defines the estimators.
         view: residuals and current noise.
-        used: effective number of parameters per sensor.
+        effective_parameters: effective number of parameters per sensor.
         refine: whether to use all rows without outliers instead of the median.
     """
     scales = []
     for k, sensor in enumerate(sensors):
         if sensor.certain:
-            scales.append(torch.ones_like(used[k]))
+            scales.append(torch.ones_like(effective_parameters[k]))
             continue
         distance = view.contributions[k].distance
         if view.contributions[k].measured < len(distance):
             distance = distance[sensor.present]
         if refine:
-            scale = loss.deviation(distance, sensor.components, used[k], view.scales[k])
+            scale = loss.deviation(distance, sensor.components, effective_parameters[k], view.scales[k])
         else:
-            scale = loss.scale(distance, sensor.components, used[k])
+            scale = loss.scale(distance, sensor.components, effective_parameters[k])
         scales.append(scale.clamp(min=SMALLEST_NOISE if sensor.sigma is None else 1.0))
     return torch.stack(scales)
 
@@ -176,7 +176,7 @@ def group_variance_ratio(
     sensors: Sequence[AbstractSensor],
     loss: AbstractLoss,
     view: SensorView,
-    used: Float64[Tensor, " sensors"],
+    effective_parameters: Float64[Tensor, " sensors"],
     pose: Int64[Tensor, " rows"] | None,
     configuration: Int64[Tensor, " rows"] | None = None,
 ) -> Float64[Tensor, " sensors"]:
@@ -189,13 +189,14 @@ def group_variance_ratio(
         sensors: the sensors, with the rows that have values.
         loss: loss function for the weights of rows within a pose.
         view: residuals and noise.
-        used: effective number of parameters per sensor, which reduces the degrees of freedom of the poses.
+        effective_parameters: effective number of parameters per sensor, which reduces the degrees of freedom of the
+            poses.
         pose: index of every row's pose; None if no pose is repeated.
         configuration: index of every row's joint values and frame; None if no configuration has several targets.
     """
     ratios = []
     for k, (sensor, part) in enumerate(zip(sensors, view.contributions, strict=True)):
-        ratio = torch.ones_like(used[k])
+        ratio = torch.ones_like(effective_parameters[k])
         ratios.append(ratio)
         if sensor.certain:
             continue
@@ -204,7 +205,7 @@ def group_variance_ratio(
             weight = torch.where(sensor.present, weight / sensor.sigma.square(), 0.0)
         square, values = _group_squares(part.residual, weight, pose)
         if pose is not None:
-            left = (values - used[k]).clamp(min=1.0)
+            left = (values - effective_parameters[k]).clamp(min=1.0)
             ratio = (square / left / view.noise[k].square()).clamp(min=1.0)
         if configuration is not None:
             shared, fewer = _group_squares(part.residual, weight, configuration)
@@ -217,8 +218,8 @@ def group_variance_ratio(
 def angle_disagreement(
     sensors: Sequence[AbstractSensor],
     view: SensorView,
-    held: Float64[Tensor, " active"],
-    pull: Float64[Tensor, " active"],
+    prior_precision: Float64[Tensor, " active"],
+    prior_gradient: Float64[Tensor, " active"],
 ) -> Float64[Tensor, " sensors"]:
     """Estimate the factor on the variance of measured angles, per sensor.
 
@@ -234,8 +235,8 @@ def angle_disagreement(
     Args:
         sensors: the sensors.
         view: normal equations and noise.
-        held: prior precision of every free parameter.
-        pull: contribution of the prior to the right-hand side of the normal equations.
+        prior_precision: prior precision of every free parameter.
+        prior_gradient: contribution of the prior to the right-hand side of the normal equations.
     """
     angular = [sensor.unit == "rad" and not sensor.certain for sensor in sensors]
     lengths = [sensor.unit != "rad" and not sensor.certain for sensor in sensors]
@@ -244,7 +245,7 @@ def angle_disagreement(
     variance = view.noise.square() * view.repetition
     normals = [part.normal / variance[k] for k, part in enumerate(view.contributions)]
     descents = [part.descent / variance[k] for k, part in enumerate(view.contributions)]
-    zero = torch.zeros_like(normals[0]), torch.zeros_like(pull)
+    zero = torch.zeros_like(normals[0]), torch.zeros_like(prior_gradient)
     by_lengths, by_angles = (
         (
             sum((one for one, angle in zip(normals, angular, strict=True) if angle is which), zero[0]),
@@ -252,9 +253,9 @@ def angle_disagreement(
         )
         for which in (False, True)
     )
-    systems = (by_lengths[0], by_lengths[1] + pull, *by_angles, held)
+    systems = (by_lengths[0], by_lengths[1] + prior_gradient, *by_angles, prior_precision)
     factor = _angle_disagreement(*(value.cpu().numpy() for value in systems))
-    return pull.new_tensor([factor if angle else 1.0 for angle in angular])
+    return prior_gradient.new_tensor([factor if angle else 1.0 for angle in angular])
 
 
 def _angle_disagreement(

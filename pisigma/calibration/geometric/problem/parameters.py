@@ -176,7 +176,7 @@ class ParameterSpace:
         """Mask of the parameters that move the tool in all rows."""
         return len(self.frames) == len(self.targets) == 1 and not self.unknowns
 
-    def most_independent(self, turning: bool) -> int:
+    def most_independent(self, with_orientation: bool) -> int:
         """Return the largest number of identifiable parameters of arm, bases and tools, for any measurements.
 
         A revolute axis is a line in space (4 parameters), a prismatic axis a direction (2), a target a pose (6) or a
@@ -184,10 +184,10 @@ class ParameterSpace:
         for R revolute and P prismatic joints (Everett, Driels and Mooring 1987, ICRA).
 
         Args:
-            turning: whether the orientation of the tool is measured.
+            with_orientation: whether the orientation of the tool is measured.
         """
         axes = sum(2 if joint.type == "prismatic" else 4 for joint in self.robot.joints)
-        return axes + (6 if turning else 3) * len(self.targets) + 6 * (len(self.frames) - 1)
+        return axes + (6 if with_orientation else 3) * len(self.targets) + 6 * (len(self.frames) - 1)
 
     def index(self, name: str) -> int:
         """Return the index of a parameter.

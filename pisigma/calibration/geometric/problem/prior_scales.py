@@ -118,7 +118,7 @@ def prior_scales(
 
 def converged_prior_scales(
     normal: Float64[Tensor, "active active"],
-    pull: Float64[Tensor, " active"],
+    right_hand_side: Float64[Tensor, " active"],
     precision: Float64[Tensor, " active"],
     group: Int64[Tensor, " active"],
     before: Float64[Tensor, " groups"],
@@ -128,7 +128,7 @@ def converged_prior_scales(
 
     Args:
         normal: normal matrix of the data, without the prior.
-        pull: right-hand side of the normal equations relative to the nominal values.
+        right_hand_side: right-hand side of the normal equations relative to the nominal values.
         precision: see `prior_scales`.
         group: see `prior_scales`.
         before: see `prior_scales`.
@@ -140,7 +140,7 @@ def converged_prior_scales(
         held, before = normal.clone(), scale
         held.diagonal().add_(scaled_precision(precision, group, before))
         covariance = covariance_of(held)
-        scale = prior_scales(covariance @ pull, precision, group, before, covariance, floor)
+        scale = prior_scales(covariance @ right_hand_side, precision, group, before, covariance, floor)
         if has_converged(before, scale, _CONVERGENCE_TOLERANCE):
             break
     return scale

@@ -63,7 +63,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         pairs: number of pairs of rows that are measured together, which come first.
         stated: conditions stated in the rows (see `JointState`), for corrections that depend on them.
         prior_scaling: "stated": prior scales are 1; "widened": at least 1; "estimated": estimated without bounds.
-        held: directions along which the search does not move, because the rows do not determine them.
+        held_directions: directions along which the search does not move, because the rows do not determine them.
         memory: cache of the last motion, shared by problems that differ only in free parameters or prior.
     """
 
@@ -81,7 +81,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
     pairs: int = 0
     stated: Mapping[str, Tensor] = field(default_factory=dict)
     prior_scaling: PriorScaling = "widened"
-    held: HeldDirections | None = None
+    held_directions: HeldDirections | None = None
     memory: MotionMemory = field(default_factory=MotionMemory, repr=False)
 
     @cached_property
@@ -111,7 +111,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
     def with_active(self, active: Sequence[int]) -> "CalibrationProblem":
         """Return the problem with other free parameters, and without held directions."""
         indices = torch.tensor(sorted(active), dtype=torch.int64, device=self.q.device)
-        return replace(self, active=indices, held=None)
+        return replace(self, active=indices, held_directions=None)
 
     def without_prior(self) -> "CalibrationProblem":
         """Return the problem without a prior."""
@@ -298,8 +298,8 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         normal, descent = self._data_equations(view)
         normal.diagonal().add_(precision)
         descent.sub_(pull)
-        if self.held is not None:
-            normal, descent = self.held.restrict(normal, descent, self.step_scale)
+        if self.held_directions is not None:
+            normal, descent = self.held_directions.restrict(normal, descent, self.step_scale)
         costs = [
             self.loss_for_sensor(sensor).cost(part.distance / view.scales[k], sensor.components).sum()
             for k, (sensor, part) in enumerate(zip(self.sensors, view.contributions, strict=True))

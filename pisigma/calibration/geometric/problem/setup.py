@@ -73,9 +73,11 @@ class CalibrationSetup:
     measurements: Measurements
     joint_repeatability: float = 0.0
 
-    def weighted_rows(self, rows: Measurements, there: "IdentifiedGeometry") -> Measurements:
+    def weighted_rows(self, rows: Measurements, geometry: "IdentifiedGeometry") -> Measurements:
         """Return rows of images whose covariances include the repeatability of the joints of an arm."""
-        return with_joint_repeatability(rows, there.robot, there.bases, there.tools, self.joint_repeatability)
+        return with_joint_repeatability(
+            rows, geometry.robot, geometry.bases, geometry.tools, self.joint_repeatability
+        )
 
     def weighted_at(self, point: Float64[Tensor, " parameters"]) -> "CalibrationSetup":
         """Return the setup whose images are weighted by the repeatability of the joints of the arm at a point."""

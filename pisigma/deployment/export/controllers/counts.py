@@ -106,7 +106,7 @@ def _refuse(request: ExportRequest) -> None:
                 "this format needs one number per joint in encoder counts",
                 option=f"--{name}",
                 remedy="give both --counts-per-turn (encoder counts per turn of the joint, including its gear, or "
-                "per 1 mm) and --present-counts (present counts of the controller)",
+                "per 1 mm) and --present-counts (current counts of the controller)",
             )
 
 
@@ -139,13 +139,13 @@ EPSON = _file(
     "epson",
     "the home offsets of an Epson controller",
     "download.epson.biz/robots, SPEL+ language reference, Hofs and HofsJointAccuracy",
-    "Enter the new counts with Hofs (or HofsJointAccuracy), joint 1 first; the present counts are those that Hofs "
+    "Enter the new counts with Hofs (or HofsJointAccuracy), joint 1 first; the current counts are those that Hofs "
     "displays.",
 ).export_format()
 FANUC = _file(
     "fanuc-mastering",
     "the mastering counts of a FANUC controller",
     "industrialmonitordirect.com, Reset FANUC Extended Axis Master Count; position = (encoder - master count) * scale",
-    "Enter the new counts into $DMR_GRP[1].$MASTER_COUN, joint 1 first; the present counts are those of that variable. "
+    "Enter the new counts into $DMR_GRP[1].$MASTER_COUN, joint 1 first; the current counts are those of that variable. "
     "Counts per turn are the encoder counts per motor turn times the gear ratio of the joint.",
 ).export_format()

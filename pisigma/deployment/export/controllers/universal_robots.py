@@ -35,7 +35,7 @@ _TILTED = 1e-6
 _LINE = r"(?m)^[ \t]*{key}[ \t]*=[ \t]*\[([^\]\n]*)\]"
 
 
-def without_beta(origins: list[Frame], own: Robot) -> Robot:
+def without_beta(origins: list[Frame], robot: Robot) -> Robot:
     """Convert a robot to the manufacturer's rows, in which beta is 0 and the last row has neither a nor alpha.
 
     Two lines have one common normal. If the lines are nearly parallel, the normal is far away, so d of this row and of
@@ -44,13 +44,13 @@ def without_beta(origins: list[Frame], own: Robot) -> Robot:
 
     Args:
         origins: frames of the joints, see `ControllerGeometry.origins`.
-        own: nominal robot with the base and tool that belong to these frames.
+        robot: nominal robot with the base and tool that belong to these frames.
     """
-    plain = robot_of_origins(own, origins, np.eye(4), _TILTED)
+    plain = robot_of_origins(robot, origins, np.eye(4), _TILTED)
     dh = plain.dh.copy()
     dh[:, 4] = 0.0  # axes that are parallel up to `_TILTED`
     turned = 0.0
-    for joint, (row, theta) in enumerate(zip(dh, own.dh[:, 0].tolist(), strict=True), 1):
+    for joint, (row, theta) in enumerate(zip(dh, robot.dh[:, 0].tolist(), strict=True), 1):
         row[0] = theta + math.remainder(row[0] + turned - theta, 2 * math.pi)
         turned = 0.0
         if abs(row[0] - theta) > math.pi / 2 and joint < len(dh):
@@ -126,8 +126,8 @@ FILE = ControllerFile(
     requirements=(
         "The controller adds these differences to its own nominal DH parameters, which are in urcontrol.conf.",
         "The file includes neither base nor tool. The line 'base' below is the pose of the controller's frame 'base' "
-        "in the frame of the model's poses (set its inverse as a feature), the line 'tool' that of the tool on the "
-        "flange (set it as TCP).",
+        "in the frame of the model's poses (set its inverse as a feature), and the line 'tool' is that of the "
+        "tool on the flange (set it as TCP).",
         "With --like the other lines of the controller's file are kept; joint checksums and raw offsets are not known.",
     ),
     text=write_calibration,

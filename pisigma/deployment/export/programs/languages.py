@@ -95,7 +95,7 @@ class Language:
         line_end: line ending.
         most_lines: largest number of numbered lines of a program; None for any number.
         keeps_branch: whether Cartesian targets may be on several branches.
-        capitals: whether names are written in capitals.
+        uses_capitals: whether names are written in capitals.
         configuration: pattern of configurations of the arm, if Cartesian targets require a configuration.
         cautions: notes for the user of a program, in addition to those for all languages.
         cartesian_cautions: additional notes for Cartesian targets.
@@ -108,7 +108,7 @@ class Language:
     line_end: str = "\r\n"
     most_lines: int | None = None
     keeps_branch: bool = False
-    capitals: bool = False
+    uses_capitals: bool = False
     configuration: re.Pattern[str] | None = None
     cautions: tuple[str, ...] = ()
     cartesian_cautions: tuple[str, ...] = ()
@@ -119,7 +119,7 @@ class Language:
         Raises:
             OutputError: the name is not valid in the language; the message proposes a valid name.
         """
-        stem = path.stem.upper() if self.capitals else path.stem
+        stem = path.stem.upper() if self.uses_capitals else path.stem
         fits = re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", stem, re.ASCII) and len(stem) <= self.longest
         if fits and stem.upper() not in self.reserved:
             return stem
@@ -232,7 +232,7 @@ FANUC = Language(
     longest=36,
     reserved=_FILES_OF_SYSTEMS,
     most_lines=9999,
-    capitals=True,
+    uses_capitals=True,
     configuration=re.compile(r"[NF] ([LR] )?[UD] [TB], -?\d, -?\d, -?\d"),
     cautions=(
         "On FANUC pendants J3 is measured from the horizontal, so it changes with J2. The values here are defined like "

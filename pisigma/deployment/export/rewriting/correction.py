@@ -46,7 +46,7 @@ class CorrectedProgram:
         text: text of the program.
         statuses: line and status of every target.
         waypoints: number of inserted waypoints.
-        left: line of every target that was not changed, and the reason.
+        unchanged_lines: line of every target that was not changed, and the reason.
         largest_shift: largest shift of a target [m].
         branches: names of the branches of the corrected targets.
     """
@@ -54,7 +54,7 @@ class CorrectedProgram:
     text: str
     statuses: tuple[tuple[int, Status], ...]
     waypoints: int
-    left: tuple[tuple[int, str], ...]
+    unchanged_lines: tuple[tuple[int, str], ...]
     largest_shift: float
     branches: tuple[str, ...]
 
@@ -131,7 +131,7 @@ class ProgramCorrection:
             text,
             tuple((target.line, there.status[0]) for target, there in answered),
             sum(len(way) for _, way in cuts),
-            tuple(sorted((reasons | dict(program.left)).items())),
+            tuple(sorted((reasons | dict(program.unchanged_lines)).items())),
             max((float((there.T[0] - pose.T)[:3, 3].norm()) for pose, there in reached), default=0.0),
             tuple(self.solver.branches[index] for index in branches),
         )
@@ -168,24 +168,24 @@ class ProgramCorrection:
         if is_straight(*(T[:, :3, 3] for T in (start, via, end))):
             return COLLINEAR
         arc = CircularArcs.through_points(*(T[:, :3, 3] for T in (start, via, end)))
-        between = start[:, :3, :3] @ rotation_from_vector(arc.passing / arc.angle * _turn(start, end))
+        between = start[:, :3, :3] @ rotation_from_vector(arc.via_angle / arc.angle * _turn(start, end))
         if _LEVER * float(rotation_vector(between.mT @ via[:, :3, :3]).norm()) > self.tolerance:
             return OTHER_ORIENTATION
         length = float(arc.angle * arc.radius.norm())
         return _round(start, via, end, _steps(start, end, length))[0]
 
-    def waypoints(self, move: PathMove, there: CommandedPoses) -> list[Frame] | str:
+    def waypoints(self, move: PathMove, commanded: CommandedPoses) -> list[Frame] | str:
         """Return the waypoints of a move (see `PathMove.waypoints`), or the reason why it is not split."""
-        if not there.all_reached:
+        if not commanded.all_reached:
             return f"the {_kind(move)} has poses that are not reached, so it has no waypoints"
-        if len(there.branches) > 1:
+        if len(commanded.branches) > 1:
             return f"the {_kind(move)} changes from one branch to another, so it has no waypoints"
-        whole = stride = len(there.T) - 1
+        whole = stride = len(commanded.T) - 1
         least = 2 if move.circular else 1
-        while stride > least and _off(there.T, stride, move.circular) > self.tolerance:
+        while stride > least and _off(commanded.T, stride, move.circular) > self.tolerance:
             stride //= 2
         between = stride // least
-        return list(there.T[between:-1:between]) if stride < whole else []
+        return list(commanded.T[between:-1:between]) if stride < whole else []
 
 
 def _kind(move: PathMove) -> str:
@@ -278,14 +278,14 @@ class CircularArcs:
         centre: centres of the circles [m].
         radius: vectors from the centres to the first points [m].
         axis: axes of counter-clockwise motion.
-        passing: angles from the first to the second points [rad].
+        via_angle: angles from the first to the second points [rad].
         angle: angles from the first to the third points [rad], below a full turn.
     """
 
     centre: Points
     radius: Points
     axis: Points
-    passing: Float64[Tensor, " arcs"]
+    via_angle: Float64[Tensor, " arcs"]
     angle: Float64[Tensor, " arcs"]
 
     @staticmethod

@@ -76,13 +76,13 @@ def rewrite_program(request: ExportRequest) -> Exported:
     scanned = SCANNERS[request.program.suffix.lower()](text, FrameFile.read(request.frames))
     if not scanned.targets:
         named = (
-            _listed([f"line {line}: {reason}" for line, reason in scanned.left])
+            _listed([f"line {line}: {reason}" for line, reason in scanned.unchanged_lines])
             or "it contains no poses, or only joint values"
         )
         raise OutputError(
             f"the program has no pose that can be rewritten: {named}",
             at=Place(request.program),
-            value=len(scanned.left),
+            value=len(scanned.unchanged_lines),
         )
     solver = load(request.model)
     if request.conditions:
@@ -128,7 +128,7 @@ def _exported(
             "way_points": corrected.waypoints,
             "tolerance_mm": tolerance_mm,
             "largest_shift_mm": shift,
-            "left_alone": [{"line": line, "reason": reason} for line, reason in corrected.left],
+            "left_alone": [{"line": line, "reason": reason} for line, reason in corrected.unchanged_lines],
             "joint_lines": list(scanned.joint_lines),
             "diff": diff,
         },
@@ -151,10 +151,9 @@ def _warnings(corrected: CorrectedProgram, source: str) -> tuple[str, ...]:
         f"Targets are corrected for the branch {' and '.join(corrected.branches) or 'of the model'}. The program's "
         "configuration was not checked: if the arm is in another configuration, use --branch."
     ]
-    if corrected.left:
-        sentences.append(
-            f"Left unchanged in {source}: {'; '.join(f'line {line}: {reason}' for line, reason in corrected.left)}."
-        )
+    if corrected.unchanged_lines:
+        unchanged = "; ".join(f"line {line}: {reason}" for line, reason in corrected.unchanged_lines)
+        sentences.append(f"Left unchanged in {source}: {unchanged}.")
     return tuple(sentences)
 
 

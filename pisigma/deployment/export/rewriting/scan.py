@@ -91,7 +91,7 @@ class ScannedProgram:
         text: text of the program.
         targets: targets whose frame and tool are known, in the order of the text.
         moves: straight moves and arcs to these targets.
-        left: line of every target that is not changed, and the reason.
+        unchanged_lines: line of every target that is not changed, and the reason.
         joint_lines: lines of moves to joint values, which are not changed.
         finish: function that is applied to the text after the edits, for example to number its lines.
     """
@@ -99,7 +99,7 @@ class ScannedProgram:
     text: str
     targets: tuple[Target, ...]
     moves: tuple[PathMove, ...]
-    left: tuple[tuple[int, str], ...]
+    unchanged_lines: tuple[tuple[int, str], ...]
     joint_lines: tuple[int, ...]
     finish: Callable[[str], str] = lambda text: text
 

@@ -63,12 +63,12 @@ class NoBoard:
 
     Attributes:
         reason: the reason as a clause, such as "no board is found in it".
-        piece: numbers of rows and columns of the corners that were found; None if no corners were found.
+        found_size: numbers of rows and columns of the corners that were found; None if no corners were found.
         is_mirrored: whether the image is mirrored.
     """
 
     reason: str
-    piece: tuple[int, int] | None = None
+    found_size: tuple[int, int] | None = None
     is_mirrored: bool = False
 
 
@@ -128,12 +128,12 @@ class EdgeProfiles:
     """Profiles of the gray values across the edges of a board.
 
     Attributes:
-        at: crossing points on every edge [px].
+        points: crossing points on every edge [px].
         across: normal vectors of the edges, with half the sampled width as length [px].
         profile: gray values along the crossings, from 0 at the start to 1 at the end; NaN without contrast.
     """
 
-    at: Float64[np.ndarray, "edges crossings 2"]
+    points: Float64[np.ndarray, "edges crossings 2"]
     across: Float64[np.ndarray, "edges 2"]
     profile: Float64[np.ndarray, "edges crossings samples"]
 
@@ -178,7 +178,7 @@ class EdgeProfiles:
         Edges without contrast keep their position.
         """
         offset = np.nan_to_num(1 - 2 * self.profile.mean(2))
-        points: np.ndarray = self.at + offset[..., None] * self.across[:, None]
+        points: np.ndarray = self.points + offset[..., None] * self.across[:, None]
         return points
 
 
@@ -186,7 +186,7 @@ def fit_saddles(
     gray: Float64[np.ndarray, "height width"],
     pixels: Float64[np.ndarray, "corners 2"],
     axes: Float64[np.ndarray, "corners 2 2"],
-    share: float,
+    clearance: float,
 ) -> Float64[np.ndarray, "corners 2"]:
     """Fit corners between two black and two white squares by least squares over the surrounding pixels.
 
@@ -200,12 +200,12 @@ def fit_saddles(
         gray: gray values of the image.
         pixels: corners, accurate to half a pixel [px].
         axes: derivative of pixels with respect to steps along rows and columns of squares, one in each column [px].
-        share: distance from a corner within which no other edge is printed, relative to a square.
+        clearance: distance from a corner within which no other edge is printed, relative to a square.
 
     Returns:
         The corners; those that a fit would move by more than `_MAX_SHIFT` are not changed.
     """
-    x, weight = _windows(gray.shape, pixels, axes, share)
+    x, weight = _windows(gray.shape, pixels, axes, clearance)
     values = gray[x[..., 1], x[..., 0]]
     x = x - pixels[:, None]
     state = np.zeros((len(pixels), 9))

@@ -76,7 +76,7 @@ def _missing(image: Image, board: Board) -> NoBoard:
     if there:
         rows, columns = piece.shape
         reason = f"only {rows} x {columns} corners of a board of {expected} are found"
-        return NoBoard(reason, piece=(rows, columns))
+        return NoBoard(reason, found_size=(rows, columns))
     return NoBoard(f"no board of {expected} is found in it")
 
 

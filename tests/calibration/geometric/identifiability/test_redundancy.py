@@ -115,7 +115,7 @@ def test_no_more_is_independent_than_axes_targets_and_frames_have(
     point[list(tools)] += 0.1 * torch.from_numpy(rng.standard_normal(len(tools)))
     seen = information(problem, point, list(range(len(point))))
     found = find_redundancy(seen, point.numpy())
-    assert found.rank == problem.space.most_independent(turning=poses)
+    assert found.rank == problem.space.most_independent(with_orientation=poses)
 
 
 @pytest.mark.parametrize("name", ["ur10", "panda", "kiro3"])

@@ -87,7 +87,7 @@ def test_arcs_pass_through_their_points():
     circle = torch.stack([angles.cos(), angles.sin(), torch.zeros_like(angles)], -1) * 0.2
     arcs = CircularArcs.through_points(*circle.unbind(1))
     assert_close(arcs.angle, angles[:, 2] - angles[:, 0], atol=1e-12)
-    assert_close(arcs.passing, angles[:, 1] - angles[:, 0], atol=1e-12)
+    assert_close(arcs.via_angle, angles[:, 1] - angles[:, 0], atol=1e-12)
     assert_close(arcs.sample(4)[:, [0, -1]], circle[:, [0, 2]], atol=1e-12)
     assert_close(arcs.sample(4).norm(dim=-1), 0.2, atol=1e-12)
     back = CircularArcs.through_points(*circle.flip(1).unbind(1))

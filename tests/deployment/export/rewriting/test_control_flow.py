@@ -42,8 +42,10 @@ def fanuc(*lines: str) -> str:
 def kept(scan, text, frames=None):
     """Tools [m] of the poses that are understood, and the reasons for leaving the others unchanged."""
     program = scan(text, frames or FrameFile())
-    assert len(program.targets) + len(program.left) == text.count("LIN {") + text.count("movel(")
-    return [float(target.T_flange_tool[2, 3]) for target in program.targets], [why for _, why in program.left]
+    assert len(program.targets) + len(program.unchanged_lines) == text.count("LIN {") + text.count("movel(")
+    return [float(target.T_flange_tool[2, 3]) for target in program.targets], [
+        why for _, why in program.unchanged_lines
+    ]
 
 
 @pytest.mark.parametrize(
@@ -146,7 +148,7 @@ def test_displaced_poses_of_a_module_are_unchanged():
     assert len(scan_rapid(text.format(""), FrameFile()).targets) == 1
     displaced = scan_rapid(text.format("PDispSet shift;\n"), FrameFile())
     assert not displaced.targets
-    ((line, reason),) = displaced.left
+    ((line, reason),) = displaced.unchanged_lines
     assert line == 4
     assert reason.startswith("PDispSet ")
 
@@ -163,7 +165,7 @@ def test_displaced_poses_of_a_module_are_unchanged():
 def test_a_frame_that_a_fanuc_program_sets_is_not_as_stated(line, understood):
     program = scan_fanuc(fanuc(f"  {line}", "L P[1] 100mm/sec FINE"), FRAMES)
     assert bool(program.targets) == understood
-    assert understood or ("UFRAME 1" in dict(program.left)[4])
+    assert understood or ("UFRAME 1" in dict(program.unchanged_lines)[4])
 
 
 def test_values_outside_routines_apply_after_their_statement():
@@ -192,7 +194,7 @@ def test_all_kinds_of_moves_are_found():
 
 def test_arcs_without_waypoints_are_reported():
     text = fanuc("A P[1] 100mm/sec CNT50")
-    assert 3 in dict(scan_fanuc(text, FRAMES).left)
+    assert 3 in dict(scan_fanuc(text, FRAMES).unchanged_lines)
 
 
 RAPID_POSE = "[[600, 0, 400], {q}, [0, 0, 0, 0], [{eax}, 9E9, 9E9, 9E9, 9E9, 9E9]]"
@@ -212,20 +214,22 @@ def test_external_axes_in_use_leave_the_pose_unchanged_and_are_reported(named):
     for value, understood in (("9E+09", True), ("0", True), ("250.5", False)):
         found = scan_rapid(rapid(RAPID_POSE.format(q=upright, eax=value), named), FrameFile())
         assert bool(found.targets) == understood
-        assert understood or "eax_a = 250.5" in dict(found.left)[5]
+        assert understood or "eax_a = 250.5" in dict(found.unchanged_lines)[5]
     for value, understood in (("0.0", True), ("-90", False)):
         pose = LIN.removeprefix("LIN ").replace("}", f", S 2, T 3, E1 {value}, E2 0}}")
         lines = (f"XP={pose}", "LIN XP") if named else (f"LIN {pose}",)
         found = scan_krl(krl(FIRST, *lines), FrameFile())
         assert bool(found.targets) == understood
-        assert understood or "E1 = -90" in found.left[0][1]
+        assert understood or "E1 = -90" in found.unchanged_lines[0][1]
         text = fanuc("L P[1] 100mm/sec FINE").replace("R = 0.0 deg", f"R = 0.0 deg,\n    E1= {value} mm")
         found = scan_fanuc(text, FRAMES)
         assert bool(found.targets) == understood
-        assert understood or ("E1 = -90 " in found.left[0][1] and "(P[1], line 5)" in found.left[0][1])
+        assert understood or (
+            "E1 = -90 " in found.unchanged_lines[0][1] and "(P[1], line 5)" in found.unchanged_lines[0][1]
+        )
     frames = "DECL FDAT FP={TOOL_NO 0,BASE_NO 0,IPO_FRAME #BASE}\n"
     data = frames + "DECL E6POS XP={X 1,Y 2,Z 3,A 4,B 5,C 6,E1 7}\n"
-    assert "E1 = 7" in dict(scan_krl_data(data, FrameFile()).left)[2]
+    assert "E1 = 7" in dict(scan_krl_data(data, FrameFile()).unchanged_lines)[2]
 
 
 @pytest.mark.parametrize(
@@ -236,7 +240,7 @@ def test_a_pose_without_an_external_axis_is_unchanged_if_the_program_moves_that_
     stated = LIN.replace("}", ", E1 0}")
     found = scan_krl(krl(FIRST, before, LIN, stated), FrameFile())
     assert [target.line for target in found.targets] == [6]
-    assert "E1 (in use in line 4)" in dict(found.left)[5]
+    assert "E1 (in use in line 4)" in dict(found.unchanged_lines)[5]
     assert not scan_krl(krl(FIRST, LIN.replace("}", ", E1 rail}")), FrameFile()).targets
 
 
@@ -266,10 +270,10 @@ def test_invalid_quaternions_are_reported_with_their_lines(quaternion):
     for named in (True, False):
         found = scan_rapid(rapid(RAPID_POSE.format(q=quaternion, eax="9E9"), named), FrameFile())
         assert not found.targets
-        assert "quaternion" in dict(found.left)[5]
+        assert "quaternion" in dict(found.unchanged_lines)[5]
     tool = scan_rapid(rapid(RAPID_POSE.format(q=good, eax="9E9"), True, quaternion), FrameFile())
     assert not tool.targets
-    assert "(line 2)" in dict(tool.left)[5]
+    assert "(line 2)" in dict(tool.unchanged_lines)[5]
 
 
 def test_the_tool_of_a_called_routine_is_uncertain():
@@ -334,7 +338,7 @@ def test_a_call_of_another_module_leaves_all_poses_unchanged(line, call):
     called = text.replace(line, call)
     assert not scan_rapid(called, FrameFile()).targets
     if "elsewhere" in call:
-        assert "elsewhere" in scan_rapid(called, FrameFile()).left[0][1]
+        assert "elsewhere" in scan_rapid(called, FrameFile()).unchanged_lines[0][1]
         assert scan_rapid(called, FrameFile(routines=("ELSEWHERE",))).targets
 
 
@@ -352,6 +356,6 @@ def test_a_routine_that_a_fanuc_program_calls_may_set_frames(lines, understood):
     text = fanuc(*(line.format(move="L P[1] 100mm/sec FINE") for line in lines))
     found = scan_fanuc(text, FRAMES.model_copy(update={"routines": ("Keeps",)}))
     assert bool(found.targets) == understood
-    assert understood or "VISION" in found.left[0][1]
+    assert understood or "VISION" in found.unchanged_lines[0][1]
     world = text.replace("UF : 1", "UF : 0")
     assert scan_fanuc(world, FRAMES).targets

@@ -38,14 +38,14 @@ def test_incomplete_and_missing_boards_are_distinguished() -> None:
     piece, nothing = detect_checkerboard(image, BOARD), detect_checkerboard(np.zeros_like(image), BOARD)
     assert isinstance(piece, NoBoard)
     assert isinstance(nothing, NoBoard)
-    assert (piece.piece, nothing.piece) == ((4, 3), None)
+    assert (piece.found_size, nothing.found_size) == ((4, 3), None)
 
 
 def test_edges_without_contrast_have_no_blur_and_are_not_moved() -> None:
     ends = np.array([[[100.0, 100.0], [150.0, 110.0]]])
     profiles = EdgeProfiles.from_image(np.full((400, 640), 90, dtype=np.uint8), ends, 0.2)
     assert np.isnan(profiles.blur)
-    assert_close(profiles.edge_positions, profiles.at)
+    assert_close(profiles.edge_positions, profiles.points)
 
 
 @pytest.mark.parametrize("blur", [1.0, 2.5])
