@@ -206,7 +206,7 @@ def _calibrate_arms(
     as_json: bool,
 ) -> None:
     """Calibrate the arms of a cell, store their models and bases there, and print them."""
-    from pisigma.reporting.arms_text import arms_text
+    from pisigma.reporting.frame_text import arms_text
     from pisigma.workflow.arms.arms_cell import calibrate_arms_of_cell
 
     with progress_of("calibrate") as progress:

@@ -19,7 +19,8 @@ from pisigma.measurement.joint_range import limit_warnings
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import load_model
 from pisigma.reporting.page.content import ReportContent, report_content
-from pisigma.reporting.page.figures import ReportFigures, check_figures, draw_figures, write_figures
+from pisigma.reporting.page.drawing import check_figures, write_figures
+from pisigma.reporting.page.figures import ReportFigures, draw_figures
 from pisigma.reporting.page.page import render_page
 from pisigma.validation.checks.wrong_rows import without_wrong_rows
 from pisigma.validation.gate import check_rows
@@ -133,7 +134,7 @@ def report(
     progress("drawing")
     figures = draw_figures(content)
     if arm is not None:
-        from pisigma.reporting.page.arm_pictures import arm_pictures  # imports OpenCV
+        from pisigma.reporting.page.images import arm_pictures  # imports OpenCV
 
         figures = replace(figures, images=arm_pictures(arm))
     return Report(content, figures, diagnostics, time.perf_counter() - started, acceptance)

@@ -20,7 +20,7 @@ def save_blank(figure: Figure, path: Path) -> None:
 def no_pictures() -> Iterator[None]:
     """Compose the figures of calibrations, trainings and reports, and write blank ones."""
     from pisigma.reporting import calibration_figures, figures
-    from pisigma.reporting.page.figures import Drawing
+    from pisigma.reporting.page.drawing import Drawing
 
     with pytest.MonkeyPatch.context() as patch:
         for module in (calibration_figures, figures):

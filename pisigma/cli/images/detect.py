@@ -92,8 +92,7 @@ _HEIGHT_PX = 1080
 def _print_board(board: Path, sheet: Path, robot: str | None, camera: Path | None, as_json: bool) -> None:
     """Write a board as a PDF, and state how large its squares have to be for a robot and a fixed camera."""
     from pisigma.files.output_file import check_output, write_atomically
-    from pisigma.measurement.camera.board import Board
-    from pisigma.measurement.camera.board_size import smallest_square
+    from pisigma.measurement.camera.board import Board, smallest_square
     from pisigma.measurement.camera.camera import Camera
     from pisigma.reporting.board_sheet import board_pdf
     from pisigma.robot import Robot
@@ -107,7 +106,7 @@ def _print_board(board: Path, sheet: Path, robot: str | None, camera: Path | Non
         height = _HEIGHT_PX if seen is None else min(seen.width, seen.height)
         size = {
             "image_height_px": height,
-            "smallest_square_mm": smallest_square(arm, height) * 1e3,
+            "smallest_square_mm": smallest_square(arm.reach, height) * 1e3,
             "square_mm": printed.square * 1e3,
         }
     write_atomically(sheet, content)

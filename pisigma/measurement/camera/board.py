@@ -22,6 +22,8 @@ _TAG_CELLS = {"tag16h5": 6, "tag25h9": 7, "tag36h10": 8, "tag36h11": 8}
 """Number of cells along the side of a tag, including its border."""
 RULER = 100.0
 """Length of the line with which the scale of a printed board is checked [mm]."""
+_SQUARE_PX = 25.0
+"""Width of a square [px] at which the cells of a marker of 4 x 4 bits are 3 px wide, on boards with margins of 14 %."""
 Length = Annotated[float, Field(ge=0.2)]
 """Length of a board [mm]; shorter lengths are probably in metres."""
 _LENGTHS: dict[BoardKind, tuple[str, ...]] = {
@@ -170,3 +172,16 @@ class Board:
         Checkerboards are symmetric if the sum of their rows and columns of corners is even.
         """
         return self.kind == "checkerboard" and (self.rows + self.columns) % 2 == 0
+
+
+def smallest_square(reach: float, height_px: int) -> float:
+    """Return the smallest side of a square that a fixed camera sees well all over the workspace of an arm [m].
+
+    A lens that covers a sphere around the base with the reach as its radius shows `height / (2 reach)` pixels per
+    metre at its middle, whatever its focal length and distance.
+
+    Args:
+        reach: reach of the arm [m].
+        height_px: the smaller side of the image [px].
+    """
+    return _SQUARE_PX * 2 * reach / height_px

@@ -17,8 +17,7 @@ from pisigma.reporting.calibration_tables import (
     undetermined_lines,
     warning_lines,
 )
-from pisigma.reporting.page.advice import advice_for
-from pisigma.reporting.page.wording import TITLES, dependence_text, rows_text, say
+from pisigma.reporting.page.wording import TITLES, advice_for, dependence_text, rows_text, say
 from pisigma.validation.held_out.calibration_summary import CalibrationSummary
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.held_out.held_out_rows import read_held_out

@@ -1,31 +1,19 @@
-"""Figures of a report as SVG and PNG: many dots are rasterised, files contain no dates, names are shown verbatim."""
+"""Figures of a report: many dots are rasterised, and names are shown verbatim."""
 
-import io
-import os
-import warnings
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 from jaxtyping import Float64
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, NullLocator
 
-from pisigma.files.conflicts import Input, check_conflicts
-from pisigma.files.errors import OutputError, Phrase, Place
-from pisigma.files.output_file import write_atomically
 from pisigma.reporting.calibration_figures import STYLES, show_correlations
 from pisigma.reporting.page.content import ReportContent
-from pisigma.reporting.page.drawn_values import csv_of
+from pisigma.reporting.page.drawing import AFTER, BEFORE, OTHER, Drawing, drawing_style
 from pisigma.reporting.page.wording import LAYER_LABELS, curve_text, dependence_text
-from pisigma.reporting.rendering import file_name
 from pisigma.validation.held_out.validation_figures import LearningPoint
 from pisigma.validation.report.corrections import CorrectionCurve, Correlations
 from pisigma.validation.report.dependence import Dependence, bin_errors
@@ -35,67 +23,10 @@ SIZE = (5.2, 3.1)
 """Width and height of a panel [inch]."""
 _MANY_DOTS = 200
 """Number of dots above which they are rasterised."""
-_PIXELS = 130
-"""Resolution of rasterised dots [pixels per inch]."""
-BEFORE, AFTER, OTHER = "#b35806", "#1f5fa8", "#4d4d4d"
-"""Colours that people with colour blindness can distinguish."""
-_STYLE: dict[Any, Any] = {
-    "text.parse_math": False,
-    "svg.hashsalt": "pisigma",
-    "svg.fonttype": "none",
-    "font.size": 10.0,
-    "axes.facecolor": "none",  # pages invert their charts in the dark
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "grid.alpha": 0.3,
-    "axes.titlesize": 10.5,
-    "axes.titlelocation": "left",
-    "legend.frameon": False,
-    "legend.fontsize": 9.0,
-}
-_SVG_METADATA: dict[str, Any] = {"Date": None, "Creator": None}
 _MAX_MAP_DOTS = 1_500
 """Number of rows with the largest errors of which the flat map has dots, and largest number of other dots; of other
 rows, every fourth has a dot."""
 _COLORS = {"nominal": BEFORE, "geometric": OTHER, "hybrid": AFTER}
-
-
-@dataclass(frozen=True, eq=False)
-class Drawing:
-    """A figure of the report.
-
-    Attributes:
-        key: file name without suffix.
-        title: title on the page.
-        alt: text alternative of the image.
-        figure: the figure.
-    """
-
-    key: str
-    title: str
-    alt: str
-    figure: Figure
-
-    def svg(self) -> str:
-        """Return the figure as SVG; the same figure always gives the same text."""
-        stream = io.BytesIO()
-        with drawing_style():
-            FigureCanvasSVG(self.figure)
-            self.figure.savefig(stream, format="svg", dpi=_PIXELS, facecolor="none", metadata=_SVG_METADATA)
-        return stream.getvalue().decode()
-
-    def png(self) -> bytes:
-        """Return the figure as PNG."""
-        stream = io.BytesIO()
-        with drawing_style():
-            FigureCanvasAgg(self.figure)
-            self.figure.savefig(stream, format="png", dpi=160, metadata={"Software": None})
-        return stream.getvalue()
-
-    def csv(self) -> str:
-        """Return the values that the figure shows as CSV."""
-        return csv_of(self.figure)
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,64 +54,6 @@ class ReportFigures:
         """All drawings."""
         charts = (*self.dependences, *self.correlations, *self.corrections, *self.learning_curve)
         return (self.map, *charts, *self.images)
-
-
-@contextmanager
-def drawing_style() -> Iterator[None]:
-    """Apply the style of all figures, without warnings about characters that no font has."""
-    with mpl.rc_context(_STYLE), warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="Glyph .* missing from")
-        yield
-
-
-def check_figures(folder: Path, inputs: Iterable[Input] = ()) -> None:
-    """Check in advance that figures can be written into a folder.
-
-    Raises:
-        OutputError: the folder is a file, is inside a model folder or an input, or cannot be created or written to.
-    """
-    check_conflicts(folder / "figure.png", inputs, "--figures")
-    if folder.exists() and not folder.is_dir():
-        raise OutputError(expected="a folder", value=Phrase("a file"), at=Place(folder), option="--figures")
-    if not folder.exists() and not folder.parent.is_dir():
-        raise OutputError(
-            f"there is no folder {folder.parent}",
-            at=Place(folder),
-            option="--figures",
-            remedy="create it or choose another folder",
-        )
-    if not os.access(folder if folder.exists() else folder.parent, os.W_OK):
-        raise OutputError(
-            "the folder is not writable", at=Place(folder), option="--figures", remedy="choose another folder"
-        )
-
-
-def write_figures(drawings: Sequence[Drawing], folder: Path) -> list[Path]:
-    """Write every figure as PNG and SVG, and the values that it shows as CSV.
-
-    Args:
-        drawings: drawings to write; characters that file names cannot have are replaced.
-        folder: folder, created if it is missing.
-
-    Raises:
-        OutputError: a file cannot be written.
-    """
-    written: list[Path] = []
-    try:
-        folder.mkdir(exist_ok=True)
-        for drawing in drawings:
-            stem = folder / file_name(drawing.key)
-            for suffix, content in (("png", drawing.png()), ("svg", drawing.svg()), ("csv", drawing.csv())):
-                written.append(Path(f"{stem}.{suffix}"))
-                write_atomically(written[-1], content)
-    except OSError as problem:
-        raise OutputError(
-            f"the folder cannot be written to: {problem.strerror}",
-            at=Place(folder),
-            option="--figures",
-            remedy="choose another folder",
-        ) from None
-    return written
 
 
 def draw_figures(content: ReportContent) -> ReportFigures:

@@ -26,7 +26,8 @@ from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.reporting.comparison_tables import comparison_tables
 from pisigma.reporting.fleet_tables import ERRORS_NOTE, cell_table
 from pisigma.reporting.lifetime_tables import chart_table, difference_table, session_table
-from pisigma.reporting.page.figures import AFTER, BEFORE, OTHER, Drawing, draw_map, drawing_style, make_panel
+from pisigma.reporting.page.drawing import AFTER, BEFORE, OTHER, Drawing, drawing_style
+from pisigma.reporting.page.figures import draw_map, make_panel
 from pisigma.reporting.page.page import html_page
 from pisigma.reporting.rendering import code
 from pisigma.reporting.result_text import Table

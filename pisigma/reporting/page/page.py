@@ -19,7 +19,8 @@ from pisigma.reporting.acceptance_tables import (
 )
 from pisigma.reporting.calibration_tables import parameter_table
 from pisigma.reporting.page.content import ReportContent
-from pisigma.reporting.page.figures import Drawing, ReportFigures
+from pisigma.reporting.page.drawing import Drawing
+from pisigma.reporting.page.figures import ReportFigures
 from pisigma.reporting.page.wording import (
     LAYER_LABELS,
     MODEL_LABELS,

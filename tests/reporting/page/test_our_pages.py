@@ -15,7 +15,7 @@ from testing.report import folder_with_held_out, hybrid_under_test
 
 from pisigma.lifetime.fleet.status import FleetStatus
 from pisigma.reporting.page.content import report_content
-from pisigma.reporting.page.drawn_values import csv_of
+from pisigma.reporting.page.drawing import csv_of
 from pisigma.reporting.page.figures import draw_figures
 from pisigma.reporting.page.lifetime import fleet_page
 from pisigma.reporting.page.page import render_page

@@ -21,8 +21,7 @@ from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.validation.held_out.judged_rows import MAX_PREDICTED, predicted_at
 from pisigma.validation.held_out.validation_figures import ErrorFigures
 from pisigma.validation.report.accuracy import limit_of
-from pisigma.validation.report.corrections import correction_curves
-from pisigma.validation.report.joint_gaps import joint_gaps, measured_intervals
+from pisigma.validation.report.corrections import correction_curves, joint_gaps, measured_intervals
 
 pytestmark = pytest.mark.usefixtures("without_type_checker")
 

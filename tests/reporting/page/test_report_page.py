@@ -17,7 +17,8 @@ from testing.report import HOSTILE, folder_with_held_out, geometric_under_test, 
 
 from pisigma.files.errors import OutputError
 from pisigma.reporting.page.content import report_content
-from pisigma.reporting.page.figures import check_figures, draw_dependence, draw_figures, write_figures
+from pisigma.reporting.page.drawing import check_figures, write_figures
+from pisigma.reporting.page.figures import draw_dependence, draw_figures
 from pisigma.reporting.page.page import render_page, script_json
 
 pytestmark = pytest.mark.usefixtures("without_type_checker")
