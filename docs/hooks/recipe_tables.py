@@ -14,7 +14,7 @@ from pydantic import BaseModel
 from pydantic_core import PydanticUndefined
 
 from pisigma.files.setting import attributes_of
-from pisigma.files.yaml_file import OneOf
+from pisigma.simulation.errors.source import OneOf
 from pisigma.workflow.recipes.recipe import GeometricRecipe, HybridRecipe, InverseRecipe
 
 PAGE = Path(__file__).parent.parent / "reference" / "recipes.md"

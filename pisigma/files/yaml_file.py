@@ -1,30 +1,17 @@
 """Read YAML files as validated, typed documents; every error states file, line and key."""
 
-import functools
 import json
-import math
 import os
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from contextlib import suppress
-from dataclasses import dataclass
-from typing import Annotated, Any, TypeVar, Union
+from typing import Annotated, Any, TypeVar
 
 import yaml
-from pydantic import (
-    BaseModel,
-    ConfigDict,
-    Field,
-    GetCoreSchemaHandler,
-    GetJsonSchemaHandler,
-    TypeAdapter,
-    ValidationError,
-)
-from pydantic_core import CoreSchema, core_schema
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from pisigma.files.errors import PisigmaError, Place, nearest_choice
 from pisigma.files.input_file import read_text
-from pisigma.files.schema_choices import allowed_texts, valid_keys
 
 MAX_BYTES = 2**18
 """Largest size of a YAML file [bytes]; reading such a file takes two seconds."""
@@ -48,51 +35,13 @@ Count = Annotated[int, Field(ge=1, le=MAX_POSES)]
 """Number of poses or rows to simulate; more would take gigabytes."""
 
 
-@dataclass(frozen=True, eq=False)
-class OneOf:
-    """Annotation of a value that is a section of a registry, selected by its `kind`.
-
-    `Annotated[AbstractErrorSource, OneOf(ERROR_SOURCES)]` reads `{kind: encoder, ...}` as the section that is
-    registered as "encoder". Sections may be registered later; errors list those registered at the time of reading.
-
-    Attributes:
-        registry: two or more section classes by kind.
-    """
-
-    registry: Mapping[str, type[Section]]
-
-    def _sections(self) -> Any:  # a TypeAdapter, which beartype does not accept as a type
-        return _one_of(tuple(self.registry.values()))
-
-    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        """Validate with the sections that are registered at the time of reading."""
-        plain = core_schema.no_info_plain_validator_function
-        return core_schema.json_or_python_schema(plain(self._from_json), plain(self._from_python))
-
-    def _from_json(self, value: Any) -> Any:
-        return self._sections().validate_json(json.dumps(value), strict=True)
-
-    def _from_python(self, value: Any) -> Any:
-        return value if isinstance(value, Section) else self._sections().validate_python(value)
-
-    def __get_pydantic_json_schema__(
-        self, schema: CoreSchema, handler: GetJsonSchemaHandler
-    ) -> dict[str, Any]:
-        """Return the JSON schema of the sections that are registered now."""
-        return handler(self._sections().core_schema)
-
-
-@functools.lru_cache(maxsize=64)
-def _one_of(sections: tuple[type[Section], ...]) -> Any:
-    any_of: Any = Annotated[Union[sections], Field(discriminator="kind")]  # noqa: UP007
-    return TypeAdapter(any_of)
-
-
 Document = TypeVar("Document", bound=BaseModel)
 _Path = tuple[str | int, ...]
+"""Keys, indices and union tags that lead to a place, as in pydantic's findings."""
+_Schema = dict[str, Any]
 
 
-class _PlainLoader(yaml.SafeLoader):
+class PlainLoader(yaml.SafeLoader):
     """YAML's safe loader with the plain scalars of YAML 1.2, which rejects duplicate keys.
 
     YAML 1.1 reads `010` as 8, `1:30` as 90, `no` as false and `1e-3` as text. Here they are 10, text, text
@@ -103,7 +52,7 @@ class _PlainLoader(yaml.SafeLoader):
 
 
 class _CompiledLoader(yaml.CSafeLoader if yaml.__with_libyaml__ else yaml.SafeLoader):  # type: ignore[misc]
-    """`_PlainLoader` on libyaml, which is ten times as fast."""
+    """`PlainLoader` on libyaml, which is ten times as fast."""
 
     yaml_implicit_resolvers: dict[str, Any] = {}  # noqa: RUF012
 
@@ -135,7 +84,7 @@ def _construct_integer(loader: Any, node: yaml.ScalarNode) -> int | float:
     return int(node.value) if re.fullmatch(r"[-+]?[0-9]{1,400}", node.value) else number
 
 
-for _loader in (_PlainLoader, _CompiledLoader):
+for _loader in (PlainLoader, _CompiledLoader):
     _loader.add_constructor(yaml.resolver.BaseResolver.DEFAULT_MAPPING_TAG, _construct_mapping)
     _loader.add_constructor("tag:yaml.org,2002:int", _construct_integer)
     _loader.add_constructor("tag:yaml.org,2002:float", _construct_number)
@@ -146,24 +95,8 @@ for _tag, _pattern, _first in (
     ("float", r"^[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?$", list("-+.0123456789")),
     ("float", r"^(?:[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))$", list("-+.")),
 ):
-    for _loader in (_PlainLoader, _CompiledLoader):
+    for _loader in (PlainLoader, _CompiledLoader):
         _loader.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(_pattern), _first)
-
-
-class _QuotingDumper(yaml.SafeDumper):
-    """YAML's safe dumper, which quotes texts that YAML 1.1 or 1.2 would read as something else."""
-
-
-for _letter, _resolvers in _PlainLoader.yaml_implicit_resolvers.items():
-    for _tag, _regexp in _resolvers:
-        _QuotingDumper.add_implicit_resolver(_tag, _regexp, [_letter])
-
-
-def yaml_text(content: Any, in_one_line: bool = False) -> str:
-    """Format plain values as YAML text that any YAML 1.1 or 1.2 reader restores unchanged."""
-    style: dict[str, Any] = {"default_flow_style": True, "width": math.inf} if in_one_line else {}
-    text: str = yaml.dump(content, Dumper=_QuotingDumper, sort_keys=False, allow_unicode=True, **style)
-    return text.removesuffix("\n").removesuffix("\n...") if in_one_line else text
 
 
 def plain_content(text: str, error: type[PisigmaError], source: str) -> Any:
@@ -244,7 +177,7 @@ def _composed(text: str) -> tuple[Any, yaml.Node | None]:
     if text.count("[") + text.count("{") + 2 * longest_line < _SAFE_DEPTH:
         with suppress(yaml.YAMLError):
             return (loader := _CompiledLoader(text)), loader.get_single_node()
-    return (plain := _PlainLoader(text)), plain.get_single_node()
+    return (plain := PlainLoader(text)), plain.get_single_node()
 
 
 def _count(node: yaml.Node, known: dict[int, int]) -> int:
@@ -343,3 +276,59 @@ def _locate(node: yaml.Node, path: _Path) -> tuple[int, list[str | int]]:
             continue
         keys.append(part)
     return line, keys
+
+
+def valid_keys(document: type[BaseModel], path: _Path) -> set[str]:
+    """Return the valid keys of the document's section at the end of a validation path."""
+    return {key for schema in _follow(document, path) for key in schema.get("properties", {})}
+
+
+def allowed_texts(document: type[BaseModel], path: _Path) -> list[str]:
+    """Return the sorted texts that are allowed at the end of a validation path; empty if any text is allowed."""
+    texts: set[str] = set()
+    for schema in _follow(document, path):
+        values = [schema["const"]] if "const" in schema else schema.get("enum", [])
+        texts |= {value for value in values if isinstance(value, str)}
+    return sorted(texts)
+
+
+def _follow(document: type[BaseModel], path: _Path) -> list[_Schema]:
+    """Return the plain schemas at the end of a validation path of keys, indices and union tags."""
+    schema = document.model_json_schema()
+    definitions = schema.get("$defs", {})
+    nodes = _alternatives([schema], definitions)
+    for part in path:
+        following: list[_Schema] = []
+        for candidate in nodes:
+            if part in candidate.get("properties", {}):
+                following.append(candidate["properties"][part])
+            elif isinstance(part, int) and "prefixItems" in candidate:
+                following.append(candidate["prefixItems"][part])
+            elif isinstance(part, int) and "items" in candidate:
+                following.append(candidate["items"])
+            elif isinstance(candidate.get("additionalProperties"), dict):
+                following.append(candidate["additionalProperties"])
+        if following:
+            nodes = _alternatives(following, definitions)
+        else:  # the key is the tag of a union: keep the alternative with that tag
+            nodes = [candidate for candidate in nodes if part in _tags(candidate)] or nodes
+    return nodes
+
+
+def _tags(schema: _Schema) -> list[Any]:
+    return [value.get("const") for value in schema.get("properties", {}).values()]
+
+
+def _alternatives(nodes: list[_Schema], definitions: dict[str, _Schema]) -> list[_Schema]:
+    """Resolve references and unions into plain schemas."""
+    plain: list[_Schema] = []
+    open_nodes = list(nodes)
+    while open_nodes:
+        schema = open_nodes.pop()
+        if "$ref" in schema:
+            open_nodes.append(definitions[schema["$ref"].rsplit("/", 1)[-1]])
+        elif "anyOf" in schema or "oneOf" in schema:
+            open_nodes += schema.get("anyOf", []) + schema.get("oneOf", [])
+        else:
+            plain.append(schema)
+    return plain

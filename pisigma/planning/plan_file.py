@@ -14,7 +14,8 @@ from torch import Tensor
 
 from pisigma.files.errors import MeasurementError, Place, PlanningError
 from pisigma.files.output_file import write_atomically
-from pisigma.files.yaml_file import Section, read_yaml, yaml_text
+from pisigma.files.yaml_file import Section, read_yaml
+from pisigma.files.yaml_writing import yaml_text
 from pisigma.measurement.csv.columns import PLAN_COLUMNS
 from pisigma.measurement.csv.reading import read_joints
 from pisigma.measurement.csv.table import Table, read_table

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from pisigma.files.errors import OutputError, RobotError
-from pisigma.files.yaml_file import yaml_text
+from pisigma.files.yaml_writing import yaml_text
 from pisigma.robot.coupling_section import coupling_document
 from pisigma.robot.description import Robot
 from pisigma.robot.row import DH_COLUMNS, FRAME_COLUMNS, Row, in_file_units

@@ -10,7 +10,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from pisigma.files.errors import RecipeError, UnreachablePoseError
-from pisigma.files.yaml_file import OneOf, Section
+from pisigma.files.yaml_file import Section
 from pisigma.robot.description import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.kinematics.numeric import solve_numeric
@@ -28,6 +28,7 @@ from pisigma.simulation.errors.source import (
     AbstractJointSource,
     AbstractPlaySource,
     JointErrorFunction,
+    OneOf,
 )
 from pisigma.simulation.errors.transmission import TransmissionHarmonics
 

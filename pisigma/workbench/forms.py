@@ -13,8 +13,8 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from pisigma.files.errors import PlanningError
 from pisigma.files.setting import Setting, attributes_of, flat_settings
-from pisigma.files.yaml_edit import with_value
 from pisigma.files.yaml_file import Section, plain_content
+from pisigma.files.yaml_writing import with_value
 from pisigma.lifetime.cell.layout import CELL_FILE
 from pisigma.robot.row import MAX_MAGNITUDE
 from pisigma.workflow.cell.cell_file import CAMERA_KEYS, STATED_ABOVE, STEPS, CellDocument, CellFile

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Int64
 from torch import Tensor
 
 from pisigma.deployment.export.programs.planned import planned_program
-from pisigma.files.engines.background import BackgroundProcess, compute_here
+from pisigma.files.engines.processes import BackgroundProcess, compute_here
 from pisigma.files.output_file import write_atomically
 from pisigma.files.progress import Progress
 from pisigma.measurement.dataset import Measurements

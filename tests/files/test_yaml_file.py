@@ -8,7 +8,8 @@ from pydantic import Field
 from testing.refusals import refused
 
 from pisigma.files.errors import Place, RecipeError
-from pisigma.files.yaml_file import Section, parse_yaml, place_of_key, read_yaml, yaml_text
+from pisigma.files.yaml_file import Section, parse_yaml, place_of_key, read_yaml
+from pisigma.files.yaml_writing import yaml_text
 
 
 class Circle(Section):

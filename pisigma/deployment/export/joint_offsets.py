@@ -10,7 +10,7 @@ from pisigma.deployment.export.dh_table import TABLE_SUFFIXES, csv_table, header
 from pisigma.deployment.export.export_format import Exported, ExportFormat, ExportRequest, model_facts
 from pisigma.deployment.export.geometry import offset_remarks
 from pisigma.files.errors import RobotError
-from pisigma.files.yaml_file import yaml_text
+from pisigma.files.yaml_writing import yaml_text
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.robot.description import Robot
 from pisigma.robot.row import FRAME_COLUMNS, in_file_units

@@ -11,7 +11,8 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from pisigma.files.errors import MeasurementError, Place
 from pisigma.files.input_file import read_text
-from pisigma.files.yaml_file import MAX_BYTES, Section, parse_yaml, yaml_text
+from pisigma.files.yaml_file import MAX_BYTES, Section, parse_yaml
+from pisigma.files.yaml_writing import yaml_text
 from pisigma.measurement.sensors.intrinsics import CAMERA_UNITS
 
 INTRINSICS = tuple(CAMERA_UNITS)

@@ -6,7 +6,8 @@ from pathlib import Path
 
 from pisigma.files.errors import MeasurementError
 from pisigma.files.output_file import write_atomically
-from pisigma.files.yaml_file import Section, read_yaml, yaml_text
+from pisigma.files.yaml_file import Section, read_yaml
+from pisigma.files.yaml_writing import yaml_text
 from pisigma.measurement.foreign.mapping import FileMapping
 
 

@@ -9,7 +9,8 @@ from pydantic import ConfigDict, Field, FiniteFloat, PlainValidator
 
 from pisigma.files.errors import ModelError, Place
 from pisigma.files.model_files import DESCRIPTION, read_model_file
-from pisigma.files.yaml_file import Section, parse_yaml, yaml_text
+from pisigma.files.yaml_file import Section, parse_yaml
+from pisigma.files.yaml_writing import yaml_text
 from pisigma.joint_correction.feature import FeatureSection
 from pisigma.joint_correction.registry import feature_section
 from pisigma.measurement.sensors.sensor import OtherUnit

@@ -14,7 +14,8 @@ from torch import Tensor
 
 from pisigma.files.errors import RecipeError
 from pisigma.files.output_folder import staged_folder
-from pisigma.files.yaml_file import Count, Section, Seed, yaml_text
+from pisigma.files.yaml_file import Count, Section, Seed
+from pisigma.files.yaml_writing import yaml_text
 from pisigma.measurement.camera.board import Board, BoardDocument
 from pisigma.measurement.camera.camera import Camera, CameraDocument, IntrinsicsSection
 from pisigma.measurement.camera.camera_files import Repeatability

@@ -1,12 +1,16 @@
 """Interface of error sources, which are recipe sections that change the geometry or the joint values of a robot."""
 
+import functools
+import json
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Annotated, Any, TypeVar, Union
 
 import numpy as np
 from jaxtyping import Float64
+from pydantic import Field, GetCoreSchemaHandler, GetJsonSchemaHandler, TypeAdapter
+from pydantic_core import CoreSchema, core_schema
 from torch import Tensor
 
 from pisigma.files.errors import RecipeError, nearest_choice
@@ -204,3 +208,43 @@ def amplitude_of(
         place,
     )
     return np.where(robot.revolute, np.deg2rad(stated), stated / 1e3)
+
+
+@dataclass(frozen=True, eq=False)
+class OneOf:
+    """Annotation of a value that is a section of a registry, selected by its `kind`.
+
+    `Annotated[AbstractErrorSource, OneOf(ERROR_SOURCES)]` reads `{kind: encoder, ...}` as the section that is
+    registered as "encoder". Sections may be registered later; errors list those registered at the time of reading.
+
+    Attributes:
+        registry: two or more section classes by kind.
+    """
+
+    registry: Mapping[str, type[Section]]
+
+    def _sections(self) -> Any:  # a TypeAdapter, which beartype does not accept as a type
+        return _one_of(tuple(self.registry.values()))
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        """Validate with the sections that are registered at the time of reading."""
+        plain = core_schema.no_info_plain_validator_function
+        return core_schema.json_or_python_schema(plain(self._from_json), plain(self._from_python))
+
+    def _from_json(self, value: Any) -> Any:
+        return self._sections().validate_json(json.dumps(value), strict=True)
+
+    def _from_python(self, value: Any) -> Any:
+        return value if isinstance(value, Section) else self._sections().validate_python(value)
+
+    def __get_pydantic_json_schema__(
+        self, schema: CoreSchema, handler: GetJsonSchemaHandler
+    ) -> dict[str, Any]:
+        """Return the JSON schema of the sections that are registered now."""
+        return handler(self._sections().core_schema)
+
+
+@functools.lru_cache(maxsize=64)
+def _one_of(sections: tuple[type[Section], ...]) -> Any:
+    any_of: Any = Annotated[Union[sections], Field(discriminator="kind")]  # noqa: UP007
+    return TypeAdapter(any_of)

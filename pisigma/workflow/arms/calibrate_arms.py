@@ -17,7 +17,7 @@ from pisigma.files.model_files import model_hash
 from pisigma.files.output_file import write_atomically, write_failure
 from pisigma.files.progress import Progress
 from pisigma.files.scratch import FOLDER, scratch_beside
-from pisigma.files.yaml_file import yaml_text
+from pisigma.files.yaml_writing import yaml_text
 from pisigma.measurement.camera.corner_file import MeasurementFiles
 from pisigma.measurement.conditions import JointState
 from pisigma.measurement.dataset import Measurements

@@ -14,7 +14,8 @@ from pisigma.files.errors import PisigmaError, Place, PlanningError
 from pisigma.files.scratch import FILE, scratch_beside
 from pisigma.files.setting import attributes_of, build_settings, by_key, flat_settings
 from pisigma.files.setting_values import checked_values
-from pisigma.files.yaml_file import Section, place_of_key, read_yaml, yaml_text
+from pisigma.files.yaml_file import Section, place_of_key, read_yaml
+from pisigma.files.yaml_writing import yaml_text
 from pisigma.lifetime.cell.facts import CellFacts
 from pisigma.lifetime.cell.layout import CELL_FILE, is_cell_of_arms
 from pisigma.lifetime.cell.status import VERIFICATION_POSES, plans_check

@@ -9,7 +9,7 @@ from functools import partial
 
 import pytest
 
-from pisigma.files.engines.background import BackgroundProcess, EndedError, compute_here
+from pisigma.files.engines.processes import BackgroundProcess, EndedError, compute_here
 from pisigma.files.progress import _within_stage
 
 REPORTS = partial(_within_stage, prefix="fold ", what="1 of 2")

@@ -19,7 +19,8 @@ from pisigma.deployment.export.controllers.ur_models import (
 )
 from pisigma.deployment.export.dh_table import header_comment
 from pisigma.files.errors import RobotError
-from pisigma.files.yaml_file import Section, parse_yaml, yaml_text
+from pisigma.files.yaml_file import Section, parse_yaml
+from pisigma.files.yaml_writing import yaml_text
 from pisigma.robot.chains import robot_of_origins
 from pisigma.robot.description import Robot
 from pisigma.robot.row import BoundedFloat

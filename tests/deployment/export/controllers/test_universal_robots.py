@@ -27,7 +27,7 @@ from pisigma.deployment.export.controllers.ur_models import controller_geometry
 from pisigma.deployment.export.export_format import ExportRequest
 from pisigma.deployment.export.registry import export_model
 from pisigma.files.errors import PisigmaError, RobotError
-from pisigma.files.yaml_file import yaml_text
+from pisigma.files.yaml_writing import yaml_text
 from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.model.folder.model_folder import save_model
 from pisigma.robot import Robot

@@ -1,5 +1,6 @@
-"""Change single values in the text of a YAML file while keeping its comments and order."""
+"""Write values as YAML text, and change single values of such a text while keeping its comments and order."""
 
+import math
 import re
 from collections.abc import Sequence
 from typing import Any
@@ -7,13 +8,29 @@ from typing import Any
 import yaml
 
 from pisigma.files.errors import PisigmaError, Place
-from pisigma.files.yaml_file import plain_content, yaml_text
+from pisigma.files.yaml_file import PlainLoader, plain_content
 
 Keys = Sequence[str | int]
 _INDENT = 2
 """Number of spaces by which the first key of an empty section is indented."""
 _COMMENTS = re.compile(r"[^\n]*\n(?:[ \t]*(?:#[^\n]*)?\n)*")
 """Pattern of the end of a line with the blank lines and comments after it."""
+
+
+class _QuotingDumper(yaml.SafeDumper):
+    """YAML's safe dumper, which quotes texts that YAML 1.1 or 1.2 would read as something else."""
+
+
+for _letter, _resolvers in PlainLoader.yaml_implicit_resolvers.items():
+    for _tag, _regexp in _resolvers:
+        _QuotingDumper.add_implicit_resolver(_tag, _regexp, [_letter])
+
+
+def yaml_text(content: Any, in_one_line: bool = False) -> str:
+    """Format plain values as YAML text that any YAML 1.1 or 1.2 reader restores unchanged."""
+    style: dict[str, Any] = {"default_flow_style": True, "width": math.inf} if in_one_line else {}
+    text: str = yaml.dump(content, Dumper=_QuotingDumper, sort_keys=False, allow_unicode=True, **style)
+    return text.removesuffix("\n").removesuffix("\n...") if in_one_line else text
 
 
 def with_value(text: str, keys: Keys, value: Any, source: str) -> str:

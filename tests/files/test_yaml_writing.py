@@ -4,8 +4,8 @@ import pytest
 from testing.refusals import refused
 
 from pisigma.files.errors import PisigmaError
-from pisigma.files.yaml_edit import with_value
 from pisigma.files.yaml_file import plain_content
+from pisigma.files.yaml_writing import with_value
 
 TEXT = """# a cell
 robot: ur5   # the arm
