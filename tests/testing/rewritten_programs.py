@@ -18,9 +18,9 @@ from pisigma.deployment.export.programs.text import (
     numbers,
     quaternion,
 )
-from pisigma.deployment.export.rewriting.export import SCANNERS
 from pisigma.deployment.export.rewriting.frame_file import FrameFile
 from pisigma.deployment.export.rewriting.scan import Frame, ScannedProgram
+from pisigma.deployment.export.targets import SCANNERS
 from pisigma.model.folder.model_folder import load_model
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.closed_form import closed_form_solver

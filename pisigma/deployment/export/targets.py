@@ -1,27 +1,53 @@
-"""Corrected targets as a table in millimetres and degrees with full precision, or as a program."""
+"""Corrected targets as a table in millimetres and degrees with full precision, as a program, or in an existing one."""
 
 import csv
 import io
 import math
 from collections import Counter
+from collections.abc import Callable
 
 import numpy as np
 import torch
 
 from pisigma.deployment.export.dh_table import header_comment
 from pisigma.deployment.export.export_format import Exported, ExportFormat, ExportRequest
+from pisigma.deployment.export.geometry import condition_remarks, frame_remarks
 from pisigma.deployment.export.programs.languages import LANGUAGES, cautions, check_program, program_text
 from pisigma.deployment.export.programs.targets import Targets, targets_of
 from pisigma.deployment.export.programs.text import millimetres_and_euler
-from pisigma.deployment.export.rewriting.export import SCANNERS, check_rewriting, rewrite_program
-from pisigma.files.errors import OutputError, Place, check_choice
+from pisigma.deployment.export.rewriting.correction import CorrectedProgram, ProgramCorrection
+from pisigma.deployment.export.rewriting.fanuc import scan_fanuc
+from pisigma.deployment.export.rewriting.frame_file import FrameFile
+from pisigma.deployment.export.rewriting.krl import scan_krl, scan_krl_data
+from pisigma.deployment.export.rewriting.rapid import scan_rapid
+from pisigma.deployment.export.rewriting.scan import ScannedProgram
+from pisigma.deployment.export.rewriting.urscript import scan_urscript
+from pisigma.files.errors import OutputError, Phrase, Place, check_choice
+from pisigma.files.input_file import read_input
 from pisigma.measurement.csv.poses import read_poses
+from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.inverse.corrected_ik import load
 from pisigma.planning.plan_file import joint_columns
 from pisigma.robot.row import FRAME_COLUMNS, in_file_units
 
 _KINDS = ("joints", "cartesian")
 POSE_COLUMNS = tuple(in_file_units(FRAME_COLUMNS, np.zeros(6)))
+SCANNERS: dict[str, Callable[[str, FrameFile], ScannedProgram]] = {
+    ".script": scan_urscript,
+    ".src": scan_krl,
+    ".dat": scan_krl_data,
+    ".mod": scan_rapid,
+    ".ls": scan_fanuc,
+}
+"""Scanners by the suffix of the file."""
+_TOLERANCE_MM = 0.1
+MAX_BYTES = 2**24
+_MAX_JOINTS = 6
+TEST = (
+    "TEST IT AT LOW SPEED FIRST: the controller has to compute with the nominal robot, its accuracy options have to be "
+    "off, and its origin and flange have to be those of the robot description. Targets given as joint values, outputs, "
+    "waits and speeds are unchanged; nothing was checked for collisions."
+)
 
 
 def sentences(targets: Targets) -> tuple[str, ...]:
@@ -139,6 +165,140 @@ def _write(request: ExportRequest) -> Exported:
         details=": " + ", ".join(f"{count} {status}" for status, count in statuses),
         failure=targets.failure_sentence,
     )
+
+
+def check_rewriting(request: ExportRequest) -> None:
+    """Check the options for a program.
+
+    Raises:
+        OutputError: the program's language is unknown or differs from that of the output file, or an option is invalid.
+    """
+    assert request.program is not None
+    suffix = request.program.suffix.lower()
+    if suffix not in SCANNERS or request.out.suffix.lower() != suffix:
+        raise OutputError(
+            expected=f"a program ({', '.join(SCANNERS)}) and an --out file with the same suffix",
+            value=Phrase(f"{suffix} and {request.out.suffix}"),
+            at=Place(request.program),
+            option="--program" if suffix not in SCANNERS else "--out",
+        )
+    for name, value in (("targets", request.targets), ("config", request.config)):
+        if value is not None:
+            raise OutputError(
+                "the option applies only to --poses, because the poses of a program remain poses",
+                option=f"--{name}",
+                value=value,
+                remedy="omit it",
+            )
+    if request.tolerance_mm is not None and not 0 < request.tolerance_mm < float("inf"):
+        raise OutputError(expected="a length > 0 mm", value=request.tolerance_mm, option="--tolerance-mm")
+
+
+def rewrite_program(request: ExportRequest) -> Exported:
+    """Return a program with corrected targets, where the targets are understood, and a report of the changes.
+
+    Raises:
+        OutputError: the program cannot be read, or has no target whose frame and tool are stated.
+    """
+    assert request.program is not None
+    # Characters beyond ASCII occur only in comments; this encoding preserves every byte.
+    text = read_input(request.program, OutputError, MAX_BYTES).decode("latin-1")
+    scanned = SCANNERS[request.program.suffix.lower()](text, FrameFile.read(request.frames))
+    if not scanned.targets:
+        named = (
+            _listed([f"line {line}: {reason}" for line, reason in scanned.unchanged_lines])
+            or "it contains no poses, or only joint values"
+        )
+        raise OutputError(
+            f"the program has no pose that can be rewritten: {named}",
+            at=Place(request.program),
+            value=len(scanned.unchanged_lines),
+        )
+    solver = load(request.model)
+    if request.conditions:
+        solver = solver.under(**request.conditions)
+    if solver.model.robot.dof > _MAX_JOINTS:
+        raise OutputError(
+            f"expected a robot with at most {_MAX_JOINTS} joints, got {solver.model.robot.dof}, because the poses of a "
+            "program do not determine further joints",
+            expected=f"at most {_MAX_JOINTS} joints",
+            value=solver.model.robot.dof,
+            option="--program",
+            remedy="export --poses with joint values instead",
+        )
+    tolerance = _TOLERANCE_MM if request.tolerance_mm is None else request.tolerance_mm
+    corrected = ProgramCorrection(solver, request.branch, tolerance / 1e3).correct_program(scanned)
+    return _exported(request, solver.model, scanned, corrected, tolerance)
+
+
+def _exported(
+    request: ExportRequest,
+    model: CalibratedModel,
+    scanned: ScannedProgram,
+    corrected: CorrectedProgram,
+    tolerance_mm: float,
+) -> Exported:
+    """Return the result with the new program, facts and warnings."""
+    assert request.program is not None
+    diff = corrected.diff(scanned.text, (str(request.program), str(request.out)))
+    language = LANGUAGES.get(request.program.suffix.lower())
+    reached = len(corrected.statuses) - len(corrected.unreached)
+    shift = corrected.largest_shift * 1e3
+    return Exported(
+        content=corrected.text.encode("latin-1"),
+        facts={
+            "robot": model.robot.name,
+            "program": str(request.program),
+            "targets": len(corrected.statuses),
+            "statuses": dict(Counter(status.name.lower() for _, status in corrected.statuses)),
+            "unreached": [
+                {"line": line, "status": status.name.lower()} for line, status in corrected.unreached
+            ],
+            "branches": list(corrected.branches),
+            "way_points": corrected.waypoints,
+            "tolerance_mm": tolerance_mm,
+            "largest_shift_mm": shift,
+            "left_alone": [{"line": line, "reason": reason} for line, reason in corrected.unchanged_lines],
+            "joint_lines": list(scanned.joint_lines),
+            "diff": diff,
+        },
+        remarks=(*condition_remarks(model), *frame_remarks(model)),
+        warnings=(
+            TEST,
+            *(language.cartesian_cautions if language else ()),
+            *_warnings(corrected, str(request.program)),
+        ),
+        summary=f"Program with {reached} corrected targets (by {shift:.3f} mm at most) "
+        f"and {corrected.waypoints} waypoints",
+        missed_limit=_shortfall(corrected, str(request.program)),
+        shown=diff,
+    )
+
+
+def _warnings(corrected: CorrectedProgram, source: str) -> tuple[str, ...]:
+    """Return warnings about branches of targets, and about targets that were not changed."""
+    sentences = [
+        f"Targets are corrected for the branch {' and '.join(corrected.branches) or 'of the model'}. The program's "
+        "configuration was not checked: if the arm is in another configuration, use --branch."
+    ]
+    if corrected.unchanged_lines:
+        unchanged = "; ".join(f"line {line}: {reason}" for line, reason in corrected.unchanged_lines)
+        sentences.append(f"Left unchanged in {source}: {unchanged}.")
+    return tuple(sentences)
+
+
+def _shortfall(corrected: CorrectedProgram, source: str) -> str | None:
+    if not corrected.unreached:
+        return None
+    line, status = corrected.unreached[0]
+    others = _listed([f"line {n} {s.name.lower()}" for n, s in corrected.unreached[1:]])
+    also = f" (Also: {others}.)" if others else ""
+    return f"{source}, line {line}: {status.name.lower()}, so the line is unchanged. {status.sentence}{also}"
+
+
+def _listed(sentences: list[str], most: int = 10) -> str:
+    more = [f"and {len(sentences) - most} more"] if len(sentences) > most else []
+    return "; ".join([*sentences[:most], *more])
 
 
 FORMAT = ExportFormat(

@@ -11,7 +11,7 @@ from pisigma.deployment.export.controllers.controller_file import (
     FileContent,
     untested_on_controller,
 )
-from pisigma.deployment.export.controllers.offset_table import read_offsets
+from pisigma.deployment.export.controllers.reading import read_offsets
 from pisigma.deployment.export.dh_table import csv_table, parameter_columns
 from pisigma.deployment.export.export_format import ExportRequest
 from pisigma.deployment.export.joint_offsets import joints_by_axes, offsets_between

@@ -21,8 +21,8 @@ from testing.rewritten_programs import (
 
 from pisigma.deployment.export.export_format import Exported, ExportRequest
 from pisigma.deployment.export.registry import export_model
-from pisigma.deployment.export.rewriting.export import TEST
 from pisigma.deployment.export.rewriting.scan import COMPUTED
+from pisigma.deployment.export.targets import TEST
 from pisigma.files.errors import OutputError
 from pisigma.model.folder.model_folder import load_model
 
