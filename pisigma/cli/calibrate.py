@@ -207,7 +207,7 @@ def _calibrate_arms(
 ) -> None:
     """Calibrate the arms of a cell, store their models and bases there, and print them."""
     from pisigma.reporting.frame_text import arms_text
-    from pisigma.workflow.arms.arms_cell import calibrate_arms_of_cell
+    from pisigma.workflow.arms.calibrate_arms import calibrate_arms_of_cell
 
     with progress_of("calibrate") as progress:
         found, folder = calibrate_arms_of_cell(cell, progress, accept_implausible, **settings.values)

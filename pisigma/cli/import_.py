@@ -83,7 +83,7 @@ def import_(
 
 def _write_joint_log(files: list[Path], settings: ImportSettings, out: Path, as_json: bool) -> None:
     """Write the joint values of a LeRobot data set."""
-    from pisigma.measurement.foreign.lerobot_log import read_joint_log
+    from pisigma.measurement.foreign.lerobot_dataset import read_joint_log
 
     if len(files) > 1:
         raise typer.BadParameter("expected one LeRobot data set without other files", param_hint="'files'")

@@ -8,9 +8,8 @@ import torch
 from jaxtyping import Bool, Float64
 from torch import Tensor
 
-from pisigma.estimation.cholesky import covariance_factor
+from pisigma.estimation.cholesky import covariance_factor, orthonormal_columns
 from pisigma.estimation.drift import compressed_columns, evidence_coordinates, evidence_gains
-from pisigma.estimation.orthonormal_columns import orthonormal_columns
 
 _SIZES = torch.logspace(-3, 1.5, 28, dtype=torch.float64)
 """Sizes of a cause relative to its scale, all equally probable."""

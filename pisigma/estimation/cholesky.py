@@ -1,4 +1,4 @@
-"""Cholesky factors of symmetric matrices, and operations on these factors that need little memory."""
+"""Cholesky factors of symmetric matrices, operations on them that need little memory, and orthonormal bases."""
 
 import ctypes
 import sys
@@ -95,3 +95,14 @@ def return_free_memory(unknowns: int) -> None:
         trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
         if trim is not None:
             trim(0)
+
+
+TOLERANCE = 1e-9
+"""Ratio of a singular value to the largest one, of columns of unit length, below which it is zero up to rounding."""
+
+
+def orthonormal_columns(A: Float64[Tensor, "rows columns"]) -> Float64[Tensor, "rows _rank"]:
+    """Return an orthonormal basis of the column space, which does not depend on the units of the columns."""
+    U, singular, _ = torch.linalg.svd(A / A.norm(dim=0).clamp(min=1e-300), full_matrices=False)
+    basis: Tensor = U[:, singular > TOLERANCE * singular.max()] if A.numel() else U
+    return basis

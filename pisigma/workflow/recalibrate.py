@@ -16,13 +16,15 @@ from pisigma.files.errors import IdentificationError, ModelError
 from pisigma.files.model_files import model_hash
 from pisigma.files.progress import Progress, with_stage
 from pisigma.lifetime.recalibration.adaptation import Adaptation, adapt
-from pisigma.lifetime.recalibration.candidates import CLEAR_RATIO, CandidateChoice, choose_candidate
-from pisigma.lifetime.recalibration.movement import Movement, movements_text, significant_movements
-from pisigma.lifetime.recalibration.recalibrated_model import (
+from pisigma.lifetime.recalibration.candidates import (
+    CLEAR_RATIO,
     KIND,
+    CandidateChoice,
+    choose_candidate,
     recalibrated_model,
     recalibration_diagnostics,
 )
+from pisigma.lifetime.recalibration.movement import Movement, movements_text, significant_movements
 from pisigma.lifetime.recalibration.recalibration_problem import FrameKey, frame_keys, recalibration_problem
 from pisigma.lifetime.recalibration.relocated_frames import relocated_frames
 from pisigma.lifetime.recalibration.summary import HeldOutFigures, RecalibrationSummary

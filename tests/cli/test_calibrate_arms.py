@@ -33,8 +33,14 @@ from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.se3 import pose_error, transform_from_xyzrpy
 from pisigma.validation.held_out.arms_summary import ArmsSummary
-from pisigma.workflow.arms.arms_cell import arms_of_cell, calibrate_arms_of_cell
-from pisigma.workflow.arms.calibrate_arms import FRAMES_FILE, Arm, ArmsCalibration, calibrate_arms
+from pisigma.workflow.arms.calibrate_arms import (
+    FRAMES_FILE,
+    Arm,
+    ArmsCalibration,
+    arms_of_cell,
+    calibrate_arms,
+    calibrate_arms_of_cell,
+)
 from pisigma.workflow.cell.upgrade import upgrade
 from pisigma.workflow.settings.calibration import CalibrationSettings
 

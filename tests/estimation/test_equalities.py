@@ -3,7 +3,7 @@
 import torch
 from testing.closeness import assert_close
 
-from pisigma.estimation.equalities import condition_on_equalities
+from pisigma.estimation.covariance_root import condition_on_equalities
 
 
 def test_solution_and_covariance_are_those_of_weighted_least_squares():

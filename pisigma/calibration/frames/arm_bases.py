@@ -10,7 +10,7 @@ from scipy.stats import chi2
 from torch import Tensor
 
 from pisigma.calibration.frames.shared_objects import ArmPosterior, SharedObject, find_shared_objects
-from pisigma.estimation.equalities import ConditionedUnknowns, condition_on_equalities
+from pisigma.estimation.covariance_root import ConditionedUnknowns, condition_on_equalities
 from pisigma.files.errors import IdentificationError, Phrase
 from pisigma.robot.frame_fits import MeasuredPoses, best_base
 from pisigma.robot.se3 import (

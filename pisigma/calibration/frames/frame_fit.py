@@ -24,7 +24,7 @@ from pisigma.calibration.geometric.problem.held_directions import LARGEST_DEVIAT
 from pisigma.calibration.geometric.problem.least_squares import SolutionStatus
 from pisigma.calibration.geometric.problem.parameters import Parameter
 from pisigma.calibration.geometric.result import SolvedCalibration
-from pisigma.estimation.leave_one_out import most_deviating_row
+from pisigma.estimation.held_out import most_deviating_row
 from pisigma.estimation.loss import SquaredLoss
 from pisigma.files.errors import IdentificationError, Phrase, Place
 from pisigma.measurement.dataset import Measurements

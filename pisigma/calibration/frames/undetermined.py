@@ -15,7 +15,7 @@ from pisigma.calibration.geometric.problem.noise import sensor_view_of
 from pisigma.calibration.geometric.problem.parameters import ParameterSpace
 from pisigma.calibration.geometric.problem.setup import identified_geometry
 from pisigma.calibration.geometric.result import SolvedCalibration
-from pisigma.estimation.orthonormal_columns import orthonormal_columns
+from pisigma.estimation.cholesky import orthonormal_columns
 from pisigma.robot.se3 import wrap_to_pi
 
 _LARGEST_SPREAD = 60.0

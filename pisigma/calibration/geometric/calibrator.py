@@ -26,7 +26,7 @@ from pisigma.calibration.geometric.identifiability.sufficiency import (
 )
 from pisigma.calibration.geometric.initial_guess.initial_guess import randomly_chosen_rows
 from pisigma.calibration.geometric.problem.information import information
-from pisigma.calibration.geometric.problem.joint_scatter import joint_scatter_factor
+from pisigma.calibration.geometric.problem.joint_repeatability import joint_scatter_factor
 from pisigma.calibration.geometric.problem.least_squares import SHORTEST_STEP, Solution, levenberg_marquardt
 from pisigma.calibration.geometric.problem.noise import sensor_view_of
 from pisigma.calibration.geometric.problem.parameters import ParameterSpace, Prior

@@ -22,10 +22,14 @@ from pisigma.calibration.geometric.identifiability.plausibility import misfittin
 from pisigma.calibration.geometric.identifiability.redundancy import RankFindings, Redundancy
 from pisigma.calibration.geometric.identifiability.sufficiency import CalibrationWarning, measurement_advice
 from pisigma.calibration.geometric.outliers import Outlier, outliers_of
-from pisigma.calibration.geometric.parameter_table import ParameterEstimate, parameter_table
+from pisigma.calibration.geometric.parameter_table import (
+    ParameterEstimate,
+    PriorRatio,
+    parameter_table,
+    prior_ratios_of,
+)
 from pisigma.calibration.geometric.posterior import ParameterPosterior
 from pisigma.calibration.geometric.prediction import predicted_poses
-from pisigma.calibration.geometric.prior_ratio import PriorRatio, prior_ratios_of
 from pisigma.calibration.geometric.problem.least_squares import (
     Linearisation,
     Solution,

@@ -133,8 +133,7 @@ def _print_pose(
     """Print the solutions of one pose."""
     import numpy as np
 
-    from pisigma.cli.ik.solutions import failure, solution_records
-    from pisigma.reporting.solution_text import solution_text
+    from pisigma.reporting.solution_text import failure, solution_records, solution_text
     from pisigma.workflow.load import stated_pose
 
     T, places = stated_pose(pose), [f"the pose {' '.join(f'{value:g}' for value in pose)}"]

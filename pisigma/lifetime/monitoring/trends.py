@@ -11,8 +11,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from pisigma.estimation.drift import NOISE_SPREAD
-from pisigma.lifetime.monitoring.changes import Event, Series
-from pisigma.lifetime.monitoring.charts import Chart, innovations, limits_of
+from pisigma.lifetime.monitoring.charts import Chart, Event, Series, innovations, limits_of
 from pisigma.lifetime.monitoring.history import Record
 from pisigma.lifetime.recalibration.movement import CLEAR, NORMAL_95
 from pisigma.measurement.sensors.sensor import SHOWN_UNITS, ShownUnit

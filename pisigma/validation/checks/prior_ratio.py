@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterator, Sequence
 
-from pisigma.calibration.geometric.prior_ratio import PriorRatio
+from pisigma.calibration.geometric.parameter_table import PriorRatio
 from pisigma.calibration.geometric.problem.prior_scales import PriorGroup
 from pisigma.robot.robot_class import CLASSES, SERVO, RobotClass
 from pisigma.validation.checks.check import CheckedCalibration

@@ -10,7 +10,7 @@ import torch
 from testing.closeness import assert_close
 from testing.refusals import refused
 
-from pisigma.calibration.geometric.problem.repeats import number_repeats
+from pisigma.calibration.geometric.problem.noise import number_repeats
 from pisigma.calibration.hybrid.calibrator import HybridCalibrator
 from pisigma.calibration.hybrid.result import HybridResult
 from pisigma.deployment.export.onnx_model import export_onnx, onnx_remarks

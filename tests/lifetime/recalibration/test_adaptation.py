@@ -13,8 +13,8 @@ from testing.refusals import refused
 
 from pisigma.files.errors import IdentificationError, ModelError
 from pisigma.lifetime.recalibration.adaptation import Adaptation, adapt
+from pisigma.lifetime.recalibration.candidates import recalibrated_model
 from pisigma.lifetime.recalibration.movement import significant_movements
-from pisigma.lifetime.recalibration.recalibrated_model import recalibrated_model
 from pisigma.lifetime.recalibration.recalibration_problem import recalibration_problem
 from pisigma.lifetime.recalibration.relocated_frames import relocated_frames
 from pisigma.model.calibrated_model import poses_of_rows

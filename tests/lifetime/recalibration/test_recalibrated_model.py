@@ -8,7 +8,7 @@ from testing.aged import original_model, rows_after_change
 from testing.closeness import assert_close
 
 from pisigma.lifetime.recalibration.adaptation import adapt
-from pisigma.lifetime.recalibration.recalibrated_model import recalibrated_model
+from pisigma.lifetime.recalibration.candidates import recalibrated_model
 from pisigma.lifetime.recalibration.recalibration_problem import recalibration_problem
 from pisigma.model.calibrated_model import poses_of_rows
 from pisigma.model.folder.model_folder import load_model, save_model

@@ -9,8 +9,7 @@ from testing.refusals import refused
 
 from pisigma.files.errors import MeasurementError
 from pisigma.measurement.foreign.image_joints import join_joint_values
-from pisigma.measurement.foreign.lerobot_dataset import joint_motors
-from pisigma.measurement.foreign.lerobot_log import read_joint_log
+from pisigma.measurement.foreign.lerobot_dataset import joint_motors, read_joint_log
 from pisigma.measurement.foreign.lerobot_motors import check_values, motors_text
 
 

@@ -15,8 +15,7 @@ pytest.importorskip("aiohttp", reason="the extra view is not installed")
 
 from aiohttp import web
 
-from pisigma.workbench.server.access import MAX_UPLOAD
-from pisigma.workbench.server.front_server import FrontServer
+from pisigma.workbench.server.front_server import MAX_UPLOAD, FrontServer
 
 
 async def length(request):

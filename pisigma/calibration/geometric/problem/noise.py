@@ -1,4 +1,4 @@
-"""Estimate the noise of sensors from residuals: robust scales, repeated poses, and angles against lengths."""
+"""Estimate the noise of sensors from residuals: robust scales, rows of repeated poses, and angles against lengths."""
 
 import math
 from collections.abc import Sequence
@@ -308,3 +308,28 @@ def _group_squares(
     squares = summed.square().sum(0) / total
     measured = total > 0
     return torch.where(measured, squares, 0.0).sum(), measured.sum() * components
+
+
+_MULTIPLIER, _FACTOR = 6_364_136_223_846_793_005, 1_442_695_040_888_963_407
+"""Constants of the linear congruential generator that hashes joint values (Knuth, MMIX)."""
+
+
+def number_repeats(q: Tensor, *names: Tensor) -> Tensor | None:
+    """Return an index for every row that is equal for equal joint values (with payload, to 1e-9) and names.
+
+    Returns:
+        The indices; None if all rows differ.
+    """
+    numbers = renumber(_mixed_keys(q, *names))
+    return None if int(numbers.max()) + 1 == len(q) else numbers
+
+
+def _mixed_keys(q: Float64[Tensor, "rows dof"], *names: Tensor) -> Int64[Tensor, " rows"]:
+    """Return a hash of every row's joint values (to 1e-9) and names."""
+    keys, dof = (q * 1e9).round().long(), q.shape[1]
+    factors = [_FACTOR * pow(_MULTIPLIER, dof - 1 - joint, 2**64) for joint in range(dof)]
+    signed = [(factor + 2**63) % 2**64 - 2**63 for factor in factors]
+    mixed: Tensor = (keys * torch.tensor(signed, device=q.device)).sum(1)  # integers wrap around
+    for name in names:
+        mixed = mixed * _MULTIPLIER + name * _FACTOR
+    return mixed

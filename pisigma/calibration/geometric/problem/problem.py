@@ -14,7 +14,6 @@ from pisigma.calibration.geometric.problem.least_squares import (
     Linearisation,
     covariance_of,
 )
-from pisigma.calibration.geometric.problem.motion_memory import MotionMemory
 from pisigma.calibration.geometric.problem.noise import (
     SensorContribution,
     SensorView,
@@ -37,7 +36,7 @@ from pisigma.calibration.geometric.problem.prior_scales import (
 from pisigma.estimation.loss import AbstractLoss, SquaredLoss
 from pisigma.measurement.conditions import JointState
 from pisigma.measurement.sensors.sensor import AbstractSensor, Unknowns
-from pisigma.robot.kinematics.parameter_jacobian import JACOBIAN_CHUNK, ToolMotion, tool_motion
+from pisigma.robot.kinematics.parameter_jacobian import JACOBIAN_CHUNK, MotionMemory, ToolMotion, tool_motion
 
 _CERTAIN_LOSS = SquaredLoss()
 _CONVERGENCE_TOLERANCE = 1e-2

@@ -12,9 +12,9 @@ from torch import Tensor
 
 from pisigma.calibration.geometric.initial_guess.initial_guess import InitialGuess, guess
 from pisigma.calibration.geometric.problem.joint_repeatability import with_joint_repeatability
+from pisigma.calibration.geometric.problem.noise import number_repeats
 from pisigma.calibration.geometric.problem.parameters import ParameterSpace, Prior, PriorScaling
 from pisigma.calibration.geometric.problem.problem import CalibrationProblem
-from pisigma.calibration.geometric.problem.repeats import number_repeats
 from pisigma.estimation.loss import AbstractLoss
 from pisigma.files.errors import IdentificationError, Place
 from pisigma.measurement.conditions import JointState, repeat_key

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
-from pisigma.estimation.orthonormal_columns import orthonormal_columns
+from pisigma.estimation.cholesky import orthonormal_columns
 from pisigma.files.errors import MeasurementError, Place
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import groups_to_keep_whole, numbers_of_names
