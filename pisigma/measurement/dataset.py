@@ -15,8 +15,8 @@ from jaxtyping import Bool, Float64
 from torch import Tensor
 
 from pisigma.files.errors import MeasurementError, Phrase, Place
+from pisigma.measurement.csv.columns import write_fields
 from pisigma.measurement.csv.reading import read_fields
-from pisigma.measurement.csv.writing import write_fields
 from pisigma.measurement.faults import RowPlace
 from pisigma.measurement.fields import KINDS, Kind, MeasuredFields, OnBadRow, UnusableRow, joined_fields
 from pisigma.measurement.readings import READINGS

@@ -1,4 +1,4 @@
-"""Measured values of a calibration problem in standard deviations, linearised in chosen parameters."""
+"""Measured values in standard deviations, linearised in chosen parameters, and how well they determine frames."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,8 +10,13 @@ from torch import Tensor
 from pisigma.calibration.geometric.problem.noise import sensor_view_of
 from pisigma.calibration.geometric.result import SolvedCalibration
 from pisigma.calibration.hybrid.sensor_values import SensorValues, sensor_values
+from pisigma.estimation.cholesky import orthonormal_columns
 from pisigma.joint_correction.feature import AbstractFeature
 from pisigma.measurement.conditions import JointState
+from pisigma.robot.se3 import wrap_to_pi
+
+_ROUNDING = 1e-9
+"""Information on a direction, relative to that on the best determined one, below which it is a rounding error."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,3 +87,58 @@ class WhitenedValues:
             for feature in features
         ]
         return torch.cat(blocks, 1) if blocks else self.X[:, :0]
+
+
+@dataclass(frozen=True, eq=False)
+class FrameDirections:
+    """Independent directions in the coordinates of frames, least determined first.
+
+    Attributes:
+        directions: the directions, orthonormal in units of 1 mm and 1 mrad, in the coordinates of the problem.
+        deviation: standard deviation of every direction in these units; infinite if the rows contain no information.
+    """
+
+    directions: Float64[Tensor, "active frames"]
+    deviation: Float64[Tensor, " frames"]
+
+    @staticmethod
+    def at_solution(solved: SolvedCalibration, frames: Sequence[int]) -> "FrameDirections":
+        """Return the directions at a solution, with the noise estimated from its residuals.
+
+        Args:
+            solved: the solution.
+            frames: indices of the coordinates; the other free parameters are eliminated.
+        """
+        active = solved.problem.active.tolist()
+        X = WhitenedValues.at_solution(solved, active).X * solved.problem.step_scale
+        ours = torch.tensor([index in set(frames) for index in active])
+        U, own = orthonormal_columns(X[:, ~ours]), X[:, ours]
+        own = own - U @ (U.t() @ own)
+        information, vectors = torch.linalg.eigh(own.t() @ own)
+        directions = X.new_zeros(len(active), len(information))
+        directions[ours] = vectors
+        is_known = information > _ROUNDING * information.max()
+        return FrameDirections(directions, torch.where(is_known, information.clamp(min=0) ** -0.5, torch.inf))
+
+    def in_user_coordinates(
+        self, solved: SolvedCalibration
+    ) -> tuple[Float64[Tensor, "parameters frames"], Float64[Tensor, " frames"]]:
+        """Return the directions in the user's coordinates as unit vectors, and their lengths before normalisation.
+
+        Both are in units of 1 mm and 1 mrad.
+        """
+        problem, units = solved.problem, torch.from_numpy(solved.problem.space.usual_errors)
+        change = solved.geometry.coordinate_jacobian[:, problem.active]
+        vectors = change @ (problem.step_scale[:, None] * self.directions) / units[:, None]
+        length = vectors.norm(dim=0)
+        return vectors / length, length
+
+    def distances(
+        self, solved: SolvedCalibration, before: Float64[Tensor, " parameters"]
+    ) -> Float64[Tensor, " frames"]:
+        """Return the distances of the previous values from a solution along all directions, per 1 mm and 1 mrad."""
+        space, units = solved.problem.space, torch.from_numpy(solved.problem.space.usual_errors)
+        vectors, length = self.in_user_coordinates(solved)
+        off = before - solved.geometry.values_of(space)
+        off = torch.where(space.is_length, off, wrap_to_pi(off)) / units
+        return (vectors.t() @ off) / length

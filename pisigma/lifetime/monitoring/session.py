@@ -11,8 +11,8 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from pisigma.calibration.hybrid.refinement import linearise_rows
+from pisigma.estimation.alternatives import Explanation, Motion, SessionEvidence
 from pisigma.estimation.drift import Drift, DriftGroup, LinearValues, PosteriorUpdate
-from pisigma.estimation.hypotheses import Explanation, Motion, SessionEvidence
 from pisigma.estimation.wrong_rows import ExplainedRows, mark_wrong_rows
 from pisigma.files.errors import IdentificationError
 from pisigma.lifetime.recalibration.adaptation import AdaptedArm, linear_values, usual_noise

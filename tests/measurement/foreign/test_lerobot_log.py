@@ -8,9 +8,9 @@ from testing.lerobot_arm import DATA_SETS, MOTORS, RANGES, SO101
 from testing.refusals import refused
 
 from pisigma.files.errors import MeasurementError
-from pisigma.measurement.foreign.image_joints import join_joint_values
 from pisigma.measurement.foreign.lerobot_dataset import joint_motors, read_joint_log
 from pisigma.measurement.foreign.lerobot_motors import check_values, motors_text
+from pisigma.workflow.images.detect import join_joint_values
 
 
 def recorded(layout):

@@ -6,7 +6,7 @@ import pytest
 from testing.refusals import refused
 
 from pisigma.files.errors import MeasurementError
-from pisigma.measurement.foreign.image_joints import join_joint_values
+from pisigma.workflow.images.detect import join_joint_values
 
 
 def log(folder: Path, text: str) -> Path:

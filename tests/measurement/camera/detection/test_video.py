@@ -9,7 +9,7 @@ from testing.closeness import assert_close
 from testing.refusals import refused
 
 from pisigma.files.errors import MeasurementError
-from pisigma.measurement.foreign.image_joints import join_joint_values
+from pisigma.workflow.images.detect import join_joint_values
 
 cv2 = pytest.importorskip("cv2", reason="opencv-python-headless is not installed")
 
