@@ -172,7 +172,7 @@ def _calibrate_frame_of_cell(
     cell: "Cell", only: FrameChoice, accept_implausible: bool, verbose: bool, as_json: bool
 ) -> None:
     """Calibrate base, tool or both with the newest session of a cell, store the model there, and print it."""
-    from pisigma.workflow.frames.cell_frames import calibrate_frame_of_cell
+    from pisigma.workflow.frames.calibrate_frame import calibrate_frame_of_cell
 
     calibration, entry = calibrate_frame_of_cell(cell, only, accept_implausible)
     folder = None if entry is None else cell.model_folder(entry.name)

@@ -11,8 +11,8 @@ from pisigma.cli.output import print_json, print_line, print_lines, print_table
 from pisigma.files.errors import OutputError
 
 if TYPE_CHECKING:
+    from pisigma.robot.chains import PendantPose
     from pisigma.robot.description import Robot
-    from pisigma.robot.pendant_poses import PendantPose
 
 Read = Annotated[
     Path | None,
@@ -143,9 +143,9 @@ def _list(as_json: bool) -> None:
 
 def _check(robot: str, base: str | None, tip: str | None, as_json: bool) -> None:
     """Print the poses of the tool according to a description."""
+    from pisigma.robot.chains import pendant_poses
     from pisigma.robot.description import Robot
     from pisigma.robot.kinematics.closed_form import closed_form_solver
-    from pisigma.robot.pendant_poses import pendant_poses
 
     poses = pendant_poses(robot, base, tip)
     form = closed_form_solver(Robot.load(robot, base, tip))

@@ -29,6 +29,7 @@ from pisigma.planning.session.growing_images import growing_file
 from pisigma.planning.session.state import SessionState
 from pisigma.reporting.calibration_text import calibration_text
 from pisigma.reporting.result_text import ResultText, sentences, table_block
+from pisigma.reporting.session_text import session_text
 from pisigma.reporting.solution_text import FAILURES, solution_text, statuses_of
 from pisigma.reporting.verdict import Verdict, count_text, uncapitalised
 from pisigma.robot.robot_file import catalogue
@@ -53,7 +54,6 @@ from pisigma.workflow.result_texts import (
     recalibration_text,
     report_doubt,
     report_text,
-    session_text,
     verification_text,
 )
 from pisigma.workflow.settings.importing import ImportSettings

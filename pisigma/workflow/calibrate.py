@@ -92,6 +92,15 @@ class Calibration(AbstractModelResult):
         """Return warnings and recommendations, one sentence each."""
         return self.summary.warnings
 
+    @property
+    def position_errors_mm(self) -> tuple[float | None, float | None]:
+        """95 % quantile and RMS of the position errors [mm]; see `AbstractModelResult`."""
+        judged, fitted = self.summary.validation_errors, self.summary.calibrated
+        if judged is not None:
+            errors = list(judged.models.values())[-1]
+            return errors.p95_mm, errors.rms_mm
+        return None, None if fitted is None else list(fitted.models.values())[-1].rms_mm
+
     def _describe(self, model: CalibratedModel, summary: CalibrationSummary, folder: Path) -> None:
         judged = self.validation or self.test
         write_calibration_card(

@@ -3,7 +3,6 @@
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 
 from pisigma.deployment.export.programs.languages import LANGUAGES, check_program
@@ -11,7 +10,7 @@ from pisigma.files.output_file import check_output
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.growing_file import FileGrowth, GrowingFile
 from pisigma.planning.plan_file import YAML_SUFFIX, yaml_of
-from pisigma.planning.session.state import AccuracyPoint, Alarm, SessionState
+from pisigma.planning.session.state import Alarm, SessionStep
 from pisigma.robot.description import Robot
 from pisigma.workflow.measure import MeasuringSession
 
@@ -19,25 +18,6 @@ _REST_SUFFIX = ".rest.csv"
 """Suffix of the remaining plan; that of `poses.csv` is written to `poses.rest.csv`."""
 PAUSE = 0.01
 """Time between two reads of the file [s]."""
-
-
-@dataclass(frozen=True, eq=False)
-class SessionStep:
-    """News of a session.
-
-    Attributes:
-        growth: new rows of the file.
-        alarms: faults of the new rows, or faults of earlier rows that the new rows reveal.
-        state: state of the session.
-        points: accuracies that were computed since the last step.
-        replanned: whether the remaining poses differ from the planned poses or from those after the last step.
-    """
-
-    growth: FileGrowth
-    alarms: tuple[Alarm, ...]
-    state: SessionState
-    points: tuple[AccuracyPoint, ...] = ()
-    replanned: bool = False
 
 
 def follow(

@@ -87,6 +87,12 @@ class Recalibration(AbstractModelResult):
         """Return warnings, one sentence each."""
         return self.summary.warnings
 
+    @property
+    def position_errors_mm(self) -> tuple[float | None, float | None]:
+        """95 % quantile and RMS of the position errors of held-out rows [mm]; see `AbstractModelResult`."""
+        p95 = self.gate.p95.get(self.gate.kept)
+        return None if p95 is None else p95 * 1e3, self.summary.cross_validation[self.summary.kept].rms_mm
+
     def _describe(self, model: CalibratedModel, summary: RecalibrationSummary, folder: Path) -> None:
         write_recalibration_card(model, summary, folder)
 

@@ -41,6 +41,14 @@ class AbstractModelResult(ABC):
         """Whether no check found the result implausible."""
         return not any(one.severity == "implausible" for one in self.diagnostics)
 
+    @property
+    def position_errors_mm(self) -> tuple[float | None, float | None]:
+        """95 % quantile and RMS of the position errors [mm]; None if unknown.
+
+        Both refer to held-out rows; without a validation, the RMS refers to the rows of the calibration.
+        """
+        return None, None
+
     def save(
         self,
         folder: str | os.PathLike[str],

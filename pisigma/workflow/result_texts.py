@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from pisigma.planning.session.state import AccuracyPoint, SessionState
 from pisigma.reporting.acceptance_tables import acceptance_sentences, budget_table, contradiction
 from pisigma.reporting.comparison_tables import comparison_blocks, model_rms
 from pisigma.reporting.derived_cards import candidate_names, candidate_table
@@ -125,49 +124,6 @@ def verification_text(verification: Verification, width: int, verbose: bool = Fa
     warnings = [*(fault.sentence for fault in verification.setup_faults), *verification.warnings]
     shown, details = comparison_blocks(verification.comparison, verification.data, width, verbose)
     return ResultText(verdict, tuple(warnings), tuple(shown), tuple(details))
-
-
-def session_text(state: SessionState, closing: Sequence[str] = ()) -> ResultText:
-    """Lay out a session: the accuracy so far, the used rows, and whether to measure more.
-
-    Args:
-        state: state of the session.
-        closing: sentence on the written files.
-    """
-    counting = int((~state.rows.alarmed).sum())
-    reached = "not known yet." if state.accuracy is None else accuracy_text(state.accuracy)
-    alarmed = len(state.rows.line) - counting
-    trust = (
-        f"{count_text(counting, 'row')} counted, {alarmed} left out"
-        if alarmed
-        else f"all {counting} rows count"
-    )
-    if state.advice.action == "correct":
-        trust = "no: all rows have the same fault"
-    left = count_text(len(state.remaining), "pose")
-    verdict = Verdict(
-        reached, f"{trust}; {left} of the plan not measured.", uncapitalised(state.advice.sentence)
-    )
-    return ResultText(verdict, tuple(_narrow(state)), closing=tuple(closing))
-
-
-def _narrow(state: SessionState) -> list[str]:
-    """Return a text on joints that were measured over less than half of their planned range."""
-    narrow = [span for span in state.coverage if span.planned < 0.5]
-    names = ", ".join(f"{span.name} ({100 * span.planned:.0f} %)" for span in narrow)
-    return [f"less than half of the planned range was measured of: {names}."] if narrow else []
-
-
-def accuracy_text(point: AccuracyPoint) -> str:
-    """Return a text on the accuracy of a calibration."""
-    texts = [_errors("predicted", point.predicted_rms, point.predicted_p95)]
-    texts += [_errors("held-out rows", point.cross_validated_rms, point.cross_validated_p95)]
-    texts += [_errors("check poses", point.checked_rms, point.checked_p95)]
-    return f"with {point.poses} poses, RMS and 95 % of the errors: {'; '.join(filter(None, texts))}."
-
-
-def _errors(name: str, rms: float, p95: float) -> str:
-    return "" if rms != rms else f"{name} {rounded(rms * 1e3)} and {rounded(p95 * 1e3)} mm"
 
 
 def monitoring_text(monitoring: MonitoringResult, closing: Sequence[str] = ()) -> ResultText:

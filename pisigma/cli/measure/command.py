@@ -21,11 +21,10 @@ from pisigma.workflow.settings.measuring import MeasureSettings
 
 if TYPE_CHECKING:
     from pisigma.planning.plan_settings import CameraSettings
-    from pisigma.planning.session.state import SessionState
+    from pisigma.planning.session.state import SessionState, SessionStep
     from pisigma.planning.surroundings.arm_in_surroundings import ArmInSurroundings
     from pisigma.robot.description import Robot
     from pisigma.workbench.viewing.body import MeshBody
-    from pisigma.workflow.follow import SessionStep
     from pisigma.workflow.measure import MeasuringSession
 
 PlanFile = Annotated[
@@ -175,12 +174,12 @@ def _printer(
     from rich.console import Console
     from rich.live import Live
 
-    from pisigma.cli.measure.session_lines import page, step_lines
+    from pisigma.reporting.session_text import session_page, step_lines
 
     console = Console(stderr=as_json)
     if console.is_terminal:
-        with Live(page(None, session.state, title), console=console, auto_refresh=False) as live:
-            yield lambda step: live.update(page(step, step.state, title), refresh=True)
+        with Live(session_page(None, session.state, title), console=console, auto_refresh=False) as live:
+            yield lambda step: live.update(session_page(step, step.state, title), refresh=True)
         return
 
     def show(step: "SessionStep") -> None:
@@ -192,7 +191,7 @@ def _printer(
 
 def _print_summary(session: "MeasuringSession", rest: Path, as_json: bool) -> None:
     """Print the verdict on the session."""
-    from pisigma.workflow.result_texts import session_text
+    from pisigma.reporting.session_text import session_text
 
     state = session.state
     written = str(rest) if session.replanned else None

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 from torch import Tensor
 
+from pisigma.measurement.growing_file import FileGrowth
 from pisigma.robot.description import Robot
 
 AlarmKind = Literal["setup", "unreadable", "duplicate", "frozen", "swapped", "off", "pose", "cleared"]
@@ -256,3 +257,22 @@ def coverage(
             robot.axes, lower.tolist(), upper.tolist(), width.tolist(), strict=True
         )
     )
+
+
+@dataclass(frozen=True, eq=False)
+class SessionStep:
+    """News of a session.
+
+    Attributes:
+        growth: new rows of the file.
+        alarms: faults of the new rows, or faults of earlier rows that the new rows reveal.
+        state: state of the session.
+        points: accuracies that were computed since the last step.
+        replanned: whether the remaining poses differ from the planned poses or from those after the last step.
+    """
+
+    growth: FileGrowth
+    alarms: tuple[Alarm, ...]
+    state: SessionState
+    points: tuple[AccuracyPoint, ...] = ()
+    replanned: bool = False

@@ -30,7 +30,6 @@ from pisigma.workflow.cell.cell_file import CellFile
 from pisigma.workflow.cell.model_choice import (
     calibrate_rows,
     check_entry,
-    errors_of,
     is_better,
     model_entry,
     put_into_use,
@@ -216,7 +215,7 @@ class Cell:
         if not doubt and prior is None and (in_use := self.history.in_use) is not None:
             better, remark = is_better(self.sessions, in_use, sessions, settings, progress)
         path = self._saved(result, accept_implausible)
-        p95, rms = errors_of(result)
+        p95, rms = result.position_errors_mm
         entry = model_entry(events, started, path, sessions, remark, result)
         verdict = "accepted_implausible" if doubt else "trusted"
         check = Check("calibrate", entry.name, "", verdict, doubt, p95, False, started, rms, stated)
@@ -330,7 +329,7 @@ class Cell:
             self.history.add(Check(*refused, None, False, now()))
             return result, None
         path = self._saved(result, accept_implausible)
-        remark, (p95, rms) = result.summary.verdict, errors_of(result)
+        remark, (p95, rms) = result.summary.verdict, result.position_errors_mm
         entry = model_entry((), started, path, [chosen], remark, result, parent)
         of = ("recalibrate", entry.name, chosen.name, result.summary.kept, remark)
         added: list[Entry] = [entry, Check(*of, p95, False, now(), rms)]

@@ -19,9 +19,9 @@ from pisigma.workflow.calibrate import Calibration, calibrate
 from pisigma.workflow.cell.sessions import Sessions
 from pisigma.workflow.cell.setup_names import ModelRows, newest_day, setup_name
 from pisigma.workflow.evaluate import evaluate
-from pisigma.workflow.frames.calibrate_frame import FrameCalibration
 from pisigma.workflow.monitor import MonitoringResult
 from pisigma.workflow.recalibrate import Recalibration, recalibrate
+from pisigma.workflow.result import AbstractModelResult
 from pisigma.workflow.settings.calibration import WITH_PRIOR, CalibrationSettings
 from pisigma.workflow.settings.evaluation import EvaluationSettings
 from pisigma.workflow.settings.recalibration import RecalibrationSettings
@@ -182,30 +182,13 @@ def calibrate_rows(
     return recalibrate(prior, rows, RecalibrationSettings(), progress, robot)
 
 
-def errors_of(result: Calibration | Recalibration | FrameCalibration) -> tuple[float | None, float | None]:
-    """Return the 95 % quantile and the RMS of the position errors [mm]; None if unknown.
-
-    Both refer to held-out rows; without a validation, the RMS refers to the rows of the calibration.
-    """
-    if isinstance(result, FrameCalibration):
-        return None, result.summary.rms_mm
-    if isinstance(result, Recalibration):
-        p95 = result.gate.p95.get(result.gate.kept)
-        return None if p95 is None else p95 * 1e3, result.summary.cross_validation[result.summary.kept].rms_mm
-    judged, fitted = result.summary.validation_errors, result.summary.calibrated
-    if judged is not None:
-        errors = list(judged.models.values())[-1]
-        return errors.p95_mm, errors.rms_mm
-    return None, None if fitted is None else list(fitted.models.values())[-1].rms_mm
-
-
 def model_entry(
     events: Sequence[Event],
     made: str,
     path: Path,
     sessions: Sequence[SessionEntry],
     remark: str,
-    result: Calibration | Recalibration | FrameCalibration,
+    result: AbstractModelResult,
     parent: ModelEntry | None = None,
 ) -> ModelEntry:
     """Return the history entry of a new model.
@@ -228,7 +211,7 @@ def model_entry(
         day=day,
         frame_day=newest_day(events, "instrument", day),
         target_day=newest_day(events, "tool", day),
-        p95_mm=errors_of(result)[0],
+        p95_mm=result.position_errors_mm[0],
         remark=remark,
         scatter_mm=identified_scatter(result.summary) if isinstance(result, Calibration) else None,
         has_posterior=result.model.uncertainty is not None,

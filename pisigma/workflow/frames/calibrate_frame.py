@@ -1,13 +1,16 @@
-"""Calibrate a base, tool or hand-eye transform from few rows, with the arm of a robot or model held fixed."""
+"""Calibrate a base, tool or hand-eye transform from few rows, or from a session of a cell, with the arm held fixed."""
 
 import os
 import time
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 from pisigma.calibration.frames.frame_fit import FrameChoice, FrameFit
 from pisigma.files.errors import IdentificationError, check_choice
 from pisigma.files.model_files import is_model, model_hash
+from pisigma.lifetime.cell.history import Check, ModelEntry, now
+from pisigma.lifetime.cell.layout import MODELS
 from pisigma.measurement.camera.camera_files import CameraFiles
 from pisigma.measurement.camera.corner_file import MeasurementFiles, read_rows
 from pisigma.measurement.dataset import Measurements
@@ -21,6 +24,9 @@ from pisigma.validation.checks.row_order import explain_refusal
 from pisigma.validation.gate import check_rows_of_frames
 from pisigma.validation.held_out.distillation_summary import ParentFigures
 from pisigma.validation.held_out.frame_summary import FrameSummary, frame_summary
+from pisigma.workflow.cell.cell import Cell
+from pisigma.workflow.cell.model_choice import model_entry
+from pisigma.workflow.cell.new_files import save_new
 from pisigma.workflow.result import AbstractModelResult
 
 _CHOICES: tuple[FrameChoice, ...] = ("tool", "base", "hand-eye")
@@ -46,6 +52,11 @@ class FrameCalibration(AbstractModelResult):
     def warnings(self) -> tuple[str, ...]:
         """Warnings, one sentence each."""
         return self.summary.warnings
+
+    @property
+    def position_errors_mm(self) -> tuple[float | None, float | None]:
+        """Return None and the RMS of the position errors of the rows [mm]; see `AbstractModelResult`."""
+        return None, self.summary.rms_mm
 
     def _describe(self, model: CalibratedModel, summary: FrameSummary, folder: Path) -> None:
         write_frame_card(model, summary, folder)
@@ -119,3 +130,51 @@ def _model_of(robot: Source) -> tuple[CalibratedModel | None, ParentFigures | No
     model, folder = loaded_model(robot)
     sha256 = "" if folder is None else model_hash(folder)
     return model, ParentFigures(name=model.name, kind=model.kind, sha256=sha256)
+
+
+def calibrate_frame_of_cell(
+    cell: Cell, only: FrameChoice, accept_implausible: bool = False
+) -> tuple[FrameCalibration, ModelEntry | None]:
+    """Calibrate base, tool or both with the newest session and the arm of the model in use, and store the model.
+
+    If no model is in use, the newest model of the cell is used or, if there is none, its nominal robot. `verify` puts
+    the new model into use.
+
+    Args:
+        cell: the cell.
+        only: what to calibrate.
+        accept_implausible: store the model even if it must not be trusted.
+
+    Returns:
+        The calibration and the entry of its model; the entry is None if an untrusted model was not stored.
+
+    Raises:
+        MeasurementError: there is no valid session, or none to which the model was not fitted.
+        IdentificationError: the session has too few rows.
+    """
+    started = now()
+    parent = cell.history.in_use or next(reversed(cell.history.models()), None)
+    if parent is None:
+        session = cell.sessions.valid_sessions()[-1]
+        found = calibrate_frame(cell.robot, cell.sessions.rows_of([session]), only)
+    else:
+        cell.controller_warnings("calibrate", parent)
+        session = cell.sessions.choose(parent, None)
+        rows = cell.sessions.as_measured(session)
+        seen = cell.sessions.rows_with_model_names(parent, rows, session.day)
+        found = calibrate_frame(cell.model_folder(parent.name), seen.rows, only)
+    doubt = "" if found.trusted else found.diagnostics[0].sentence
+    if doubt and not accept_implausible:
+        refused = ("calibrate", "", session.name, "not_trusted", doubt)
+        cell.history.add(Check(*refused, None, False, started))
+        return found, None
+    taken = [one.name for one in cell.history.models()]
+    save = partial(found.save, accept_implausible=accept_implausible)
+    path = save_new(cell.folder / MODELS, save, taken)
+    events = cell.history.events() if parent is None else ()
+    remark = f"{only} calibrated with session '{session.name}'"
+    entry = model_entry(events, started, path, [session], remark, found, parent)
+    verdict = "accepted_implausible" if doubt else "trusted"
+    check = Check("calibrate", entry.name, session.name, verdict, doubt or remark, None, False, started)
+    cell.history.add(entry, check)
+    return found, entry

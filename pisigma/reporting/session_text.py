@@ -1,4 +1,4 @@
-"""A measuring session as text: lines, or a page that changes."""
+"""A measuring session as text: its result, lines about its steps, or a page on the terminal that changes."""
 
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
@@ -6,14 +6,56 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pisigma.files.errors import make_printable
-from pisigma.planning.session.state import AccuracyPoint, SessionState
-from pisigma.reporting.result_text import MAX_ALIKE, merge_alike_warnings, numbers_as_ranges
-from pisigma.reporting.verdict import rounded
-from pisigma.workflow.follow import SessionStep
-from pisigma.workflow.result_texts import accuracy_text
+from pisigma.planning.session.state import AccuracyPoint, SessionState, SessionStep
+from pisigma.reporting.result_text import MAX_ALIKE, ResultText, merge_alike_warnings, numbers_as_ranges
+from pisigma.reporting.verdict import Verdict, count_text, rounded, uncapitalised
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
+
+
+def session_text(state: SessionState, closing: Sequence[str] = ()) -> ResultText:
+    """Lay out a session: the accuracy so far, the used rows, and whether to measure more.
+
+    Args:
+        state: state of the session.
+        closing: sentence on the written files.
+    """
+    counting = int((~state.rows.alarmed).sum())
+    reached = "not known yet." if state.accuracy is None else accuracy_text(state.accuracy)
+    alarmed = len(state.rows.line) - counting
+    trust = (
+        f"{count_text(counting, 'row')} counted, {alarmed} left out"
+        if alarmed
+        else f"all {counting} rows count"
+    )
+    if state.advice.action == "correct":
+        trust = "no: all rows have the same fault"
+    left = count_text(len(state.remaining), "pose")
+    verdict = Verdict(
+        reached, f"{trust}; {left} of the plan not measured.", uncapitalised(state.advice.sentence)
+    )
+    return ResultText(verdict, tuple(_narrow(state)), closing=tuple(closing))
+
+
+def _narrow(state: SessionState) -> list[str]:
+    """Return a text on joints that were measured over less than half of their planned range."""
+    narrow = [span for span in state.coverage if span.planned < 0.5]
+    names = ", ".join(f"{span.name} ({100 * span.planned:.0f} %)" for span in narrow)
+    return [f"less than half of the planned range was measured of: {names}."] if narrow else []
+
+
+def accuracy_text(point: AccuracyPoint) -> str:
+    """Return a text on the accuracy of a calibration."""
+    texts = [_errors("predicted", point.predicted_rms, point.predicted_p95)]
+    texts += [_errors("held-out rows", point.cross_validated_rms, point.cross_validated_p95)]
+    texts += [_errors("check poses", point.checked_rms, point.checked_p95)]
+    return f"with {point.poses} poses, RMS and 95 % of the errors: {'; '.join(filter(None, texts))}."
+
+
+def _errors(name: str, rms: float, p95: float) -> str:
+    return "" if rms != rms else f"{name} {rounded(rms * 1e3)} and {rounded(p95 * 1e3)} mm"
+
 
 _SHOWN_ROWS, _SHOWN_ALARMS, _SHOWN_POINTS = 8, 4, 8
 """Largest numbers of rows, alarms and points on the page; the last ones are shown."""
@@ -76,7 +118,7 @@ def next_text(state: SessionState) -> str:
     return f"Next: pose {following.number} of {following.count}{kind}: {joints}."
 
 
-def page(step: SessionStep | None, state: SessionState, title: str) -> "RenderableType":
+def session_page(step: SessionStep | None, state: SessionState, title: str) -> "RenderableType":
     """Return the session laid out for a terminal."""
     from rich.console import Group
     from rich.table import Table
