@@ -260,8 +260,8 @@ def pack(
     as_json: AsJson = False,
 ) -> None:
     """Write a cell into one ZIP file."""
-    from pisigma.workflow.cell.archive import pack as workflow
     from pisigma.workflow.cell.cell import Cell
+    from pisigma.workflow.cell.transfer import pack as workflow
 
     count = workflow(Cell.open(cell), out)
     if as_json:
@@ -276,7 +276,7 @@ def unpack(
     as_json: AsJson = False,
 ) -> None:
     """Restore a cell from a file written by `pisigma pack`."""
-    from pisigma.workflow.cell.archive import unpack as workflow
+    from pisigma.workflow.cell.transfer import unpack as workflow
 
     opened = workflow(file, out)
     if as_json:

@@ -9,7 +9,7 @@ from pisigma.cli.output import print_json, print_lines
 def upgrade(model: ModelOrCell, as_json: AsJson = False) -> None:
     """Convert a model folder or a cell of an earlier version to the current format, with its history."""
     from pisigma.lifetime.cell.layout import is_cell, is_cell_of_arms
-    from pisigma.workflow.cell.upgrade import upgrade as workflow
+    from pisigma.workflow.cell.transfer import upgrade as workflow
 
     done = workflow(model)
     models = [asdict(one) for one in done.models]

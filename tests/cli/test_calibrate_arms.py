@@ -41,7 +41,7 @@ from pisigma.workflow.arms.calibrate_arms import (
     calibrate_arms,
     calibrate_arms_of_cell,
 )
-from pisigma.workflow.cell.upgrade import upgrade
+from pisigma.workflow.cell.transfer import upgrade
 from pisigma.workflow.settings.calibration import CalibrationSettings
 
 CELL = """arms:

@@ -13,11 +13,10 @@ from pisigma.files.errors import MeasurementError
 from pisigma.measurement.csv.columns import find_column
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.readings import READINGS
-from pisigma.measurement.sensors.anchor import AnchorSensor
 from pisigma.measurement.sensors.corner import CornerSensor, as_poses
+from pisigma.measurement.sensors.distance import AnchorSensor, PairSensor
 from pisigma.measurement.sensors.intrinsics import BoardScaleSensor, IntrinsicsSensor
-from pisigma.measurement.sensors.pair import PairSensor
-from pisigma.measurement.sensors.pose import PositionSensor, RotationSensor
+from pisigma.measurement.sensors.pose import PositionSensor, RotationSensor, TouchSensor
 from pisigma.measurement.sensors.sensor import (
     AbstractSensor,
     SensorRows,
@@ -26,7 +25,6 @@ from pisigma.measurement.sensors.sensor import (
     indices_of_names,
 )
 from pisigma.measurement.sensors.socket import SocketSensor
-from pisigma.measurement.sensors.touch import TouchSensor
 from pisigma.robot.kinematics.parameter_jacobian import ToolMotion
 from pisigma.robot.se3 import transform
 

@@ -16,7 +16,7 @@ from pisigma.files.output_folder import staged_folder
 from pisigma.files.yaml_file import plain_content
 from pisigma.joint_correction.gear_lines import GearLines
 from pisigma.joint_correction.input_products import InputProducts
-from pisigma.measurement.sensors.anchor import ANCHOR_COLUMNS
+from pisigma.measurement.sensors.distance import ANCHOR_COLUMNS
 from pisigma.measurement.sensors.socket import SOCKET_COLUMNS
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_document import (

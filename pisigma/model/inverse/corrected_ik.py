@@ -31,7 +31,7 @@ class CorrectedIK(AbstractInverse):
     """Corrected inverse kinematics of a model; call it with poses.
 
     Poses are solved by compiled kernels on the CPU. For NumPy arrays and nested lists, the solutions are NumPy arrays,
-    and torch is not imported; for tensors, they are tensors on the same device, with gradients (see `pose_gradients`).
+    and torch is not imported; for tensors, they are tensors on the same device, with gradients (see `numeric_arm`).
     Models without a compiled form, and all models on machines without kernels, are solved by `NumericIK` instead.
 
     Attributes:
@@ -352,7 +352,7 @@ class CorrectedIK(AbstractInverse):
         """Return solutions as tensors, with gradients if required, if the poses are tensors, otherwise as arrays."""
         if poses is None:
             return replace(solution.map(as_array), owner=self)
-        from pisigma.model.inverse.pose_gradients import as_tensors
+        from pisigma.model.inverse.numeric_arm import as_tensors
 
         return as_tensors(solution, poses, self.model if poses.requires_grad else None, self, axes)
 

@@ -34,7 +34,7 @@ from pisigma.joint_correction.input_products import InputProducts
 from pisigma.joint_correction.shared_features import SinesCosines
 from pisigma.measurement.conditions import JointState
 from pisigma.measurement.dataset import Measurements
-from pisigma.measurement.sensors.anchor import ANCHOR_COLUMNS
+from pisigma.measurement.sensors.distance import ANCHOR_COLUMNS
 from pisigma.measurement.sensors.intrinsics import CAMERA_UNITS
 from pisigma.measurement.sensors.sensor import UnknownGroup
 from pisigma.measurement.sensors.socket import SOCKET_COLUMNS

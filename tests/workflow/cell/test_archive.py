@@ -9,8 +9,8 @@ from testing.refusals import refused
 from pisigma.files.errors import MeasurementError, OutputError, PlanningError
 from pisigma.lifetime.cell.history import HISTORY
 from pisigma.lifetime.cell.layout import CELL_FILE, newest_plan
-from pisigma.workflow.cell.archive import pack, unpack
 from pisigma.workflow.cell.cell import Cell
+from pisigma.workflow.cell.transfer import pack, unpack
 
 
 @pytest.fixture
@@ -86,7 +86,7 @@ def test_an_archive_that_leads_out_of_its_folder_is_refused_and_nothing_is_writt
 
 
 def test_an_archive_that_claims_too_much_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr("pisigma.workflow.cell.archive.MAX_BYTES", 10)
+    monkeypatch.setattr("pisigma.workflow.cell.transfer.MAX_BYTES", 10)
     with refused(PlanningError, file="big.zip"):
         unpack(archive(tmp_path / "big.zip"), tmp_path / "cell")
 

@@ -13,7 +13,7 @@ from pisigma.calibration.geometric.problem.parameters import ParameterSpace
 from pisigma.files.errors import ImplausibleError, Place
 from pisigma.measurement.csv.columns import MISNAMED_UNITS
 from pisigma.measurement.dataset import Measurements
-from pisigma.measurement.sensors.anchor import (
+from pisigma.measurement.sensors.distance import (
     MAX_NOMINAL_ERROR,
     MIN_DISTANCES,
     anchor_from_distances,
