@@ -53,7 +53,7 @@ def draw_accuracy(errors: Errors, path: Path) -> None:
 
 
 def draw_learning_curves(errors: Errors, fits: pa.Table, path: Path) -> None:
-    """Draw the RMS error over the number of training rows, one plot for each series with several numbers."""
+    """Draw the RMS error against the number of training rows, one plot for each series with several numbers."""
     rows = {(fit["series"], fit["split"]): fit["train_rows"] for fit in fits.to_pylist()}
     names = [name for name in SERIES if sum((name, split) in rows for split in LEARNING) > 1]
     count = max(len(names), 1)

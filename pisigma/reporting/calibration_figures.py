@@ -149,7 +149,7 @@ def show_correlations(
 
 
 def draw_corrections(correction: JointCorrection, measurements: Measurements, path: Path) -> None:
-    """Draw the correction of every joint over the value of this joint, and at the measured rows.
+    """Draw the correction of every joint against its value, and at the measured rows.
 
     Along the line, all other joints have their median values; the dots are at the measured joint values. Where the
     dots are off the line, the correction depends on other joints too.
@@ -198,7 +198,7 @@ def _over_own_value(
 
 
 def draw_learning_curve(points: Sequence[LearningPoint], path: Path) -> None:
-    """Draw the error on held-out rows over the number of training rows, with logarithmic axes.
+    """Draw the error on held-out rows against the number of training rows, with logarithmic axes.
 
     Args:
         points: errors by number of training rows, in ascending order.
@@ -228,7 +228,7 @@ def draw_learning_curve(points: Sequence[LearningPoint], path: Path) -> None:
 
 
 def draw_spread(spread: PredictedSpread, path: Path) -> None:
-    """Draw errors of held-out coordinates over their predicted standard deviations.
+    """Draw errors of held-out coordinates against their predicted standard deviations.
 
     The diamonds are the RMS errors of bins with equal numbers of values; they should be on the line.
 

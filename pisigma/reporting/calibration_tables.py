@@ -119,7 +119,7 @@ def coverage_line(figures: AbstractValidationFigures) -> str:
 
 
 def curve_table(points: Sequence[LearningPoint]) -> Table:
-    """Return a table of RMS position errors of held-out rows [mm] over the number of training rows."""
+    """Return a table of RMS position errors of held-out rows [mm] by number of training rows."""
     models = list(points[0].models)
     head = ["training rows", *(f"{name}, RMS [mm]" for name in models)]
     has_coverage = all(point.coverage is not None for point in points)

@@ -76,7 +76,7 @@ def draw_jigs(result: Result, path: Path) -> None:
 
 
 def draw_learning_curves(robots: Mapping[str, Result], path: Path) -> None:
-    """Draw the position errors of held-out rows over the number of training rows.
+    """Draw the position errors of held-out rows against the number of training rows.
 
     Args:
         robots: Results of hybrid recipes, by title.

@@ -43,7 +43,8 @@ def measured_sections(published: Published, results: StoredResults) -> list[str]
         pose_table({name: ErrorFigures.model_validate(figures[name]) for name in ("nominal", "corrected")}),
         published.notes["ur10_inverse"],
         picture(
-            LEARNING_CURVES, "position error of held-out rows over the number of training rows, three robots"
+            LEARNING_CURVES,
+            "position error of held-out rows against the number of training rows, three robots",
         ),
     ]
     for name, heading in HYBRIDS.items():

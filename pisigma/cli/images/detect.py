@@ -129,6 +129,6 @@ def _size_text(robot: str, size: "Mapping[str, float]") -> str:
         "" if square >= least else "; print a larger board, move the camera closer, or record more pixels"
     )
     return (
-        f"A fixed camera whose image of {size['image_height_px']:g} px covers the workspace of {robot} sees squares of "
-        f"{least:.0f} mm or more well; those of this board are {square:.0f} mm wide{advice}."
+        f"A fixed camera whose image of {size['image_height_px']:g} px covers the workspace of {robot} resolves "
+        f"squares of {least:.0f} mm or more; those of this board are {square:.0f} mm wide{advice}."
     )

@@ -218,7 +218,7 @@ def _settings_changed(facts: CellFacts, _: ModelEntry | None = None) -> Step | N
     last = _last_calibration(facts)
     if last is None or last.settings_sha256 in ("", facts.settings_sha256):
         return None
-    why = "the settings of the calibration in cell.yaml, or a file that they name, were changed after the last one"
+    why = "the settings of the calibration in cell.yaml, or a file that they name, changed after the last calibration"
     return Step("settings_changed", why, facts.command("calibrate"))
 
 

@@ -187,7 +187,7 @@ class ArmInSurroundings:
         return faults
 
     def _gaps(self, segments: Float64[Tensor, "poses pieces 2 3"]) -> dict[str, Float64[Tensor, " poses"]]:
-        """Return the distances between the links and every obstacle, minus the clearance [m], by reason."""
+        """Return the smallest distances minus the clearance [m], by reason why negative ones are refused."""
         clearance, radius = self.surroundings.clearance, self.capsules.radius
         infinite = segments.new_full((len(segments), 1), torch.inf)
         gaps = {

@@ -151,7 +151,7 @@ class ReportContent:
         rows: evaluated rows, or None.
         remarks: sentences about these rows.
         map: points of the error map.
-        dependences: errors over joint values, order, payload and temperature.
+        dependences: errors against joint values, order, payload and temperature.
         frames: errors per frame; empty if there is only one frame.
         targets: errors per target; empty if there is only one target.
         correlations: correlations of the parameters.

@@ -35,7 +35,7 @@ class ReportFigures:
 
     Attributes:
         map: error map from above and from the side.
-        dependences: errors over joint values, order, payload and temperature.
+        dependences: errors against joint values, order, payload and temperature.
         correlations: correlations of lengths and of angles.
         corrections: corrections of the joints.
         learning_curve: learning curve; empty if there is none.
@@ -84,7 +84,7 @@ def draw_dependence(dependence: Dependence) -> Drawing:
 
 
 def draw_correction(curve: CorrectionCurve) -> Drawing:
-    """Draw the correction of a joint over the value of this joint, with the measured range shaded."""
+    """Draw the correction of a joint against its value, with the measured range shaded."""
     with drawing_style():
         figure, axes = make_panel()
         for low, high in _stretches(curve.values, curve.measured):
@@ -130,7 +130,7 @@ def _correlations(title: str, table: Correlations) -> Drawing:
 
 
 def draw_learning_curve(points: Sequence[LearningPoint]) -> Drawing:
-    """Draw errors of held-out rows over the number of calibration rows, with logarithmic axes."""
+    """Draw errors of held-out rows against the number of calibration rows, with logarithmic axes."""
     with drawing_style():
         figure, axes = make_panel()
         rows = [point.rows for point in points]
@@ -145,7 +145,7 @@ def draw_learning_curve(points: Sequence[LearningPoint]) -> Drawing:
         axes.xaxis.set_minor_formatter(NullFormatter())
         _plain_log(axes)
         axes.legend()
-    alt = "RMS error of held-out rows over the number of calibration rows."
+    alt = "RMS error of held-out rows against the number of calibration rows."
     return Drawing("learning_curve", "learning curve", alt, figure)
 
 

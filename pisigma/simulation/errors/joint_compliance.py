@@ -48,7 +48,7 @@ class JointCompliance(AbstractJointSource):
         compliance_m_per_N: compliance by name of a prismatic joint [m/N].
         links: masses and centres of mass of links by row name.
         payload: mass and centre of mass of the payload.
-        gravity_m_per_s2: gravitational acceleration [m/s^2] in the frame of the first row (excluding `base`).
+        gravity_m_per_s2: gravitational acceleration [m/s^2] in the frame of the first DH row (excluding `base`).
     """
 
     kind: Literal["joint_compliance"]
@@ -85,7 +85,7 @@ def gravity_load(
         q: joint values [rad or m].
         links: masses by index of the row.
         payload: mass in the tool frame.
-        gravity: gravitational acceleration [m/s^2] in the frame of the first row.
+        gravity: gravitational acceleration [m/s^2] in the frame of the first DH row.
     """
     columns = q.reshape(-1, robot.dof).t().contiguous().unbind(0)
     geometry = Geometry(robot.dh.tolist(), [0.0] * 6, robot.tool.tolist())
@@ -114,6 +114,6 @@ def gravity_load(
 
 
 def _first_moment(mass: LinkMass, frame: Frame, q: Tensor) -> Float[Tensor, "poses 3"]:
-    """Return mass times centre of mass [kg m] in the frame of the first row."""
+    """Return mass times centre of mass [kg m] in the frame of the first DH row."""
     T = as_transform(frame, q.reshape(-1, q.shape[-1])[:, 0])
     return mass.mass_kg * (T @ q.new_tensor([*(value / 1e3 for value in mass.centre_mm), 1.0]))[:, :3]

@@ -90,7 +90,7 @@ def _pairs(tables: tuple[Correlations, ...]) -> tuple[tuple[str, str, float], ..
 
 @dataclass(frozen=True, eq=False)
 class CorrectionCurve:
-    """Learned correction of a joint over its value, with the other joints at the values of a measured row.
+    """Learned correction of a joint against its value, with the other joints at the values of a measured row.
 
     Attributes:
         joint: name of the joint.

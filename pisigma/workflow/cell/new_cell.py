@@ -164,7 +164,7 @@ def _copied(cameras: CameraFiles, folder: Path) -> dict[str, Any]:
     for path in cameras.files:
         if (folder / Path(path).name).exists() or Path(path).name == CELL_FILE:
             raise OutputError(
-                "expected different names for the files of a cell",
+                "expected unique names for the files of a cell",
                 value=Path(path).name,
                 at=Place(path),
                 remedy="rename one of them",

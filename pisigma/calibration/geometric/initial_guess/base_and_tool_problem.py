@@ -25,7 +25,7 @@ class BaseToolState:
         R_base: rotation of the base.
         p_base: position of the base [m].
         R_tool: rotation of the tool.
-        points: position of every target in the frame of the last row [m].
+        points: position of every target in the frame of the last DH row [m].
     """
 
     R_base: Float64[Tensor, "3 3"]
@@ -47,11 +47,11 @@ class BaseToolProblem(AbstractLeastSquares[BaseToolState]):
     """Least-squares problem of flange poses and measurements.
 
     The unknowns are the shift [m] and rotation [rad] of the base (about its origin, in the measuring frame), and the
-    points (3 per target) [m] and the rotation [rad] of the tool in the frame of the last row.
+    points (3 per target) [m] and the rotation [rad] of the tool in the frame of the last DH row.
 
     Attributes:
-        R_flange: rotations of the last row's frame in the first row's frame.
-        p_flange: positions of the last row's frame in the first row's frame [m].
+        R_flange: rotations of the last DH row's frame in the first DH row's frame.
+        p_flange: positions of the last DH row's frame in the first DH row's frame [m].
         position: measured positions [m].
         rotation: measured rotations; the identity in rows without one.
         rotated: mask of the rows with a measured rotation.
@@ -162,7 +162,7 @@ class BaseToolProblem(AbstractLeastSquares[BaseToolState]):
         )
 
     def _arm(self, state: BaseToolState) -> Tensor:
-        """Compute the positions of the targets in the first row's frame."""
+        """Compute the positions of the targets in the first DH row's frame."""
         return self.p_flange + (self.R_flange @ state.points[self.target, :, None])[..., 0]
 
     @cached_property

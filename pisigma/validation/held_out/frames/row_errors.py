@@ -76,8 +76,8 @@ def fitted_points_remark(measurements: Measurements) -> tuple[str, ...]:
     what = " and ".join(f"{len(group.owners)} {group.name}s" for group in groups)
     return (
         f"For every model, these rows are used to fit the positions of {what}: an error is the deviation of a row from "
-        "the other rows of its socket or anchor, corrected for the fitted parameters. It does not depend on the pose "
-        "of the robot's base.",
+        "the position fitted to all rows of its socket or anchor, corrected for the fitted parameters. It does not "
+        "depend on the pose of the robot's base.",
     )
 
 
