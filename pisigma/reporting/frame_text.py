@@ -172,6 +172,15 @@ def rotation_lines(summary: ArmsSummary) -> list[str]:
     ]
 
 
+def tip_lines(summary: ArmsSummary) -> list[str]:
+    """Return a sentence on every touching tip that was found together with the bases."""
+    return [
+        f"The tip '{one.name}' of '{one.arm}' is at {one.x_mm:.3f}, {one.y_mm:.3f}, {one.z_mm:.3f} mm on the last row "
+        f"(standard errors {', '.join(rounded(error, 0) for error in one.standard_errors)} mm)."
+        for one in summary.tips
+    ]
+
+
 def arms_text(
     summary: ArmsSummary,
     calibrations: Mapping[str, CalibrationSummary],
@@ -209,6 +218,7 @@ def arms_text(
         (
             table_block("bases of the arms relative to each other", BASE_COLUMNS, rows, "bases"),
             sentences("rotations", rotation_lines(summary)),
+            *((sentences("tips", tip_lines(summary)),) if summary.tips else ()),
             table_block("shared by the arms", ("kind", "name", "arms", "apart [mm]"), shared),
             sentences("agreement", [agreement]),
             sentences("arms", arms),

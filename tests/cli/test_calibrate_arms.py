@@ -14,7 +14,7 @@ import torch
 from click.testing import Result
 from testing.closeness import assert_close
 from testing.refusals import refused
-from testing.two_arms import BASES, UR5, measured_positions, pose_of
+from testing.two_arms import BASES, TIP, UR5, measured_positions, pose_of, touching_rows
 
 from pisigma.files.errors import (
     AcceptanceError,
@@ -37,9 +37,9 @@ from pisigma.workflow.arms.calibrate_arms import (
     FRAMES_FILE,
     Arm,
     ArmsCalibration,
-    arms_of_cell,
     calibrate_arms,
     calibrate_arms_of_cell,
+    posterior_of,
 )
 from pisigma.workflow.cell.transfer import upgrade
 from pisigma.workflow.settings.calibration import CalibrationSettings
@@ -186,36 +186,30 @@ def test_faulty_files_are_refused(calibrated, tmp_path, old, new, error, fields)
         calibrate_arms_of_cell(tmp_path)
 
 
-TORSO = """<robot name="torso"><link name="root"/><link name="chest"/>
-<joint name="waist" type="revolute"><origin xyz="0 0 0.5"/><parent link="root"/><child link="chest"/>
-<axis xyz="0 0 1"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint>
-"""
-
-
-def torso_with_arms() -> str:
-    """Return a URDF tree: a waist with a left and a right arm of two joints."""
-    text = TORSO
-    for side, y in (("left", 0.2), ("right", -0.2)):
-        parent = "chest"
-        for number in (1, 2):
-            link = f"{side}_{number}"
-            text += (
-                f'<link name="{link}"/><joint name="{link}_joint" type="revolute"><origin xyz="0.3 {y} 0"/>'
-                f'<parent link="{parent}"/><child link="{link}"/><axis xyz="0 1 0"/>'
-                '<limit lower="-1" upper="1" effort="1" velocity="1"/></joint>\n'
-            )
-            parent = link
-    return text + "</robot>\n"
-
-
-@pytest.mark.parametrize("robot", ["torso.urdf", "./torso.urdf"])
-def test_joint_of_two_arms_is_refused_unless_it_is_before_their_base(tmp_path, robot):
-    (tmp_path / "torso.urdf").write_text(torso_with_arms())
+def test_arms_that_touch_are_connected(tmp_path):
+    (tmp_path / "sessions").mkdir()
     lines = ["arms:"]
-    for side, file in (("left", "torso.urdf"), ("right", robot)):
-        lines.append(f"  {side}: {{robot: {file}, tip: {side}_2, sessions: [{side}.csv]}}")
-    (tmp_path / "cell.yaml").write_text("\n".join(lines))
-    with refused(PlanningError, value="waist", column="arms.right", line=3):
-        arms_of_cell(tmp_path)
-    (tmp_path / "cell.yaml").write_text("\n".join(lines).replace("tip", "base: chest, tip"))
-    assert [arm.name for arm in arms_of_cell(tmp_path)] == ["left", "right"]
+    for number, (name, frame) in enumerate((("left", "hall"), ("right", "jig"))):
+        measured_positions(number, 0, (frame,)).write_csv(tmp_path / "sessions" / f"{name}.csv", UR5)
+        touching_rows(number, 0, "tip").write_csv(tmp_path / "sessions" / f"{name}_touches.csv", UR5)
+        files = f"sessions: [sessions/{name}.csv], touches: [sessions/{name}_touches.csv]"
+        lines.append(f"  {name}: {{robot: ur5, {files}}}")
+    (tmp_path / "cell.yaml").write_text("\n".join([*lines, "calibrate: {model: geometric, folds: 0}"]))
+    found, folder = calibrate_arms_of_cell(tmp_path)
+    assert folder is not None
+    written = read_yaml(folder / FRAMES_FILE, ArmsSummary, PlanningError)
+    (base,) = written.bases
+    assert_close([base.x_mm, base.y_mm, base.z_mm], BASES[1][:3] * 1e3, atol=0.5)
+    assert [(one.kind, one.name) for one in written.shared] == [("touch", f"touch {k}") for k in range(20)]
+    for tip in written.tips:
+        assert_close([tip.x_mm, tip.y_mm, tip.z_mm], TIP[:3] * 1e3, atol=4 * max(tip.standard_errors))
+    assert found.trusted
+    assert [one["name"] for one in found.to_json()["tips"]] == ["tip", "tip"]
+
+
+def test_touch_without_name_or_standard_deviation_is_refused(disagreeing):
+    touching = touching_rows(0, 0)
+    unnamed = replace(touching, socket=("", *("" if touching.socket is None else touching.socket[1:])))
+    for rows in (unnamed, replace(touching, sigma_position=None)):
+        with refused(MeasurementError):
+            posterior_of(Arm("left", UR5, rows, QUICK, rows), disagreeing.calibrations["left"], ())

@@ -6,7 +6,7 @@ from functools import lru_cache
 import numpy as np
 import torch
 
-from pisigma.calibration.frames.shared_objects import ArmPosterior, uncertainty_of
+from pisigma.calibration.frames.shared_objects import ArmPosterior, Touches, uncertainty_of
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.calibration.geometric.result import CalibrationResult
 from pisigma.estimation.loss import SquaredLoss
@@ -21,6 +21,7 @@ FREE = ("theta_2", "theta_3", "theta_4", "theta_5")
 """Parameters of the arms that have errors: joint zeros."""
 NOISE = 5e-5
 TOOL = np.array([0.05, -0.03, 0.15, 0.0, 0.0, 0.0])
+TIP = np.array([-0.02, 0.04, 0.12, 0.0, 0.0, 0.0])
 BASES = (np.zeros(6), np.array([1.1, 0.1, 0.05, 2.8, 0.1, -0.2]))
 """Bases of the arms in the base of the first one."""
 FRAMES = {"hall": np.array([0.6, -0.5, 0.0, 0.4, 0.0, 0.1]), "jig": np.array([0.5, 0.3, 0.2, -0.3, 0.1, 0.0])}
@@ -64,13 +65,10 @@ def socket_positions(count: int) -> torch.Tensor:
     return torch.from_numpy(corner)
 
 
-def socket_rows(number: int, seed: int, sockets: int = 6, touches: int = 8) -> Measurements:
-    """Return joint values of an arm whose ball sits in sockets, each in several postures."""
-    rng = np.random.default_rng([seed, number, 2])
-    robot = true_arm(number, seed)
+def reached(number: int, robot: Robot, wanted: torch.Tensor, rng: np.random.Generator) -> torch.Tensor:
+    """Return joint values of an arm whose tool is at points in the base of the first arm, with noise."""
     there = invert(pose_of(BASES[number]))
-    points = socket_positions(sockets) @ there[:3, :3].mT + there[:3, 3]
-    wanted = points.repeat_interleave(touches, 0)
+    wanted = wanted @ there[:3, :3].mT + there[:3, 3]
     q = torch.from_numpy(np.array([0, -1.5, 1.5, 0, 1.5, 0]) + rng.uniform(-1, 1, (len(wanted), 6)))
     noise = torch.from_numpy(rng.normal(0, NOISE, wanted.shape))
     q[:, 0] = torch.atan2(wanted[:, 1], wanted[:, 0]) + np.pi
@@ -79,7 +77,34 @@ def socket_rows(number: int, seed: int, sockets: int = 6, touches: int = 8) -> M
         step = torch.linalg.pinv(J[:, :3]) @ (wanted + noise - T[:, :3, 3])[..., None]
         q = q + step[..., 0].clamp(-0.3, 0.3)
     assert float((forward_kinematics(robot, q)[:, :3, 3] - wanted - noise).norm(dim=1).max()) < 1e-9
+    return q
+
+
+def socket_rows(number: int, seed: int, sockets: int = 6, touches: int = 8) -> Measurements:
+    """Return joint values of an arm whose ball sits in sockets, each in several postures."""
+    rng = np.random.default_rng([seed, number, 2])
+    wanted = socket_positions(sockets).repeat_interleave(touches, 0)
+    q = reached(number, true_arm(number, seed), wanted, rng)
     return Measurements(q=q, socket=tuple(f"plate/{k}" for k in range(sockets) for _ in range(touches)))
+
+
+def touching_rows(number: int, seed: int, tip: str = "", touches: int = 20) -> Measurements:
+    """Return the rows of an arm in which its tip touched that of the other arm.
+
+    Args:
+        number: the arm.
+        seed: seed of the arms, as in `true_arm`.
+        tip: name of the tip, which is at `TIP`; "" for the target of the other rows, at `TOOL`.
+        touches: number of touches.
+    """
+    robot = true_arm(number, seed).with_geometry(tool=TIP if tip else TOOL)
+    q = reached(number, robot, socket_positions(touches), np.random.default_rng([seed, number, 4]))
+    return Measurements(
+        q=q,
+        socket=tuple(f"touch {k}" for k in range(touches)),
+        target=(tip,) * touches,
+        sigma_position=torch.full((touches,), NOISE, dtype=torch.float64),
+    )
 
 
 @lru_cache(maxsize=32)
@@ -93,9 +118,10 @@ def own_fit(number: int, seed: int, sensor: str) -> CalibrationResult:
     return GeometricCalibrator(UR5, free=FREE, prior=None, loss=SquaredLoss(), tool="position").fit(rows)
 
 
-def posterior(name: str, fit: CalibrationResult) -> ArmPosterior:
+def posterior(name: str, fit: CalibrationResult, touching: Measurements | None = None) -> ArmPosterior:
     """Return the posterior of an arm."""
-    return ArmPosterior(name, uncertainty_of(fit))
+    touches = None if touching is None else Touches.from_measurements(touching, touching.q)
+    return ArmPosterior(name, uncertainty_of(fit), touches)
 
 
 def posteriors(seed: int, sensor: str) -> tuple[ArmPosterior, ArmPosterior]:

@@ -1,6 +1,6 @@
 """Bases of several arms relative to each other, from what the fits of the arms have in common."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -9,24 +9,42 @@ from jaxtyping import Float64
 from scipy.stats import chi2
 from torch import Tensor
 
-from pisigma.calibration.frames.shared_objects import ArmPosterior, SharedObject, find_shared_objects
+from pisigma.calibration.frames.initial_bases import fitted_pose, in_base, initial_bases
+from pisigma.calibration.frames.shared_joints import (
+    axis_difference,
+    shared_count,
+    shared_counts,
+    stepped,
+    updated,
+    with_common_joints,
+)
+from pisigma.calibration.frames.shared_objects import (
+    JOINT,
+    TOUCH,
+    ArmPosterior,
+    SharedObject,
+    find_shared_objects,
+)
+from pisigma.calibration.frames.touch_equations import (
+    Tip,
+    TipPositions,
+    check_touches,
+    initial_tips,
+    tip_positions,
+    touch_equations,
+    touch_sigmas,
+)
 from pisigma.estimation.covariance_root import ConditionedUnknowns, condition_on_equalities
 from pisigma.files.errors import IdentificationError, Phrase
-from pisigma.robot.frame_fits import MeasuredPoses, best_base
-from pisigma.robot.se3 import (
-    invert,
-    pose_error,
-    rotation_from_vector,
-    transform,
-    transform_from_xyzrpy,
-)
+from pisigma.robot.se3 import invert, pose_error
 
 _CLOSURE = 1e-9
 """Standard deviation [m or rad] with which frames and points that two arms share are equated, for rounding errors."""
 _FALSE_ALARMS = 1e-4
 """Probability that arms without faults are reported to disagree."""
 MAX_ITERATIONS, _CONVERGENCE_TOLERANCE = 20, 1e-12
-_MIN_POINTS = 3
+_UNDETERMINED = 1e-5
+"""Ratio of the smallest to the largest singular value of equations that do not determine all bases and tips."""
 _COLLINEAR = 1e-3
 """Ratio of the second to the first singular value of points below which they lie on a line and determine no
 rotation."""
@@ -56,29 +74,35 @@ class ArmBases:
         arms: posteriors of the individually calibrated arms.
         shared: what the arms have in common.
         T_first_base: pose of every arm's base in the base of the first arm.
+        tips: positions of touching tips that no target of the rows is, on the last row of an arm [m].
         conditioned: the joint posterior; its x are shifts of the bases of all other arms along, and rotations about,
-            the axes of the first arm's base [m and rad], its z the directions of the roots of all arms.
+            the axes of the first arm's base [m and rad], followed by `tips`; its z the directions of the roots of all
+            arms.
         equations: per equation, the index of the shared object.
         distances: per shared object, the largest distance between its positions by two arms [m].
-        system: derivatives of the equations with respect to z and x, and their misclosure at z = 0.
+        system: derivatives of the equations with respect to z and x, their misclosure at z = 0, and their standard
+            deviations.
     """
 
     arms: tuple[ArmPosterior, ...]
     shared: tuple[SharedObject, ...]
     T_first_base: Float64[Tensor, "arms 4 4"]
+    tips: dict[Tip, Float64[Tensor, " 3"]]
     conditioned: ConditionedUnknowns
     equations: tuple[int, ...]
     distances: tuple[float, ...]
-    system: tuple[Tensor, Tensor, Tensor]
+    system: tuple[Tensor, Tensor, Tensor, Tensor]
 
     @property
     def covariance_root(self) -> Float64[Tensor, "arms 6 directions"]:
         """Root of the covariance of the bases, as shifts along and rotations about the axes of the first base."""
-        found = self.conditioned.x_root
+        found = self.conditioned.x_root[: 6 * (len(self.arms) - 1)]
         return torch.cat([found.new_zeros(6, found.shape[1]), found]).view(len(self.arms), 6, -1)
 
     def relative(self, first: int, second: int) -> tuple[Float64[Tensor, "4 4"], Float64[Tensor, "6 6"]]:
         """Return the base of an arm relative to that of another arm, with its covariance.
+
+        Arms of one torso have one base, see `updated_arms`.
 
         Args:
             first: index of the arm in whose base the pose is expressed.
@@ -88,6 +112,7 @@ class ArmBases:
             The pose, and the covariance of its shift along and rotation about the axes of the base of arm `first` [m
             and rad].
         """
+        first, second = (self.reference(number) for number in (first, second))
         T = invert(self.T_first_base[first]) @ self.T_first_base[second]
         away = self.T_first_base[second, :3, 3] - self.T_first_base[first, :3, 3]
         moved = self.covariance_root[second] - self.covariance_root[first]
@@ -97,6 +122,39 @@ class ArmBases:
         )
         turned = (self.T_first_base[first, :3, :3].mT @ moved.view(2, 3, -1)).flatten(0, 1)
         return T, turned @ turned.mT
+
+    def joints_in_common(self, first: int, second: int) -> int:
+        """Return the number of joints of a torso that two arms share."""
+        return shared_count(self.arms[first], self.arms[second])
+
+    def reference(self, number: int) -> int:
+        """Return the index of the arm whose base and shared joints an arm has."""
+        while (before := shared_counts(self.arms)[number][0]) != number:
+            number = before
+        return number
+
+    @cached_property
+    def updated_arms(self) -> tuple[ArmPosterior, ...]:
+        """The arms given all equations; those of a torso have one base and equal rows before the last shared joint."""
+        sizes = [arm.root.shape[1] for arm in self.arms]
+        parts = zip(
+            torch.split(self.conditioned.z, sizes),
+            torch.split(self.conditioned.z_root, sizes),
+            shared_counts(self.arms),
+            strict=True,
+        )
+        arms: list[ArmPosterior] = []
+        for number, (z, z_root, (before, count)) in enumerate(parts):
+            arm, own = self.arms[number], len(self.arms[number].space.parameters)
+            arm = updated(arm, arm.values + arm.root[:own] @ z, arm.root @ z_root)
+            if count:
+                root = self.reference(number)
+                T, steps = self.T_first_base, self.covariance_root
+                arm = with_common_joints(
+                    arm, arms[before], (T[number], T[root]), (steps[number], steps[root]), count
+                )
+            arms.append(arm)
+        return tuple(arms)
 
     @property
     def probability(self) -> float:
@@ -110,14 +168,14 @@ class ArmBases:
         if self.probability >= _FALSE_ALARMS:
             return ()
         found = []
-        B, G, r = self.system
+        B, G, r, closure = self.system
         number = torch.tensor(self.equations)
         for index, shared in enumerate(self.shared):
             others = number != index
             if int(torch.linalg.matrix_rank(G[others], rtol=_COLLINEAR)) < G.shape[1]:
                 drop, freedom = self.conditioned.misfit, self.conditioned.redundancy
             else:
-                left = condition_on_equalities(B[others], G[others], r[others], closures(others.sum()))
+                left = condition_on_equalities(B[others], G[others], r[others], closure[others])
                 drop = self.conditioned.misfit - left.misfit
                 freedom = self.conditioned.redundancy - left.redundancy
             probability = float(chi2.sf(drop, freedom))
@@ -126,16 +184,13 @@ class ArmBases:
         return tuple(sorted(found, key=lambda one: (one.probability, -one.distance)))
 
 
-def closures(count: int | Tensor) -> Float64[Tensor, " equations"]:
-    """Return the standard deviations of the equations."""
-    return torch.full((int(count),), _CLOSURE, dtype=torch.float64)
-
-
 def fit_arm_bases(arms: Sequence[ArmPosterior]) -> ArmBases:
     """Find the base of every arm in that of the first one, by equating what the arms have in common.
 
     The arms were calibrated independently of each other. Their joint posterior is the product of their individual
-    posteriors, given that every shared frame is one frame and every shared point is one point; the bases have no prior.
+    posteriors, given that every shared frame is one frame, every shared point is one point, every shared joint of a
+    torso has one axis, and the tips of two arms are at one point if they touch, except for the stated noise of the
+    touch; bases and unknown tips have no prior.
     The individual posteriors summarise the rows as normal distributions. The result therefore equals that of one
     least-squares fit to all rows with the noise and prior scales of the individual fits, to first order in the errors
     of the arms, and exactly if positions are linear in the parameters. The equations are linearised repeatedly until
@@ -148,34 +203,67 @@ def fit_arm_bases(arms: Sequence[ArmPosterior]) -> ArmBases:
         arms: two or more arms.
 
     Raises:
-        IdentificationError: the shared frames and points do not connect all arms.
+        IdentificationError: the shared frames, points and touches do not determine the bases of all arms, or a touch is
+            not one row of each of two arms.
     """
+    check_touches(arms)
     shared = find_shared_objects(arms)
-    T = torch.stack(list(_start(arms, shared)))
+    touches = [one for one in shared if one.kind == TOUCH]
+    others, tips = shared[: len(shared) - len(touches)], initial_tips(arms)
+    T = torch.stack(list(initial_bases(arms, shared, tip_positions(arms, tips))))
     z = [torch.zeros(arm.root.shape[1], dtype=torch.float64) for arm in arms]
+    closed = [_CLOSURE] * sum(_count(arms, one) for one in others)
+    closure = torch.tensor([*closed, *(sigma for sigma in touch_sigmas(arms, touches) for _ in range(3))]).to(
+        T
+    )
     for _ in range(MAX_ITERATIONS):
-        B, G, closed = _linearised(arms, shared, T, z)
-        r = B @ torch.cat(z) - closed
-        found = condition_on_equalities(B, G, r, closures(len(r)))
-        step = found.x.view(-1, 6)
-        T = torch.cat([T[:1], _moved(T[1:], step)])
+        B, G, missed = _linearised(arms, others, T, z)
+        more = touch_equations(arms, touches, T, tips, z)
+        G = torch.nn.functional.pad(G, (0, 3 * len(tips)))
+        B, G, missed = (torch.cat(pair) for pair in zip((B, G, missed), more, strict=True))
+        _check_rank(arms, shared, G)
+        r = B @ torch.cat(z) - missed
+        found = condition_on_equalities(B, G, r, closure)
+        step, moved = found.x[: 6 * (len(arms) - 1)].view(-1, 6), found.x[6 * (len(arms) - 1) :].view(-1, 3)
+        T = torch.cat([T[:1], stepped(T[1:], step)])
+        tips = {name: tip + one for (name, tip), one in zip(tips.items(), moved, strict=True)}
         z = list(torch.split(found.z, [len(one) for one in z]))
-        if float(step.abs().max()) < _CONVERGENCE_TOLERANCE:
+        if float(found.x.abs().max()) < _CONVERGENCE_TOLERANCE:
             break
     numbers = tuple(number for number, one in enumerate(shared) for _ in range(_count(arms, one)))
-    distances = tuple(_distance(arms, one, T) for one in shared)
-    return ArmBases(tuple(arms), shared, T, found, numbers, distances, (B, G, r))
+    there = tip_positions(arms, tips)
+    distances = tuple(_distance(arms, one, T, there) for one in shared)
+    return ArmBases(tuple(arms), shared, T, tips, found, numbers, distances, (B, G, r, closure))
 
 
-def _moved(T: Float64[Tensor, "*batch 4 4"], step: Float64[Tensor, "*batch 6"]) -> Tensor:
-    """Return poses that are shifted along and rotated about the axes of their frame, in place."""
-    R = rotation_from_vector(step[..., 3:]) @ T[..., :3, :3]
-    return transform(R, T[..., :3, 3] + step[..., :3])
+def _check_rank(arms: Sequence[ArmPosterior], shared: Sequence[SharedObject], G: Tensor) -> None:
+    """Refuse equations that do not determine all bases and tips.
+
+    Raises:
+        IdentificationError: G does not have full column rank.
+    """
+    if int(torch.linalg.matrix_rank(G, rtol=_UNDETERMINED)) < G.shape[1]:
+        raise IdentificationError(
+            expected=f"shared frames, points and touches that determine the bases of {', '.join(a.name for a in arms)}",
+            value=Phrase(f"{len(shared)} that leave a direction open"),
+            remedy="touch at points that are not on one line, with different orientations of both arms if their tips "
+            "are unknown",
+        )
 
 
 def _count(arms: Sequence[ArmPosterior], one: SharedObject) -> int:
     """Return the number of equations of a shared object: one per parameter and further arm."""
+    if one.kind == TOUCH:
+        return 3
+    if one.kind == JOINT:
+        return (4 if _is_revolute(arms, one) else 2) * (len(one.arms) - 1)
     return len(arms[one.arms[0]].shared_objects[one.key][1]) * (len(one.arms) - 1)
+
+
+def _is_revolute(arms: Sequence[ArmPosterior], one: SharedObject) -> bool:
+    """Return whether a shared joint is revolute."""
+    rows = arms[one.arms[0]].space.robot.rows
+    return next(row.type == "revolute" for row in rows if row.name == one.name)
 
 
 def _used(arms: Sequence[ArmPosterior], shared: Sequence[SharedObject]) -> list[list[int]]:
@@ -184,20 +272,8 @@ def _used(arms: Sequence[ArmPosterior], shared: Sequence[SharedObject]) -> list[
     for one in shared:
         for number in one.arms:
             frame, rows = arms[number].shared_objects[one.key]
-            used[number] |= {*rows, *arms[number].base_rows(frame)}
+            used[number] |= {*rows, *(() if one.kind == JOINT else arms[number].base_rows(frame))}
     return [sorted(rows) for rows in used]
-
-
-def _in_base(
-    arm: ArmPosterior, key: tuple[str, str], values: Callable[[Sequence[int]], Tensor]
-) -> tuple[Tensor, Tensor]:
-    """Return the pose of a shared object in the base of an arm, and the other unknowns of its sensor."""
-    frame, rows = arm.shared_objects[key]
-    T_base_frame = invert(transform_from_xyzrpy(values(arm.base_rows(frame))))
-    if key[0] == "frame":
-        return T_base_frame, values(())
-    point = transform(torch.eye(3, dtype=torch.float64), values(rows[:3]))
-    return T_base_frame @ point, values(rows[3:])
 
 
 def _linearised(
@@ -206,7 +282,7 @@ def _linearised(
     T: Float64[Tensor, "arms 4 4"],
     z: Sequence[Tensor],
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return derivatives of all equations with respect to z and the steps of the bases, and their values."""
+    """Return derivatives of the equations of frames and points with respect to z and bases, and their values."""
     used = _used(arms, shared)
     roots = [arm.root[rows] for arm, rows in zip(arms, used, strict=True)]
     now = [arm.values[rows] + R @ one for arm, rows, R, one in zip(arms, used, roots, z, strict=True)]
@@ -215,9 +291,9 @@ def _linearised(
 
     def equations(unknowns: Tensor) -> Tensor:
         steps = unknowns[sum(sizes) :].view(-1, 6)
-        bases = torch.cat([T[:1], _moved(T[1:], steps)])
+        bases = torch.cat([T[:1], stepped(T[1:], steps)])
         parts = torch.split(unknowns[: sum(sizes)], sizes)
-        return torch.cat(list(_equations(arms, shared, bases, parts, places)))
+        return torch.cat([unknowns[:0], *_equations(arms, shared, bases, parts, places)])
 
     at = torch.cat([*now, torch.zeros(6 * (len(arms) - 1), dtype=torch.float64)])
     J = torch.func.jacrev(equations)(at)
@@ -241,66 +317,25 @@ def _equations(
             def values(rows: Sequence[int], number: int = number) -> Tensor:
                 return parts[number][[places[number][row] for row in rows]]
 
-            pose, more = _in_base(arms[number], one.key, values)
+            pose, more = in_base(arms[number], one.key, values)
             seen.append((bases[number] @ pose, more))
         for pose, more in seen[1:]:
+            if one.kind == JOINT:
+                yield axis_difference(seen[0][0], pose, _is_revolute(arms, one))
+                continue
             error = pose_error(pose, seen[0][0])
             yield torch.cat([error if one.kind == "frame" else error[:3], more - seen[0][1]])
 
 
-def _pose(arm: ArmPosterior, key: tuple[str, str]) -> Float64[Tensor, "4 4"]:
-    """Return the pose of a shared object in the base of an arm, according to the fit of this arm."""
-    return _in_base(arm, key, lambda rows: arm.values[list(rows)])[0]
-
-
-def _distance(arms: Sequence[ArmPosterior], one: SharedObject, T: Float64[Tensor, "arms 4 4"]) -> float:
+def _distance(
+    arms: Sequence[ArmPosterior],
+    one: SharedObject,
+    T: Float64[Tensor, "arms 4 4"],
+    tips: Sequence[TipPositions | None],
+) -> float:
     """Return the largest distance between the positions of a shared object by the fits of two arms [m]."""
-    there = torch.stack([(T[number] @ _pose(arms[number], one.key))[:3, 3] for number in one.arms])
-    return float(torch.cdist(there, there).max())
-
-
-def _start(arms: Sequence[ArmPosterior], shared: Sequence[SharedObject]) -> list[Float64[Tensor, "4 4"]]:
-    """Return a base for every arm, from a frame shared with an earlier arm, or else from shared points."""
-    placed = {0: torch.eye(4, dtype=torch.float64)}
-    while len(placed) < len(arms):
-        for number in range(len(arms)):
-            if number in placed:
-                continue
-            found = _place(arms, shared, placed, number)
-            if found is not None:
-                placed[number] = found
-                break
-        else:
-            lost = [arm.name for number, arm in enumerate(arms) if number not in placed]
-            raise IdentificationError(
-                expected=f"a frame, or {_MIN_POINTS} sockets or anchors that are not on one line, that arm "
-                f"'{lost[0]}' shares with the other arms",
-                value=Phrase(", ".join(f"{one.kind} '{one.name}'" for one in shared) or "none"),
-                remedy="name the same board, jig or instrument in the column 'frame' of the rows of both arms, or the "
-                "same sockets in the column 'socket'",
-            )
-    return [placed[number] for number in range(len(arms))]
-
-
-def _place(
-    arms: Sequence[ArmPosterior], shared: Sequence[SharedObject], placed: dict[int, Tensor], number: int
-) -> Float64[Tensor, "4 4"] | None:
-    """Return the base of an arm from what it shares with arms of known bases; None if this does not determine it."""
-    wanted, own = [], []
-    for one in shared:
-        known = [other for other in one.arms if other in placed]
-        if number not in one.arms or not known:
-            continue
-        there = placed[known[0]] @ _pose(arms[known[0]], one.key)
-        mine = _pose(arms[number], one.key)
-        if one.kind == "frame":
-            return there @ invert(mine)
-        wanted.append(there[:3, 3])
-        own.append(mine)
-    if len(own) < _MIN_POINTS:
-        return None
-    points = torch.stack(wanted)
-    spread = torch.linalg.svdvals(points - points.mean(0))
-    if spread[1] <= _COLLINEAR * spread[0]:
-        return None
-    return best_base(torch.stack(own), MeasuredPoses.from_tensors(points, None, 0.0))
+    poses = torch.stack([T[number] @ fitted_pose(arms, number, one, tips) for number in one.arms])
+    if one.kind == JOINT:
+        apart = [axis_difference(poses[0], pose, True)[2:].norm() for pose in poses]
+        return float(max(apart)) if _is_revolute(arms, one) else 0.0
+    return float(torch.cdist(poses[:, :3, 3], poses[:, :3, 3]).max())

@@ -1,10 +1,11 @@
-"""What the fits of several arms have in common: frames, sockets and anchors with the same name."""
+"""What the fits of several arms have in common: frames, sockets and anchors with the same name, and touches."""
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
+import numpy as np
 import torch
 from jaxtyping import Float64
 from torch import Tensor
@@ -13,9 +14,61 @@ from pisigma.calibration.geometric.problem.parameters import ParameterSpace
 from pisigma.calibration.geometric.result import CalibrationResult
 from pisigma.calibration.hybrid.uncertainty import PositionUncertainty
 from pisigma.estimation.covariance_root import CovarianceRoot
+from pisigma.measurement.conditions import JointState
+from pisigma.measurement.dataset import Measurements
+from pisigma.robot.kinematics.forward import forward_kinematics
+from pisigma.robot.se3 import transform_from_xyzrpy
 
+TOUCH, JOINT = "touch", "joint"
+"""Kinds of objects that arms share if the tip of one touches that of another, and if they are on one torso."""
 _DETERMINED = 1e-6
 """Ratio of the smallest to the largest standard deviation of a base's directions below which one was not estimated."""
+
+
+@dataclass(frozen=True, eq=False)
+class Postures:
+    """Postures of an arm.
+
+    Attributes:
+        state: commanded joint values and stated conditions.
+        q_moved: joint values with their corrections [rad or m].
+    """
+
+    state: JointState
+    q_moved: Float64[Tensor, "postures dof"]
+
+    def __getitem__(self, chosen: Tensor) -> "Postures":
+        """Return the postures that a mask selects."""
+        return Postures(self.state[chosen], self.q_moved[chosen])
+
+
+@dataclass(frozen=True, eq=False)
+class Touches:
+    """Rows of an arm whose tip touched that of another arm.
+
+    Attributes:
+        names: name of every touch; the row of the other arm has the same name.
+        tips: name of the tip of every touch, as in the column `target`.
+        sigma: standard deviation of every touch along an axis [m].
+        postures: the postures.
+    """
+
+    names: tuple[str, ...]
+    tips: tuple[str, ...]
+    sigma: Float64[Tensor, " touches"]
+    postures: Postures
+
+    @staticmethod
+    def from_measurements(rows: Measurements, q_moved: Float64[Tensor, "rows dof"]) -> "Touches":
+        """Return the touches in rows with `socket`, `target` and `sigma_position`."""
+        assert rows.socket is not None
+        assert rows.sigma_position is not None
+        return Touches(
+            rows.socket,
+            rows.target,
+            rows.sigma_position,
+            Postures(JointState.from_measurements(rows), q_moved),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,10 +79,14 @@ class ArmPosterior:
         name: name of the arm.
         uncertainty: its parameters, with the bases of its measuring frames and the unknowns of its sensors, and the
             weights of its joint correction.
+        touches: its touches with other arms; None without any.
+        torso: names of its first joints, which it shares with other arms of one torso.
     """
 
     name: str
     uncertainty: PositionUncertainty
+    touches: Touches | None = None
+    torso: tuple[str, ...] = ()
 
     @property
     def space(self) -> ParameterSpace:
@@ -55,11 +112,14 @@ class ArmPosterior:
     def shared_objects(self) -> dict[tuple[str, str], tuple[str, tuple[int, ...]]]:
         """Frame and parameter indices of everything that another arm could also have measured.
 
-        These are named frames in which the base was calibrated, and points at positions that were estimated: sockets
-        and anchors. For a frame, the parameters are those of the base. A base is not shared if the rows did not
+        These are joints of a torso, named frames in which the base was calibrated, and points at positions that were
+        estimated: sockets and anchors. For a joint, the parameters are those of the rows before it; for a frame, those
+        of the base. A base is not shared if the rows did not
         determine one of its directions, because such a direction keeps its previous value and has no covariance.
         """
-        found = {
+        names = [row.name for row in self.space.robot.rows]
+        found = {(JOINT, name): ("", tuple(range(5 * names.index(name)))) for name in self.torso}
+        found |= {
             ("frame", frame): (frame, tuple(self.base_rows(frame)))
             for frame in self.space.frames
             if frame and is_determined(self.root[list(self.base_rows(frame))])
@@ -71,6 +131,42 @@ class ArmPosterior:
                 if group.has_point and bool(self.root[list(rows)].any()):
                     found[group.name, owner] = frame, rows
         return found
+
+    @property
+    def objects(self) -> tuple[tuple[str, str], ...]:
+        """Kind and name of everything that another arm could also have measured or touched."""
+        touched = () if self.touches is None else self.touches.names
+        return (*self.shared_objects, *((TOUCH, name) for name in touched))
+
+    @property
+    def unknown_tips(self) -> tuple[str, ...]:
+        """Names of the touching tips that are not targets of the arm's own rows."""
+        tips = () if self.touches is None else dict.fromkeys(self.touches.tips)
+        return tuple(tip for tip in tips if tip not in self.space.targets)
+
+    def positions_in_base(
+        self, postures: Postures, target: str | None = None, tip: Float64[Tensor, " 3"] | None = None
+    ) -> tuple[Float64[Tensor, "postures 4 4"], Float64[Tensor, "postures 3 unknowns"]]:
+        """Return poses of a tool in the base of the arm, and the derivatives of its positions.
+
+        Args:
+            postures: the postures.
+            target: name of the target on the tool; None for the first one.
+            tip: position of a tip on the last row instead of a target [m].
+        """
+        known = self.uncertainty
+        number = 0 if target is None or tip is not None else self.space.targets.index(target)
+        tools = dict(known.geometry.tools)
+        if tip is not None:
+            tools[self.space.targets[0]] = np.array([*tip.tolist(), 0.0, 0.0, 0.0])
+            known = replace(known, geometry=replace(known.geometry, tools=tools))
+        columns = known.columns(postures.state, postures.q_moved, target=number)[:, :3].clone()
+        base, tool = self.space.indices_of("base"), self.space.indices_of("tool")
+        columns[..., base.start : base.stop if tip is None else tool.stop] = 0.0
+        robot = known.geometry.robot
+        T_base = transform_from_xyzrpy(torch.from_numpy(robot.base.copy()))
+        bare = robot.with_geometry(base=np.zeros(6), tool=tools[self.space.targets[number]])
+        return forward_kinematics(bare, postures.q_moved), T_base[:3, :3].mT @ columns
 
 
 def is_determined(root: Float64[Tensor, "6 directions"]) -> bool:
@@ -86,7 +182,7 @@ class SharedObject:
     """A frame or a point that several arms measured.
 
     Attributes:
-        kind: "frame" or the group of the sensor's unknowns, such as "socket".
+        kind: "joint", "frame", the group of the sensor's unknowns, such as "socket", or "touch".
         name: its name in the rows of all these arms.
         arms: indices of the arms.
     """
@@ -102,13 +198,13 @@ class SharedObject:
 
 
 def find_shared_objects(arms: Sequence[ArmPosterior]) -> tuple[SharedObject, ...]:
-    """Return what two or more arms measured under one name: frames in which they are calibrated, and points."""
-    keys = dict.fromkeys(itertools.chain.from_iterable(arm.shared_objects for arm in arms))
-    found = (
-        SharedObject(*key, tuple(k for k, arm in enumerate(arms) if key in arm.shared_objects))
-        for key in keys
-    )
-    return tuple(one for one in found if len(one.arms) > 1)
+    """Return what two or more arms measured under one name: frames in which they are calibrated, points, and touches.
+
+    Touches are last.
+    """
+    keys = dict.fromkeys(itertools.chain.from_iterable(arm.objects for arm in arms))
+    found = (SharedObject(*key, tuple(k for k, arm in enumerate(arms) if key in arm.objects)) for key in keys)
+    return tuple(sorted((one for one in found if len(one.arms) > 1), key=lambda one: one.kind == TOUCH))
 
 
 def uncertainty_of(result: CalibrationResult) -> PositionUncertainty:

@@ -1,29 +1,13 @@
 """Uncertainty of the position of one arm's tool relative to that of another arm."""
 
-from dataclasses import dataclass
-
 import torch
 from jaxtyping import Float64
 from torch import Tensor
 
 from pisigma.calibration.frames.arm_bases import ArmBases
-from pisigma.calibration.hybrid.uncertainty import PositionUncertainty
+from pisigma.calibration.frames.shared_objects import Postures
 from pisigma.measurement.conditions import JointState
-from pisigma.robot.kinematics.forward import forward_kinematics
-from pisigma.robot.se3 import invert, skew, transform_from_xyzrpy
-
-
-@dataclass(frozen=True, eq=False)
-class Postures:
-    """Postures of an arm.
-
-    Attributes:
-        state: commanded joint values and stated conditions.
-        q_moved: joint values with their corrections [rad or m].
-    """
-
-    state: JointState
-    q_moved: Float64[Tensor, "postures dof"]
+from pisigma.robot.se3 import skew
 
 
 def tool_to_tool_deviation(bases: ArmBases, first: int, second: int, postures: tuple[Postures, ...]) -> float:
@@ -35,32 +19,26 @@ def tool_to_tool_deviation(bases: ArmBases, first: int, second: int, postures: t
         bases: the arms.
         first: number of an arm.
         second: number of the other arm.
-        postures: postures of every arm; the n-th postures of both arms form a pair.
+        postures: postures of every arm; the n-th postures of both arms form a pair, in which the shared joints of a
+            torso have the values of the first arm.
     """
-    moved = [_tool_root(bases, number, postures[number]) for number in (first, second)]
-    count = min(map(len, moved))
-    return float((moved[1][:count] - moved[0][:count]).square().sum((1, 2)).mean().sqrt())
+    count = min(len(postures[number].q_moved) for number in (first, second))
+    one, other = (postures[number][torch.arange(count)] for number in (first, second))
+    shared = bases.joints_in_common(first, second)
+    q, moved = other.state.q.clone(), other.q_moved.clone()
+    q[:, :shared], moved[:, :shared] = one.state.q[:, :shared], one.q_moved[:, :shared]
+    other = Postures(JointState(q, other.state.stated), moved)
+    apart = _tool_root(bases, second, other) - _tool_root(bases, first, one)
+    return float(apart.square().sum((1, 2)).mean().sqrt())
 
 
 def _tool_root(bases: ArmBases, number: int, postures: Postures) -> Float64[Tensor, "postures 3 directions"]:
     """Return a root of the covariance of the positions of a tool in the base of the first arm."""
-    known = bases.arms[number].uncertainty
-    sizes = [arm.root.shape[1] for arm in bases.arms]
-    root = bases.arms[number].root @ torch.split(bases.conditioned.z_root, sizes)[number]
-    in_base = _own_columns(known, postures) @ root
+    arm = bases.arms[number]
+    sizes = [one.root.shape[1] for one in bases.arms]
+    T, columns = arm.positions_in_base(postures)
+    in_base = columns @ (arm.root @ torch.split(bases.conditioned.z_root, sizes)[number])
     R = bases.T_first_base[number, :3, :3]
-    T = forward_kinematics(known.geometry.robot, postures.q_moved)
-    T_base = transform_from_xyzrpy(torch.from_numpy(known.geometry.robot.base.copy()))
-    away = (R @ (invert(T_base) @ T)[:, :3, 3, None])[..., 0]
+    away = (R @ T[:, :3, 3, None])[..., 0]
     shift, turn = bases.covariance_root[number, :3], bases.covariance_root[number, 3:]
     return R @ in_base + shift - skew(away) @ turn
-
-
-def _own_columns(known: PositionUncertainty, postures: Postures) -> Float64[Tensor, "postures 3 unknowns"]:
-    """Return the derivatives of the positions of the first tool in the base of its arm."""
-    columns = known.columns(postures.state, postures.q_moved)[:, :3].clone()
-    base = known.space.indices_of("base")
-    columns[..., base.start : base.stop] = 0.0
-    T_base = transform_from_xyzrpy(torch.from_numpy(known.geometry.robot.base.copy()))
-    turned: Tensor = T_base[:3, :3].mT @ columns
-    return turned

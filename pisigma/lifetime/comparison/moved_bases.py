@@ -85,11 +85,11 @@ class ArmBefore:
 
 @dataclass(frozen=True, eq=False)
 class MovedBody:
-    """An arm or a frame that may have moved.
+    """An arm, a frame, or the zero of the first joint of a torso that may have moved.
 
     Attributes:
-        kind: "arm" (its base) or "frame".
-        name: name of the arm or frame.
+        kind: "arm" (its base, or the one base of the arms of a torso), "frame" or "joint" (its zero).
+        name: name of the arm (the first one of a torso), frame or joint.
         shift: shift of the origin along the axes of the first arm's base [m].
         rotation: rotation about these axes [rad].
         covariance: covariance of both [m and rad].
@@ -110,19 +110,24 @@ class MovedBases:
 
     Attributes:
         probability: probability of differences this large if nothing moved.
-        bodies: arms and frames, best explanation first, each as if only it had moved.
+        bodies: arms, frames and joints, best explanation first, each as if only it had moved.
         is_one_body: whether the motion of the first body explains the differences; otherwise more than one body moved.
+        joint: the joint whose zero alone explains the differences as well as the motion of a body; None if there is
+            none.
     """
 
     probability: float
     bodies: tuple[MovedBody, ...]
     is_one_body: bool
+    joint: MovedBody | None = None
 
     @cached_property
     def likely_bodies(self) -> tuple[MovedBody, ...]:
         """The body whose motion explains the differences best; several if these cannot be distinguished, or none."""
         if self.probability >= _FALSE_ALARMS:
             return ()
+        if self.joint is not None:
+            return (self.joint,)
         best = self.bodies[0].log_likelihood
         return tuple(one for one in self.bodies if one.log_likelihood > best - _CERTAIN)
 
@@ -132,8 +137,10 @@ def find_moved_bases(arms: Sequence[ArmBefore]) -> MovedBases:
 
     The current bases are fitted with the arms as calibrated. Errors of an arm shift its base equally before and now, so
     they cancel, which the covariance takes into account. Under every hypothesis, one body moved by an unknown rigid
-    motion. The noise is estimated from few rows, so differences are compared with an F distribution with the degrees of
-    freedom of this estimate.
+    motion; the arms of a torso have one base. A new zero of the first joint of a torso is a rotation of this base about
+    the axis of the joint, and is named if the other five directions of a rigid motion explain no more. The noise is
+    estimated from few rows, so differences are compared with an F distribution with the degrees of freedom of this
+    estimate.
 
     Args:
         arms: the arms, each now measured in one or more of its previous frames.
@@ -162,16 +169,28 @@ def find_moved_bases(arms: Sequence[ArmBefore]) -> MovedBases:
     freedom = min(arm.degrees_of_freedom for arm in arms)
     square = float(white.square().sum())
     probability = float(fisher.sf(square / len(y), len(y), freedom))
+    torso = {
+        name: arm.posterior.torso[0] for arm in arms for name in (arm.posterior.name,) if arm.posterior.torso
+    }
+    first = {joint: name for name, joint in reversed(torso.items())}
     bodies = [
         _if_moved(arms, owners, body, L, white)
         for body in dict.fromkeys(
-            [("arm", arm.posterior.name) for arm in arms] + [("frame", frame) for _, frame in owners]
+            [("arm", first.get(torso.get(arm.posterior.name, ""), arm.posterior.name)) for arm in arms]
+            + [("frame", frame) for _, frame in owners]
+            + [("joint", joint) for joint in first]
         )
     ]
     bodies.sort(key=lambda one: -one.log_likelihood)
     rest, count = square - 2 * bodies[0].log_likelihood, len(y) - 6
     is_one = count == 0 or float(fisher.sf(rest / count, count, freedom)) >= _FALSE_ALARMS
-    return MovedBases(probability, tuple(bodies), is_one)
+    gains = [
+        (2 * (bodies[0].log_likelihood - one.log_likelihood) / 5, one)
+        for one in bodies
+        if one.kind == "joint"
+    ]
+    joints = [one for gain, one in gains if is_one and float(fisher.sf(gain, 5, freedom)) >= _FALSE_ALARMS]
+    return MovedBases(probability, tuple(bodies), is_one, joints[0] if joints else None)
 
 
 def _joint_covariance(
@@ -195,19 +214,25 @@ def _if_moved(
 ) -> MovedBody:
     """Return the motion of a body if only this body moved; the arms see the opposite motion of a frame."""
     kind, name = body
+    moving = [arms[number].posterior for number, _ in owners]
+    same = next((arm.torso[0] for arm in moving if arm.torso and name in (arm.name, arm.torso[0])), "")
     signs = [
-        (1.0 if arms[number].posterior.name == name else 0.0)
-        if kind == "arm"
-        else (-1.0 if frame == name else 0.0)
-        for number, frame in owners
+        (-1.0 if frame == name else 0.0)
+        if kind == "frame"
+        else float(arm.name == name or same in arm.torso[:1])
+        for arm, (_, frame) in zip(moving, owners, strict=True)
     ]
     eye = torch.eye(6, dtype=torch.float64)
-    G = torch.linalg.solve_triangular(L, torch.cat([sign * eye for sign in signs]), upper=False)
+    origin = _origin(arms, owners, body)
+    along = eye
+    if kind == "joint":
+        axis = next(arm.T_first_base[:3, 2] for arm in arms if name in arm.posterior.torso)
+        along = torch.cat([torch.linalg.cross(origin, axis), axis])[:, None]
+    G = torch.linalg.solve_triangular(L, torch.cat([sign * along for sign in signs]), upper=False)
     Q, R = torch.linalg.qr(G)
     explained = Q.mT @ white
-    inverse = torch.linalg.inv(R)
+    inverse = along @ torch.linalg.inv(R)
     motion = inverse @ explained
-    origin = _origin(arms, owners, body)
     turn = rotation_from_vector(motion[3:])
     J = eye.clone()
     J[:3, 3:] = -skew(origin)
@@ -224,8 +249,8 @@ def _origin(
 ) -> Float64[Tensor, " 3"]:
     """Return the origin of an arm's base or of a frame in the base of the first arm [m]."""
     kind, name = body
-    if kind == "arm":
-        arm = next(arm for arm in arms if arm.posterior.name == name)
+    if kind != "frame":
+        arm = next(arm for arm in arms if name in (arm.posterior.name, *arm.posterior.torso))
         return arm.T_first_base[:3, 3]
     arm = next(arms[number] for number, frame in owners if frame == name)
     before = arm.posterior.values[list(arm.posterior.base_rows(name))]

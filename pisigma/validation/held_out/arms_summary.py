@@ -4,14 +4,17 @@ import math
 from typing import Any
 
 import numpy as np
+import torch
 
 from pisigma.calibration.frames.arm_bases import ArmBases, Disagreement
-from pisigma.calibration.frames.tool_to_tool import Postures, tool_to_tool_deviation
+from pisigma.calibration.frames.shared_objects import TOUCH, Postures
+from pisigma.calibration.frames.tool_to_tool import tool_to_tool_deviation
 from pisigma.calibration.geometric.result import CalibrationResult
 from pisigma.files.yaml_file import Section
 from pisigma.robot.se3 import xyzrpy_from_transform
 from pisigma.validation.held_out.diagnostic import Diagnostic
 
+Three = tuple[float, float, float]
 Six = tuple[float, float, float, float, float, float]
 
 
@@ -48,14 +51,14 @@ class ArmBaseFigures(Section):
 
 
 class SharedFigures(Section):
-    """A frame or point that several arms measured under one name.
+    """A frame or point that several arms measured under one name, or a touch of two arms.
 
     Attributes:
-        kind: "frame", "socket" or "anchor".
+        kind: "joint" (of a torso), "frame", "socket", "anchor" or "touch".
         name: its name.
         arms: names of the arms.
-        distance_mm: largest distance between its positions according to two arms [mm]; 0 if it only served to determine
-            the bases.
+        distance_mm: largest distance between its positions (of a joint, between its axes) according to two arms [mm]; 0
+            if it only served to determine the bases.
     """
 
     kind: str
@@ -64,17 +67,39 @@ class SharedFigures(Section):
     distance_mm: float
 
 
+class TipFigures(Section):
+    """A touching tip that no target of the arm's own rows is.
+
+    Attributes:
+        arm: name of the arm.
+        name: its name in the column `target`.
+        x_mm: position on the last row of the arm along x [mm].
+        y_mm: position along y [mm].
+        z_mm: position along z [mm].
+        standard_errors: standard errors of x, y, z [mm].
+    """
+
+    arm: str
+    name: str
+    x_mm: float
+    y_mm: float
+    z_mm: float
+    standard_errors: Three
+
+
 class ModelFile(Section):
     """Model folder of an arm.
 
     Attributes:
         name: name of the arm and of its folder next to `frames.yaml`.
         robot: name of the robot.
+        torso: first joints of the arm, which it shares with other arms of one torso.
         sha256: hash of the folder, see `pisigma.files.model_files.model_hash`; empty before it is written.
     """
 
     name: str
     robot: str
+    torso: tuple[str, ...] = ()
     sha256: str = ""
 
 
@@ -85,6 +110,7 @@ class ArmsSummary(Section):
         arms: the arms with their models.
         bases: base of every arm relative to that of every arm listed before it.
         shared: objects that the arms share.
+        tips: touching tips that no target of the rows is.
         misfit: sum of the squared differences between the arms in units of their standard deviations.
         redundancy: number of independent differences that the bases do not absorb.
         probability: probability of a larger misfit of arms without faults.
@@ -98,6 +124,7 @@ class ArmsSummary(Section):
     misfit: float
     redundancy: int
     probability: float
+    tips: tuple[TipFigures, ...] = ()
     diagnostics: tuple[Diagnostic, ...] = ()
     sums: tuple[str, ...] = ()
 
@@ -123,12 +150,29 @@ def base_figures(bases: ArmBases, first: int, second: int, postures: tuple[Postu
     )
 
 
+def tip_figures(bases: ArmBases) -> tuple[TipFigures, ...]:
+    """Return the tips that were found together with the bases."""
+    first, sizes = 6 * (len(bases.arms) - 1), [3] * len(bases.tips)
+    roots = torch.split(bases.conditioned.x_root[first:], sizes) if sizes else ()
+    return tuple(
+        TipFigures(
+            arm=bases.arms[number].name,
+            name=name,
+            **dict(zip(("x_mm", "y_mm", "z_mm"), (position * 1e3).tolist(), strict=True)),
+            standard_errors=tuple((root.norm(dim=1) * 1e3).tolist()),
+        )
+        for ((number, name), position), root in zip(bases.tips.items(), roots, strict=True)
+    )
+
+
 def disagreement_diagnostic(bases: ArmBases, disagreement: Disagreement) -> Diagnostic:
     """Return the finding that arms disagree on the location of a shared object."""
     names = " and ".join(f"'{bases.arms[number].name}'" for number in disagreement.shared.arms)
     remedy = (
-        "check that it was not moved between the measurements of the arms, that its name is right in all rows, and "
-        "the rows of both arms"
+        "check the names and joint values of both rows, and that both tips were at rest"
+        if disagreement.shared.kind == TOUCH
+        else "check that it was not moved between the measurements of the arms, that its name is right in all rows, "
+        "and the rows of both arms"
     )
     return Diagnostic(
         kind="arms",
@@ -175,7 +219,10 @@ def arms_summary(
     names = [arm.name for arm in bases.arms]
     count = len(names)
     return ArmsSummary(
-        arms=tuple(ModelFile(name=name, robot=robot) for name, robot in zip(names, robots, strict=True)),
+        arms=tuple(
+            ModelFile(name=arm.name, robot=robot, torso=arm.torso)
+            for arm, robot in zip(bases.arms, robots, strict=True)
+        ),
         bases=tuple(base_figures(bases, a, b, postures) for b in range(count) for a in range(b)),
         shared=tuple(
             SharedFigures(
@@ -189,6 +236,7 @@ def arms_summary(
         misfit=bases.conditioned.misfit,
         redundancy=bases.conditioned.redundancy,
         probability=bases.probability,
+        tips=tip_figures(bases),
         diagnostics=tuple(disagreement_diagnostic(bases, one) for one in bases.disagreements),
         sums=sums,
     )

@@ -12,27 +12,37 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
+import torch
+from jaxtyping import Float64
 from pydantic import Field
+from torch import Tensor
 
 from pisigma.calibration.frames.arm_bases import ArmBases, fit_arm_bases
-from pisigma.calibration.frames.shared_objects import ArmPosterior, uncertainty_of
-from pisigma.calibration.frames.tool_to_tool import Postures
+from pisigma.calibration.frames.shared_objects import ArmPosterior, Postures, Touches, uncertainty_of
 from pisigma.calibration.geometric.initial_guess.initial_guess import randomly_chosen_rows
-from pisigma.files.errors import AcceptanceError, IdentificationError, OutputError, Place, PlanningError
+from pisigma.files.errors import (
+    AcceptanceError,
+    IdentificationError,
+    MeasurementError,
+    OutputError,
+    Place,
+    PlanningError,
+)
 from pisigma.files.model_files import model_hash
 from pisigma.files.output_file import write_atomically, write_failure
 from pisigma.files.progress import Progress
 from pisigma.files.scratch import FOLDER, scratch_beside
-from pisigma.files.yaml_file import Section, place_of_key, read_yaml
+from pisigma.files.yaml_file import Section, read_yaml
 from pisigma.files.yaml_writing import yaml_text
 from pisigma.lifetime.cell.layout import CELL_FILE, MODELS
-from pisigma.measurement.camera.corner_file import MeasurementFiles
+from pisigma.measurement.camera.corner_file import MeasurementFiles, read_rows
 from pisigma.measurement.conditions import JointState
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import corrected_joints
 from pisigma.robot.description import Robot
 from pisigma.validation.held_out.arms_summary import ArmsSummary, arms_summary, sums_with_tool
 from pisigma.validation.held_out.trained_calibrations import geometric_result
+from pisigma.workflow.arms.torso import torso_joints, torso_settings, with_common_joints
 from pisigma.workflow.calibrate import Calibration, calibrate
 from pisigma.workflow.cell.cell_file import CameraSection, CellDocument, CellFile, path_inside_cell
 from pisigma.workflow.cell.new_files import save_new
@@ -55,12 +65,15 @@ class Arm:
         data: measurements, or CSV files of them. Objects that other arms also measured have the same name in all rows:
             a board, jig or instrument in the column `frame`, sockets in `socket`, anchors in `anchor`.
         settings: settings of the calibration of the arm.
+        touches: rows in which its tip touched that of another arm: joint values, name of the touch in the column
+            `socket`, `sigma_mm`, and the name of the tip in the column `target`; None without touches.
     """
 
     name: str
     robot: Robot | str | os.PathLike[str]
     data: Measurements | MeasurementFiles
     settings: CalibrationSettings = field(default_factory=CalibrationSettings)
+    touches: Measurements | MeasurementFiles | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,26 +165,53 @@ class ArmsCalibration:
         return summary
 
 
-def posterior_of(name: str, calibration: Calibration) -> ArmPosterior:
-    """Return the posterior of a calibrated arm: that of its model, or of its geometric calibration."""
-    known = calibration.model.uncertainty
-    return ArmPosterior(name, known or uncertainty_of(geometric_result(calibration.result)))
+def posterior_of(arm: Arm, calibration: Calibration, torso: tuple[str, ...]) -> ArmPosterior:
+    """Return the posterior of a calibrated arm, that of its model or of its geometric calibration, with its touches.
+
+    Raises:
+        MeasurementError: the touches cannot be read, or lack a name or a standard deviation.
+    """
+    known = calibration.model.uncertainty or uncertainty_of(geometric_result(calibration.result))
+    if arm.touches is None:
+        return ArmPosterior(arm.name, known, torso=torso)
+    rows = read_rows(arm.touches, calibration.model.robot)
+    for column, stated in (
+        ("socket", rows.is_measured("socket")),
+        (
+            "sigma_position",
+            torch.zeros(rows.rows) if rows.sigma_position is None else rows.sigma_position > 0,
+        ),
+    ):
+        if not bool(stated.all()):
+            raise MeasurementError(
+                "a touch lacks its name (column 'socket') or its standard deviation (column 'sigma_mm')",
+                expected="both in every row",
+                at=rows.place_of(int(stated.long().argmin()), column),
+                remedy="state the same name in the row of the other arm, and the play of the tips as 'sigma_mm'",
+            )
+    touches = Touches.from_measurements(rows, moved_joints(calibration, rows))
+    return ArmPosterior(arm.name, known, touches, torso)
+
+
+def moved_joints(calibration: Calibration, rows: Measurements) -> Float64[Tensor, "rows dof"]:
+    """Return the joint values of rows with their corrections [rad or m]."""
+    hybrid = calibration.model.hybrid
+    return rows.q if hybrid is None else corrected_joints(hybrid, rows)
 
 
 def postures_of(calibration: Calibration) -> Postures:
     """Return the postures of some rows of a calibration, in random order."""
     rows = calibration.rows.select(randomly_chosen_rows(calibration.rows.rows, _MAX_POSTURES))
-    arm = calibration.model.hybrid
-    return Postures(
-        JointState.from_measurements(rows), rows.q if arm is None else corrected_joints(arm, rows)
-    )
+    return Postures(JointState.from_measurements(rows), moved_joints(calibration, rows))
 
 
 def calibrate_arms(arms: Sequence[Arm], progress: Progress = lambda what: None) -> ArmsCalibration:
     """Calibrate every arm with its own rows, and find the bases of the arms relative to each other.
 
     Every arm is calibrated as by `calibrate`. The bases then follow from the shared objects, see `fit_arm_bases`. The
-    models are those of the arms' own rows; information that one arm has about another is used only for the bases.
+    models are those of the arms' own rows; information that one arm has about another is used only for the bases. Arms
+    of one torso (of one URDF file, with the same first joints) are an exception: they have one base, and one set of
+    parameters of these joints from the rows of all of them.
 
     Args:
         arms: two or more arms.
@@ -187,15 +227,23 @@ def calibrate_arms(arms: Sequence[Arm], progress: Progress = lambda what: None) 
             is not valid.
     """
     started = time.perf_counter()
-    _check_names([arm.name for arm in arms])
+    names = [arm.name for arm in arms]
+    _check_names(names)
+    nominal = [
+        one.robot if isinstance(one.robot, Robot) else Robot.load(os.fspath(one.robot)) for one in arms
+    ]
+    torso = torso_joints(names, nominal)
     found = {}
-    for arm in arms:
+    for arm, robot in zip(arms, nominal, strict=True):
 
         def of_arm(what: str, name: str = arm.name) -> None:
             progress(f"{name}: {what}")
 
-        found[arm.name] = calibrate(arm.robot, arm.data, arm.settings, of_arm)
-    bases = fit_arm_bases([posterior_of(name, one) for name, one in found.items()])
+        settings = torso_settings(arm.name, arm.settings) if torso[arm.name] else arm.settings
+        found[arm.name] = calibrate(robot, arm.data, settings, of_arm)
+    bases = fit_arm_bases([posterior_of(arm, found[arm.name], torso[arm.name]) for arm in arms])
+    updated = bases.updated_arms if any(torso.values()) else ()
+    found |= {one.name: with_common_joints(found[one.name], one) for one in updated if torso[one.name]}
     robots = tuple(one.model.robot.name for one in found.values())
     sums = tuple(
         sentence
@@ -231,6 +279,7 @@ class ArmSection(Section):
         base: base link of the URDF file; None for its root.
         tip: tool link of the URDF file; None for its only leaf link.
         sessions: measurement files (CSV) of the arm.
+        touches: files of rows in which its tip touched that of another arm.
         camera: cameras and boards; None without cameras.
     """
 
@@ -238,6 +287,7 @@ class ArmSection(Section):
     base: str | None = None
     tip: str | None = None
     sessions: Annotated[tuple[str, ...], Field(min_length=1)]
+    touches: tuple[str, ...] = ()
     camera: CameraSection | None = None
 
 
@@ -261,8 +311,7 @@ def arms_of_cell(folder: str | os.PathLike[str], **changed: Any) -> tuple[Arm, .
         **changed: settings of the calibration that override the file, by its keys.
 
     Raises:
-        PlanningError: `cell.yaml` is not valid, a file is outside the cell, or two arms of one URDF file share a joint,
-            such as that of a torso.
+        PlanningError: `cell.yaml` is not valid, or a file is outside the cell.
         PisigmaError: a robot cannot be loaded, or a setting is not valid.
     """
     path = Path(folder) / CELL_FILE
@@ -273,34 +322,14 @@ def arms_of_cell(folder: str | os.PathLike[str], **changed: Any) -> tuple[Arm, .
             robot=arm.robot, base=arm.base, tip=arm.tip, camera=arm.camera, calibrate=document.calibrate
         )
         file = CellFile(path, one)
-        rows = [path_inside_cell(Path(folder), session) for session in arm.sessions]
-        robot = Robot.load(file.robot, arm.base, arm.tip)
-        for before in arms:
-            _check_joints(path, before, Arm(name, robot, rows), document)
-        arms.append(Arm(name, robot, rows, file.settings_of_step("calibrate", **changed)))
-    return tuple(arms)
-
-
-def _check_joints(path: Path, first: Arm, second: Arm, document: ArmsDocument) -> None:
-    """Refuse two arms of one URDF file with a common joint, which would be calibrated twice.
-
-    Raises:
-        PlanningError: two arms have a common joint.
-    """
-    one, other = document.arms[first.name], document.arms[second.name]
-    assert isinstance(first.robot, Robot)
-    assert isinstance(second.robot, Robot)
-    shared = {joint.name for joint in first.robot.joints} & {joint.name for joint in second.robot.joints}
-    same_file = os.path.normpath(one.robot) == os.path.normpath(other.robot)
-    if same_file and one.tip != other.tip and shared:
-        raise PlanningError(
-            f"arms '{first.name}' and '{second.name}' share joint '{sorted(shared)[0]}', which would be calibrated "
-            "twice",
-            expected="arms without common joints",
-            value=sorted(shared)[0],
-            at=place_of_key(path, ("arms", second.name)),
-            remedy="keep this joint at rest, and state a link after it as the `base` of both arms",
+        rows, touches = (
+            [path_inside_cell(Path(folder), session) for session in those]
+            for those in (arm.sessions, arm.touches)
         )
+        robot = Robot.load(file.robot, arm.base, arm.tip)
+        settings = file.settings_of_step("calibrate", **changed)
+        arms.append(Arm(name, robot, rows, settings, touches or None))
+    return tuple(arms)
 
 
 def calibrate_arms_of_cell(

@@ -31,11 +31,11 @@ Three = tuple[float, float, float]
 
 
 class MovedFigures(Section):
-    """An arm or a frame that may have moved.
+    """An arm, a frame, or the zero of the first joint of a torso that may have moved.
 
     Attributes:
-        kind: "arm" (its base) or "frame".
-        name: name of the arm or frame.
+        kind: "arm" (its base, or the one base of the arms of a torso), "frame" or "joint" (its zero).
+        name: name of the arm (the first one of a torso), frame or joint.
         is_named: whether its motion explains the rows best; if this is true of several, the rows cannot distinguish
             them.
         shift_mm: shift of its origin along x, y, z of the first arm's base [mm], if only it moved.
@@ -55,6 +55,11 @@ class MovedFigures(Section):
     @property
     def sentence(self) -> str:
         """Sentence that states the motion."""
+        if self.kind == "joint":
+            turned, error = math.hypot(*self.rotation_deg), math.hypot(*self.standard_errors[3:])
+            return (
+                f"the zero of joint '{self.name}' moved by {turned:.3g} deg (standard error {error:.2g} deg)"
+            )
         error = math.hypot(*self.standard_errors[:3])
         what = "base of arm" if self.kind == "arm" else "frame"
         turned = math.hypot(*self.rotation_deg)
@@ -158,8 +163,8 @@ def _arm(
     data: Measurements | MeasurementFiles,
     cameras: CameraFiles | None,
 ) -> ArmBefore:
-    stated = next(one.sha256 for one in summary.arms if one.name == name)
-    if model_hash(folder / name) != stated:
+    stated = next(one for one in summary.arms if one.name == name)
+    if model_hash(folder / name) != stated.sha256:
         raise ModelError(
             "the model was changed after the bases were found",
             at=Place(folder / name),
@@ -175,7 +180,9 @@ def _arm(
         )
     rows = read_rows(data, model.robot, cameras)
     return ArmBefore(
-        ArmPosterior(name, model.uncertainty), T_first_base, frames_of_model(model, rows, "base")
+        ArmPosterior(name, model.uncertainty, torso=stated.torso),
+        T_first_base,
+        frames_of_model(model, rows, "base"),
     )
 
 

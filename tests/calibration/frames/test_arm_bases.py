@@ -9,10 +9,25 @@ from scipy.optimize import OptimizeResult, least_squares
 from testing.closeness import assert_close
 from testing.models import no_type_checker
 from testing.refusals import refused
-from testing.two_arms import BASES, FRAMES, FREE, TOOL, UR5, own_fit, pose_of, posterior, posteriors, true_arm
+from testing.two_arms import (
+    BASES,
+    FRAMES,
+    FREE,
+    NOISE,
+    TIP,
+    TOOL,
+    UR5,
+    own_fit,
+    pose_of,
+    posterior,
+    posteriors,
+    touching_rows,
+    true_arm,
+)
 
 from pisigma.calibration.frames.arm_bases import fit_arm_bases
-from pisigma.calibration.frames.tool_to_tool import Postures, tool_to_tool_deviation
+from pisigma.calibration.frames.shared_objects import ArmPosterior, Postures
+from pisigma.calibration.frames.tool_to_tool import tool_to_tool_deviation
 from pisigma.calibration.geometric.result import CalibrationResult
 from pisigma.estimation.covariance_root import CovarianceRoot
 from pisigma.files.errors import IdentificationError
@@ -30,27 +45,45 @@ def fitted_arm(fit: CalibrationResult) -> Robot:
     return fit.robot.with_geometry(base=np.zeros(6))
 
 
-def predicted(fit: CalibrationResult, arm: np.ndarray, in_frame: np.ndarray) -> np.ndarray:
-    """Return positions of the tool in the frames of the rows; `arm` has free parameters, then the tool."""
+def own_fits(seed: int, sensor: str) -> list[CalibrationResult]:
+    """Return the fits of both arms; those that only touch one another are in a frame each."""
+    frames = ("hall", "jig") if sensor == "touches" else (sensor, sensor)
+    return [own_fit(number, seed, frame) for number, frame in enumerate(frames)]
+
+
+def touching_arms(seed: int, tip: str = "") -> tuple[ArmPosterior, ArmPosterior]:
+    """Return arms that were measured in a frame each and touched one another."""
+    left, right = (
+        posterior(name, fit, touching_rows(number, seed, tip))
+        for number, (name, fit) in enumerate(zip(("left", "right"), own_fits(seed, "touches"), strict=True))
+    )
+    return left, right
+
+
+def predicted(arm: np.ndarray, in_frame: np.ndarray, q: torch.Tensor) -> np.ndarray:
+    """Return positions of the tool in the frames of rows; `arm` has free parameters, then the tool."""
     values = UR5.dh.copy()
     for name, value in zip(FREE, arm, strict=False):
         values[int(name[-1]) - 1, 0] = value
     robot = UR5.with_geometry(values, base=np.zeros(6), tool=np.array([*arm[len(FREE) :], 0.0, 0.0, 0.0]))
-    p = forward_kinematics(robot, fit.solved.measurements.q.numpy())[:, :3, 3]
+    p = forward_kinematics(robot, q.numpy())[:, :3, 3]
     return np.einsum("rij,rj->ri", in_frame[:, :3, :3], p) + in_frame[:, :3, 3]
 
 
 def fitted_together(seed: int, sensor: str) -> OptimizeResult:
     """Fit both arms and the second base at once by scipy, with the noise of the arms' own fits."""
-    fits = [own_fit(number, seed, sensor) for number in (0, 1)]
+    fits = own_fits(seed, sensor)
+    arms = touching_arms(seed) if sensor == "touches" else posteriors(seed, sensor)
     own = len(FREE) + 3
     guess = np.concatenate(
         [[*(fit.robot.dh[int(name[-1]) - 1, 0] for name in FREE), *TOOL[:3]] for fit in fits]
     )
-    found = fit_arm_bases(posteriors(seed, sensor)).T_first_base[1].numpy()
-    there = [fits[0].bases[name] for name in FRAMES] if sensor == "frames" else []
+    found = fit_arm_bases(arms).T_first_base[1].numpy()
+    there = FRAMES if sensor in ("frames", "touches") else {}
     where = [fits[0].unknowns["socket"][f"plate/{k}"] for k in range(SOCKETS)] if sensor == "sockets" else []
     start = np.concatenate([guess, np.zeros(6), np.zeros(6 * len(there)), *where])
+
+    touching = [touching_rows(number, seed).q for number in (0, 1)] if sensor == "touches" else []
 
     def residual(x: np.ndarray) -> np.ndarray:
         second = x[2 * own : 2 * own + 6]
@@ -59,6 +92,10 @@ def fitted_together(seed: int, sensor: str) -> OptimizeResult:
         T_second[:3, 3] = found[:3, 3] + second[:3]
         rest = x[2 * own + 6 :]
         missed = []
+        for q, T_arm, sign in zip(touching, (np.eye(4), T_second), (-1, 1), strict=False):
+            part = x[own:] if sign > 0 else x
+            missed.append(sign * predicted(part[:own], T_arm[None], q).ravel() / (NOISE * np.sqrt(2)))
+        missed = [sum(missed)] if missed else []
         for number, (fit, T_arm) in enumerate(zip(fits, (np.eye(4), T_second), strict=True)):
             rows = fit.solved.measurements
             if sensor == "sockets":
@@ -70,22 +107,22 @@ def fitted_together(seed: int, sensor: str) -> OptimizeResult:
                     name: transform(
                         rotation_from_vector(torch.from_numpy(step[3:])), torch.from_numpy(step[:3])
                     ).numpy()
-                    @ pose_of(fits[0].bases[name]).numpy()
+                    @ invert(pose_of(FRAMES[name])).numpy()
                     @ T_arm
                     for name, step in steps.items()
                 }
                 in_first = np.stack([moved[name] for name in rows.frame])
                 wanted = rows.position.numpy()
-            miss = predicted(fit, x[number * own : (number + 1) * own], in_first) - wanted
+            miss = predicted(x[number * own : (number + 1) * own], in_first, rows.q) - wanted
             missed.append(miss.ravel() / fit.noise[0].sigma)
         return np.concatenate(missed)
 
     return least_squares(residual, start, x_scale="jac", xtol=1e-9, ftol=1e-12)
 
 
-@pytest.mark.parametrize("sensor", ["frames", "sockets"])
+@pytest.mark.parametrize("sensor", ["frames", "sockets", "touches"])
 def test_posterior_is_that_of_one_fit_of_all_rows(sensor):
-    found = fit_arm_bases(posteriors(0, sensor))
+    found = fit_arm_bases(touching_arms(0) if sensor == "touches" else posteriors(0, sensor))
     with no_type_checker():
         peer = fitted_together(0, sensor)
     second = slice(2 * (len(FREE) + 3), 2 * (len(FREE) + 3) + 6)
@@ -95,10 +132,10 @@ def test_posterior_is_that_of_one_fit_of_all_rows(sensor):
     assert_close(found.covariance_root[1].norm(dim=1).numpy() / error, 1.0, atol=0.01)
     misfit = peer.fun @ peer.fun - sum(
         np.square(fit.residuals[fit.noise[0].sensor]).sum() / fit.noise[0].sigma ** 2
-        for fit in (own_fit(number, 0, sensor) for number in (0, 1))
+        for fit in own_fits(0, sensor)
     )
     assert_close(found.conditioned.misfit, misfit, rtol=0.02)
-    assert found.conditioned.redundancy == (6 if sensor == "frames" else 3 * SOCKETS - 6)
+    assert found.conditioned.redundancy == {"frames": 6, "sockets": 3 * SOCKETS - 6, "touches": 54}[sensor]
 
 
 @pytest.mark.parametrize("sensor", ["hall", "sockets"])
@@ -183,3 +220,41 @@ def test_order_of_the_arms_does_not_matter():
     one, other = fit_arm_bases((left, right)), fit_arm_bases((right, left))
     assert_close(one.T_first_base[1], invert(other.T_first_base[1]), atol=1e-9)
     assert_close(one.relative(0, 1)[1], other.relative(1, 0)[1], rtol=1e-6, atol=1e-16)
+
+
+@pytest.mark.parametrize("tip", ["", "tip"])
+def test_arms_that_touch_are_connected(tip):
+    scores = []
+    for seed in range(4):
+        found = fit_arm_bases(touching_arms(seed, tip))
+        T, covariance = found.relative(0, 1)
+        error = pose_error(pose_of(BASES[1]), T)
+        scores.append(float(error @ torch.linalg.solve(covariance, error)))
+        assert found.disagreements == ()
+        assert found.conditioned.redundancy == 20 * 3 - (12 if tip else 6)
+        for position in found.tips.values():
+            assert_close(position, torch.from_numpy(TIP[:3]), atol=5e-4)
+    assert np.sum(scores) < 43  # 99 % of chi-squared with 24 degrees
+
+
+def test_wrong_touch_is_named():
+    left, right = touching_arms(1, "")
+    assert right.touches is not None
+    q = right.touches.postures.q_moved.clone()
+    q[7, 1] += 2e-3
+    state = JointState.from_measurements(Measurements(q=q))
+    wrong = replace(right, touches=replace(right.touches, postures=Postures(state, q)))
+    (worst, *_) = fit_arm_bases((left, wrong)).disagreements
+    assert worst.shared.key == ("touch", "touch 7")
+
+
+def test_touches_of_one_arm_and_too_few_touches_are_refused():
+    left, right = touching_arms(1, "tip")
+    with refused(IdentificationError, value=["left"], option="touches"):
+        fit_arm_bases((left, replace(right, touches=None)))
+    few = [
+        posterior(name, own_fit(k, 1, "hall"), touching_rows(k, 1, "tip", 3)) for k, name in enumerate("ab")
+    ]
+    separate = [few[0], replace(few[1], uncertainty=right.uncertainty)]
+    with refused(IdentificationError):
+        fit_arm_bases(separate)
