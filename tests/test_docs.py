@@ -12,8 +12,8 @@ from types import ModuleType
 from typing import get_args
 
 import pytest
-import tomllib
 import yaml
+from testing.projects import project_of
 from typer.main import get_command
 
 from pisigma.cli.main import app
@@ -271,7 +271,7 @@ def test_the_licence_of_every_dependency_is_stated(monkeypatch: pytest.MonkeyPat
     page = _text(DOCS / "reference" / "dependencies.md")
     named = dict(re.findall(r"^\| ([\w-]+) \| ([^|]+) \|", page, flags=re.MULTILINE))
     for project in licences.PROJECTS.values():
-        stated = tomllib.loads(project.read_text(encoding="utf-8"))["project"]["dependencies"]
+        stated = project_of(project.parent)["dependencies"]
         assert {re.split("[<>=]", one)[0] for one in stated} <= set(named)
     assert named["numpy"].startswith("BSD-3-Clause")
 

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import tomllib
 from packaging.requirements import Requirement
+from testing.projects import project_of
 from testing.serving import client
 
 import pisigma
@@ -51,9 +51,7 @@ def wheel(repository, tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def dependencies(repository) -> dict[str, Distribution]:
     """Distributions that the wheel requires, as installed here."""
-    project = tomllib.loads((repository / "packaging" / "pisigma-ik" / "pyproject.toml").read_text())[
-        "project"
-    ]
+    project = project_of(repository / "packaging" / "pisigma-ik")
     return required([Requirement(one) for one in project["dependencies"]])
 
 
@@ -102,10 +100,7 @@ def test_it_contains_the_modules_of_pisigma(wheel):
 
 
 def test_its_dependencies_are_those_of_pisigma_and_small(wheel, dependencies, repository):
-    projects = [
-        tomllib.loads((folder / "pyproject.toml").read_text())["project"]
-        for folder in (repository, repository / "packaging" / "pisigma-ik")
-    ]
+    projects = [project_of(folder) for folder in (repository, repository / "packaging" / "pisigma-ik")]
     assert set(projects[1]["dependencies"]) <= set(projects[0]["dependencies"])
     assert "torch" not in dependencies
     size = sum(one.file_size for one in zipfile.ZipFile(wheel).infolist())

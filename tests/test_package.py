@@ -15,9 +15,9 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
-import tomllib
 import yaml
 from testing.models import hand_made_model
+from testing.projects import project_of
 
 import pisigma
 from pisigma.files.errors import EXTRAS
@@ -200,13 +200,13 @@ def test_unknown_names_are_no_attributes():
 
 
 def test_version_is_that_of_the_project(repository):
-    project = tomllib.loads((repository / "pyproject.toml").read_text())["project"]
+    project = project_of(repository)
     assert pisigma.__version__ == project["version"]
 
 
 def test_published_metadata_agree(repository):
     """Version and licence agree in pyproject.toml and CITATION.cff, and extras named in messages exist."""
-    project = tomllib.loads((repository / "pyproject.toml").read_text())["project"]
+    project = project_of(repository)
     citation = yaml.safe_load((repository / "CITATION.cff").read_text())
     assert (citation["version"], citation["license"]) == (project["version"], project["license"])
     for package, extra in EXTRAS.items():

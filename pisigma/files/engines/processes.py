@@ -202,7 +202,11 @@ class RayEngine(AbstractEngine):
                 yield chunk, None
 
 
-COMMAND = "from pisigma.files.engines.processes import serve; serve()"
+COMMAND = (
+    "import sys; sys.path[:] = filter(None, sys.path); "
+    "from pisigma.files.engines.processes import serve; serve()"
+)
+"""Program of the process, without the working directory on the path; `PYTHONSAFEPATH` needs Python 3.11."""
 
 
 class EndedError(Exception):

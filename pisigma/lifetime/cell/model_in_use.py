@@ -82,7 +82,8 @@ class ModelInUse:
         """
         self._is_followed, followed = True, weakref.ref(self)
         _start_following(followed, report)
-        os.register_at_fork(after_in_child=lambda: _start_following(followed, report))
+        if hasattr(os, "register_at_fork"):  # not on Windows, which does not fork
+            os.register_at_fork(after_in_child=lambda: _start_following(followed, report))
 
     def stop(self) -> None:
         """Stop looking for changes."""

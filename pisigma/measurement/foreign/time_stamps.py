@@ -3,7 +3,7 @@
 import math
 import re
 from collections.abc import Sequence
-from datetime import UTC, datetime
+from datetime import datetime, timezone
 
 import numpy as np
 from jaxtyping import Float64
@@ -11,6 +11,10 @@ from jaxtyping import Float64
 from pisigma.files.errors import MeasurementError, Place
 
 _DATE = re.compile(r"(\d{1,4})([./-])(\d{1,2})\2(\d{1,4})(?:$|[ T,]+(.*))")
+_BASIC = re.compile(r"(\d{4})(\d\d)(\d\d)T(\d\d)(\d\d)(\d\d)")
+"""Start of a time stamp without separators, such as 20260302T103102."""
+_ZONED = re.compile(r"(.*?)(?:Z|([+-]\d\d(?::?\d\d)?))?")
+"""Clock time and time zone, such as 10:31:02Z, 10:31:02+01:00 or 10:31:02+01."""
 _CLOCK = re.compile(r"(\d{1,2}):(\d{2})(?::(\d{2}(?:[.,]\d+)?))?(?:\s*([AaPp])\.?[Mm]\.?)?")
 
 
@@ -30,16 +34,18 @@ def seconds_of(text: str, day_first: bool | None = None) -> float | None:
         pass
     if match := _CLOCK.fullmatch(text):
         return _clock(match)
-    if match := _DATE.fullmatch(text):
-        clock, day = _CLOCK.fullmatch((match[5] or "").strip()), _day(match, day_first)
-        seconds = _clock(clock) if clock else None
-        if day is not None and seconds is not None:
-            return day.timestamp() + seconds
     try:
+        match = _DATE.fullmatch(_BASIC.sub(r"\1-\2-\3T\4:\5:\6", text))
+        if match and (zoned := _ZONED.fullmatch(match[5] or "")):
+            clock, day = _CLOCK.fullmatch(zoned[1].strip()), _day(match, day_first)
+            seconds = _clock(clock) if clock else None
+            if day is not None and seconds is not None:
+                local = datetime.strptime((zoned[2] or "+00").ljust(5, "0"), "%z")
+                return day.replace(tzinfo=local.tzinfo).timestamp() + seconds
         stamp = datetime.fromisoformat(text.replace("/", "-"))
     except ValueError:
         return None
-    return (stamp if stamp.tzinfo else stamp.replace(tzinfo=UTC)).timestamp()
+    return stamp.replace(tzinfo=stamp.tzinfo or timezone.utc).timestamp()
 
 
 def iso_day(text: str, day_first: bool | None = None) -> str | None:
@@ -135,7 +141,7 @@ def _day(match: re.Match[str], first: bool | None) -> datetime | None:
     else:
         return None
     try:
-        return datetime(year, month, day, tzinfo=UTC)
+        return datetime(year, month, day, tzinfo=timezone.utc)
     except ValueError:
         return None
 

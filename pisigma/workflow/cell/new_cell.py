@@ -118,7 +118,7 @@ class NewCell:
         entry = ModelEntry(
             name,
             model_hash(model),
-            made.astimezone(datetime.UTC).isoformat("T", "milliseconds"),
+            made.astimezone(datetime.timezone.utc).isoformat("T", "milliseconds"),
             "",
             day,
             remark=remark,

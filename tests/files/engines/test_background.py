@@ -32,6 +32,14 @@ def test_it_computes_what_this_process_computes(process):
         assert said == ["fold 1 of 2"]
 
 
+def test_it_imports_nothing_from_the_working_directory(tmp_path, monkeypatch):
+    (tmp_path / "pisigma.py").write_text("raise SystemExit")
+    monkeypatch.chdir(tmp_path)
+    process = BackgroundProcess()
+    assert process.compute(partial(math.hypot, 3, 4)) == 5
+    process.close()
+
+
 @pytest.mark.skipif(not hasattr(os, "nice"), reason="no priorities on this system")
 def test_it_leaves_the_processor_to_this_process(process):
     assert process.compute(partial(os.nice, 0)) == min(os.nice(0) + 10, 19)

@@ -113,6 +113,15 @@ def test_a_forked_process_follows_changes_too(cell, loads):
     in_use.stop()
 
 
+def test_changes_are_followed_on_systems_without_fork(cell, loads, monkeypatch):
+    monkeypatch.delattr(os, "register_at_fork")
+    _, in_use, _ = loads
+    in_use.follow()
+    put_into_use(cell, SECOND)
+    until(lambda: in_use.folder.name == SECOND)
+    in_use.stop()
+
+
 def test_findings_that_cannot_be_read_are_read_again(cell, loads, monkeypatch):
     names, in_use, _ = loads
     time.sleep(2 * model_in_use.SETTLED)
