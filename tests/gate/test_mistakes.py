@@ -27,7 +27,7 @@ EVERYWHERE = (
 
 @pytest.fixture(scope="module")
 def quick():
-    with few_choices():
+    with few_choices(), few_robots():
         yield
 
 
@@ -61,8 +61,7 @@ def test_wrong_rows_are_named():
 @pytest.mark.parametrize("name", EVERYWHERE)
 def test_commands_agree(name, tmp_path):
     (mistake,) = (one for one in MISTAKES if one.name == name)
-    with few_robots():
-        assert disagreements(mistake, tmp_path) == []
+    assert disagreements(mistake, tmp_path) == []
 
 
 def test_every_command_accepts_right_rows(tmp_path):

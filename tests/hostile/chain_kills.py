@@ -60,7 +60,7 @@ class Chain:
     def wait_for_writing(self, process: subprocess.Popen[bytes]) -> None:
         """Wait until the command starts to write next to the models, or ends."""
         while process.poll() is None and _files(self.folder) == self._files:
-            time.sleep(0.001)
+            time.sleep(0.005)
 
     def sessions(self) -> set[tuple[str, str]]:
         """Return the sessions in the histories of all models, by model and rows."""
