@@ -1,5 +1,6 @@
 """Check whether only some of the rows agree with a model while the others belong to another setup."""
 
+import functools
 import itertools
 import math
 from collections.abc import Iterator, Sequence
@@ -104,13 +105,18 @@ def _agreements(judged: RowsUnderModel) -> Iterator[Float64[Tensor, "rows 4 4"]]
         return
     limit = AGREES * judged.predicted_deviation
     samples = list(_samples(judged.rows.rows))
+
+    @functools.lru_cache(maxsize=16)  # most samples soon lead to the same agreeing rows
+    def fit(kind: str, chosen: tuple[int, ...]) -> tuple[Tensor, Tensor]:
+        T = _fitted(judged, kind, torch.tensor(chosen))
+        return T, judged.error_lengths(T) <= limit
+
     for kind in ("base", "tool"):
         best, most = None, _SAMPLE + _SPARE_ROWS - 1
         for sample in samples:
             chosen = sample
             for _ in range(3):  # local optimisation: fit again to all rows that agree
-                T = _fitted(judged, kind, chosen)
-                agreeing = judged.error_lengths(T) <= limit
+                T, agreeing = fit(kind, tuple(chosen.tolist()))
                 chosen = agreeing.nonzero()[:, 0]
                 if len(chosen) < _SAMPLE:
                     break
