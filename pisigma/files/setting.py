@@ -5,6 +5,7 @@ class, and an `Option` in the annotation states how the command line differs.
 """
 
 import functools
+import inspect
 import itertools
 import math
 import re
@@ -196,14 +197,15 @@ def build_settings(group: type, stated: Mapping[str, Any], is_optional: bool = F
 
 def attributes_of(documented: type) -> dict[str, str]:
     """Return the text of every attribute in the docstring of a class."""
-    lines = (documented.__doc__ or "").partition("Attributes:")[2].splitlines()
+    # Python 3.13 and newer remove the indentation of docstrings, as `cleandoc` does
+    lines = inspect.cleandoc(documented.__doc__ or "").partition("Attributes:")[2].splitlines()
     found: dict[str, str] = {}
     last = ""
     for line in lines:
-        if match := re.match(r"^ {8}(\w+): (.*)$", line):
+        if match := re.match(r"^ {4}(\w+): (.*)$", line):
             last = match[1]
             found[last] = match[2]
-        elif last and line.startswith(" " * 12):
+        elif last and line.startswith(" " * 8):
             found[last] += f" {line.strip()}"
     return found
 

@@ -1,3 +1,4 @@
+import inspect
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -82,3 +83,10 @@ def test_option_units_are_converted_to_setting_units():
     assert_close(reach.read(3.0), 3e-3, rtol=1e-15)
     assert SETTINGS["words"].read("a, b") == ("a", "b")
     assert SETTINGS["words"].read("") == ()
+
+
+def test_docstrings_without_indentation_are_read():
+    """Python 3.13 removes the indentation of docstrings."""
+    stripped = type("Outer", (), {"__doc__": inspect.cleandoc(Outer.__doc__)})
+    assert attributes_of(stripped) == attributes_of(Outer)
+    assert attributes_of(stripped)["count"].endswith("described on two lines. None: as many as fit.")
