@@ -1,16 +1,18 @@
 """A report draws the nominal and the calibrated arm over its images, and states zeros and errors."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from PIL import Image
 from testing.closeness import assert_close
-from testing.phone_arm import BOARD, PHONE, phone_rows
+from testing.phone_arm import BOARD, PHONE, arm_before_phone, phone_rows, rows_of_phone
 
 import pisigma
 from pisigma.files.errors import MeasurementError
 from pisigma.measurement.camera.camera_files import CameraFiles
+from pisigma.reporting.page.wording import arm_sentence
 from pisigma.validation.report.arm_in_images import arm_in_images
 from pisigma.workflow.report import report
 
@@ -50,6 +52,20 @@ def test_predictions_are_those_of_both_arms(arm):
             np.linalg.norm(those.corners - one.measured, axis=1) for those in (one.nominal, one.calibrated)
         ]
         assert off[1].max() < 40
+
+
+def test_images_of_the_fit_are_counted(arm):
+    model, rows, true, cameras, folder = arm
+    files = tuple(sorted((folder / "images").iterdir()))
+    fitted = arm_in_images(model, rows, cameras, files)
+    assert fitted.to_json()["training_images"] == fitted.training_images == len(files)
+    _, q, random = arm_before_phone(0)
+    later = arm_in_images(model, rows_of_phone(true, q[40:80], random, 1), cameras, files)
+    assert later.training_images == 0
+    assert later.calibrated_rms > fitted.calibrated_rms / 2
+    half = replace(fitted, training_images=len(files) // 2)
+    remark = "fitted to"
+    assert [remark in arm_sentence(one) for one in (fitted, half, later)] == [True, True, False]
 
 
 def test_page_states_zeros_and_errors(arm):

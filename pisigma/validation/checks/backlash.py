@@ -5,12 +5,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
+from pisigma.calibration.geometric.result import CalibrationResult
 from pisigma.files.errors import IdentificationError
 from pisigma.measurement.conditions import approach_by_order
 from pisigma.measurement.dataset import Measurements
-from pisigma.robot.description import Robot
 from pisigma.robot.kinematics.jacobian import joint_jacobian
 from pisigma.validation.checks.lag import LIKELY, MIN_ROWS, NOTICED, find_lag
 from pisigma.validation.held_out.diagnostic import Diagnostic
@@ -112,25 +113,28 @@ def unstated_backlash(calibrator: GeometricCalibrator, rows: Measurements) -> Di
     if rows.position is None:
         return None
     try:
-        ordered = OrderedRows.from_result(calibrator.fit(replace(rows, approach=None)))
+        result = calibrator.fit(replace(rows, approach=None))
     except IdentificationError:
         return None  # the calibration itself rejects these rows
+    ordered = OrderedRows.from_result(result)
     found = None if ordered is None else find_backlash(ordered, rows)
     if ordered is None or found is None or found.log_bayes_factor < LIKELY or found.error_ratio < NOTICED:
         return None
     lag = find_lag(ordered, rows)
     if lag is not None and lag.log_bayes_factor > found.log_bayes_factor:
         return None
-    return _diagnostic(calibrator.robot, rows, found)
+    return _diagnostic(result, rows, found)
 
 
-def _diagnostic(robot: Robot, rows: Measurements, found: LostMotion) -> Diagnostic:
-    """Name the joints with backlash, its size, and what it means for commanded poses."""
+def _diagnostic(result: CalibrationResult, rows: Measurements, found: LostMotion) -> Diagnostic:
+    """Name the joints with backlash, its size, and what it means for commanded poses of the fitted tools."""
+    robot = result.robot
     joints = tuple(sorted(found.play))
     play = [found.play[joint] for joint in joints]
     per_unit = [(180 / math.pi, "deg") if robot.revolute[joint] else (1e3, "mm") for joint in joints]
     sizes = [(size * factor, unit) for size, (factor, unit) in zip(play, per_unit, strict=True)]
-    J = joint_jacobian(robot, rows.q)[1][:, :3, list(joints)]
+    tools = [robot.with_geometry(tool=tool) for tool in result.tools.values()]
+    J = torch.cat([joint_jacobian(tool, rows.q)[1][:, :3, list(joints)] for tool in tools])
     error = float((J * J.new_tensor(play) / 2).square().sum((1, 2)).mean().sqrt())
     remedy = (
         "State the side from which each joint approaches (docs/how-to/backlash.md), in the rows and for the poses "

@@ -18,6 +18,7 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.sensors.corner import as_poses
 from pisigma.measurement.sensors.intrinsics import CAMERA_COLUMN, boards, texts_of
 from pisigma.model.calibrated_model import CalibratedModel, corrected_joints, poses_of_rows
+from pisigma.model.training_rows import known_rows
 from pisigma.robot.kinematics.components import as_transform
 from pisigma.robot.kinematics.forward import Geometry, iterate_rows
 from pisigma.robot.se3 import invert, transform, transform_from_xyzrpy
@@ -86,10 +87,12 @@ class ArmInImages:
     Attributes:
         images: the images, in the order of the rows.
         zeros: zeros of the revolute joints.
+        training_images: number of the images to which the calibrated arm was fitted.
     """
 
     images: tuple[ArmInImage, ...]
     zeros: tuple[JointZero, ...]
+    training_images: int
 
     @property
     def nominal_rms(self) -> float:
@@ -112,6 +115,7 @@ class ArmInImages:
             "nominal_rms_mm": self.nominal_rms * 1e3,
             "calibrated_rms_mm": self.calibrated_rms * 1e3,
             "halvings": self.halvings,
+            "training_images": self.training_images,
             "images": [
                 {
                     "name": one.name,
@@ -151,6 +155,7 @@ def arm_in_images(
             at=Place(rows.source, column="image"),
             remedy="give the images from which `pisigma detect` made the file of corners",
         )
+    training_images = int(known_rows(model, rows)[chosen].sum())
     rows = rows.select(torch.tensor(chosen))
     unknowns = {} if model.uncertainty is None else model.uncertainty.geometry.unknowns
     measured = as_poses(rows, unknowns)
@@ -182,7 +187,7 @@ def arm_in_images(
         image = (rows.image or ())[row]
         size = (camera.width, camera.height)
         images.append(ArmInImage(by_name[image], image, size, seen(each[0]), before, after, *errors))
-    return ArmInImages(tuple(images), _zeros(model))
+    return ArmInImages(tuple(images), _zeros(model), training_images)
 
 
 def _pixels(camera: Camera, points: Float64[np.ndarray, "points 3"], T: Tensor) -> np.ndarray:

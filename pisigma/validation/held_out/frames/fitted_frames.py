@@ -62,7 +62,7 @@ def fitted_remark(rows: Measurements, fitted: Collection[FrameKind]) -> tuple[st
         "tool": (6 if turned else 3) * len(set(rows.target)) * ("tool" in fitted),
     }
     what = " and ".join(f"the {name} ({count} parameters)" for name, count in numbers.items() if count)
-    values = len(set(groups_to_keep_whole(rows).tolist())) * (6 if turned else 3)
+    values = _readings(rows) * (6 if turned else 3)
     return (
         f"For every model, these rows are used to fit {what}, so errors of the robot's {' or '.join(fitted)} are not "
         f"included. The errors are corrected for this: their squares are divided by {values - sum(numbers.values())} "
@@ -77,8 +77,8 @@ def errors_in_fitted_frames(
 
     Parameters that are fitted to n values make their errors too small. Therefore the errors are multiplied by
     `sqrt(n / (n - p))`, where p is the trace of the hat matrix over these values, which is the number of parameters if
-    there is only one kind of values (Draper and Smith 1998, Applied Regression Analysis, section 8.1). Rows with equal
-    joint values count once in n.
+    there is only one kind of values (Draper and Smith 1998, Applied Regression Analysis, section 8.1). Rows of one frame
+    and target with equal joint values count once in n.
 
     Args:
         model: a model of any kind; its frames or targets are not used if they are fitted.
@@ -123,9 +123,14 @@ def errors_in_fitted_frames(
     )
 
 
+def _readings(rows: Measurements) -> int:
+    """Return the number of different combinations of joint values, frame and target; repeats are not independent."""
+    return len(set(zip(groups_to_keep_whole(rows).tolist(), rows.frame, rows.target, strict=True)))
+
+
 def _enlargement(rows: Measurements, fitted: float) -> float:
     """Compute the factor on errors that corrects for the number of fitted parameters."""
-    values = 3 * len(set(groups_to_keep_whole(rows).tolist()))
+    values = 3 * _readings(rows)
     return float((values / (values - fitted)) ** 0.5) if fitted else 1.0
 
 

@@ -90,6 +90,20 @@ def test_equal_joint_values_count_once(arm):
     ]  # parameters, degrees of freedom, values, parameters
 
 
+@pytest.mark.parametrize("targets", [2, 4])
+def test_targets_at_equal_joint_values_are_separate_values(arm, targets):
+    model, q, T = arm
+    T_tools = TOOL.repeat(targets, 1, 1)
+    T_tools[:, :3, 3] += 0.1 * torch.eye(4, dtype=torch.float64)[:targets, :3]
+    rows = measured(q.repeat_interleave(targets, 0), (BASE @ T[:, None] @ T_tools).flatten(0, 1), False)
+    rows = replace(rows, target=tuple(map(str, range(targets))) * len(q), frame=("east",) * rows.rows)
+    squares = [
+        float(errors_in_fitted_frames(model, rows.select(some), ("base", "tool")).position.square().mean())
+        for some in torch.arange(rows.rows).split(MIN_CONFIGURATIONS * targets)
+    ]
+    assert_close(np.sqrt(np.mean(squares)), NOISE, rtol=0.15)
+
+
 def test_what_is_fitted_needs_poses(arm):
     model, q, T = arm
     rows = elsewhere(q[:11], T[:11], ("base",))
