@@ -2,6 +2,7 @@
 
 from collections.abc import Hashable, Sequence
 
+import numpy as np
 import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
@@ -12,20 +13,44 @@ from pisigma.measurement.dataset import Measurements
 _MIN_GROUPS = 3
 """Smallest number of placements, sockets or anchors that are held out as wholes; with fewer, too few rows would
 remain."""
+_REPEATABILITY = 1e-3
+"""Largest difference of joint values of one pose [rad or m]; values that encoders read differ from repeat to repeat."""
 
 
 def groups_of_equal_joints(q: Float64[Tensor, "rows dof"]) -> Int64[Tensor, " rows"]:
     """Return the index of every row's joint values among the distinct ones, numbered by their first row.
 
     Args:
-        q: joint values [rad or m]; rows belong together if their joint values are exactly equal.
+        q: joint values [rad or m]; rows belong together if all their joint values are equal up to `_REPEATABILITY`.
 
     Returns:
         For every row, the index of its group, from 0.
     """
     if q.shape[0] == 0:
         return torch.zeros(0, dtype=torch.int64, device=q.device)
-    return _numbered(torch.unique(q + 0.0, dim=0, return_inverse=True)[1])  # -0.0 becomes 0.0
+    values, number = torch.unique(q + 0.0, dim=0, return_inverse=True)  # -0.0 becomes 0.0
+    return _numbered(torch.from_numpy(_representatives(values.detach().cpu().numpy())).to(q.device)[number])
+
+
+def _representatives(values: Float64[np.ndarray, "rows columns"]) -> Int64[np.ndarray, " rows"]:
+    """Return, for every row, the index of the row that represents it: one that equals it up to `_REPEATABILITY`.
+
+    Rows are sorted by a weighted sum, so that only neighbours need to be compared. A representative represents itself,
+    so rows along a path do not all belong together.
+    """
+    weight = np.sqrt(np.arange(2.0, 2 + values.shape[1])) % 1 + 0.5  # without simple ratios
+    order = np.argsort(values @ weight, kind="stable")
+    values, key = values[order], (values @ weight)[order]
+    end = np.searchsorted(key, key + _REPEATABILITY * weight.sum(), side="right")
+    found = np.arange(len(key))
+    for row in np.flatnonzero(end > found + 1).tolist():
+        if found[row] == row:
+            near = slice(row, end[row])
+            equal = (np.abs(values[near] - values[row]) <= _REPEATABILITY).all(1)
+            found[near][equal & (found[near] == np.arange(row, end[row]))] = row
+    representative = np.empty_like(order)
+    representative[order] = order[found]
+    return representative
 
 
 def numbers_of_names(names: Sequence[Hashable]) -> Int64[Tensor, " rows"]:

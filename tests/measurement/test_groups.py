@@ -65,3 +65,12 @@ def test_rows_of_a_pair_and_rows_without_a_name_are_separate_groups():
     distance[[1, 3]] = 0.5
     measured = rows(8, socket=names, pair=pair, distance=distance)
     assert held_out_groups(measured).tolist() == [0, 1, 2, 1, 3, 4, 4, 5]
+
+
+def test_joint_values_that_encoders_read_are_one_pose_and_those_along_a_path_are_not():
+    random = torch.Generator().manual_seed(0)
+    commanded = torch.rand(40, 6, generator=random, dtype=torch.float64) * 4 - 2
+    read = commanded.repeat(5, 1) + 1e-4 * torch.randn(200, 6, generator=random, dtype=torch.float64)
+    assert groups_of_equal_joints(read).tolist() == [*range(40)] * 5
+    path = torch.linspace(0, 1, 2001, dtype=torch.float64)[:, None].expand(-1, 6)
+    assert int(groups_of_equal_joints(path).max()) + 1 > 600

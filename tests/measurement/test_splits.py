@@ -25,7 +25,7 @@ def repeated(labels: list[int]) -> Measurements:
 
 
 def test_groups_are_numbered_as_they_appear():
-    q = torch.tensor([[2.0, 1], [0.0, 1], [2, 1], [-0.0, 1], [2, 1.0000001]], dtype=torch.float64)
+    q = torch.tensor([[2.0, 1], [0.0, 1], [2, 1], [-0.0, 1], [2, 1.002]], dtype=torch.float64)
     assert groups_of_equal_joints(q).tolist() == [0, 1, 0, 1, 2]
     assert groups_of_equal_joints(q[:0]).tolist() == []
 

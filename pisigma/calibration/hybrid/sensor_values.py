@@ -13,6 +13,8 @@ from pisigma.calibration.geometric.problem.problem import CalibrationProblem
 from pisigma.joint_correction.feature import AbstractFeature
 from pisigma.measurement.conditions import JointState
 
+_SAME_SIGHT = 1e-2
+"""Relative difference of derivatives below which two rows of a pose measure the same."""
 Shift = Callable[[JointState], Tensor]
 """Function that returns joint corrections [rad or m] for joint values and stated conditions."""
 
@@ -103,7 +105,7 @@ class SensorValues:
         """
         if not len(self.row) or self.other_row is not None:
             return self
-        key = renumber(pose[self.row] * len(self.row) + self._sights())
+        key = renumber(pose[self.row] * len(self.row) + self._sights(pose[self.row]))
         poses = int(key.max()) + 1
         if poses == len(key):
             return self
@@ -144,13 +146,16 @@ class SensorValues:
         repetition = max(shared / max(square, 1e-300), 1.0)
         return replace(self, repetition=repetition, root=self.root * repetition**-0.5)
 
-    def _sights(self) -> Int64[Tensor, " values"]:
-        """Return an index for every row that is equal for rows with equal derivatives."""
-        # A fixed generic linear combination distinguishes derivatives, up to rounding.
-        key = self.geometry.new_zeros(len(self.row))
-        for J in (self.geometry.flatten(1), self.joints.flatten(1)):
-            key = key + J @ torch.arange(1, J.shape[1] + 1).to(J).sin()
-        return renumber((key / key.abs().max().clamp(min=1e-300) * 1e6).round().to(torch.int64))
+    def _sights(self, pose: Int64[Tensor, " values"]) -> Int64[Tensor, " values"]:
+        """Return, for every row, the first row of its pose that has about the same derivatives."""
+        J = torch.cat([self.geometry.flatten(1), self.joints.flatten(1)], 1)
+        found, left = torch.zeros_like(pose), torch.arange(len(pose), device=pose.device)
+        while len(left):
+            first = torch.full_like(pose, len(pose)).scatter_reduce(0, pose[left], left, "amin")[pose[left]]
+            same = (J[left] - J[first]).norm(dim=1) <= _SAME_SIGHT * J[first].norm(dim=1)
+            found[left[same]] = first[same]
+            left = left[~same]
+        return found
 
 
 def weight_columns(

@@ -100,7 +100,9 @@ def arm_sentence(arm: ArmInImages) -> str:
     before, after = arm.nominal_rms * 1e3, arm.calibrated_rms * 1e3
     times = f"{before / after:.1f} times smaller: it is halved {arm.halvings:.1f} times"
     change = times if after < before else "not smaller"
-    fitted = "these images" if arm.training_images == len(arm.images) else f"{arm.training_images} of these images"
+    fitted = (
+        "these images" if arm.training_images == len(arm.images) else f"{arm.training_images} of these images"
+    )
     remark = f" The calibrated arm was fitted to {fitted}; errors in new images are larger."
     return (
         f"In {len(arm.images)} images, the board is {before:.3g} mm RMS from where the nominal arm says (base and tool "

@@ -1,6 +1,7 @@
 """Joint torques: learned as compliances where rows state them, and replaced by modelled ones where they do not."""
 
 import dataclasses
+import re
 import functools
 import json
 
@@ -31,7 +32,7 @@ from pisigma.model.stated_conditions import condition_warnings, under_stated_tor
 from pisigma.robot import Robot
 from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.validation.checks.check import CheckedCalibration
-from pisigma.validation.checks.torques import check_torques
+from pisigma.validation.checks.torques import _negative, check_torques
 
 ROBOT = Robot.load("ur5")
 COMPLIANCE = np.array([0.0, 2e-5, 2e-5, 5e-5, 5e-5, 5e-5])
@@ -177,6 +178,11 @@ def test_negative_compliances_are_named(joints, cause):
     assert [one.cause for one in found] == ([cause] if cause else [])
     if cause == "mixed_signs":
         assert found[0].values["joints"] == (2,)
+
+
+def test_compliances_of_prismatic_joints_have_their_own_unit():
+    (found,) = _negative({0: -1e-6, 2: -2e-6}, Robot.load("kiro3"))
+    assert re.findall(r"(tau_\d) \(\S+ (\S+)\)", found.sentence) == [("tau_1", "rad/Nm"), ("tau_3", "m/N")]
 
 
 def test_a_folder_states_that_torques_are_modelled(tmp_path):

@@ -68,6 +68,19 @@ def test_repeats_as_one_row_come_to_the_same_normal_equations() -> None:
     assert few.square[0] < many.square[0]
 
 
+def test_repeats_whose_joint_values_encoders_read_are_one_row() -> None:
+    """Their joint values differ by the repeatability of the controller."""
+    robot, random = Robot.load("ur5"), torch.Generator().manual_seed(0)
+    q = random_joints(robot, 20, 0).repeat(5, 1)
+    q = q + 1e-4 * torch.randn(q.shape, generator=random, dtype=torch.float64)
+    problem = (
+        GeometricCalibrator(robot).build(Measurements(q, forward_kinematics(robot, q)[:, :3, 3])).problem
+    )
+    assert problem.pose is not None
+    (values,) = sensor_values(problem.with_active(range(30)), problem.nominal)
+    assert len(values.merge_repeats(problem.pose).row) == 20
+
+
 def test_other_sights_of_a_pose_are_no_repeats() -> None:
     """Touches along three axes, each made twice: six rows of one pose are three."""
     robot = Robot.load("welding")

@@ -18,6 +18,7 @@ from pisigma.model.accuracy import sigma_of_rows
 from pisigma.model.geometric_model import model_of_calibration, with_hybrid
 from pisigma.model.inverse.corrected_ik import CorrectedIK
 from pisigma.robot import Robot
+from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.simulation.errors.backlash import Backlash
 from pisigma.simulation.errors.joint_compliance import JointCompliance, LinkMass
 from pisigma.simulation.true_robot import TrueRobot
@@ -100,6 +101,20 @@ def test_backlash_that_is_smaller_than_the_sag_is_found(seed):
     assert_close(found.values["play1_deg"], 0.02, rtol=0.35)
     drawn = np.random.default_rng(seed).choice([-1.0, 1.0], rows.q.shape)
     assert unstated_backlash(calibrator, replace(rows, approach=torch.from_numpy(drawn))) is None
+
+
+def test_error_of_commanded_poses_is_that_of_the_measured_tool():
+    rng, nominal = np.random.default_rng(1), Robot.load("ur5")
+    robot = nominal.with_geometry(nominal.dh + dh_errors(nominal, 5e-4, 5e-4, rng), base=BASE, tool=TOOL)
+    q = draw_joints(nominal, 54, rng)
+    rows = sided(Measurements(q, torch.zeros(54, 3).double(), line=tuple(range(2, 56)), source="rows.csv"))
+    true = TrueRobot(robot, [Backlash(kind="backlash", play_deg={"theta_6": 0.3})])
+    position = true.forward(q, rows.approach.nan_to_num(1.0))[:, :3, 3]
+    noise = torch.from_numpy(rng.normal(0, 3e-5, (54, 3)))
+    found = unstated_backlash(GeometricCalibrator(nominal), replace(rows, position=position + noise))
+    assert found.values["joints"] == (6,)
+    error = (position - forward_kinematics(robot, q)[:, :3, 3]).norm(dim=1)
+    assert_close(found.values["error_mm"], float(error.square().mean().sqrt()) * 1e3, rtol=0.3)
 
 
 @pytest.mark.parametrize("seed", [1, 4, 5])

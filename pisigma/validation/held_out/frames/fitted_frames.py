@@ -77,8 +77,8 @@ def errors_in_fitted_frames(
 
     Parameters that are fitted to n values make their errors too small. Therefore the errors are multiplied by
     `sqrt(n / (n - p))`, where p is the trace of the hat matrix over these values, which is the number of parameters if
-    there is only one kind of values (Draper and Smith 1998, Applied Regression Analysis, section 8.1). Rows of one frame
-    and target with equal joint values count once in n.
+    there is only one kind of values (Draper and Smith 1998, Applied Regression Analysis, section 8.1). Rows of a frame
+    and a target with equal joint values count once in n.
 
     Args:
         model: a model of any kind; its frames or targets are not used if they are fitted.
