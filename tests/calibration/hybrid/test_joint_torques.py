@@ -1,9 +1,9 @@
 """Joint torques: learned as compliances where rows state them, and replaced by modelled ones where they do not."""
 
 import dataclasses
-import re
 import functools
 import json
+import re
 
 import numpy as np
 import pytest
