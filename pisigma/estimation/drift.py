@@ -64,6 +64,7 @@ class LinearValues:
         configuration: index of the joint values at which every value was measured.
         counts: number of values of every sensor.
         wrong: configurations with wrong measurements, with the factors on their noise.
+        rejected: indices of the rows whose values the loss rejects; they have no values here.
     """
 
     X: Float64[Tensor, "values unknowns"]
@@ -72,6 +73,7 @@ class LinearValues:
     configuration: Int64[Tensor, " values"]
     counts: tuple[SensorCount, ...]
     wrong: Mapping[int, float] = field(default_factory=dict)
+    rejected: frozenset[int] = frozenset()
 
     def select(self, values: Tensor) -> "LinearValues":
         """Return a subset of the values, given by a mask or indices."""

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from pisigma.files.errors import PlanningError
 from pisigma.measurement.csv.reading import read_joints
+from pisigma.measurement.groups import groups_of_equal_joints
 from pisigma.planning.board_views import BoardViews
 from pisigma.planning.surroundings.arm_in_surroundings import ArmInSurroundings, Faults
 from pisigma.robot.kinematics.forward import forward_kinematics
@@ -25,8 +26,6 @@ _KERNEL_WIDTH, _RARE_SHARE = 0.25, 0.5
 is rare."""
 _MIN_VIEWS = 100
 """Number of views of a board that are drawn together, because a robot reaches few of them."""
-_SAME_JOINTS = 1e-6
-"""Difference of joint values below which rows of a file are the same pose [rad or m]."""
 _OUTSIDE_WORKSPACE = "the reflector is outside the box of the workspace"
 _REPEATED = "an earlier row has the same joint values"
 _UNREACHED = "the robot does not reach a view of the board"
@@ -170,9 +169,8 @@ def read_candidates(
 
 def _repeats(q: Float64[Tensor, "poses dof"]) -> Bool[Tensor, " poses"]:
     """Return the mask of poses that equal an earlier pose and would be planned twice."""
-    steps = (q / _SAME_JOINTS).round().numpy()
-    _, first, group = np.unique(steps, axis=0, return_index=True, return_inverse=True)
-    return torch.from_numpy(first[group.reshape(-1)] < np.arange(len(q)))
+    group = groups_of_equal_joints(q)  # numbered by their first row
+    return group.cummax(0).values.diff(prepend=group.new_tensor([-1])) == 0
 
 
 def select_spread_poses(

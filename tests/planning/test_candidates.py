@@ -49,7 +49,7 @@ def test_candidates_of_a_file_keep_their_row(tmp_path: Path):
 
 def test_repeated_poses_of_a_file_are_candidates_once(tmp_path: Path):
     drawn = draw_candidates(ARM, 4, 0)
-    q = torch.cat([drawn.q, drawn.q + 1e-8, drawn.q[1:3]])
+    q = torch.cat([drawn.q, drawn.q + 1e-4, drawn.q[1:3]])  # as encoders read them
     path = tmp_path / "repeated.csv"
     rows = [",".join(map(repr, row)) for row in torch.rad2deg(q).tolist()]
     path.write_text("\n".join(["q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg", *rows]))

@@ -158,11 +158,13 @@ class Rows:
         values: weighted values per sensor, with repeats of a pose as one row; residuals are those of the nominal
             parameters without a correction, by linearisation.
         group: index of every row's group; rows of a group, such as one placement of sockets, are held out together.
+        rejected: indices of the rows whose values the loss rejects.
     """
 
     problem: CalibrationProblem
     values: tuple[SensorValues, ...]
     group: Int64[Tensor, " rows"]
+    rejected: frozenset[int] = frozenset()
 
     @property
     def groups(self) -> int:
@@ -221,14 +223,16 @@ class Rows:
             group: index of every row's group, see the attributes.
         """
         problem, rows = design.problem, []
+        rejected = {row for sensor in values for row in sensor.row.tolist()}
         for sensor, weight in zip(values, weights, strict=True):
             one = sensor.apply_weights(weight)
+            rejected -= set(one.row.tolist())
             if problem.pose is not None:
                 one = one.merge_repeats(problem.pose)
             if problem.configuration is not None:
                 one = one.downweight_correlated(problem.configuration)
             rows.append(replace(one, residual=one.residual + design.predicted_change(one, x)))
-        return Rows(problem, tuple(rows), group)
+        return Rows(problem, tuple(rows), group, frozenset(rejected))
 
     def squared_difference(
         self, other: "Rows", x: Float64[Tensor, " unknowns"], design: Design, noise: Sequence[float]

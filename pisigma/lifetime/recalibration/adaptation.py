@@ -190,7 +190,10 @@ def linear_values(problem: RecalibrationProblem, rows: Rows) -> LinearValues:
         y.append((one.residual * one.root[:, None]).flatten() - columns @ problem.mean)
         sensor.append(torch.full((len(columns),), number))
         configuration.append(problem.configuration[one.row].repeat_interleave(one.components))
-    return LinearValues(torch.cat(X), torch.cat(y), torch.cat(sensor), torch.cat(configuration), rows.sensors)
+    found = LinearValues(
+        torch.cat(X), torch.cat(y), torch.cat(sensor), torch.cat(configuration), rows.sensors
+    )
+    return replace(found, rejected=rows.rejected)
 
 
 def _with_sizes(groups: tuple[DriftGroup, ...], like: tuple[DriftGroup, ...]) -> tuple[DriftGroup, ...]:

@@ -92,6 +92,7 @@ class RecalibrationProblem:
     def wrong_rows(self, values: LinearValues) -> Bool[Tensor, " rows"]:
         """Return the mask of rows that are not used: rejected by the loss, or of wrong configurations."""
         wrong = ~torch.isin(self.configuration, values.configuration)
+        wrong[torch.tensor([*values.rejected], dtype=torch.int64)] = True
         return wrong | torch.isin(self.configuration, torch.tensor([*values.wrong]))
 
     def with_fixed_arm(self) -> "RecalibrationProblem":

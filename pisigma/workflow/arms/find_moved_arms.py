@@ -18,6 +18,7 @@ from pisigma.files.errors import ModelError, Place, nearest_choice
 from pisigma.files.model_files import model_hash
 from pisigma.files.yaml_file import Section, read_yaml
 from pisigma.lifetime.comparison.moved_bases import ArmBefore, MovedBases, MovedBody, find_moved_bases
+from pisigma.lifetime.recalibration.movement import deviation_along
 from pisigma.measurement.camera.camera_files import CameraFiles
 from pisigma.measurement.camera.corner_file import MeasurementFiles, read_rows
 from pisigma.measurement.dataset import Measurements
@@ -41,6 +42,7 @@ class MovedFigures(Section):
         shift_mm: shift of its origin along x, y, z of the first arm's base [mm], if only it moved.
         rotation_deg: rotation about these axes [deg], as a rotation vector.
         standard_errors: standard errors of shift and rotation [mm and deg].
+        distance_error_mm: standard error of the length of the shift [mm].
         log_likelihood: log likelihood if only it moved, relative to no motion [nats].
     """
 
@@ -50,6 +52,7 @@ class MovedFigures(Section):
     shift_mm: Three
     rotation_deg: Three
     standard_errors: Six
+    distance_error_mm: float
     log_likelihood: float
 
     @property
@@ -60,12 +63,11 @@ class MovedFigures(Section):
             return (
                 f"the zero of joint '{self.name}' moved by {turned:.3g} deg (standard error {error:.2g} deg)"
             )
-        error = math.hypot(*self.standard_errors[:3])
         what = "base of arm" if self.kind == "arm" else "frame"
         turned = math.hypot(*self.rotation_deg)
         return (
-            f"the {what} '{self.name}' moved by {math.hypot(*self.shift_mm):.3g} mm (standard error {error:.2g} mm) "
-            f"and {turned:.2g} deg"
+            f"the {what} '{self.name}' moved by {math.hypot(*self.shift_mm):.3g} mm (standard error "
+            f"{self.distance_error_mm:.2g} mm) and {turned:.2g} deg"
         )
 
 
@@ -195,5 +197,6 @@ def _figures(one: MovedBody, is_named: bool) -> MovedFigures:
         shift_mm=tuple((one.shift * 1e3).tolist()),
         rotation_deg=tuple(one.rotation.rad2deg().tolist()),
         standard_errors=tuple(sizes.tolist()),
+        distance_error_mm=deviation_along(one.shift, one.covariance[:3, :3]) * 1e3,
         log_likelihood=one.log_likelihood,
     )

@@ -62,6 +62,17 @@ def test_a_wrong_row_is_not_mistaken_for_a_movement(joint):
     assert_close(session.rms, judged(rows.select(torch.tensor([0, 1, 2, 3, 5, 6, 7, 8, 9])))[0].rms, rtol=0.1)
 
 
+def test_a_wrong_reading_of_a_repeated_pose_is_named_and_left_out():
+    rows = rows_after_change(10, 3).select(torch.arange(10).repeat_interleave(3))
+    noise = 2e-5 * torch.randn(30, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    rows = replace(rows, position=rows.position + noise, line=tuple(range(2, 32)))
+    wrong = rows.position.clone()
+    wrong[4, 1] += 0.005
+    session, _ = judged(replace(rows, position=wrong))
+    assert session.outliers == (rows.place(4),)
+    assert_close(session.rms, judged(rows)[0].rms, rtol=0.1)
+
+
 def test_two_joints_that_moved_are_both_named():
     both = tuple(a + b for a, b in zip(moved_joint(2, 0.2), moved_joint(5, -0.3), strict=True))
     session, _ = judged(rows_after_change(12, 4, both))
