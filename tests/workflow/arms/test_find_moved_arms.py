@@ -47,7 +47,7 @@ def test_bumped_base_is_named_with_shift_and_standard_errors(folder):
     assert (one.kind, one.name, found.moved_bases.is_one_body) == ("arm", "right", True)
     assert_close(one.shift_mm, [0.3, 0.0, -0.4], atol=0.1)
     assert max(one.standard_errors[:3]) < 0.05
-    (body,) = found.found.named
+    (body,) = found.moved_bases.likely_bodies
     drawn = torch.randn(20_000, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     lengths = (body.shift + drawn @ torch.linalg.cholesky(body.covariance[:3, :3]).mT).norm(dim=1)
     assert_close(one.distance_error_mm, float(lengths.std()) * 1e3, rtol=0.05)
