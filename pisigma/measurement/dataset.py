@@ -325,7 +325,7 @@ class Measurements:
 
 
 def join(
-    data: Sequence[Measurements], cleared: Callable[[MeasuredFields], MeasuredFields] = lambda rows: rows
+    data: Sequence[Measurements], keep_rows: Callable[[MeasuredFields], MeasuredFields] = lambda rows: rows
 ) -> Measurements:
     """Concatenate data sets; fields that one of them does not have are NaN or "" in its rows.
 
@@ -333,7 +333,7 @@ def join(
 
     Args:
         data: one or more data sets with the same number of joints.
-        cleared: function that returns the rows to keep; it is called before the check that rows fit together.
+        keep_rows: function that returns the rows to keep; it is called before the check that rows fit together.
 
     Raises:
         MeasurementError: there is no data set, the numbers of joints differ, only some data sets have a split, or rows
@@ -356,7 +356,7 @@ def join(
             value="split",
             remedy="give the column in all data sets or in none",
         )
-    return Measurements.from_fields(cleared(joined_fields([one.as_fields() for one in data])))
+    return Measurements.from_fields(keep_rows(joined_fields([one.as_fields() for one in data])))
 
 
 def with_new_frames(measurements: Measurements, lines: Sequence[int]) -> Measurements:

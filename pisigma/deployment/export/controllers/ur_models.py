@@ -66,14 +66,14 @@ class ControllerGeometry:
             robot: nominal parameters, with the names and limits of the description.
             T_poses_base: maps the controller's frame `base` into the frame of the description's poses.
             T_flange_tool: maps the description's tool into the controller's flange.
-            described: robot as described.
+            described_robot: robot as described.
     """
 
     model: str
     robot: Robot
     T_poses_base: Frame
     T_flange_tool: Frame
-    described: Robot
+    described_robot: Robot
 
     def origins(self, calibrated: Robot) -> tuple[list[Frame], Robot]:
         """Return the frames of a calibrated robot's joints as the controller defines them, each in the previous frame.
@@ -86,7 +86,7 @@ class ControllerGeometry:
         Returns:
             The frames, the first one in `base`, and the nominal robot with the base and tool that belong to them.
         """
-        T_rows_base = inverse(frame_of(self.described.base)) @ self.T_poses_base
+        T_rows_base = inverse(frame_of(self.described_robot.base)) @ self.T_poses_base
         before, moved = T_rows_base, []
         origins, end = joint_origins(calibrated)
         for origin, screw in zip(origins, self._screws(T_rows_base), strict=True):
@@ -99,12 +99,12 @@ class ControllerGeometry:
     def _screws(self, T_rows_base: Frame) -> list[Frame]:
         """Return every joint's shift along and about its axis from the description's frame to the controller's."""
         described, own, screws = np.eye(4), T_rows_base, []
-        origins, end = joint_origins(self.described)
+        origins, end = joint_origins(self.described_robot)
         for described_origin, own_origin in zip(origins[:-1], joint_origins(self.robot)[0][:-1], strict=True):
             described, own = described @ described_origin, own @ own_origin
             screws.append(_screw(inverse(described) @ own))
         # After the last joint there is only the flange.
-        return [*screws, _screw(end @ frame_of(self.described.tool) @ inverse(self.T_flange_tool))]
+        return [*screws, _screw(end @ frame_of(self.described_robot.tool) @ inverse(self.T_flange_tool))]
 
     def frames(self) -> Frames:
         """Return the differences between the description's frames and the controller's."""
@@ -115,12 +115,13 @@ class ControllerGeometry:
         base, tool = _frame_words(self.T_poses_base), _frame_words(self.T_flange_tool)
         poses = f"Poses are those of the {self.model}'s flange in the controller's frame 'base'"
         if not base and not tool:
-            return f"{poses}, which are also the frames of robot '{self.described.name}'."
+            return f"{poses}, which are also the frames of robot '{self.described_robot.name}'."
         differences = [
             f"'base' is at {base} in the frame of its poses" if base else "",
             f"its tool is at {tool} on the flange" if tool else "",
         ]
-        return f"{poses}; robot '{self.described.name}' has other frames: {' and '.join(filter(None, differences))}."
+        other = " and ".join(filter(None, differences))
+        return f"{poses}; robot '{self.described_robot.name}' has other frames: {other}."
 
 
 def _screw(T: Frame) -> Frame:
