@@ -26,7 +26,7 @@ _SIZES = torch.logspace(-3, 1.5, 28, dtype=torch.float64)
 _NOISE = torch.logspace(-2, 2, 41, dtype=torch.float64)
 """Factors on the noise that are tried."""
 _STATED_SPREAD = 0.3
-"""Prior standard deviation of the logarithm of the factor if the noise is stated."""
+"""Prior standard deviation of the logarithm of the factor on the noise if the noise is stated."""
 CLEAR = 5.0
 """Log Bayes factor [nats] above which residuals have a cause: odds of 150 to 1."""
 _MAX_CAUSES = 3

@@ -19,7 +19,7 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 
 FLEET_PRIOR = "fleet_prior"
-"""Kind of a model that contains the prior of a fleet, which robots of a type share except for base and tool."""
+"""Kind of a model that contains the prior of a fleet: the distribution of all errors except those of base and tool."""
 
 
 def check_fleet_prior(model: CalibratedModel) -> None:

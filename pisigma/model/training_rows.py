@@ -43,7 +43,7 @@ def without_known_rows(model: CalibratedModel, rows: Measurements) -> tuple[Meas
     known = known_rows(model, rows)
     if bool(known.all()):
         raise MeasurementError(
-            f"expected new rows, got only rows whose joint values and readings are those of rows of model "
+            f"expected new rows, got only rows whose joint values and readings equal those of training rows of model "
             f"'{model.name}'",
             expected="new rows",
             at=Place(rows.source),

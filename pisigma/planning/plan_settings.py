@@ -27,8 +27,8 @@ class CameraSettings:
         board: board file (YAML), for the sensor camera.
         is_fixed: the camera is fixed and the board is on the flange, not the other way round.
         sigma_px: standard deviation of u and v of a detected corner [px].
-        repeatability_mm: standard deviation of the robot's position repeatability, per axis [mm].
-        repeatability_deg: standard deviation of the robot's orientation repeatability, per axis [deg].
+        repeatability_mm: repeatability of the robot's position: standard deviation per axis [mm].
+        repeatability_deg: repeatability of the robot's orientation: standard deviation per axis [deg].
 
     Raises:
         PlanningError: the noise is outside its valid range.

@@ -37,7 +37,7 @@ _WIDE_PRIOR = (*(1.0,) * 6, *(0.1,) * 3, *(1.0,) * 3)
 effect."""
 
 _POSES_PER_CHUNK = 512
-"""Number of poses whose derivatives are computed together (some MB)."""
+"""Number of poses whose derivatives are computed together (a few MB)."""
 
 
 @dataclass(frozen=True)

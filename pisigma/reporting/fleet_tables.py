@@ -51,7 +51,7 @@ def fleet_verdict(status: FleetStatus) -> Verdict:
     due = sum(one.is_due for one in status.cells)
     first = next((one for one in status.cells if one.step.state == (serious or [""])[-1]), None)
     return Verdict(
-        "no cell has an error yet."
+        "not known yet for any cell."
         if worst is None
         else f"largest error {rounded(worst[1].rms_mm or 0.0, 0)} mm RMS, of {worst[0].name}.",
         f"{found} of {count_text(count, 'cell')}." if found else "yes: no cell needs attention.",

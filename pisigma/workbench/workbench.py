@@ -136,7 +136,7 @@ class Workbench(UploadedRows):
         }
 
     def status(self) -> CellStatus | None:
-        """Return the status of the cell, which is read again after some seconds and after every step.
+        """Return the status of the cell, which is read again after a few seconds and after every step.
 
         The status is None until there is a cell.
         """

@@ -56,7 +56,7 @@ class MeasuringSession:
     """A robot that is being measured with a plan.
 
     `add` checks new rows at once. `update` looks for faults of the setup that all rows share, calibrates with the rows
-    so far and replans the remaining poses, which takes some seconds. `next_step` and `idle_step` return the same work
+    so far and replans the remaining poses, which takes a few seconds. `next_step` and `idle_step` return the same work
     in short steps, the most urgent one first. They may run in another thread than `add`, and within `in_background` in
     another process; their results are in the next `state`.
 

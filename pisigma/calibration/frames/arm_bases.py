@@ -135,7 +135,7 @@ class ArmBases:
 
     @cached_property
     def updated_arms(self) -> tuple[ArmPosterior, ...]:
-        """The arms given all equations; those of a torso have one base and equal rows before the last shared joint."""
+        """Posteriors of the arms given all equations; arms of a torso share the base and the rows of common joints."""
         sizes = [arm.root.shape[1] for arm in self.arms]
         parts = zip(
             torch.split(self.conditioned.z, sizes),

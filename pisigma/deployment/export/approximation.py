@@ -100,7 +100,7 @@ def solve_approximation(problem: ApproximationProblem) -> tuple[Robot, tuple[boo
     """Minimise the sum of squares from the initial robot by Levenberg-Marquardt steps.
 
     Returns:
-        The robot, and for every parameter, whether it is observable together with base, tool and the preceding
+        The robot, and for every parameter whether it is observable together with base, tool and the preceding
         parameters; unobservable parameters are not changed.
     """
     robot = problem.robot

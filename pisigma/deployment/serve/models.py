@@ -59,7 +59,7 @@ class ServedModel:
 
     @cached_property
     def short_hash(self) -> bytes:
-        """The first eight bytes of `sha256`, which name the model in frames."""
+        """The first eight bytes of `sha256`, which identify the model in binary frames."""
         return bytes.fromhex(self.sha256)[:8]
 
     @cached_property

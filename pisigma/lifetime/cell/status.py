@@ -172,7 +172,7 @@ def _file_to_take_in(facts: CellFacts) -> Step | None:
     command = facts.import_command(f"{facts.folder}/{SESSIONS}/{name}")
     refusals = [one for one in facts.checks if one.command == "import" and f"{one.session}.csv" == name]
     if refusals and refusals[-1].verdict == FOREIGN:
-        why = f"{SESSIONS}/{name} is not a measurement file, but may be imported"
+        why = f"{SESSIONS}/{name} is not a measurement file; `import` can convert many formats"
         return Step("file_refused", why, command)
     if refusals:
         why = f"{refusals[-1].summary.rstrip('.')}; correct the file, or set it aside"

@@ -155,7 +155,7 @@ def _joint_repeatability(posterior: ModelPosterior, rows: Measurements) -> float
 
 
 def _joined_space(space: ParameterSpace, rows: Measurements) -> ParameterSpace:
-    """Return the parameters of a model and of rows.
+    """Return the parameters of a model, extended by those of new rows.
 
     Frames and targets of the model come first. Owners of sensor unknowns are in the order of the rows, which is that of
     the sensors' indices, followed by those that the rows lack, in their previous frames.

@@ -18,8 +18,8 @@ class Repeatability:
     """Repeatability of a robot: deviation of the pose at given joint values, independent in each image.
 
     Attributes:
-        length: standard deviation of the robot's position repeatability, per axis [m], for images.
-        angle: standard deviation of the robot's orientation repeatability, per axis [rad], for images.
+        length: repeatability of the robot's position in images: standard deviation per axis [m].
+        angle: repeatability of the robot's orientation in images: standard deviation per axis [rad].
     """
 
     length: Annotated[float, Option("--repeatability-mm", unit="mm", is_key=True)] = 2e-5

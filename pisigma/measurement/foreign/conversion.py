@@ -75,7 +75,7 @@ def check_complete(mapping: FileMapping) -> None:
                 f"the columns '{column.heading}' and '{other.heading}' are both {column.target.quantity}",
                 at=mapping.place_of(column),
                 value=column.target.quantity,
-                remedy=f"omit one of them, such as with --map '{mapping.key(column)}=-'",
+                remedy=f"omit one of them, for example with --map '{mapping.key(column)}=-'",
             )
     for group in (
         position_columns(mapping.columns),

@@ -18,7 +18,7 @@ from pisigma.robot.kinematics.forward import forward_kinematics
 from pisigma.robot.kinematics.tolerances import LIMIT_TOLERANCE
 
 POSES_PER_CHUNK = 2048
-"""Number of poses that are checked together (some MB)."""
+"""Number of poses that are checked together (a few MB)."""
 _ROUNDING = 1e-9
 """Distance by which capsules of a measured pose may overlap without a self-collision [m]."""
 

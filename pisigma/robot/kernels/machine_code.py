@@ -43,7 +43,7 @@ _FEATURES = ("avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe", "xsave")
 """Features that x86-64-v3 adds to x86-64."""
 _PATIENCE = 2.0
 """Delay of the notice on compilation [s]; cached kernels load much faster."""
-_COMPILING = "pisigma: preparing the inverse kinematics for this processor, once, in some seconds ...\n"
+_COMPILING = "pisigma: preparing the inverse kinematics for this processor (once, takes a few seconds) ...\n"
 Said = ctypes.c_int64 * 1
 """Status that a call of the kernels writes."""
 IGNORED = Said()
@@ -75,7 +75,7 @@ def load_kernels(wanted: KernelForms = _NOTHING) -> Callable[..., int]:
     It has two more arguments before those of `run`: a `Said`, into which -1 or the result of `kernels.solve_poses` is
     written, and `IGNORED` for exceptions, which are never raised.
 
-    On Linux and processors with AVX2, the package contains the machine code. Otherwise it is compiled in some seconds
+    On Linux and processors with AVX2, the package contains the machine code. Otherwise it is compiled in a few seconds
     at the first use on a machine, and read from a file afterwards; on a terminal a notice explains the delay.
 
     Args:

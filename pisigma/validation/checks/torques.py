@@ -14,7 +14,7 @@ _SIGNIFICANT = 3.0
 
 
 def check_torques(checked: CheckedCalibration) -> Iterator[Diagnostic]:
-    """Warn about negative compliances, which show torques of the load instead of the drive, or of opposite sign."""
+    """Warn about negative compliances: torques of the load instead of the drive, or torques of the wrong sign."""
     hybrid = checked.hybrid
     if hybrid is None or hybrid.learned is None:
         return
@@ -48,7 +48,7 @@ def _negative(compliances: dict[int, float], robot: Robot) -> Iterator[Diagnosti
         kind="torques",
         severity="warning",
         sentence=f"expected torques of the drives, positive towards larger joint values, got negative compliances "
-        f"with the columns {columns}: their sign is probably the opposite one{others}. {remedy}",
+        f"with the columns {columns}: their sign is probably reversed{others}. {remedy}",
         cause="mixed_signs" if is_mixed else "opposite_sign",
         values={"joints": tuple(joint + 1 for joint in negative)},
         remedy=remedy,

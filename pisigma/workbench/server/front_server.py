@@ -221,7 +221,7 @@ class Access:
 def is_local_host(host: str) -> bool:
     """Return whether a Host header names this machine by an address or by a name that only this machine has.
 
-    A foreign page whose name was made to point to this machine (DNS rebinding) is recognised by its name.
+    A foreign page whose host name was made to resolve to this machine (DNS rebinding) is recognised by that name.
     """
     name = ""
     with contextlib.suppress(ValueError):

@@ -74,8 +74,8 @@ class CameraSection(Section):
         board: board files (YAML: rows, columns, square_mm).
         fixed_camera: whether the cameras are fixed and the boards are on the flange, not the other way round.
         intrinsics: fixed, prior or free.
-        repeatability_mm: standard deviation of the robot's position repeatability, per axis [mm].
-        repeatability_deg: standard deviation of the robot's orientation repeatability, per axis [deg].
+        repeatability_mm: repeatability of the robot's position: standard deviation per axis [mm].
+        repeatability_deg: repeatability of the robot's orientation: standard deviation per axis [deg].
     """
 
     camera: tuple[str, ...]

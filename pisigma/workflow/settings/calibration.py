@@ -101,7 +101,7 @@ class CalibrationSettings:
         split: how to split the rows: joints (at random), interleaved, time, space or placement. Rows of equal joint
             values always stay together.
         repeats: number of repeats of the cross-validation. None: 200 divided by the number of distinct joint
-            configurations, limited to 1 to 10.
+            configurations, but at least 1 and at most 10.
         jobs: number of processes that calibrate in parallel, for all rows and for each fold. Each uses one thread.
             None: threads of one process.
         seed: random seed of the split and of the choice of training rows.

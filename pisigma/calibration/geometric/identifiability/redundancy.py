@@ -152,9 +152,9 @@ def _singular_values(A: Float64[np.ndarray, "rows columns"]) -> Float64[np.ndarr
 def _rank(R: Float64[np.ndarray, "rank columns"], tolerance: float) -> int:
     """Compute the numerical rank of a triangle with columns of unit length (or zero).
 
-    The largest singular value is between 1 and the square root of the number of columns, so the rank is k if the block
-    below row k is shorter than the tolerance and the inverse of the leading k x k block is short enough. This bound
-    is nearly always conclusive, so the singular values need not be computed.
+    The largest singular value is between 1 and the square root of the number of columns, so the rank is k if the
+    Frobenius norms of the block below row k and of the inverse of the leading k x k block are small enough. This
+    criterion is nearly always conclusive, so the singular values need not be computed.
     """
     from scipy.linalg.lapack import dtrtri  # imported here, because models are loaded without scipy
 

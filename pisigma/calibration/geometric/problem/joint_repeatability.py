@@ -1,4 +1,4 @@
-"""Repeatability of joints that repeat badly, such as servos: the noise of poses in images, and its estimate."""
+"""Repeatability of imprecise joints, such as servos: the noise of poses in images, and its estimate."""
 
 from collections.abc import Mapping
 
