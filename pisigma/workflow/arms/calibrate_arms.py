@@ -184,7 +184,7 @@ def posterior_of(arm: Arm, calibration: Calibration, torso: tuple[str, ...]) -> 
     ):
         if not bool(stated.all()):
             raise MeasurementError(
-                "a touch lacks its name (column 'socket') or its standard deviation (column 'sigma_mm')",
+                "a touch has no name in the column 'socket' or no standard deviation in the column 'sigma_mm'",
                 expected="both in every row",
                 at=rows.place_of(int(stated.long().argmin()), column),
                 remedy="state the same name in the row of the other arm, and the play of the tips as 'sigma_mm'",
