@@ -85,11 +85,11 @@ READINGS: dict[str, SensorReadings] = {}
 """Columns that `pisigma.measurement.sensors.register_sensor` added to measurement files, by sensor."""
 
 
-def reading_numbers() -> tuple[str, ...]:
+def numeric_columns() -> tuple[str, ...]:
     """Return the names of all registered numeric columns."""
     return tuple(name for readings in READINGS.values() for name in readings.numbers)
 
 
-def reading_texts() -> tuple[str, ...]:
+def text_columns() -> tuple[str, ...]:
     """Return the names of all registered text columns."""
     return tuple(name for readings in READINGS.values() for name in readings.texts)

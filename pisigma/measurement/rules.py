@@ -13,7 +13,7 @@ from pisigma.files.errors import MeasurementError, Phrase, Place, nearest_choice
 from pisigma.measurement.dates import EXPECTED_DATE, is_date
 from pisigma.measurement.faults import Fault
 from pisigma.measurement.fields import NUMBERS, TEXTS, MeasuredFields
-from pisigma.measurement.readings import READINGS, Unit, from_si, reading_numbers, reading_texts
+from pisigma.measurement.readings import READINGS, Unit, from_si, numeric_columns, text_columns
 
 AXES = ("x", "y", "z")
 """Names of the axes of a frame, for touches."""
@@ -76,7 +76,7 @@ def check_fields(data: MeasuredFields) -> None:
 def _check_shapes(data: MeasuredFields) -> None:
     """Check that there is one row per measurement, in float64, on one device."""
     source, q = data.source, data.numbers["q"]
-    sizes = {"q": (-1,), **NUMBERS, **dict.fromkeys(reading_numbers(), ())}
+    sizes = {"q": (-1,), **NUMBERS, **dict.fromkeys(numeric_columns(), ())}
     for name, values in data.numbers.items():
         if name not in sizes:
             raise MeasurementError(
@@ -84,7 +84,7 @@ def _check_shapes(data: MeasuredFields) -> None:
                 option="readings",
                 value=name,
                 at=Place(source),
-                remedy=nearest_choice(name, reading_numbers()),
+                remedy=nearest_choice(name, numeric_columns()),
             )
         shape = (len(q), *(q.shape[1] if size < 0 else size for size in sizes[name]))
         if tuple(values.shape) != shape:
@@ -109,13 +109,13 @@ def _check_shapes(data: MeasuredFields) -> None:
                 remedy="move the values to that device",
             )
     for name, entries in {**data.texts, "line": data.line}.items():
-        if name not in (*TEXTS, "line", *reading_texts()):
+        if name not in (*TEXTS, "line", *text_columns()):
             raise MeasurementError(
                 f"no sensor has a text column '{name}'",
                 option="readings",
                 value=name,
                 at=Place(source),
-                remedy=nearest_choice(name, reading_texts()),
+                remedy=nearest_choice(name, text_columns()),
             )
         if len(entries) != len(q):
             expected = f"{len(q)} entries, one per row"

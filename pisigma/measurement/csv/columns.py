@@ -16,7 +16,7 @@ from torch import Tensor
 from pisigma.files.errors import MeasurementError, Place, nearest_choice
 from pisigma.files.output_file import write_atomically
 from pisigma.measurement.fields import KINDS, TEXTS, MeasuredFields
-from pisigma.measurement.readings import READINGS, Unit, from_si, reading_texts
+from pisigma.measurement.readings import READINGS, Unit, from_si, text_columns
 from pisigma.robot.se3 import quaternion_from_rotation
 
 POSITION = ("x", "y", "z")
@@ -61,7 +61,7 @@ class Column:
     @property
     def is_number(self) -> bool:
         """Whether the cells of the column are numbers."""
-        return self.quantity not in (*TEXTS, *PLAN_COLUMNS, *reading_texts())
+        return self.quantity not in (*TEXTS, *PLAN_COLUMNS, *text_columns())
 
     @property
     def joint(self) -> int:
@@ -152,7 +152,7 @@ def _columns() -> dict[str, Column]:
     columns = [column for field in number_fields() for column in field.columns]
     columns += [Column(f"{name}_deg", name, "deg") for name in RPY]
     columns += [Column(name, name, "") for name in PLAN_COLUMNS]
-    columns += [Column("set" if name == "split" else name, name, "") for name in (*TEXTS, *reading_texts())]
+    columns += [Column("set" if name == "split" else name, name, "") for name in (*TEXTS, *text_columns())]
     return {column.name: column for column in columns}
 
 
@@ -192,7 +192,7 @@ def write_fields(data: MeasuredFields, path: str | os.PathLike[str], revolute: S
             "there is no row to write", at=Place(data.source), remedy="give at least one measurement"
         )
     numbers = _numbers(data, revolute)
-    names = (*TEXTS, *reading_texts())
+    names = (*TEXTS, *text_columns())
     texts = {"set" if name == "split" else name: data.text(name) for name in names if any(data.text(name))}
     _check(data, texts)
     text = io.StringIO()

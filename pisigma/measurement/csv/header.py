@@ -18,7 +18,7 @@ from pisigma.measurement.csv.columns import (
     quoted_names,
 )
 from pisigma.measurement.csv.table import Table
-from pisigma.measurement.readings import READINGS, reading_numbers
+from pisigma.measurement.readings import READINGS, numeric_columns
 from pisigma.robot import Robot
 
 
@@ -49,7 +49,7 @@ class Layout:
 
         They include names (of sockets and anchors), so that a name without a value is reported.
         """
-        return tuple(name for name in ("socket", *_NEEDED, *reading_numbers()) if name in self.index)
+        return tuple(name for name in ("socket", *_NEEDED, *numeric_columns()) if name in self.index)
 
     @property
     def joints(self) -> tuple[str, ...]:
@@ -221,7 +221,7 @@ def _check_joint_fields(place: Place, columns: tuple[Column, ...], dof: int) -> 
 def _check_position(place: Place, columns: tuple[Column, ...]) -> None:
     """Check that x, y and z are present in one unit, unless the file has other lengths."""
     present = [column for column in columns if column.quantity in POSITION]
-    if not present and {column.quantity for column in columns} & {"socket", *_NEEDED, *reading_numbers()}:
+    if not present and {column.quantity for column in columns} & {"socket", *_NEEDED, *numeric_columns()}:
         return
     unit = present[0].unit if present else "mm"
     for quantity in POSITION:

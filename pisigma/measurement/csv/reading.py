@@ -27,7 +27,7 @@ from pisigma.measurement.fields import TEXTS, MeasuredFields, OnBadRow, Unusable
 from pisigma.measurement.foreign.export_file import read_export
 from pisigma.measurement.foreign.mapping import FileMapping, map_columns
 from pisigma.measurement.foreign.quantities import KEYS
-from pisigma.measurement.readings import READINGS, reading_texts, to_si
+from pisigma.measurement.readings import READINGS, text_columns, to_si
 from pisigma.measurement.rules import FieldLabels, group_faults, row_faults
 from pisigma.robot import Robot
 from pisigma.robot.se3 import rotation_from_quaternion, rotation_from_rpy
@@ -163,7 +163,7 @@ def _fields(table: Table, layout: Layout, rows: CheckedRows) -> MeasuredFields:
         name, number = column.joint_field
         values = fields.setdefault(name, torch.full_like(fields["q"], torch.nan))
         values[:, number - 1] = numbers(column.quantity)[:, 0]
-    names = (*TEXTS, *reading_texts())
+    names = (*TEXTS, *text_columns())
     texts = {name: rows.texts(layout.index[name]) for name in names if name in layout.index}
     return MeasuredFields(fields, texts, table.lines, table.source)
 
