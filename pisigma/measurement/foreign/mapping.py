@@ -19,8 +19,8 @@ from pisigma.measurement.foreign.proposal import (
 from pisigma.measurement.foreign.quantities import (
     KEYS,
     LEFT_OUT,
+    ColumnTarget,
     MappedColumn,
-    Target,
     fits_unit,
     is_joint,
     joints_of,
@@ -165,7 +165,7 @@ def _take_stated(proposal: Proposal, name: str, text: str) -> None:
                 expected=f"{written}, as the file states",
                 value=target.unit,
                 at=Place(file.source, file.header_line, name),
-                remedy=f"map it to {Target(target.quantity, written).text}, or to {text}! if the file is wrong",
+                remedy=f"map it to {ColumnTarget(target.quantity, written).text}, or to {text}! if the file is wrong",
             )
         if target.missing_unit_kind and fits_unit(target.quantity, written):
             target = replace(target, unit=written)

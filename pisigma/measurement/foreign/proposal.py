@@ -18,7 +18,7 @@ from pisigma.measurement.foreign.headings import (
     joint_of,
     parse_heading,
 )
-from pisigma.measurement.foreign.quantities import LEFT_OUT, MappedColumn, Target, joints_of
+from pisigma.measurement.foreign.quantities import LEFT_OUT, ColumnTarget, MappedColumn, joints_of
 from pisigma.measurement.foreign.rotations import MATRIX_ROWS, ROTATIONS, encodings_of
 from pisigma.measurement.foreign.time_stamps import seconds_of
 from pisigma.measurement.foreign.units import UNITS, UnitKind
@@ -69,7 +69,7 @@ class Proposal:
 
     def set_quantity(self, index: int, quantity: str, reason: str) -> None:
         """Set the quantity of a column."""
-        target = Target(quantity, "" if quantity == LEFT_OUT else self.headings[index].unit)
+        target = ColumnTarget(quantity, "" if quantity == LEFT_OUT else self.headings[index].unit)
         self.columns[index] = MappedColumn(index, self.file.headings[index], target, reason)
 
     def names(self, *kinds: UnitKind) -> dict[str, list[int]]:
@@ -318,7 +318,7 @@ def _take_names(proposal: Proposal) -> None:
         )
         if file.has_header and is_open and is_name and len(set(cells)) == len(cells) > 1:
             proposal.columns[index] = MappedColumn(
-                index, file.headings[index], Target("point"), "a different name in every row"
+                index, file.headings[index], ColumnTarget("point"), "a different name in every row"
             )
             return
 

@@ -42,7 +42,7 @@ _KINDS: dict[str, UnitKind] = {
 
 
 @dataclass(frozen=True)
-class Target:
+class ColumnTarget:
     """The target of a column in a mapping.
 
     Attributes:
@@ -84,7 +84,7 @@ class MappedColumn:
 
     index: int
     heading: str
-    target: Target
+    target: ColumnTarget
     reason: str = ""
     is_stated: bool = False
 
@@ -121,7 +121,7 @@ def measurement_column(quantity: str, unit: str) -> str:
     return next((name for name in names if (column := find_column(name)) and column.quantity == quantity), "")
 
 
-def parse_target(text: str, heading: str) -> Target:
+def parse_target(text: str, heading: str) -> ColumnTarget:
     """Parse the target of a column in a mapping, such as "q1_deg", "-q1_deg", "x_in", "x_in!", "point", or "-".
 
     Args:
@@ -132,7 +132,7 @@ def parse_target(text: str, heading: str) -> Target:
         MeasurementError: there is no such column or unit.
     """
     if text in ("", LEFT_OUT):
-        return Target(LEFT_OUT)
+        return ColumnTarget(LEFT_OUT)
     name, is_reversed = text.removeprefix(LEFT_OUT).removesuffix(_ALTHOUGH), text.startswith(LEFT_OUT)
     column = find_column(name)
     known = () if column is None else ((column.quantity, "", column.unit),)
@@ -140,7 +140,7 @@ def parse_target(text: str, heading: str) -> Target:
         is_quantity = bool(known) or quantity in _quantities() or is_joint(quantity)
         has_sign = unit_kind(quantity) in ("angle", "length") or not is_reversed
         if is_quantity and has_sign and (not unit or unit in UNITS) and fits_unit(quantity, unit):
-            return Target(quantity, unit, is_reversed, text.endswith(_ALTHOUGH))
+            return ColumnTarget(quantity, unit, is_reversed, text.endswith(_ALTHOUGH))
     choices = {"q1_deg", "x_mm", "y_mm", "z_mm", "time_s", LEFT_OUT, *_quantities()}
     raise MeasurementError(
         f"unknown target '{text}' of the column '{heading}'",

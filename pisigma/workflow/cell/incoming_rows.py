@@ -16,7 +16,7 @@ from pisigma.measurement.csv.reading import is_measurement_file
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.foreign.headings import parse_heading
 from pisigma.measurement.foreign.mapping import FileMapping
-from pisigma.measurement.foreign.quantities import MappedColumn, Target
+from pisigma.measurement.foreign.quantities import ColumnTarget, MappedColumn
 from pisigma.measurement.foreign.units import unit_symbol
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.workflow.cell.cell import Cell
@@ -177,7 +177,7 @@ def _corrected(mapping: FileMapping, finding: Diagnostic) -> Mapping[str, str]:
     """Return the meanings of a file's columns that correct a finding, by heading; empty if there is no repair."""
     kinds, values = set(finding.cause.split("+")) - {"frame", "tool"}, finding.values
     columns, ratio = values.get("columns"), values.get("ratio", _MISNAMED.get(finding.cause))
-    targets: list[tuple[MappedColumn, Target]] = []
+    targets: list[tuple[MappedColumn, ColumnTarget]] = []
     if isinstance(columns, tuple) and kinds <= {"joint_order", "joint_sign"}:
         for joint, logged in enumerate(columns, 1):
             one = mapping.quantities.get(f"q{abs(logged)}")
