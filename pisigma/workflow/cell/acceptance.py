@@ -13,7 +13,7 @@ from pisigma.validation.iso9283.repeats import repeated_poses
 from pisigma.validation.uncertainty.components import uncertainty_budget
 from pisigma.validation.uncertainty.instrument import Instrument
 from pisigma.workflow.cell.cell import Cell
-from pisigma.workflow.cell.setup_names import ModelRows
+from pisigma.workflow.cell.setup_names import RowsWithModelNames
 from pisigma.workflow.evaluate import evaluate
 
 _JUDGED = frozenset(("position", "rotation", "pose", "corner"))
@@ -84,7 +84,7 @@ def acceptance_of(cell: Cell) -> Acceptance:
 
 
 def _measured(
-    cell: Cell, entry: ModelEntry, session: SessionEntry, seen: ModelRows
+    cell: Cell, entry: ModelEntry, session: SessionEntry, seen: RowsWithModelNames
 ) -> tuple[MeasuredAccuracy | None, str]:
     """Evaluate the model on a session; return the reason if this is not possible."""
     if others := seen.rows.kinds - _JUDGED:
@@ -100,7 +100,7 @@ def _measured(
 
 
 def _attained(
-    cell: Cell, model: CalibratedModel, session: SessionEntry, seen: ModelRows | None
+    cell: Cell, model: CalibratedModel, session: SessionEntry, seen: RowsWithModelNames | None
 ) -> tuple[Measurements, Float64[Tensor, "rows 3"] | None]:
     """Return the rows of a session and the commanded positions; None if the frames may have changed."""
     if seen is None or seen.moved:

@@ -39,7 +39,7 @@ from pisigma.workflow.cell.model_choice import (
 from pisigma.workflow.cell.new_cell import NewCell
 from pisigma.workflow.cell.new_files import free_path, save_new
 from pisigma.workflow.cell.sessions import Sessions
-from pisigma.workflow.cell.setup_names import ModelRows
+from pisigma.workflow.cell.setup_names import RowsWithModelNames
 from pisigma.workflow.evaluate import Evaluation, evaluate
 from pisigma.workflow.monitor import MonitoringResult, monitor
 from pisigma.workflow.plan import Plan, plan
@@ -387,7 +387,7 @@ class Cell:
 
     def _new_rows(
         self, command: str, model: str | None, session: str | None
-    ) -> tuple[ModelEntry, SessionEntry, ModelRows]:
+    ) -> tuple[ModelEntry, SessionEntry, RowsWithModelNames]:
         """Return a model, a session (by default the newest to which it was not fitted), and rows of the session."""
         entry = self._candidate(model)
         self.controller_warnings(command, entry)

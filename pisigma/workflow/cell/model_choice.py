@@ -17,7 +17,7 @@ from pisigma.robot.description import Robot
 from pisigma.validation.report.accuracy import identified_scatter
 from pisigma.workflow.calibrate import Calibration, calibrate
 from pisigma.workflow.cell.sessions import Sessions
-from pisigma.workflow.cell.setup_names import ModelRows, newest_day, setup_name
+from pisigma.workflow.cell.setup_names import RowsWithModelNames, newest_day, setup_name
 from pisigma.workflow.evaluate import evaluate
 from pisigma.workflow.monitor import MonitoringResult
 from pisigma.workflow.recalibrate import Recalibration, recalibrate
@@ -114,7 +114,7 @@ def check_entry(
     monitoring: MonitoringResult,
     entry: ModelEntry,
     session: SessionEntry,
-    rows: ModelRows,
+    rows: RowsWithModelNames,
     settings: RecalibrationSettings,
 ) -> Check:
     """Return the history entry of a session's monitoring result.

@@ -33,7 +33,7 @@ from pisigma.robot.description import Robot
 from pisigma.validation.gate import RowVerdict, check_rows
 from pisigma.validation.held_out.diagnostic import Diagnostic
 from pisigma.workflow.cell.new_files import write_new
-from pisigma.workflow.cell.setup_names import ModelRows, newest_day, with_setup_names
+from pisigma.workflow.cell.setup_names import RowsWithModelNames, newest_day, with_setup_names
 from pisigma.workflow.recalibrate import may_move
 from pisigma.workflow.settings.recalibration import RecalibrationSettings
 
@@ -321,7 +321,7 @@ class Sessions:
             )
         return rows
 
-    def rows_with_model_names(self, model: ModelEntry, rows: Measurements, day: str) -> ModelRows:
+    def rows_with_model_names(self, model: ModelEntry, rows: Measurements, day: str) -> RowsWithModelNames:
         """Return rows with a model's names of frame and target, and the parts that were moved since it was made.
 
         Args:
@@ -336,7 +336,7 @@ class Sessions:
             for what, kind in changed.items()
             if newest_day(events, kind, day) != newest_day(events, kind, model.day)
         )
-        return ModelRows(with_setup_names(rows, model.frame_day, model.target_day), moved)
+        return RowsWithModelNames(with_setup_names(rows, model.frame_day, model.target_day), moved)
 
 
 def with_session(model: ModelEntry, session: SessionEntry) -> ModelEntry:

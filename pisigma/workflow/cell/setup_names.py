@@ -10,7 +10,7 @@ from pisigma.workflow.settings.recalibration import RecalibrationSettings
 
 
 @dataclass(frozen=True, eq=False)
-class ModelRows:
+class RowsWithModelNames:
     """Rows with the names of a model's frame and target.
 
     Attributes:
