@@ -28,11 +28,11 @@ from pisigma.validation.held_out.trained_calibrations import (
     Calibrator,
     DistanceErrors,
     Result,
+    assign_distances_to_folds,
     distance_figures,
     drop_missing_frames,
     fit_compared_calibrations,
     geometric_of,
-    held_out_distances,
     judgeable_rows,
     with_frames,
 )
@@ -224,7 +224,7 @@ def fold_tasks(
         of_repeat = progress
         if len(repeats) > 1:
             of_repeat = with_stage(progress, f"repeat {number} of {len(repeats)}", ", ")
-        held_out = held_out_distances(geometric_of(calibrator).socket_distances, measurements, splits)
+        held_out = assign_distances_to_folds(geometric_of(calibrator).socket_distances, measurements, splits)
         for fold, (split, without) in enumerate(zip(splits, held_out, strict=True), 1):
             name = f"fold {fold} of {len(splits)}"
             tasks.append(partial(_judged_fold, calibrator, measurements, name, split, without, of_repeat))

@@ -255,7 +255,7 @@ class DistanceErrors:
         )
 
 
-def held_out_distances(
+def assign_distances_to_folds(
     stated: Mapping[PairOfSockets, float], measurements: Measurements, splits: Sequence[TrainTest]
 ) -> tuple[dict[PairOfSockets, float], ...]:
     """Assign every stated distance to one fold, whose calibration does not use it.

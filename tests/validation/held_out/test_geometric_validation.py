@@ -17,7 +17,11 @@ from pisigma.measurement.splits import holdout, k_folds
 from pisigma.reporting.calibration_tables import held_out_lines
 from pisigma.reporting.tables import distance_table
 from pisigma.validation.held_out.calibration_validation import validate
-from pisigma.validation.held_out.trained_calibrations import DistanceErrors, held_out_distances, with_frames
+from pisigma.validation.held_out.trained_calibrations import (
+    DistanceErrors,
+    assign_distances_to_folds,
+    with_frames,
+)
 
 KNOWN = {(f"{plate}/0", f"{plate}/1"): 0.05 for plate in ("plate", "low", "high")}
 
@@ -104,15 +108,15 @@ def test_every_stated_distance_is_predicted_by_a_calibration_without_it() -> Non
 
 def test_distances_are_held_out_once_but_never_all_together() -> None:
     data = socket_data()
-    whole = held_out_distances(KNOWN, data, k_folds(data, None, 0, "placement"))
+    whole = assign_distances_to_folds(KNOWN, data, k_folds(data, None, 0, "placement"))
     assert sorted(len(one) for one in whole) == [1, 1, 1]
     assert {pair for one in whole for pair in one} == set(KNOWN)
-    assert held_out_distances(KNOWN, data, [holdout(data, 0.3, 0)]) == ({},)
-    assert [len(one) for one in held_out_distances(KNOWN, data, k_folds(data, 2, 0))] == [2, 1]
+    assert assign_distances_to_folds(KNOWN, data, [holdout(data, 0.3, 0)]) == ({},)
+    assert [len(one) for one in assign_distances_to_folds(KNOWN, data, k_folds(data, 2, 0))] == [2, 1]
     two = dict(list(KNOWN.items())[:2])
-    assert [len(one) for one in held_out_distances(two, data, k_folds(data, 2, 0))] == [1, 1]
+    assert [len(one) for one in assign_distances_to_folds(two, data, k_folds(data, 2, 0))] == [1, 1]
     alone = {("low/0", "low/1"): 0.05}
-    assert held_out_distances(alone, data, k_folds(data, 3, 0)) == ({}, {}, {})
+    assert assign_distances_to_folds(alone, data, k_folds(data, 3, 0)) == ({}, {}, {})
 
 
 def test_a_ball_that_once_missed_its_socket_does_not_move_it() -> None:
