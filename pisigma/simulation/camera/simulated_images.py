@@ -342,17 +342,17 @@ def simulate_images(
 
 
 def images_of(
-    q: Float64[Tensor, "images dof"], corners: Sequence[np.ndarray], pixels: Sequence[np.ndarray]
+    q: Float64[Tensor, "images dof"], corner_numbers: Sequence[np.ndarray], pixels: Sequence[np.ndarray]
 ) -> Images:
     """Return simulated corners as images.
 
     Args:
         q: joint values of every image [rad or m].
-        corners: numbers of the corners in every image.
+        corner_numbers: numbers of the corners in every image.
         pixels: pixels of the corners in every image [px].
     """
     names = tuple(f"{number:04d}" for number in range(len(q)))
-    return Images("simulated images", names, q, (0,) * len(q), tuple(corners), tuple(pixels))
+    return Images("simulated images", names, q, (0,) * len(q), tuple(corner_numbers), tuple(pixels))
 
 
 def write_images(images: SimulatedImages, robot: TrueRobot, folder: str | os.PathLike[str]) -> int:
