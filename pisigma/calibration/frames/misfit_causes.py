@@ -134,7 +134,7 @@ def _per_row(values: WhitenedValues) -> Float64[Tensor, "values _joints"]:
 def _stated_deviations(solved: SolvedCalibration, rows: Measurements) -> Float64[Tensor, " unknowns"]:
     """Return the stated standard deviation of every unknown of cameras and boards; 0 where none is stated."""
     space, unknowns = solved.problem.space, solved.setup.free_unknowns
-    images = ImageIntrinsics.from_texts(texts_of(rows, INTRINSICS_COLUMN))
+    images = ImageIntrinsics.from_csv_cells(texts_of(rows, INTRINSICS_COLUMN))
     stated = {
         ("camera", name): images.sigma[(cameras(rows) or ()).index(name)].tolist()
         for name in distinct_names(cameras(rows))

@@ -144,7 +144,7 @@ def _readings(
     }
     if solved.sigma.any():
         J = np.stack(changes) @ solved.intrinsics.pose_jacobian
-        readings[INTRINSICS_COLUMN] = replace(solved.intrinsics, pose_jacobian=J).texts
+        readings[INTRINSICS_COLUMN] = replace(solved.intrinsics, pose_jacobian=J).csv_cells
     if board.scale_deviation is not None:
         readings[SCALE_COLUMN] = (f"{board.scale_deviation:.17g}",) * count
     return readings

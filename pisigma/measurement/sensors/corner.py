@@ -137,7 +137,7 @@ class CornerSensor(AbstractSensor):
         # errors are in the frame of the base's anchor, weights in the axes of the row's frame
         rotated = (weight.view(-1, 6, 2, 3) @ R[:, None]).view(-1, 6, 6)
         rotated = torch.where(present[:, None, None], rotated, 0.0)
-        images = ImageIntrinsics.from_texts(texts_of(data, INTRINSICS_COLUMN))
+        images = ImageIntrinsics.from_csv_cells(texts_of(data, INTRINSICS_COLUMN))
         of_camera, of_board = cameras(data), boards(data)
         at, by = (torch.from_numpy(values).to(R) for values in (images.intrinsics, images.pose_jacobian))
         scale_derivative = torch.where(
@@ -228,7 +228,7 @@ def as_poses(
     position, rotation = measurements.position, measurements.rotation
     if position is None or rotation is None or CAMERA_COLUMN not in measurements.readings:
         return replace(measurements, readings=others)
-    images = ImageIntrinsics.from_texts(texts_of(measurements, INTRINSICS_COLUMN))
+    images = ImageIntrinsics.from_csv_cells(texts_of(measurements, INTRINSICS_COLUMN))
     moved = np.zeros((measurements.rows, NUMBERS))
     scale = np.ones(measurements.rows)
     for row, camera in enumerate(cameras(measurements) or ()):

@@ -72,16 +72,16 @@ class ImageIntrinsics:
         return ImageIntrinsics(*(getattr(self, item.name)[rows] for item in fields(self)))
 
     @property
-    def texts(self) -> tuple[str, ...]:
+    def csv_cells(self) -> tuple[str, ...]:
         """Cells of the column of intrinsics: all numbers of an image as text, separated by spaces."""
         blocks = [getattr(self, item.name).reshape(len(self.intrinsics), -1) for item in fields(self)]
         return tuple(" ".join(f"{value:.17g}" for value in row) for row in np.concatenate(blocks, 1))
 
     @staticmethod
-    def from_texts(texts: tuple[str, ...]) -> "ImageIntrinsics":
+    def from_csv_cells(cells: tuple[str, ...]) -> "ImageIntrinsics":
         """Return the information in cells of the column of intrinsics; 0 for empty cells."""
         empty = [0.0] * SIZE
-        block = np.array([numbers_in(text, SIZE) or empty for text in texts]).reshape(-1, 19, NUMBERS)
+        block = np.array([numbers_in(text, SIZE) or empty for text in cells]).reshape(-1, 19, NUMBERS)
         return ImageIntrinsics(block[:, :6], block[:, 6:15], *(block[:, row] for row in range(15, 19)))
 
 
@@ -123,12 +123,12 @@ def without_stated_priors(
     if CAMERA_COLUMN not in measurements.readings:
         return measurements
     stated, scales = (texts_of(measurements, name) for name in (INTRINSICS_COLUMN, SCALE_COLUMN))
-    images, names = ImageIntrinsics.from_texts(stated), cameras(measurements) or ("",) * len(stated)
+    images, names = ImageIntrinsics.from_csv_cells(stated), cameras(measurements) or ("",) * len(stated)
     is_counted = np.array([name in included.get("camera", ()) for name in names])
     images = replace(images, sigma=np.where(is_counted[:, None], _UNINFORMATIVE, 1.0) * images.sigma)
     texts = {
         INTRINSICS_COLUMN: tuple(
-            text if name else "" for name, text in zip(names, images.texts, strict=True)
+            text if name else "" for name, text in zip(names, images.csv_cells, strict=True)
         ),
         SCALE_COLUMN: tuple(
             "1" if board in included.get("board", ()) else text
@@ -218,7 +218,7 @@ class IntrinsicsSensor(AbstractSensor):
         data, names = rows.measurements, cameras(rows.measurements)
         if names is None or not bool(rows.has_corner_poses.any()):
             return None
-        images = ImageIntrinsics.from_texts(texts_of(data, INTRINSICS_COLUMN))
+        images = ImageIntrinsics.from_csv_cells(texts_of(data, INTRINSICS_COLUMN))
         noise = torch.nan_to_num(rows.readings(NOISE_COLUMN), nan=1.0)
         number = indices_of_names(names, distinct_names(names), data.rows).numpy()
         owners = np.full(data.rows, -1)
@@ -263,7 +263,7 @@ class IntrinsicsSensor(AbstractSensor):
         names = cameras(measurements)
         if names is None:
             return None
-        images = ImageIntrinsics.from_texts(texts_of(measurements, INTRINSICS_COLUMN))
+        images = ImageIntrinsics.from_csv_cells(texts_of(measurements, INTRINSICS_COLUMN))
         first = [names.index(name) for name in distinct_names(names)]
         return InitialUnknowns(
             torch.from_numpy(images.stated[first]), torch.from_numpy(images.sigma[first] > 0)
