@@ -122,9 +122,12 @@ class MonitoringResult:
     def needs_action(self) -> bool:
         """Whether action is needed: rows are implausible, a recalibration is recommended, or a limit is exceeded."""
         alarmed = any(chart.alarm is not None for chart in self.charts)
-        passed = self.forecast is not None and self.forecast.passed
+        exceeded = self.forecast is not None and self.forecast.limit_exceeded
         return (
-            bool(self.untrusted) or alarmed or passed or any(one.session.recalibrate for one in self.sessions)
+            bool(self.untrusted)
+            or alarmed
+            or exceeded
+            or any(one.session.recalibrate for one in self.sessions)
         )
 
     @property

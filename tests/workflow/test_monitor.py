@@ -56,7 +56,7 @@ def test_a_collision_calls_for_action():
     assert_close(moved[0]["shift_deg"], 0.25, rtol=0.05)
     assert moved[0]["interval"][0] < 0.25 < moved[0]["interval"][1]
     assert report["sessions"][1]["recalibrate"]
-    assert report["forecast"]["passed"]
+    assert report["forecast"]["limit_exceeded"]
     assert any("pisigma recalibrate" in line for line in report["summary"])
     settings = MonitorSettings(dates=("2026-03-01", "2026-02-01"))
     repaired = monitor(

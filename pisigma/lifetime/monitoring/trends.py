@@ -120,20 +120,20 @@ class Forecast:
 
     Attributes:
         limit_mm: the limit [mm].
-        passed: whether the error of the last session is above the limit.
+        limit_exceeded: whether the error of the last session is above the limit.
         date: date on which the trend reaches the limit; None if it does not do so within ten years.
         earliest: start of the 95 % confidence interval of the date; None if this is more than ten years away.
     """
 
     limit_mm: float
-    passed: bool
+    limit_exceeded: bool
     date: str | None
     earliest: str | None
 
     @property
     def sentence(self) -> str:
         """Sentence that states the forecast."""
-        if self.passed:
+        if self.limit_exceeded:
             return f"The RMS error of the last session is above the limit of {self.limit_mm:g} mm."
         if self.date is None:
             return f"No significant trend leads to an RMS error above {self.limit_mm:g} mm within ten years."
@@ -276,9 +276,9 @@ def forecast_of(records: Sequence[Record], limit_mm: float) -> Forecast:
     """Forecast when the RMS error of a session passes a limit, from a straight line through all sessions."""
     months, last = months_of(records), records[-1]
     rms = torch.tensor([one.session.rms * 1e3 for one in records], dtype=torch.float64)
-    passed = bool(rms[-1] > limit_mm)
+    exceeded = bool(rms[-1] > limit_mm)
     date = earliest = None
-    if not passed and bool((rms > 0).all()) and len(torch.unique(months)) >= _MIN_SESSIONS:
+    if not exceeded and bool((rms > 0).all()) and len(torch.unique(months)) >= _MIN_SESSIONS:
         # The RMS of n values has a relative standard deviation of sqrt(1 / 2n).
         spread = rms * torch.tensor([math.sqrt(0.5 / one.session.values) for one in records]).double()
         # A jump must exceed the usual noise between sessions; the fit of the line below estimates this scatter.
@@ -299,7 +299,7 @@ def forecast_of(records: Sequence[Record], limit_mm: float) -> Forecast:
         if slope > NORMAL_95 * deviation:
             date = _after(last.date, (limit_mm - now) / slope)
             earliest = _after(last.date, (limit_mm - now) / (slope + NORMAL_95 * deviation))
-    return Forecast(limit_mm, passed, date, earliest if date else None)
+    return Forecast(limit_mm, exceeded, date, earliest if date else None)
 
 
 def months_of(records: Sequence[Record]) -> Float64[Tensor, " sessions"]:

@@ -104,15 +104,15 @@ def test_few_sessions_do_not_determine_a_drift():
 
 
 @pytest.mark.parametrize(
-    ("slope", "limit", "passed", "date"),
+    ("slope", "limit", "exceeded", "date"),
     [(0.0, 0.5, False, None), (2e-5, 0.5, False, "2026-1"), (2e-5, 0.2, True, None)],
 )
-def test_a_limit_is_forecast(slope, limit, passed, date):
+def test_a_limit_is_forecast(slope, limit, exceeded, date):
     forecast = forecast_of(records(10, rms=lambda month: 3e-4 + slope * month), limit)
     if date is None:
         assert forecast.date is None
     else:
         assert forecast.date.startswith(date)
         assert forecast.earliest <= forecast.date
-    assert forecast.passed is passed
+    assert forecast.limit_exceeded is exceeded
     assert forecast.sentence.endswith(".")
