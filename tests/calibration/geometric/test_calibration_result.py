@@ -53,7 +53,7 @@ def test_noise_is_recovered_and_counted(result: CalibrationResult) -> None:
     assert [noise.sensor for noise in result.noise] == ["position", "rotation"]
     assert_close(result.noise[0].sigma, 5e-5, rtol=0.15)
     assert_close(result.noise[1].sigma, 1e-4, rtol=0.15)
-    assert_close(sum(noise.used for noise in result.noise), len(result.free), atol=1.0)
+    assert_close(sum(noise.effective_parameters for noise in result.noise), len(result.free), atol=1.0)
     assert_close(result.noise[0].rms, result.rms_path[-1], rtol=1e-6)
 
 

@@ -203,7 +203,7 @@ def test_noise_is_the_misfit_over_the_values_that_the_unknowns_leave() -> None:
     C, X = covariance_of(fit, posterior), fit.X[:30] / NOISE[0]
     residual = fit.y[:30] - fit.X[:30] @ posterior.x
     used = float(((X @ C) * X).sum())
-    assert_close(posterior.used[0], used, rtol=1e-10)
+    assert_close(posterior.effective_parameters[0], used, rtol=1e-10)
     expected = math.sqrt(float(residual.square().sum()) / (30 - used))
     assert_close(fit.updated_noise(posterior)[0], expected, rtol=1e-10)
 
