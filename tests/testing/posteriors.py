@@ -49,7 +49,12 @@ def assert_same_posterior(
         assert_close(here.square, there.square, rtol=exactness, atol=1e-9)
         assert_close(here.determined, there.determined, atol=max(exactness, 1e-6))
         assert_close(np.array(here.misfit), np.array(there.misfit), rtol=exactness)
-        assert_close(np.array(here.effective_parameters), np.array(there.effective_parameters), rtol=exactness, atol=1e-6)
+        assert_close(
+            np.array(here.effective_parameters),
+            np.array(there.effective_parameters),
+            rtol=exactness,
+            atol=1e-6,
+        )
         assert_close(here.effective_unknowns, there.effective_unknowns, atol=max(exactness, 1e-6))
         evidence.append((here.log_evidence, there.log_evidence))
     here, there = (second - first for first, second in zip(*evidence, strict=True))
