@@ -17,40 +17,40 @@ _REPEATABILITY = 1e-3
 """Largest difference of joint values of one pose [rad or m]; values that encoders read differ from repeat to repeat."""
 
 
-def groups_of_equal_joints(q: Float64[Tensor, "rows dof"]) -> Int64[Tensor, " rows"]:
+def groups_of_equal_joints(
+    q: Float64[Tensor, "rows dof"], tolerance: float = _REPEATABILITY
+) -> Int64[Tensor, " rows"]:
     """Return the index of every row's joint values among the distinct ones, numbered by their first row.
 
+    Every group has a row that all its rows equal up to the tolerance, so rows along a path do not all belong together.
+
     Args:
-        q: joint values [rad or m]; rows belong together if all their joint values are equal up to `_REPEATABILITY`.
+        q: joint values [rad or m].
+        tolerance: largest difference of joint values of one pose [rad or m]; 0 for exactly equal values.
 
     Returns:
         For every row, the index of its group, from 0.
     """
     if q.shape[0] == 0:
         return torch.zeros(0, dtype=torch.int64, device=q.device)
-    values, number = torch.unique(q + 0.0, dim=0, return_inverse=True)  # -0.0 becomes 0.0
-    return _numbered(torch.from_numpy(_representatives(values.detach().cpu().numpy())).to(q.device)[number])
+    distinct, number = torch.unique(q + 0.0, dim=0, return_inverse=True)  # -0.0 becomes 0.0
+    if tolerance > 0 and len(distinct) > 1:
+        number = _nearby(distinct.detach().cpu().numpy(), tolerance).to(q.device)[number]
+    return _numbered(number)
 
 
-def _representatives(values: Float64[np.ndarray, "rows columns"]) -> Int64[np.ndarray, " rows"]:
-    """Return, for every row, the index of the row that represents it: one that equals it up to `_REPEATABILITY`.
+def _nearby(values: Float64[np.ndarray, "rows columns"], tolerance: float) -> Int64[Tensor, " rows"]:
+    """Return, for every row, the index of the first row without an earlier equal one that it equals."""
+    from scipy.spatial import KDTree  # imported here, because models are loaded without scipy
 
-    Rows are sorted by a weighted sum, so that only neighbours need to be compared. A representative represents itself,
-    so rows along a path do not all belong together.
-    """
-    weight = np.sqrt(np.arange(2.0, 2 + values.shape[1])) % 1 + 0.5  # without simple ratios
-    order = np.argsort(values @ weight, kind="stable")
-    values, key = values[order], (values @ weight)[order]
-    end = np.searchsorted(key, key + _REPEATABILITY * weight.sum(), side="right")
-    found = np.arange(len(key))
-    for row in np.flatnonzero(end > found + 1).tolist():
-        if found[row] == row:
-            near = slice(row, end[row])
-            equal = (np.abs(values[near] - values[row]) <= _REPEATABILITY).all(1)
-            found[near][equal & (found[near] == np.arange(row, end[row]))] = row
-    representative = np.empty_like(order)
-    representative[order] = order[found]
-    return representative
+    tree = KDTree(values)
+    representative = np.arange(len(values))
+    distance, _ = tree.query(values, k=2, p=np.inf, distance_upper_bound=tolerance)
+    for row in np.flatnonzero(np.isfinite(distance[:, 1])):
+        if representative[row] == row:
+            near = np.array(tree.query_ball_point(values[row], tolerance, p=np.inf))
+            representative[near[(near > row) & (representative[near] == near)]] = row
+    return torch.from_numpy(representative)
 
 
 def numbers_of_names(names: Sequence[Hashable]) -> Int64[Tensor, " rows"]:

@@ -9,12 +9,11 @@ from jaxtyping import Float64
 from scipy.stats import chi2
 from torch import Tensor
 
-from pisigma.calibration.frames.initial_bases import fitted_pose, in_base, initial_bases
+from pisigma.calibration.frames.initial_bases import COLLINEAR, fitted_pose, in_base, initial_bases
 from pisigma.calibration.frames.shared_joints import (
     axis_difference,
     shared_count,
     shared_counts,
-    stepped,
     updated,
     with_common_joints,
 )
@@ -36,6 +35,7 @@ from pisigma.calibration.frames.touch_equations import (
 )
 from pisigma.estimation.covariance_root import ConditionedUnknowns, condition_on_equalities
 from pisigma.files.errors import IdentificationError, Phrase
+from pisigma.robot.frame_fits import moved_frame
 from pisigma.robot.se3 import invert, pose_error
 
 _CLOSURE = 1e-9
@@ -45,9 +45,6 @@ _FALSE_ALARMS = 1e-4
 MAX_ITERATIONS, _CONVERGENCE_TOLERANCE = 20, 1e-12
 _UNDETERMINED = 1e-5
 """Ratio of the smallest to the largest singular value of equations that do not determine all bases and tips."""
-_COLLINEAR = 1e-3
-"""Ratio of the second to the first singular value of points below which they lie on a line and determine no
-rotation."""
 
 
 @dataclass(frozen=True)
@@ -172,7 +169,7 @@ class ArmBases:
         number = torch.tensor(self.equations)
         for index, shared in enumerate(self.shared):
             others = number != index
-            if int(torch.linalg.matrix_rank(G[others], rtol=_COLLINEAR)) < G.shape[1]:
+            if int(torch.linalg.matrix_rank(G[others], rtol=COLLINEAR)) < G.shape[1]:
                 drop, freedom = self.conditioned.misfit, self.conditioned.redundancy
             else:
                 left = condition_on_equalities(B[others], G[others], r[others], closure[others])
@@ -225,7 +222,7 @@ def fit_arm_bases(arms: Sequence[ArmPosterior]) -> ArmBases:
         r = B @ torch.cat(z) - missed
         found = condition_on_equalities(B, G, r, closure)
         step, moved = found.x[: 6 * (len(arms) - 1)].view(-1, 6), found.x[6 * (len(arms) - 1) :].view(-1, 3)
-        T = torch.cat([T[:1], stepped(T[1:], step)])
+        T = torch.cat([T[:1], moved_frame(T[1:], step)])
         tips = {name: tip + one for (name, tip), one in zip(tips.items(), moved, strict=True)}
         z = list(torch.split(found.z, [len(one) for one in z]))
         if float(found.x.abs().max()) < _CONVERGENCE_TOLERANCE:
@@ -291,7 +288,7 @@ def _linearised(
 
     def equations(unknowns: Tensor) -> Tensor:
         steps = unknowns[sum(sizes) :].view(-1, 6)
-        bases = torch.cat([T[:1], stepped(T[1:], steps)])
+        bases = torch.cat([T[:1], moved_frame(T[1:], steps)])
         parts = torch.split(unknowns[: sum(sizes)], sizes)
         return torch.cat([unknowns[:0], *_equations(arms, shared, bases, parts, places)])
 

@@ -14,7 +14,7 @@ from pisigma.robot.frame_fits import MeasuredPoses, best_base
 from pisigma.robot.se3 import invert, transform, transform_from_xyzrpy
 
 _MIN_POINTS = 3
-_COLLINEAR = 1e-3
+COLLINEAR = 1e-3
 """Ratio of the second to the first singular value of points below which they lie on a line and determine no
 rotation."""
 
@@ -95,6 +95,6 @@ def _place(
         return None
     points = torch.stack(wanted)
     spread = torch.linalg.svdvals(points - points.mean(0))
-    if spread[1] <= _COLLINEAR * spread[0]:
+    if spread[1] <= COLLINEAR * spread[0]:
         return None
     return best_base(torch.stack(own), MeasuredPoses.from_tensors(points, None, 0.0))

@@ -12,6 +12,7 @@ from pisigma.calibration.frames.shared_objects import ArmPosterior
 from pisigma.calibration.geometric.problem.parameters import ParameterSpace
 from pisigma.calibration.geometric.problem.setup import IdentifiedGeometry
 from pisigma.estimation.covariance_root import CovarianceRoot
+from pisigma.robot.frame_fits import moved_frame
 from pisigma.robot.kinematics.components import (
     IDENTITY,
     as_transform,
@@ -20,13 +21,7 @@ from pisigma.robot.kinematics.components import (
     rotate_z,
     translate,
 )
-from pisigma.robot.se3 import (
-    invert,
-    rotation_from_vector,
-    transform,
-    transform_from_xyzrpy,
-    xyzrpy_from_transform,
-)
+from pisigma.robot.se3 import invert, transform_from_xyzrpy, xyzrpy_from_transform
 
 
 def frame_after_rows(dh: Float64[Tensor, " parameters"]) -> Float64[Tensor, "4 4"]:
@@ -53,14 +48,6 @@ def axis_difference(
     return torch.cat([turned, across @ (other[:3, 3] - axis[:3, 3])]) if is_revolute else turned
 
 
-def stepped(
-    T: Float64[Tensor, "*batch 4 4"], step: Float64[Tensor, "*batch 6"]
-) -> Float64[Tensor, "*batch 4 4"]:
-    """Return poses that are shifted along and rotated about the axes of their frame, in place."""
-    R = rotation_from_vector(step[..., 3:]) @ T[..., :3, :3]
-    return transform(R, T[..., :3, 3] + step[..., :3])
-
-
 def with_common_joints(
     arm: ArmPosterior,
     reference: ArmPosterior,
@@ -85,8 +72,8 @@ def with_common_joints(
 
     def combined(unknowns: Tensor) -> Tensor:
         theirs, values, step, their_step = torch.split(unknowns, [shared, own, 6, 6])
-        T_base = stepped(T_first_base[0], step)
-        T_reference = stepped(T_first_base[1], their_step)
+        T_base = moved_frame(T_first_base[0], step)
+        T_reference = moved_frame(T_first_base[1], their_step)
         T_new_old = invert(T_reference) @ T_base
         between = invert(frame_after_rows(theirs)) @ T_new_old @ frame_after_rows(values[:shared])
         offsets = values[shared : shared + 2] + torch.stack(

@@ -61,12 +61,12 @@ def repeated_poses(
     """Compute AP_P of poses with two or more measured positions, and RP_l of poses with `MIN_CYCLES` or more.
 
     Args:
-        rows: measured rows; rows of one pose have equal joint values, frames and targets.
+        rows: measured rows; rows of one pose have exactly equal joint values, frames and targets.
         commanded: commanded position of every row, in the frame of the row [m]; None if it is not known.
     """
     if rows.position is None:
         return ()
-    joints = groups_of_equal_joints(rows.q).tolist()
+    joints = groups_of_equal_joints(rows.q, tolerance=0.0).tolist()
     pose = numbers_of_names(list(zip(joints, rows.frame, rows.target, strict=True)))
     found = []
     for number in range(int(pose.max()) + 1):

@@ -100,7 +100,8 @@ def with_common_joints(calibration: Calibration, found: ArmPosterior) -> Calibra
     robot = model.robot.with_geometry(base=geometry.robot.base, tool=geometry.robot.tool)
     text = (
         f"{calibration.texts.description} Arms of one torso share its base and {', '.join(found.torso)}: their values "
-        "are from the rows of all these arms, standard errors in tables from the rows of this arm only."
+        "are from the rows of all these arms, held-out errors and standard errors in tables from the rows of this arm "
+        "only. There is no joint correction."
     )
     summary = calibration.summary.with_figures(parameters=summarise(updated).parameters)
     return replace(

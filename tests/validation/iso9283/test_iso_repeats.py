@@ -47,6 +47,11 @@ def test_scatter_is_unbiased_with_two_cycles():
     assert pooled_deviation(()) is None
 
 
+def test_poses_that_were_commanded_half_a_milliradian_apart_are_not_repeats():
+    q = Q[:1] + 5e-4 * torch.arange(MIN_CYCLES, dtype=torch.float64)[:, None]
+    assert repeated_poses(Measurements(q=q, position=ATTAINED[:1].expand(MIN_CYCLES, -1)), None) == ()
+
+
 def test_there_is_no_accuracy_without_the_command():
     assert [one.accuracy for one in repeated_poses(ROWS, None)] == [None, None]
 
