@@ -1,7 +1,6 @@
 """Propose the quantities of an export's columns from their headings or, without headings, from their order."""
 
-import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -20,7 +19,7 @@ from pisigma.measurement.foreign.headings import (
 )
 from pisigma.measurement.foreign.quantities import LEFT_OUT, ColumnTarget, MappedColumn, joints_of
 from pisigma.measurement.foreign.rotations import MATRIX_ROWS, ROTATIONS, encodings_of
-from pisigma.measurement.foreign.time_stamps import seconds_of
+from pisigma.measurement.foreign.time_stamps import is_like_time, seconds_of
 from pisigma.measurement.foreign.units import UNITS, UnitKind
 
 NO_ROTATION = "none"
@@ -29,15 +28,6 @@ UNRECOGNISED = "not recognised"
 """Reason that is stated for columns whose headings have no known meaning."""
 
 _JOINTS_WITHOUT_HEADINGS = (6, 7)
-_MIN_RISING = 5
-"""Number of rows at which the first column rises by chance in one of 120 files."""
-_MIN_ORDERED = 8
-"""Number of rows at which one of ten columns rises or falls by chance in one of 2,000 files."""
-_MANY, _MAX_REVERSED = 20, 0.1
-"""Smallest number of rows at which some steps of a time may have the opposite sign, for example because a clock was
-set, and the largest share of such steps."""
-_MIN_CHANGES = 0.4
-"""Smallest share of the rows in which a time changes; joints that are at rest in many rows change less often."""
 _Side = Literal["commanded", "measured"]
 
 
@@ -117,7 +107,8 @@ def propose_quantities(proposal: Proposal, rotation: str | None) -> None:
     if not proposal.file.has_header:
         _take_by_order(proposal, rotation)
     for index, heading in enumerate(proposal.headings):
-        if heading.is_column_name and index not in proposal.columns:
+        of_rotation = heading.name in (*RPY, *QUATERNION)
+        if heading.is_column_name and index not in proposal.columns and not of_rotation:
             proposal.set_quantity(index, heading.name, "heading")
     _take_joints(proposal)
     _take_position(proposal)
@@ -195,7 +186,7 @@ def _check_times(proposal: Proposal, of_index: Mapping[int, str]) -> None:
         numbers = file.numbers(index)
         if index in proposal.columns or quantity == "point" or len(numbers) < len(file.records):
             continue
-        if not _is_ordered(numbers, 0 if index else _MIN_RISING):
+        if not is_like_time(numbers, is_first=not index):
             continue
         unit = "mm" if quantity in POSITION else "deg"
         raise MeasurementError(
@@ -204,23 +195,6 @@ def _check_times(proposal: Proposal, of_index: Mapping[int, str]) -> None:
             value=f"{numbers[0]:g} to {numbers[-1]:g}",
             remedy=f"map it with --map {index + 1}=time_s or --map {index + 1}={quantity}_{unit}",
         )
-
-
-def _is_ordered(numbers: Sequence[float], rising: int) -> bool:
-    """Return whether numbers rise or fall from row to row more often than by chance, apart from changes of the clock.
-
-    Args:
-        numbers: numbers of a column.
-        rising: number of rows above which it is sufficient that all numbers rise; 0 if that is never sufficient.
-    """
-    steps = [after - before for before, after in itertools.pairwise(numbers)]
-    up, down = (sum(sign * step > 0 for step in steps) for sign in (1, -1))
-    few, most = sorted((up, down))
-    if most < _MIN_CHANGES * len(steps) or len(numbers) < min(rising or _MIN_ORDERED, _MIN_ORDERED):
-        return False
-    if len(numbers) >= _MANY:
-        return few <= _MAX_REVERSED * most
-    return few == 0 and (len(numbers) >= _MIN_ORDERED or most == len(steps) == up)
 
 
 def _ends_with_matrices(file: ExportFile, leading: int) -> bool:
@@ -277,7 +251,23 @@ def _take_position(proposal: Proposal) -> None:
 
 
 def _take_rotation(proposal: Proposal, rotation: str | None) -> None:
-    """Map the rotation by the names of its values, by the manufacturer of the joints, or as stated."""
+    """Map the rotation by the names of its values, by the manufacturer of the joints, or as stated.
+
+    Columns such as roll_deg have the meaning of measurement files only in a file whose joints and position have names
+    of measurement files too, because elsewhere roll is often the angle about x.
+
+    Raises:
+        MeasurementError: the headings are those of another encoding than the stated one.
+    """
+    placed = [
+        proposal.headings[index].is_column_name
+        for index, one in proposal.columns.items()
+        if not one.is_stated and (one.target.quantity in POSITION or joints_of([one.target.quantity]))
+    ]
+    for index, heading in enumerate(proposal.headings):
+        of_file = rotation is None and all(placed) and heading.is_column_name
+        if of_file and index not in proposal.columns and heading.name in (*RPY, *QUATERNION):
+            proposal.set_quantity(index, heading.name, "heading")
     columns = {name for one in ROTATIONS.values() for name in (*one.columns, *one.quantities())}
     names = {
         name: indices
@@ -301,6 +291,15 @@ def _take_rotation(proposal: Proposal, rotation: str | None) -> None:
         proposal.assign_columns(group, names, "measured", f"{chosen}: {encoding.meaning}")
     elif rotation is None:
         proposal.rotations = tuple(matches)
+    elif matches:
+        headings = ", ".join(next(iter(matches.values())))
+        raise MeasurementError(
+            option="--rotation",
+            expected=f"{', '.join(matches)} or {NO_ROTATION}, which fit the headings {headings}",
+            value=rotation,
+            at=Place(proposal.file.source, proposal.file.header_line),
+            remedy="state it, or name the columns with --map",
+        )
 
 
 def _take_names(proposal: Proposal) -> None:

@@ -1,5 +1,6 @@
 """Time stamps of instruments and controllers."""
 
+import itertools
 import math
 import re
 from collections.abc import Sequence
@@ -16,6 +17,15 @@ _BASIC = re.compile(r"(\d{4})(\d\d)(\d\d)T(\d\d)(\d\d)(\d\d)")
 _ZONED = re.compile(r"(.*?)(?:Z|([+-]\d\d(?::?\d\d)?))?")
 """Clock time and time zone, such as 10:31:02Z, 10:31:02+01:00 or 10:31:02+01."""
 _CLOCK = re.compile(r"(\d{1,2}):(\d{2})(?::(\d{2}(?:[.,]\d+)?))?(?:\s*([AaPp])\.?[Mm]\.?)?")
+_MIN_RISING = 5
+"""Number of rows at which the first column rises by chance in one of 120 files."""
+_MIN_ORDERED = 8
+"""Number of rows at which one of ten columns rises or falls by chance in one of 2,000 files."""
+_MANY, _MAX_REVERSED = 20, 0.1
+"""Smallest number of rows at which some steps of a time may have the opposite sign, for example because a clock was
+set, and the largest share of such steps."""
+_MIN_CHANGES = 0.4
+"""Smallest share of the rows in which a time changes; joints that are at rest in many rows change less often."""
 
 
 def seconds_of(text: str, day_first: bool | None = None) -> float | None:
@@ -118,6 +128,23 @@ def check_restarts(
             remedy="join one recording after the other, or join by point; the time stamps of LeRobot restart in every "
             "episode",
         )
+
+
+def is_like_time(numbers: Sequence[float], is_first: bool) -> bool:
+    """Return whether numbers rise or fall from row to row more often than by chance, apart from changes of the clock.
+
+    Args:
+        numbers: numbers of a column.
+        is_first: whether it is the first column, of which `_MIN_RISING` numbers that all rise are sufficient.
+    """
+    steps = [after - before for before, after in itertools.pairwise(numbers)]
+    up, down = (sum(sign * step > 0 for step in steps) for sign in (1, -1))
+    few, most = sorted((up, down))
+    if most < _MIN_CHANGES * len(steps) or len(numbers) < (_MIN_RISING if is_first else _MIN_ORDERED):
+        return False
+    if len(numbers) >= _MANY:
+        return few <= _MAX_REVERSED * most
+    return few == 0 and (len(numbers) >= _MIN_ORDERED or most == len(steps) == up)
 
 
 def _is_open(match: re.Match[str]) -> bool:

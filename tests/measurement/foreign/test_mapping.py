@@ -178,6 +178,37 @@ def test_rotations_of_several_makers(tmp_path: Path):
     assert "'kuka'" in caught.value.remedy
 
 
+ROTATED = {
+    "roll_deg,pitch_deg,yaw_deg": {
+        "rpy": ["yaw_deg", "pitch_deg", "roll_deg"],
+        "omron": ["omron_roll_deg", "omron_pitch_deg", "omron_yaw_deg"],
+    },
+    "qx,qy,qz,qw": {"quaternion": ["qx", "qy", "qz", "qw"]},
+    "Rx [deg],Ry [deg],Rz [deg]": {"yaskawa": ["yaw_deg", "pitch_deg", "roll_deg"]},
+}
+
+
+@pytest.mark.parametrize("columns", ROTATED)
+def test_stated_rotation_is_used_or_refused(tmp_path: Path, columns: str):
+    numbers = ",".join(["0"] * columns.count(",") + ["1"])
+    for others in ("q1_deg,q2_deg,x_mm,y_mm,z_mm", "J1 [deg],J2 [deg],X [mm],Y [mm],Z [mm]"):
+        text = f"{others},{columns}\n1,2,3,4,5,{numbers}\n"
+        expected = {**ROTATED[columns], "none": ["-"] * (columns.count(",") + 1)}
+        for rotation, names in expected.items():
+            assert targets(mapped(tmp_path, text, rotation=rotation))[5:] == names
+        with refused(MeasurementError, option="--rotation", value="kuka"):
+            mapped(tmp_path, text, rotation="kuka")
+
+
+def test_roll_has_the_meaning_of_measurement_files_only_in_such_files(tmp_path: Path):
+    names = ["roll_deg", "pitch_deg", "yaw_deg"]
+    text = f"q1_deg,q2_deg,x_mm,y_mm,z_mm,{','.join(names)}\n1,2,3,4,5,6,7,8\n"
+    assert targets(mapped(tmp_path, text))[5:] == names
+    for foreign in (text.replace("q", "J"), text.replace("x_mm,y_mm,z_mm", "X mm,Y mm,Z mm")):
+        assert_fields(refusal(tmp_path, foreign), option="--rotation", value="rpy, omron")
+        assert targets(mapped(tmp_path, foreign, dict(zip(names, names, strict=True))))[5:] == names
+
+
 def test_rows_that_are_not_a_rotation_are_refused(tmp_path: Path):
     names = ",".join(f"r{i}{k}" for i in (1, 2, 3) for k in (1, 2, 3))
     text = f"q1_deg,q2_deg,x_mm,y_mm,z_mm,{names}\n1,2,3,4,5,1,0,0,0,1,0,0,0,1\n1,2,3,4,5,1,0,0,0,1,0,0,0,2\n"
