@@ -1,28 +1,28 @@
 """The gallery: every example runs, improves what it shows, and is on the page."""
 
 import re
-import subprocess
-import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from PIL import Image
+from testing.forked import Programs, programs
 
 ROOT = Path(__file__).parent.parent
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 MAX_LINES = 60
 
 
+@pytest.fixture(scope="module")
+def running() -> Iterator[Programs]:
+    with programs() as started:
+        yield started
+
+
 @pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)
-def test_an_example_runs_and_writes_its_picture(example, tmp_path):
+def test_an_example_runs_and_writes_its_picture(running, example, tmp_path):
     assert len(example.read_text(encoding="utf-8").splitlines()) <= MAX_LINES
-    done = subprocess.run(
-        [sys.executable, "-W", "error", str(example)],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = running.run(example, tmp_path)
     assert done.returncode == 0, done.stderr
     picture = f"{example.stem}.png"
     for folder in (tmp_path, ROOT / "docs" / "figures" / "gallery"):
