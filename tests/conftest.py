@@ -4,6 +4,7 @@ import gc
 import os
 import shutil
 import sys
+import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -30,6 +31,7 @@ import testing.bytecode
 import testing.type_checker  # noqa: F401  its place is before pisigma's, which it shall check
 from testing.models import no_type_checker
 from testing.pictures import no_pictures
+from testing.stored import FOLDER
 
 from pisigma.workflow.recipes.reader import read_recipe
 from pisigma.workflow.recipes.recipe import InverseRecipe
@@ -43,9 +45,13 @@ CHROMIUM = (
 """Options of a browser that fetches nothing by itself and draws in three dimensions without a graphics card."""
 
 
-def pytest_configure() -> None:
-    """Do not look for garbage while tests are collected, which takes a fifth of that time."""
+def pytest_configure(config: pytest.Config) -> None:
+    """Do not look for garbage while tests are collected, which takes a fifth of that time; see `testing.stored`."""
     gc.disable()
+    if getattr(config.option, "numprocesses", None):  # not in the workers, which inherit the folder
+        folder = tempfile.TemporaryDirectory(prefix="pisigma-tests-")
+        config.add_cleanup(folder.cleanup)
+        os.environ[FOLDER] = folder.name
 
 
 def pytest_collection_finish() -> None:

@@ -1,12 +1,11 @@
 """The geometric calibration of a simulated UR5, and new measurements of it."""
 
-import functools
-
 import numpy as np
 import torch
 from testing.hybrid import joints_in
 from testing.models import no_type_checker
 from testing.simulated_arm import simulate
+from testing.stored import stored
 
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.measurement.dataset import Measurements
@@ -24,7 +23,7 @@ def measured(q: torch.Tensor, T: torch.Tensor, turned: bool) -> Measurements:
     return Measurements(q=q, position=T[:, :3, 3] + noise, rotation=T[:, :3, :3].clone() if turned else None)
 
 
-@functools.cache
+@stored
 def calibrated_ur5(rows: int) -> tuple[CalibratedModel, torch.Tensor, torch.Tensor]:
     """Return the model, new joint values `(rows, 6)` [rad] and their true poses `(rows, 4, 4)`."""
     with no_type_checker():

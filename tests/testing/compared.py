@@ -1,12 +1,12 @@
 """Models of one simulated arm that were made from different rows, for tests."""
 
-import functools
 import math
 
 import torch
 from testing.aged import NAME, rows_after_change
 from testing.hybrid import hybrid_of
 from testing.models import no_type_checker
+from testing.stored import stored
 
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.calibration.hybrid.calibrator import HybridCalibrator
@@ -19,7 +19,7 @@ CARRIED = (0.3, -0.2, 0.1, 0.4, 0.02, -0.03)
 """Motion of the relocated instrument."""
 
 
-@functools.cache
+@stored
 def model_of(
     seed: int, moved: tuple[float, ...] = (0.0,) * 6, base: tuple[float, ...] = (0.0,) * 6
 ) -> CalibratedModel:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from testing.models import no_type_checker
+from testing.stored import stored
 
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.calibration.hybrid.calibrator import HybridCalibrator
@@ -102,7 +103,6 @@ def joints_in(robot: Robot, rows: int, seed: int, share: float = 1.0) -> torch.T
     )
 
 
-@functools.cache
 def hybrid_of(
     name: str,
     rows: int = 200,
@@ -123,6 +123,34 @@ def hybrid_of(
         features: features to try.
         payloads: masses [kg] that the rows carry in turn, as they state; the usual one and not stated where none.
     """
+    true, measurements = _measured(name, rows, share, frames, payloads)
+    return HybridArmUnderTest(
+        true, measurements, _calibrated(name, rows, share, products, frames, features, payloads)
+    )
+
+
+@stored
+def _calibrated(
+    name: str,
+    rows: int,
+    share: float,
+    products: bool,
+    frames: bool,
+    features: tuple[str, ...],
+    payloads: tuple[float, ...],
+) -> HybridResult:
+    true, measurements = _measured(name, rows, share, frames, payloads)
+    with no_type_checker():
+        calibrator = HybridCalibrator(
+            GeometricCalibrator(true.nominal), features=features, harmonics=(4, 8), products=products
+        )
+        return calibrator.fit(measurements)
+
+
+@functools.cache
+def _measured(
+    name: str, rows: int, share: float, frames: bool, payloads: tuple[float, ...]
+) -> tuple[TrueRobot, Measurements]:
     true = true_robot(Robot.load(name))
     q = joints_in(true.nominal, rows, seed=0, share=share)
     T, names = true.forward(q), {}
@@ -143,9 +171,4 @@ def hybrid_of(
         }
     rng = np.random.default_rng(1)
     position = T[:, :3, 3] + NOISE * torch.from_numpy(rng.normal(size=(rows, 3)))
-    measurements = Measurements(q=q, position=position, **names)
-    with no_type_checker():
-        calibrator = HybridCalibrator(
-            GeometricCalibrator(true.nominal), features=features, harmonics=(4, 8), products=products
-        )
-        return HybridArmUnderTest(true, measurements, calibrator.fit(measurements))
+    return true, Measurements(q=q, position=position, **names)

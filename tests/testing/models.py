@@ -1,6 +1,5 @@
 """Small calibrated models for tests: hand-made, or trained once per test run."""
 
-import functools
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -9,6 +8,7 @@ from pathlib import Path
 
 import jaxtyping
 import torch
+from testing.stored import stored
 
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.domain import Domain
@@ -101,7 +101,7 @@ def small_recipe_text(name: str) -> str:
     return "\n".join(lines) + "\n"
 
 
-@functools.cache
+@stored
 def shipped_training(name: str, seed: int | None = None):
     """Train a complete shipped recipe with `pisigma.train`, with its seed or another one."""
     import pisigma
@@ -114,7 +114,7 @@ def shipped_training(name: str, seed: int | None = None):
         return pisigma.train(recipe)
 
 
-@functools.cache
+@stored
 def trained_run(name: str):
     """Return a shortened shipped recipe, and its training run."""
     from pisigma.files.errors import RecipeError

@@ -1,10 +1,10 @@
 """Two simulated UR5s that were measured in shared frames, or whose balls sat in the same sockets."""
 
 from collections.abc import Sequence
-from functools import lru_cache
 
 import numpy as np
 import torch
+from testing.stored import stored
 
 from pisigma.calibration.frames.shared_objects import ArmPosterior, Touches, uncertainty_of
 from pisigma.calibration.geometric.calibrator import GeometricCalibrator
@@ -107,7 +107,7 @@ def touching_rows(number: int, seed: int, tip: str = "", touches: int = 20) -> M
     )
 
 
-@lru_cache(maxsize=32)
+@stored
 def own_fit(number: int, seed: int, sensor: str) -> CalibrationResult:
     """Return the calibration of one arm with its own rows: "frames", "hall" or "sockets"."""
     rows = (
