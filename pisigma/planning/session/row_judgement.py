@@ -105,7 +105,12 @@ class RowModel:
 
     @staticmethod
     def from_rows(
-        robot: Robot, rows: Measurements, sigma: float | None, kept: Bool[Tensor, " rows"]
+        robot: Robot,
+        rows: Measurements,
+        sigma: float | None,
+        kept: Bool[Tensor, " rows"],
+        earlier: "RowModel | None" = None,
+        of_kept: "RowModel | None" = None,
     ) -> "RowModel":
         """Return the model linearised at the base and tool that fit the kept rows.
 
@@ -114,24 +119,17 @@ class RowModel:
             rows: all rows.
             sigma: standard deviation of measured lengths if the rows state none [m]; None for `_USUAL_NOISE`.
             kept: rows to which base and tool are fitted.
+            earlier: a model of the same rows, whose setup is used again; None to make one.
+            of_kept: the model of the kept rows alone; None to make it.
 
         Raises:
             IdentificationError: there are too few rows for base and tool.
             PoseError: the joint values do not fit the robot.
         """
-        calibrator = GeometricCalibrator(robot)
-        setup = calibrator.build(with_fixed_intrinsics(rows, _REPEATABILITY["m"], _REPEATABILITY["rad"]))
-        floating = set(floating_bases(setup))
-        chosen = [index for index in calibrator.candidates(setup.problem.space) if index not in floating]
-        active = [*setup.free_unknowns, *chosen]
-        setup = replace(setup, problem=setup.problem.with_active(active))
-        gravity = GravityTorques(robot, to_first_row_frame(robot, USUAL))
-        design = Design(
-            setup.problem, (gravity, FourierSeries(robot, RobotClass.from_robot(robot).harmonics))
-        )
+        setup, design = _problem(robot, rows) if earlier is None else (earlier.setup, earlier.design)
         point, rounds = setup.start, LINEARISATIONS
         if not bool(kept.all()):
-            of_kept = RowModel.from_rows(robot, rows.select(kept), sigma, kept[kept])
+            of_kept = of_kept or RowModel.from_rows(robot, rows.select(kept), sigma, kept[kept])
             point, rounds = _start_at(setup, of_kept.geometry), 1
         values = sensor_values(setup.problem, point)
         columns = torch.cat([design.columns(one, slice(None)).flatten(0, 1) for one in values])
@@ -261,6 +259,20 @@ class RowModel:
         return replace(prior, sizes=sizes).precision.rsqrt()
 
 
+def _problem(robot: Robot, rows: Measurements) -> tuple[CalibrationSetup, Design]:
+    """Return the setup with initial guesses of base and tool, and the unknowns."""
+    calibrator = GeometricCalibrator(robot)
+    setup = calibrator.build(with_fixed_intrinsics(rows, _REPEATABILITY["m"], _REPEATABILITY["rad"]))
+    floating = set(floating_bases(setup))
+    chosen = [index for index in calibrator.candidates(setup.problem.space) if index not in floating]
+    active = [*setup.free_unknowns, *chosen]
+    setup = replace(setup, problem=setup.problem.with_active(active))
+    gravity = GravityTorques(robot, to_first_row_frame(robot, USUAL))
+    return setup, Design(
+        setup.problem, (gravity, FourierSeries(robot, RobotClass.from_robot(robot).harmonics))
+    )
+
+
 def _start_at(setup: CalibrationSetup, geometry: IdentifiedGeometry) -> Float64[Tensor, " parameters"]:
     """Return the start parameters with the bases and tools of another fit, where it has them."""
     bases, tools = (block.clone() for block in setup.problem.space.split(setup.start)[1:])
@@ -330,7 +342,7 @@ def judge_rows(
             model, errors = wrong
         right = ~(errors.p_value < FALSE_ALARMS) & ~model.kept
         if bool(right.any()):
-            model = RowModel.from_rows(robot, rows, sigma, model.kept | right)
+            model = RowModel.from_rows(robot, rows, sigma, model.kept | right, model)
             again = model.leave_one_out()
             errors = replace(again, p_value=errors.p_value)
         return RowJudgement(model.kept, model, errors)
@@ -355,19 +367,20 @@ def _contradicted(
     suspects = [int(chance.nan_to_num(nan=1.0).argmin())] if bool((chance < FALSE_ALARMS).any()) else []
     if few and (suspects or errors.scale > _CONTRADICTORY_FACTOR):
         suspects = counts.nonzero()[:, 0].tolist()
-    misfits: dict[int, float] = {}
+    fits: dict[int, RowModel] = {}
     for row in suspects if len(suspects) > 1 else ():
         others = counts.clone()
         others[row] = False
         with contextlib.suppress(IdentificationError):
             every = torch.ones(int(others.sum()), dtype=torch.bool)
-            misfits[row] = RowModel.from_rows(robot, rows.select(others), sigma, every).misfit
+            fits[row] = RowModel.from_rows(robot, rows.select(others), sigma, every)
+    misfits = {row: fit.misfit for row, fit in fits.items()}
     least = min(misfits.values(), default=0.0)
     likely = [row for row in suspects if misfits.get(row, math.inf) <= least + _MIN_MISFIT_GAIN] or suspects
     for row in likely[-1:]:
         others = counts.clone()
         others[row] = False
-        model = RowModel.from_rows(robot, rows, sigma, others)
+        model = RowModel.from_rows(robot, rows, sigma, others, model, fits.get(row))
         errors = model.leave_one_out()
         if float(errors.p_value[row]) < FALSE_ALARMS:
             return model, errors

@@ -4,6 +4,7 @@ import numpy as np
 import torch
 from testing.measured_plans import NOISE, measured_plan, with_offset
 
+from pisigma.calibration.geometric.calibrator import GeometricCalibrator
 from pisigma.measurement.dataset import Measurements
 from pisigma.planning.session.row_judgement import judge_rows
 
@@ -45,6 +46,18 @@ def test_a_new_row_that_is_5_mm_off_does_not_count():
 def test_a_swapped_point_among_the_first_rows_is_found():
     rows = swapped(PLAN.rows(20), 1, 19).select(torch.arange(6))
     assert counting(rows, 5) == [0, 2, 3, 4, 5]
+
+
+def test_base_and_tool_of_every_set_of_rows_are_guessed_once(monkeypatch):
+    guessed, build = [], GeometricCalibrator.build
+
+    def noted(calibrator, rows):
+        guessed.append(rows.line)
+        return build(calibrator, rows)
+
+    monkeypatch.setattr(GeometricCalibrator, "build", noted)
+    assert counting(with_offset(PLAN.rows(6), 1, (0.02, 0.0, 0.0)), 5) == [0, 2, 3, 4, 5]
+    assert len(set(guessed)) == len(guessed) == 7
 
 
 def test_a_row_that_was_called_wrong_can_be_used_again():
