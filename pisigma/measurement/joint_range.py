@@ -80,8 +80,8 @@ def limit_warnings(robot: Robot, rows: Measurements) -> tuple[str, ...]:
 
 
 def row_warnings(robot: Robot, rows: Measurements) -> tuple[str, ...]:
-    """Return warnings about duplicate rows, joint values beyond the limits, and impossible torques."""
-    return (*copy_warnings(rows.left_out), *limit_warnings(robot, rows), *_torque_warnings(robot, rows))
+    """Return warnings about joint values beyond the limits, duplicate rows, and impossible torques."""
+    return (*limit_warnings(robot, rows), *copy_warnings(rows.left_out), *_torque_warnings(robot, rows))
 
 
 def _torque_warnings(robot: Robot, rows: Measurements) -> tuple[str, ...]:
