@@ -264,13 +264,13 @@ class _Problem:
     def choose(self, progress: Progress) -> tuple[Int64[Tensor, " chosen"], StoredPlan, Tour]:
         """Choose poses to calibrate with and poses to test with, and order them.
 
-        Poses without a collision-free path are replaced. The most informative poses come first, in stages, so that the
-        measurement may end early.
+        Poses without a collision-free path are replaced, by candidates that can be reached from most others. The most
+        informative poses come first, in stages, so that the measurement may end early.
         """
         q, count = self.candidates.q, self.settings.count
         free, motions = torch.arange(len(q)), Motions(self.arm, self.candidates.workspace)
         kept, kept_check = free[:0], free[:0]
-        for _ in range(_MAX_ROUNDS):
+        for earlier_rounds in range(_MAX_ROUNDS):
             progress(f"{count} of {len(free):,} candidates")
             others = _without(free, torch.cat([kept, kept_check]))
             chosen = complete_selection(
@@ -284,6 +284,9 @@ class _Problem:
             progress("order of the poses")
             way = plan_tour(motions, q[poses], self.settings.pace, stages=stage_ends(len(poses)))
             unreached = poses[way.left_out]
+            if len(unreached) and not earlier_rounds:
+                most = free[motions.reach_most(q[free])]
+                free = most if len(most) >= len(poses) else free
             free, kept, kept_check = (_without(some, unreached) for some in (free, chosen, check))
             if not len(unreached) or len(free) < len(poses):
                 break

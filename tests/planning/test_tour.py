@@ -21,6 +21,15 @@ ARM = ArmInSurroundings.from_robot(Robot.load("fanuc_r2000"), CELL)
 PACE = Pace(speed=math.radians(20), settling=2.0)
 
 
+def scara_between_walls(gap_mm: float) -> ArmInSurroundings:
+    """Return a SCARA robot between two walls on one line, which end at a distance from its base."""
+    boxes = [
+        {"name": f"wall {side}", "center_mm": (side * (3000 + gap_mm), 0, 1500), "size_mm": (6000, 40, 3000)}
+        for side in (-1, 1)
+    ]
+    return ArmInSurroundings.from_robot(Robot.load("kiro3"), Surroundings.model_validate({"boxes": boxes}))
+
+
 def test_few_poses_are_in_the_best_order():
     q = torch.from_numpy(np.random.default_rng(3).uniform(-0.4, 0.4, (7, 6)))
     arm = ArmInSurroundings.from_robot(Robot.load("fanuc_r2000"))
@@ -75,15 +84,34 @@ def test_every_motion_is_collision_free():
 
 
 def test_an_unreachable_pose_is_left_out():
-    wall = {"name": "wall", "center_mm": (-3200.0, 0.0, 1500.0), "size_mm": (6000.0, 40.0, 3000.0)}
-    robot = Robot.load("kiro3")
     q = torch.tensor([[1.5, 0.3, -0.1, 0], [1.2, 0.1, -0.2, 1], [-1.5, -0.3, -0.1, 0]], dtype=torch.float64)
-    blocked = Surroundings.model_validate(
-        {"boxes": [wall, wall | {"name": "other", "center_mm": (3200.0, 0.0, 1500.0)}]}
-    )
-    way = plan_tour(Motions(ArmInSurroundings.from_robot(robot, blocked), q), q, PACE)
+    way = plan_tour(Motions(scara_between_walls(200), q), q, PACE)
     assert len(way.left_out) == 1
     assert len(way.order) == 2
+
+
+def test_poses_in_the_smaller_part_of_the_free_space_are_found():
+    arm = scara_between_walls(200)
+    q = draw_candidates(arm, 300, 0).q
+    front = q[:, 0] > 0
+    few_behind = torch.cat([q[front], q[~front][:20]])
+    reached = Motions(arm, few_behind).reach_most(q)
+    assert not bool(reached[~front].any())
+    assert float(reached[front].double().mean()) > 0.95
+
+
+def test_paths_with_several_waypoints_are_collision_free():
+    arm = scara_between_walls(400)
+    pool = draw_candidates(arm, 60, 1).q
+    motions = Motions(arm, pool)
+    points = [motions.points_between(pool[i], pool[i + 1]) for i in range(0, 40, 2)]
+    paths = [
+        torch.cat([pool[[2 * i]], some, pool[[2 * i + 1]]])
+        for i, some in enumerate(points)
+        if some is not None and len(some) > 1
+    ]
+    assert paths
+    assert all(bool(is_free(arm, path[:-1], path[1:]).all()) for path in paths)
 
 
 def test_invalid_paces_are_refused():

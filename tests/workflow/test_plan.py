@@ -173,3 +173,19 @@ def test_plans_are_the_same_at_every_call():
         one, other = (plan("kiro3", PlanSettings(count=3, check=1, candidates=30)) for _ in range(2))
     assert_close(one.stored.q, other.stored.q)
     assert one.curve == other.curve
+
+
+def test_all_poses_are_planned_if_the_free_space_has_two_parts():
+    boxes = [
+        {"name": f"wall {side}", "center_mm": (side * 3200, 0, 1500), "size_mm": (6000, 40, 3000)}
+        for side in (-1, 1)
+    ]
+    planned = plan(
+        "kiro3",
+        PlanSettings(count=12, check=4, candidates=300, limit_mm=2.0),
+        CELL.model_validate({"boxes": boxes}),
+    )
+    q = planned.stored.q
+    assert len(q) == 16
+    assert int(planned.stored.check.sum()) == 4
+    assert len(q[:, 0].sign().unique()) == 1

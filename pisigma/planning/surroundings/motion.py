@@ -1,7 +1,11 @@
 """Straight joint motions between poses: check for collisions, and waypoints for blocked motions."""
 
+from functools import cached_property
+
+import numpy as np
 import torch
 from jaxtyping import Bool, Float64
+from scipy.sparse.csgraph import connected_components, dijkstra
 from torch import Tensor
 
 from pisigma.planning.surroundings.arm_in_surroundings import ArmInSurroundings
@@ -10,9 +14,11 @@ _MIN_STEP = 1e-3
 """Motion of any point of the robot below which a piece is not divided further [m]; half the clearance if that is
 larger."""
 _MAX_WAYPOINTS_TRIED = 60
-"""Number of poses that are tried as waypoints of a motion; ten times as many pairs of poses are tried."""
+"""Number of poses that are tried as the only waypoint of a motion, and number of nodes of the roadmap."""
 BATCH = 20
 """Number of waypoints that are checked together."""
+_NEAREST = 3
+"""Number of nodes of the roadmap to which motions from a pose are tried."""
 _SAMPLE = 50
 """Number of poses to which motions are checked in order to find which of two poses is harder to leave."""
 
@@ -50,8 +56,58 @@ class Motions:
             return self.pool[:0]
         (pair,) = zip(_names(start[None]), _names(end[None]), strict=True)
         if pair not in self._points:
-            self._points[pair] = waypoints(self.arm, start, end, self.pool)
+            self._points[pair] = self._waypoints(start, end)
         return self._points[pair]
+
+    def _waypoints(
+        self, start: Float64[Tensor, " dof"], end: Float64[Tensor, " dof"]
+    ) -> Float64[Tensor, "points dof"] | None:
+        """Return a pose of the pool with a short detour, or else the shortest path on the roadmap; None without any."""
+        detour = _travel(self.arm, start, self.pool) + _travel(self.arm, self.pool, end)
+        for tried in torch.split(detour.argsort()[:_MAX_WAYPOINTS_TRIED], BATCH):
+            points = self.pool[tried]
+            points = points[is_free(self.arm, start.expand_as(points), points)]
+            points = points[is_free(self.arm, points, end.expand_as(points))]
+            if len(points):
+                return points[:1]
+        nodes, lengths = self._roadmap
+        ends = np.stack([_lengths(self.arm, pose.expand_as(nodes), nodes) for pose in (start, end)])
+        graph = np.block([[lengths, ends.T], [ends, np.full((2, 2), np.inf)]])
+        _, previous = dijkstra(graph, directed=False, indices=len(nodes), return_predecessors=True)
+        path: list[int] = []
+        node = int(previous[-1])
+        while 0 <= node < len(nodes):
+            path.insert(0, node)
+            node = int(previous[node])
+        return nodes[path] if path else None
+
+    @cached_property
+    def _roadmap(self) -> tuple[Float64[Tensor, "nodes dof"], Float64[np.ndarray, "nodes nodes"]]:
+        """Probabilistic roadmap: some poses of the pool, and lengths of the free motions between them [m].
+
+        Blocked motions have the length inf (Kavraki, Svestka, Latombe and Overmars 1996, IEEE Trans. Robotics and
+        Automation 12(4)).
+        """
+        nodes = self.pool[:: max(1, len(self.pool) // _MAX_WAYPOINTS_TRIED)]
+        first, second = torch.triu_indices(len(nodes), len(nodes), 1)
+        lengths = np.full((len(nodes), len(nodes)), np.inf)
+        lengths[first, second] = lengths[second, first] = _lengths(self.arm, nodes[first], nodes[second])
+        return nodes, lengths
+
+    def reach_most(self, poses: Float64[Tensor, "poses dof"]) -> Bool[Tensor, " poses"]:
+        """Return the mask of poses with a free motion to the largest connected part of the roadmap.
+
+        Free poses can form parts without motions between them, such as those on both sides of a collision of the
+        gripper with the forearm.
+        """
+        nodes, lengths = self._roadmap
+        part = connected_components(np.isfinite(lengths), directed=False)[1]
+        nodes = nodes[part == np.bincount(part).argmax()]
+        nearest = torch.stack([_travel(self.arm, poses, node) for node in nodes], 1).argsort(1)
+        reached = torch.zeros(len(poses), dtype=torch.bool)
+        for node in nearest.unbind(1)[:_NEAREST]:
+            reached[~reached] = is_free(self.arm, poses[~reached], nodes[node[~reached]])
+        return reached
 
     def is_harder_to_leave(self, pose: Float64[Tensor, " dof"], other: Float64[Tensor, " dof"]) -> bool:
         """Return whether fewer free motions lead away from a pose than from another pose."""
@@ -89,44 +145,11 @@ def is_free(
     return free
 
 
-def waypoints(
-    arm: ArmInSurroundings,
-    start: Float64[Tensor, " dof"],
-    end: Float64[Tensor, " dof"],
-    pool: Float64[Tensor, "poses dof"],
-) -> Float64[Tensor, "points dof"] | None:
-    """Find one or two waypoints that make a motion collision-free, on the shortest of the paths tried.
-
-    Args:
-        arm: the robot in its surroundings.
-        start: joint values at the start [rad or m].
-        end: joint values at the end [rad or m].
-        pool: joint values of free poses that can be waypoints [rad or m].
-
-    Returns:
-        Joint values of the waypoints [rad or m]; None if no path was found.
-    """
-    to, back = _travel(arm, start, pool), _travel(arm, pool, end)
-    tried = (to + back).argsort()[:_MAX_WAYPOINTS_TRIED]
-    pool, to, back = pool[tried], to[tried], back[tried]
-    reached, left = torch.zeros(2, len(pool), dtype=torch.bool)
-    for some in torch.split(torch.arange(len(pool)), BATCH):
-        reached[some] = is_free(arm, start.expand_as(pool[some]), pool[some])
-        left[some] = is_free(arm, pool[some], end.expand_as(pool[some]))
-        if bool((reached & left).any()):
-            return pool[reached & left][:1]
-    first, second = reached.nonzero()[:, 0], left.nonzero()[:, 0]
-    if not len(first) or not len(second):
-        return None
-    first, second = torch.cartesian_prod(first, second).unbind(-1)
-    length = to[first] + _travel(arm, pool[first], pool[second]) + back[second]
-    shortest = length.argsort()[: 10 * _MAX_WAYPOINTS_TRIED]
-    for some in torch.split(shortest, BATCH):
-        free = is_free(arm, pool[first[some]], pool[second[some]])
-        if bool(free.any()):
-            best = some[int(free.int().argmax())]
-            return torch.stack([pool[first[best]], pool[second[best]]])
-    return None
+def _lengths(
+    arm: ArmInSurroundings, start: Float64[Tensor, "motions dof"], end: Float64[Tensor, "motions dof"]
+) -> Float64[np.ndarray, " motions"]:
+    """Return the lengths of motions [m]; inf for blocked ones."""
+    return np.where(is_free(arm, start, end), _travel(arm, start, end), np.inf)
 
 
 def _travel(arm: ArmInSurroundings, start: Tensor, end: Tensor) -> Float64[Tensor, " poses"]:

@@ -7,7 +7,7 @@ from testing.cells import CELL, is_collision_free, is_visible
 from testing.closeness import assert_close
 
 from pisigma.planning.surroundings.arm_in_surroundings import ArmInSurroundings
-from pisigma.planning.surroundings.motion import Motions, is_free, waypoints
+from pisigma.planning.surroundings.motion import Motions, is_free
 from pisigma.planning.surroundings.surroundings import LinkSection, Surroundings
 from pisigma.robot import Robot
 
@@ -83,11 +83,11 @@ def test_waypoints_avoid_obstacles():
     q = Q[ARM.smallest_clearance(Q) >= 0]
     blocked = (~is_free(ARM, q[:20], q[20:40])).nonzero()[:, 0].tolist()
     start, end = q[blocked[0]], q[20 + blocked[0]]
-    points = waypoints(ARM, start, end, q)
+    points = Motions(ARM, q).points_between(start, end)
     assert points is not None
     path = torch.cat([start[None], points, end[None]])
     assert bool(is_free(ARM, path[:-1], path[1:]).all())
-    assert waypoints(ARM, start, end, q[:0]) is None
+    assert Motions(ARM, q[:0]).points_between(start, end) is None
 
 
 def test_checked_motions_are_kept_in_both_directions():
