@@ -104,7 +104,7 @@ class Fleet:
         base = np.array([*arm.base[1], *np.deg2rad([130.0, 2.0, 1.0])])
         tool = np.array([*arm.tool, 0.0, 0.0, 0.0])
         posterior = RobotPosterior.from_model(prior, self.instrument).with_unknown_base_and_tool(base, tool)
-        chosen: Tensor = q[select_poses(posterior.sensitivities(q), posterior.tool(task), count)]
+        chosen: Tensor = q[select_poses(posterior.sensitivities(q), posterior.tool_derivatives(task), count)]
         return chosen.numpy()
 
     def exact(self, judged: int) -> float:

@@ -45,7 +45,7 @@ def rms(predicts: Any, test: Measurements) -> float:
 def true_prior(individual: float, gears: float) -> CalibratedModel:
     """Return the distribution from which the robots are drawn, as a prior."""
     posterior = RobotPosterior.from_robot(NOMINAL)
-    size = posterior.uncertainty.space.arm_size
+    size = posterior.uncertainty.space.arm_parameter_count
     means, deviations = [common_errors().flatten()], [torch.full((size,), individual, dtype=torch.float64)]
     for feature in posterior.uncertainty.features:
         mean, deviation = torch.zeros(2, *feature.used.shape, dtype=torch.float64)
@@ -124,7 +124,8 @@ def main() -> None:
     torch.set_num_threads(1)
     prior = fleet_table(wanted.fleets, wanted.robots, wanted.odd, wanted.judged)
     print(
-        f"usual fleet, odd robots {[*range(wanted.robots - wanted.odd, wanted.robots)]}: named {[*prior.odd]}"
+        f"usual fleet, odd robots {[*range(wanted.robots - wanted.odd, wanted.robots)]}: "
+        f"named {[*prior.inconsistent_robots]}"
     )
     for odd, count in ((False, wanted.judged), (True, wanted.odd)):
         figures = np.array([gated(prior, 500 + k, odd) for k in range(count)])

@@ -257,7 +257,9 @@ def causes(seeds: int) -> None:
             seen = replace(seen, q=q + torch.from_numpy(moved.get(kind, np.zeros(6))))
             camera = stated_camera(rng, 15.0 if kind == "camera" else 1.0)
             rows = image_measurements(seen, camera, BOARD, False, REPEATABILITY)
-            first = [one.name for one in misfit_causes(fit_frames(NOMINAL, rows, "hand-eye")) if one.named]
+            first = [
+                one.name for one in misfit_causes(fit_frames(NOMINAL, rows, "hand-eye")) if one.is_supported
+            ]
             named[first[0] if first else "nothing"] += 1
         print(
             f"{kind} wrong: named {', '.join(f'{name} {count}' for name, count in named.most_common())} of {seeds}"

@@ -83,7 +83,7 @@ def main() -> None:
         for name, robot in robots.items():
             off = forward_kinematics(robot, q)[:, :3, 3] - there
             errors[config.level][name].append(float(off.square().sum(-1).mean().sqrt()) * 1e3)
-        first = [one.name for one in misfit_causes(fit) if one.named]
+        first = [one.name for one in misfit_causes(fit) if one.is_supported]
         named[config.level][first[0] if first else "nothing"] += 1
     for level, found in errors.items():
         figures = ", ".join(f"{name} {np.median(values):.2f}" for name, values in found.items())

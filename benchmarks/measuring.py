@@ -46,7 +46,7 @@ def alarms(names: list[str], seeds: range) -> None:
                     began = time.perf_counter()
                     some = changed.select(torch.arange(row + 1))
                     known = torch.cat([trusted, torch.tensor([False])])
-                    trusted = judge_rows(arm.nominal, some, NOISE, known).counts
+                    trusted = judge_rows(arm.nominal, some, NOISE, known).used_rows
                     at_once.append(not bool(trusted[row]))
                     slowest = max(slowest, time.perf_counter() - began)
                 wrong += [(row, at_once[row], not bool(trusted[row])) for row in at]

@@ -99,7 +99,7 @@ class Bench:
         rows = image_measurements(images, self.camera, self.board, False, noise.repeatability, "fixed")
         robot = GeometricCalibrator(self.arm.robot, prior=PRIOR).fit(rows).robot
         points, estimated = (forward_kinematics(one, judged)[:, :3, 3] for one in (true, robot))
-        predicted = rms_of(self.posterior["geometric"].after_measuring(q).tool(judged))
+        predicted = rms_of(self.posterior["geometric"].after_measuring(q).tool_derivatives(judged))
         return 1e3 * aligned_error(points, estimated), 1e3 * predicted
 
 
@@ -126,7 +126,7 @@ def main(draws: int, candidates: int, counts: list[int]) -> None:
         for name, posterior in bench.posterior.items():
             for criterion in get_args(Criterion):
                 chosen = select_poses(
-                    posterior.sensitivities(bench.q), posterior.tool(bench.task), count, criterion
+                    posterior.sensitivities(bench.q), posterior.tool_derivatives(bench.task), count, criterion
                 )
                 ways[f"{criterion}, {name}"] = [chosen] * draws
         pooled = {}

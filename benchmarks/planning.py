@@ -79,7 +79,9 @@ def measured(
         for count in counts:
             rows: dict[str, Tensor] = {"random": torch.arange(count)}
             rows |= {
-                one: select_poses(posterior.sensitivities(pool.q), posterior.tool(pool.q[:300]), count, one)
+                one: select_poses(
+                    posterior.sensitivities(pool.q), posterior.tool_derivatives(pool.q[:300]), count, one
+                )
                 for one in criteria
             }
             for how, chosen in rows.items():
@@ -98,7 +100,7 @@ def sequential(name: str, counts: tuple[int, ...], draws: range) -> None:
             free = torch.arange(POOL)[~torch.isin(torch.arange(POOL), chosen)]
             more = select_poses(
                 posterior.sensitivities(pool.q[free]),
-                posterior.tool(pool.q[:300]),
+                posterior.tool_derivatives(pool.q[:300]),
                 count - len(chosen),
                 "I",
             )
@@ -149,7 +151,9 @@ class Arm:
         result = fit_if_better(HybridCalibrator(self.nominal), self.rows(q), lambda what: None)
         assert isinstance(result, HybridResult)
         both = posterior.after_measuring(q), RobotPosterior.from_result(result, posterior.instrument)
-        return Figures(rms_mm(result, self.test), *(rms_of(one.tool(self.test.q)) * 1e3 for one in both))
+        return Figures(
+            rms_mm(result, self.test), *(rms_of(one.tool_derivatives(self.test.q)) * 1e3 for one in both)
+        )
 
 
 def predicted(seeds: range) -> None:
@@ -159,7 +163,9 @@ def predicted(seeds: range) -> None:
         arm = Arm(ARMS[seed % len(ARMS)], seed)
         posterior, q = RobotPosterior.from_robot(arm.planned, Instrument(sigma=NOISE)), arm.candidates(1000)
         for count in (15, 30, 60):
-            chosen = q[select_poses(posterior.sensitivities(q), posterior.tool(q[:300]), count, "I")]
+            chosen = q[
+                select_poses(posterior.sensitivities(q), posterior.tool_derivatives(q[:300]), count, "I")
+            ]
             one = arm.figures(chosen, posterior)
             ratios.setdefault((count, "plan"), []).append(one.predicted / one.true)
             ratios.setdefault((count, "calibration"), []).append(one.after / one.true)
@@ -181,7 +187,9 @@ def needed(seeds: range) -> None:
                 RobotPosterior.from_robot(arm.planned, Instrument(sigma=NOISE)),
                 arm.candidates(1000),
             )
-            order = select_poses(posterior.sensitivities(q), posterior.tool(q[:300]), STEPS[-1], "I")
+            order = select_poses(
+                posterior.sensitivities(q), posterior.tool_derivatives(q[:300]), STEPS[-1], "I"
+            )
             poses = [first(arm, rows, posterior) for rows in (q, q[order])]
             ratios.append(poses[1] / poses[0])
             print(f"{name} seed {seed}: {poses[0]:.0f} random, {poses[1]:.0f} chosen", flush=True)
@@ -210,7 +218,7 @@ def speed() -> None:
     posterior = RobotPosterior.from_robot(robot)
     for criterion in ("D", "I"):
         began = time.perf_counter()
-        select_poses(posterior.sensitivities(q), posterior.tool(q[:300]), 100, criterion)  # type: ignore[arg-type]
+        select_poses(posterior.sensitivities(q), posterior.tool_derivatives(q[:300]), 100, criterion)  # type: ignore[arg-type]
         seconds = time.perf_counter() - began
         unknowns = len(posterior.uncertainty.root)
         print(

@@ -131,7 +131,7 @@ def errors(draw: Draw, rows: pisigma.Measurements, q: Tensor, aligned: bool) -> 
     before, after = (positions(one, q) for one in (draw.nominal, calibration.model.identified))
     root = CovarianceRoot(result.solved.root)
     known = PositionUncertainty(result.solved.problem.space, result.solved.geometry, (), root, 1.0)
-    spread = root.left_multiply(known.columns(JointState(q), q)[:, :3]).flatten(0, 1)
+    spread = root.left_multiply(known.pose_derivatives(JointState(q), q)[:, :3]).flatten(0, 1)
     if aligned:
         Q = rigid_motions(true)
         spread = spread - Q @ (Q.mT @ spread)

@@ -131,7 +131,7 @@ def determined_parameters(q: torch.Tensor, base: np.ndarray) -> tuple[str, ...]:
     """Return the parameters of a UR5 that its images determine."""
     drawn = np.concatenate([base, ON_FLANGE.numpy()])
     rows = measured((), drawn, q, np.random.default_rng(0))
-    every = GeometricCalibrator(NOMINAL, prior=None, loss=SquaredLoss()).fit(rows).free
+    every = GeometricCalibrator(NOMINAL, prior=None, loss=SquaredLoss()).fit(rows).free_parameters
     return tuple(name for name in every if name.split("_")[0] in SIZES)
 
 

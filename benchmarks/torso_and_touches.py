@@ -119,7 +119,7 @@ def calibrator_of(nominal: Robot, free: tuple[str, ...] | str = "identifiable") 
 def free_of(nominal: Robot, q: torch.Tensor, base: np.ndarray) -> tuple[str, ...]:
     """Return the parameters of an arm that its rows determine, in addition to base and tool."""
     rows = measured(nominal.with_geometry(base=base, tool=TOOL), q, "hall", np.random.default_rng(0))
-    every = calibrator_of(nominal).fit(rows).free
+    every = calibrator_of(nominal).fit(rows).free_parameters
     return tuple(name for name in every if name.split("_")[0] in DH_COLUMNS)
 
 

@@ -135,7 +135,11 @@ def test_figures_are_reproduced(folder, repository):
             "held_out": build_pairs(model.robot, data.held_out, None),
         }
     for part, pairs in parts.items():
-        T, q, before = pairs.T[pairs.used], pairs.q_nominal[pairs.used], pairs.target[pairs.used]
+        T, q, before = (
+            pairs.T[pairs.used_rows],
+            pairs.q_nominal[pairs.used_rows],
+            pairs.target[pairs.used_rows],
+        )
         after = before - model.correction(T, q)
         for joint in model.metrics["joints"]:
             index = names.index(joint["name"])

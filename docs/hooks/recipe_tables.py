@@ -14,7 +14,7 @@ from pydantic import BaseModel
 from pydantic_core import PydanticUndefined
 
 from pisigma.files.setting import attributes_of
-from pisigma.simulation.errors.source import OneOf
+from pisigma.simulation.errors.source import RegisteredSection
 from pisigma.workflow.recipes.recipe import GeometricRecipe, HybridRecipe, InverseRecipe
 
 PAGE = Path(__file__).parent.parent / "reference" / "recipes.md"
@@ -61,7 +61,7 @@ def _inner(annotation: Any) -> Iterator[type[BaseModel]]:
 def _closed(annotation: Any) -> Any:
     """Return the annotation, or the union of all sections of a registry that it names."""
     for choice in getattr(annotation, "__metadata__", ()):
-        if isinstance(choice, OneOf):
+        if isinstance(choice, RegisteredSection):
             return typing.Union[tuple(choice.registry.values())]  # noqa: UP007
     return annotation
 

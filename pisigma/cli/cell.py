@@ -83,11 +83,12 @@ def _print_status(status: "CellStatus") -> None:
     print_lines(one.sentence for one in facts.events)
     print_lines(_controller_lines(status))
     print_lines(
-        f"sessions/{name} will be added by the next command that reads rows." for name in facts.not_taken_in
+        f"sessions/{name} will be added by the next command that reads rows."
+        for name in facts.unrecorded_files
     )
     print_lines(
         f"sessions/{name} is not read, because it is not a measurement file (.csv); import it if it contains rows."
-        for name in facts.not_read
+        for name in facts.foreign_files
     )
     print_next(status)
 

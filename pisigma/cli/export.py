@@ -163,7 +163,7 @@ def _print(exported: "Exported", form: str, out: Path, contents: str, as_json: b
         remarks = [*exported.remarks, *exported.warnings]
         print_json({"file": str(out), "format": form, **exported.facts, "remarks": remarks})
     else:
-        for line in (*exported.shown.splitlines(), *exported.remarks):
+        for line in (*exported.leading_text.splitlines(), *exported.remarks):
             print_line(line)
         what = exported.summary or contents[0].upper() + contents[1:]
         print_line(f"{what} written to {out}{exported.details}.")

@@ -17,7 +17,7 @@ from pisigma.planning.plan_settings import PlanSettings
 if TYPE_CHECKING:
     from pisigma.workflow.cell.cell import Cell as OpenedCell
 
-Subject = Annotated[
+RobotOrModel = Annotated[
     str,
     typer.Argument(
         metavar="ROBOT|MODEL|CELL",
@@ -43,7 +43,7 @@ Programs = Annotated[
 
 @takes_settings
 def plan(
-    subject: Subject,
+    subject: RobotOrModel,
     *,
     out: Out = None,
     settings: StatedSettings[PlanSettings],
@@ -60,7 +60,7 @@ def plan(
     measured columns and pass the file to `pisigma calibrate`.
     """
     from pisigma.planning.plan_file import yaml_of
-    from pisigma.planning.subject import Subject as PlanningSubject
+    from pisigma.planning.subject import RobotOrModel as PlanningSubject
     from pisigma.workflow import plan as workflow
     from pisigma.workflow.result_texts import plan_text
 

@@ -84,7 +84,7 @@ def _convert(
 
     check_output(out, (".yaml", ".yml"), "a robot file", (read, Path(like)))
     reading = read_controller_file(read, nominal, MAX_CHANGE if max_change_mm is None else max_change_mm)
-    robot, change = reading.robot, reading.change
+    robot, change = reading.robot, reading.deviation_from_nominal
     write_atomically(out, dh_yaml(robot, (robot.source, *reading.remarks)))
     if as_json:
         print_json(
@@ -175,4 +175,9 @@ def _pendant_row(pose: "PendantPose") -> tuple[str, ...]:
     """Return the table cells of a pose."""
     at = f"{pose.in_file_unit:g} {pose.axis.file_unit}" if pose.axis else "0"
     numbers = (f"{value + 0.0:.2f}" for value in pose.tool_in_file_units.values())
-    return (pose.axis.name if pose.axis else "-", at, *numbers, "inside" if pose.inside else "outside")
+    return (
+        pose.axis.name if pose.axis else "-",
+        at,
+        *numbers,
+        "inside" if pose.is_within_limits else "outside",
+    )

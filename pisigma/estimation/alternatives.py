@@ -42,15 +42,15 @@ class Cause:
         size: most probable size relative to the scale of the cause.
         explained_share: share of the squared residuals, in units of the noise, that the cause alone explains at
             this size.
-        named: whether the evidence supports the cause, because it is the clearest one, or clear in addition to clearer
-            ones.
+        is_supported: whether the evidence supports the cause, because it is the clearest one, or clear in addition to
+            clearer ones.
     """
 
     name: str
     log_bayes_factor: float
     size: float
     explained_share: float
-    named: bool = False
+    is_supported: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,8 +80,8 @@ class FitResiduals:
     @staticmethod
     def from_fit(
         y: Float64[Tensor, " values"],
-        fitted: Float64[Tensor, "values unknowns"],
-        known: Float64[Tensor, "values directions"],
+        fitted_columns: Float64[Tensor, "values unknowns"],
+        known_root: Float64[Tensor, "values directions"],
         exact: Bool[Tensor, " values"],
         is_stated: bool,
         causes: Mapping[str, Float64[Tensor, "values _columns"]],
@@ -90,15 +90,15 @@ class FitResiduals:
 
         Args:
             y: residuals in units of the stated noise.
-            fitted: derivatives with respect to the fitted unknowns.
-            known: root of the covariance of the residuals due to quantities known with a stated uncertainty.
+            fitted_columns: derivatives with respect to the fitted unknowns.
+            known_root: root of the covariance of the residuals due to quantities known with a stated uncertainty.
             exact: values whose noise is exactly as stated.
             is_stated: whether the noise of the other values is stated.
             causes: derivatives with respect to the unknowns of every cause at size 1.
         """
-        U = orthonormal_columns(fitted)
+        U = orthonormal_columns(fitted_columns)
         N = torch.linalg.qr(U, mode="complete")[0][:, U.shape[1] :].t()
-        A = N @ known
+        A = N @ known_root
         columns = {name: compressed_columns(N @ Z) for name, Z in causes.items()}
         return FitResiduals(N @ y, A @ A.t(), N[:, exact], is_stated, columns)
 
@@ -114,8 +114,8 @@ class FitResiduals:
             named.add(best.name)
             Z = best.size * self.causes[best.name]
             here = replace(here, covariance=here.covariance + Z @ Z.t())
-        causes = [replace(one, named=one.name in named) for one in alone]
-        return tuple(sorted(causes, key=lambda one: (not one.named, -one.log_bayes_factor)))
+        causes = [replace(one, is_supported=one.name in named) for one in alone]
+        return tuple(sorted(causes, key=lambda one: (not one.is_supported, -one.log_bayes_factor)))
 
     def _compared(self) -> list[Cause]:
         """Compare all causes one by one."""
@@ -165,7 +165,7 @@ _MAX_MOTIONS = 3
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
+class GroupMotion:
     """A hypothesis that one group of unknowns moved, and its probability.
 
     Attributes:
@@ -186,15 +186,15 @@ class Explanation:
     Attributes:
         motions: motions that certainly happened, most probable first.
         candidates: all hypotheses, most probable first, if something moved but it is unclear what; otherwise empty.
-        unchanged: probability that no part moved.
+        unchanged_probability: probability that no part moved.
         noise_factor: most probable factor on the usual noise.
         log_evidence: log evidence of the rows given the motions, averaged over all other hypotheses, minus the prior
             penalties of the motions and of wrong rows.
     """
 
-    motions: tuple[Motion, ...]
-    candidates: tuple[Motion, ...]
-    unchanged: float
+    motions: tuple[GroupMotion, ...]
+    candidates: tuple[GroupMotion, ...]
+    unchanged_probability: float
     noise_factor: float
     log_evidence: float
 
@@ -230,40 +230,40 @@ class SessionEvidence:
         self.values, self._usual_noise = values, usual_noise
         self.known = values.X @ root
         self._K = self.known @ self.known.t()
-        for B in (values.X[:, one.index] * one.deviation for one in standing):
+        for B in (values.X[:, one.index] * one.sigma for one in standing):
             self._K += B @ B.t()
-        self._sigma = values.deviation(usual_noise)
+        self._sigma = values.sigma(usual_noise)
         self._scaled = ~values.exact
         self._groups = tuple(hypotheses)
         self._Z = [compressed_columns(values.X[:, one.index] * one.scale) for one in self._groups]
 
-    def with_wrong(self, wrong: Mapping[int, float]) -> "SessionEvidence":
-        """Return the evidence of the same rows with other configurations marked as wrong, see `LinearValues.wrong`."""
+    def with_wrong(self, wrong_rows: Mapping[int, float]) -> "SessionEvidence":
+        """Return the evidence with other `LinearValues.wrong_configurations`."""
         other = copy(self)
-        other.values = replace(self.values, wrong=wrong)
-        other._sigma = other.values.deviation(self._usual_noise)
+        other.values = replace(self.values, wrong_configurations=wrong_rows)
+        other._sigma = other.values.sigma(self._usual_noise)
         return other
 
     def with_moved(self, groups: Sequence[DriftGroup]) -> "SessionEvidence":
         """Return the evidence of the same rows if groups have moved, with their sizes as standard deviations."""
         other = copy(self)
         for one in groups:
-            B = self.values.X[:, one.index] * one.deviation
+            B = self.values.X[:, one.index] * one.sigma
             other._K = other._K + B @ B.t()
         return other
 
     def compare_hypotheses(self) -> Explanation:
         """Compare all hypotheses, and repeat with each clear motion added until nothing else has moved."""
-        motions: list[Motion] = []
+        motions: list[GroupMotion] = []
         unchanged = 1.0
         while True:
             compared = self._compare(motions)
-            unchanged = unchanged if motions else compared.unchanged
-            clear, best = compared.unchanged < _CERTAIN, compared.candidates[0]
-            named = best.probability >= _NAMED and best.group.single
+            unchanged = unchanged if motions else compared.unchanged_probability
+            clear, best = compared.unchanged_probability < _CERTAIN, compared.candidates[0]
+            named = best.probability >= _NAMED and best.group.is_one_motion
             if not (clear and named) or len(motions) == _MAX_MOTIONS:
                 candidates = compared.candidates if clear and not motions else ()
-                return replace(compared, unchanged=unchanged, candidates=candidates)
+                return replace(compared, unchanged_probability=unchanged, candidates=candidates)
             motions.append(best)
 
     def estimate_shift(
@@ -306,7 +306,7 @@ class SessionEvidence:
         a = torch.linalg.solve_triangular(factor, self.values.y[:, None], upper=False)
         return float(a.square().mean().sqrt())
 
-    def _compare(self, motions: Sequence[Motion]) -> Explanation:
+    def _compare(self, motions: Sequence[GroupMotion]) -> Explanation:
         """Compare all hypotheses given some motions, including that nothing else has moved."""
         K = self._K
         for one in motions:
@@ -333,13 +333,13 @@ class SessionEvidence:
         log_odds = torch.cat([log_odds, log_odds.new_zeros(1)])
         *probability, unchanged = log_odds.softmax(0).tolist()
         sizes = _TRIED[joint.logsumexp(0).argmax(1)].tolist()
-        compared = [Motion(*one) for one in zip(self._groups, sizes, probability, strict=True)]
+        compared = [GroupMotion(*one) for one in zip(self._groups, sizes, probability, strict=True)]
         # noise factor of the explanation: without further motion if none is needed, otherwise with all of them
         likely = evidence if unchanged >= _CERTAIN else joint.logsumexp((1, 2))
         return Explanation(
             motions=tuple(motions),
             candidates=tuple(sorted(compared, key=lambda one: -one.probability)),
-            unchanged=unchanged,
+            unchanged_probability=unchanged,
             noise_factor=float(NOISE_FACTORS[likely.argmax()]),
             log_evidence=float(nothing + log_odds.logsumexp(0))
             - sum(one.group.log_prior_penalty for one in motions)
@@ -369,13 +369,11 @@ class SessionEvidence:
         """Return the gain matrix from values to an estimate of the groups' unknowns, and its covariance."""
         # Groups of fixed size are part of K, but those to be estimated must not also be treated as noise.
         V = self._K + self._noise(noise_factor).square().diag()
-        for B in (self.values.X[:, one.index] * one.deviation for one in groups if one.fixed_size):
+        for B in (self.values.X[:, one.index] * one.sigma for one in groups if one.fixed_size):
             V = V - B @ B.t()
-        # Given the other variances, the estimate is a ridge regression with unit prior in units of `deviation`.
+        # Given the other variances, the estimate is a ridge regression with unit prior in units of `sigma`.
         factor = covariance_factor(V)
-        index, deviation = (
-            torch.cat([getattr(one, name) for one in groups]) for name in ("index", "deviation")
-        )
+        index, deviation = (torch.cat([getattr(one, name) for one in groups]) for name in ("index", "sigma"))
         W = torch.linalg.solve_triangular(factor, self.values.X[:, index] * deviation, upper=False)
         normal = W.t() @ W
         normal.diagonal().add_(1.0)

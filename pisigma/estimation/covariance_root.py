@@ -48,17 +48,17 @@ class ImplicitCovarianceRoot:
 
 
 def multiply_updated_root(
-    along: Float64[Tensor, "*batch directions"], B: Float64[Tensor, "values directions"]
+    columns: Float64[Tensor, "*batch directions"], B: Float64[Tensor, "values directions"]
 ) -> Float64[Tensor, "*batch directions"]:
     """Return `A R'` for the root R' after a measurement of any values: `A R L^-T` with `L L^T = 1 + B^T B`.
 
     Args:
-        along: `A R` with the root R before the measurement.
+        columns: `A R` with the root R before the measurement.
         B: derivatives of the values along the columns of R, divided by the noise of the values.
     """
     lower = torch.linalg.cholesky(torch.eye(B.shape[1]).to(B) + B.t() @ B)
-    after: Tensor = torch.linalg.solve_triangular(lower, along.flatten(0, -2).t(), upper=False).t()
-    return after.reshape(along.shape)
+    after: Tensor = torch.linalg.solve_triangular(lower, columns.flatten(0, -2).t(), upper=False).t()
+    return after.reshape(columns.shape)
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,19 +115,19 @@ class CovarianceRoot:
         self,
         added: Float64[Tensor, "unknowns columns"],
         scale: float,
-        change: Float64[Tensor, "parameters active"],
+        coordinate_change: Float64[Tensor, "parameters active"],
     ) -> "CovarianceRoot":
         """Return a root with more columns, scaled standard deviations, and the first unknowns in other coordinates.
 
         Args:
             added: columns to add.
             scale: factor on the standard deviations.
-            change: matrix that converts the first unknowns to the other coordinates.
+            coordinate_change: matrix that converts the first unknowns to the other coordinates.
         """
-        (parameters, active), (unknowns, columns) = change.shape, self.directions.shape
-        directions = change.new_empty((parameters + unknowns - active, columns + added.shape[1]))
+        (parameters, active), (unknowns, columns) = coordinate_change.shape, self.directions.shape
+        directions = coordinate_change.new_empty((parameters + unknowns - active, columns + added.shape[1]))
         for block, place in ((self.directions, slice(columns)), (added, slice(columns, None))):
-            directions[:parameters, place] = change @ block[:active].cpu()
+            directions[:parameters, place] = coordinate_change @ block[:active].cpu()
             directions[parameters:, place] = block[active:]
         directions.mul_(scale)
         few = self.weights

@@ -36,7 +36,7 @@ class DriftGroup:
         size: size of the drift; 0 if the group has not drifted.
         fixed_size: whether the size is stated rather than estimated, as for a base that was relocated.
         log_prior_penalty: increase of the log evidence that a drift of the group requires [nats].
-        single: whether the group is one motion rather than a set of many independent changes.
+        is_one_motion: whether the group is one motion rather than a set of many independent changes.
     """
 
     what: str
@@ -45,10 +45,10 @@ class DriftGroup:
     size: float = 0.0
     fixed_size: bool = False
     log_prior_penalty: float = LOG_PRIOR_PENALTY
-    single: bool = True
+    is_one_motion: bool = True
 
     @property
-    def deviation(self) -> Float64[Tensor, " members"]:
+    def sigma(self) -> Float64[Tensor, " members"]:
         """Standard deviation of every unknown's drift [m or rad]."""
         return self.size * self.scale
 
@@ -63,7 +63,7 @@ class LinearValues:
         sensor: index of every value's sensor.
         configuration: index of the joint values at which every value was measured.
         counts: number of values of every sensor.
-        wrong: configurations with wrong measurements, with the factors on their noise.
+        wrong_configurations: configurations with wrong measurements, with the factors on their noise.
         rejected: indices of the rows whose values the loss rejects; they have no values here.
     """
 
@@ -72,7 +72,7 @@ class LinearValues:
     sensor: Int64[Tensor, " values"]
     configuration: Int64[Tensor, " values"]
     counts: tuple[SensorCount, ...]
-    wrong: Mapping[int, float] = field(default_factory=dict)
+    wrong_configurations: Mapping[int, float] = field(default_factory=dict)
     rejected: frozenset[int] = frozenset()
 
     def select(self, values: Tensor) -> "LinearValues":
@@ -80,10 +80,10 @@ class LinearValues:
         names = ("X", "y", "sensor", "configuration")
         return replace(self, **{name: getattr(self, name)[values] for name in names})
 
-    def deviation(self, noise: Float64[Tensor, " sensors"]) -> Float64[Tensor, " values"]:
+    def sigma(self, noise: Float64[Tensor, " sensors"]) -> Float64[Tensor, " values"]:
         """Return the standard deviation of the noise of every value, given that of every sensor."""
         deviation = noise[self.sensor]
-        for number, factor in self.wrong.items():
+        for number, factor in self.wrong_configurations.items():
             wrong = (self.configuration == number) & ~self.exact
             deviation = torch.where(wrong, math.hypot(1.0, factor) * deviation, deviation)
         return deviation
@@ -97,7 +97,7 @@ class LinearValues:
     def log_prior_penalty(self) -> float:
         """Increase of the log evidence that all wrong configurations together require [nats]."""
         count = len(torch.unique(self.configuration))
-        return len(self.wrong) * (_WRONG_ROW_PENALTY + math.log(max(count, 1)))
+        return len(self.wrong_configurations) * (_WRONG_ROW_PENALTY + math.log(max(count, 1)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,7 +146,7 @@ class DriftSearch:
         self.values, self._K = values, A @ A.t()
         self._groups, self._noise, self._usual = list(groups), noise.clone(), usual_noise
         self._Z = [compressed_columns(values.X[:, one.index] * one.scale) for one in groups]
-        self.covariance = self._K + self.deviation.square().diag()
+        self.covariance = self._K + self.sigma.square().diag()
         for one, Z in zip(self._groups, self._Z, strict=True):
             self.covariance += one.size**2 * Z @ Z.t()
 
@@ -159,7 +159,7 @@ class DriftSearch:
                     self._resize(number, self._best_size(number))
             for sensor, count in enumerate(self.values.counts):
                 if not count.exact and count.values:
-                    self._update_noise(sensor, 1.0 if count.stated else 0.0)
+                    self._update_noise(sensor, 1.0 if count.has_stated_noise else 0.0)
             if before == [one.size for one in self._groups]:
                 break
 
@@ -174,9 +174,9 @@ class DriftSearch:
         return self._log_evidence(self.covariance)
 
     @property
-    def deviation(self) -> Float64[Tensor, " values"]:
+    def sigma(self) -> Float64[Tensor, " values"]:
         """Standard deviation of the noise of every value."""
-        return self.values.deviation(self._noise)
+        return self.values.sigma(self._noise)
 
     def estimate_shift(
         self, number: int, with_prior: bool = True
@@ -224,7 +224,7 @@ class DriftSearch:
     def _update_noise(self, sensor: int, least: float) -> None:
         """Update the noise of a sensor with the factor of highest evidence on its usual noise (log-normal prior)."""
         variance, now = (
-            self.values.deviation(torch.ones_like(self._noise)).square(),
+            self.values.sigma(torch.ones_like(self._noise)).square(),
             float(self._noise[sensor]),
         )
         variance = variance * (self.values.sensor == sensor)
@@ -301,9 +301,9 @@ class PosteriorUpdate:
         self._root = root
         drifted = [group for group in drift.groups if group.size > 0]
         index = torch.cat([group.index for group in drifted] or [torch.zeros(0, dtype=torch.int64)])
-        deviation = torch.cat([group.deviation for group in drifted] or [values.y[:0]])
+        deviation = torch.cat([group.sigma for group in drifted] or [values.y[:0]])
         self._index, self._deviation = index, deviation
-        noise = values.deviation(drift.noise)
+        noise = values.sigma(drift.noise)
         # Old uncertainty and drift are independent, so their roots are joined as columns.
         A = torch.cat([values.X @ root, values.X[:, index] * deviation], 1) / noise[:, None]
         y = values.y / noise

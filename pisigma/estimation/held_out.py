@@ -36,7 +36,7 @@ class HeldOutErrors:
         M: Float64[Tensor, "values values"],
         residual: Float64[Tensor, " values"],
         sensor: Int64[Tensor, " values"],
-        counts: Sequence[SensorCount],
+        sensor_counts: Sequence[SensorCount],
     ) -> "HeldOutErrors":
         """Compute the errors of the values of a fold from a fit to all values: `M^-1 r` with the covariance `M^-1`.
 
@@ -48,7 +48,7 @@ class HeldOutErrors:
             M: block of `I - X C X^T` for the held-out values, whitened.
             residual: residuals r of the held-out values, whitened.
             sensor: index of every value's sensor.
-            counts: number of values of every sensor.
+            sensor_counts: number of values of every sensor.
         """
         factor, failed = torch.linalg.cholesky_ex(M)
         if len(M) and (failed or float(factor.diagonal().min()) ** 2 < SINGULAR):
@@ -58,7 +58,7 @@ class HeldOutErrors:
             residual = residual * (len(M) / max(int(certain.sum()), 1)) ** 0.5
         else:
             inverse = torch.cholesky_inverse(factor)
-        repetition = residual.new_tensor([one.repetition for one in counts])[sensor]
+        repetition = residual.new_tensor([one.repeat_variance_factor for one in sensor_counts])[sensor]
         spread = 1 + repetition * (inverse.diagonal() - 1).clamp(min=0)
         return HeldOutErrors((inverse @ residual) * repetition.sqrt(), spread.sqrt(), sensor)
 

@@ -44,7 +44,7 @@ class AbstractLoss(ABC):
         """
 
     @abstractmethod
-    def deviation(
+    def sigma(
         self, distance: Float[Tensor, " rows"], components: int, effective_parameters: Scalar, scale: Scalar
     ) -> Float[Tensor, ""]:
         """Estimate the standard deviation of one value from all good rows.
@@ -73,9 +73,9 @@ class SquaredLoss(AbstractLoss):
         self, distance: Float[Tensor, " rows"], components: int, effective_parameters: Scalar
     ) -> Float[Tensor, ""]:
         """Return the root mean square of the distances, corrected for the parameters."""
-        return self.deviation(distance, components, effective_parameters, 1.0)
+        return self.sigma(distance, components, effective_parameters, 1.0)
 
-    def deviation(
+    def sigma(
         self, distance: Float[Tensor, " rows"], components: int, effective_parameters: Scalar, scale: Scalar
     ) -> Float[Tensor, ""]:
         """Return the root mean square of the distances, corrected for the parameters."""
@@ -114,7 +114,7 @@ class HampelLoss(AbstractLoss):
         factor = math.sqrt(len(distance) * components) / MEDIAN_DISTANCE[components]
         return distance.median() * _left(distance, components, effective_parameters).rsqrt() * factor
 
-    def deviation(
+    def sigma(
         self, distance: Float[Tensor, " rows"], components: int, effective_parameters: Scalar, scale: Scalar
     ) -> Float[Tensor, ""]:
         """Return the weighted root mean square, corrected for the parameters and the weights."""

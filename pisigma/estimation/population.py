@@ -47,12 +47,12 @@ class Population:
     Attributes:
         mean: mean of the unknowns [m or rad].
         covariance: covariance between robots; full for geometric parameters, diagonal for weights of the correction.
-        geometric: number of geometric parameters, which come first.
+        geometric_count: number of geometric parameters, which come first.
     """
 
     mean: Float64[Tensor, " unknowns"]
     covariance: Float64[Tensor, "unknowns unknowns"]
-    geometric: int
+    geometric_count: int
 
     def predictive_distribution(self, robots: int) -> "Population":
         """Return the predictive distribution of a robot that was not used for the estimate.
@@ -93,7 +93,7 @@ class Population:
 
 
 def without_outliers(
-    evidence: Sequence[Information], start: Population, usual: Float64[Tensor, " unknowns"]
+    evidence: Sequence[Information], start: Population, class_variances: Float64[Tensor, " unknowns"]
 ) -> tuple[Population, tuple[int, ...]]:
     """Estimate the population of the robots without outliers, and return the indices of the outliers.
 
@@ -105,13 +105,15 @@ def without_outliers(
     Args:
         evidence: information on every robot.
         start: population of typical robots, as a starting point.
-        usual: variances of the robot class.
+        class_variances: variances of the robot class.
     """
     alike = _nearest_to_median(evidence, start)
     population = start
     for _ in range(_MAX_CONCENTRATIONS):
         chosen = [evidence[number] for number in alike]
-        population = expectation_maximisation(chosen, start, usual, _SEARCH_CLASS_ROBOTS, _SEARCH_STEPS)
+        population = expectation_maximisation(
+            chosen, start, class_variances, _SEARCH_CLASS_ROBOTS, _SEARCH_STEPS
+        )
         surprises = [population.squared_distance(one) for one in evidence]
         ratios = sorted(square / max(count, 1) for square, count in surprises)
         # The chosen half scatters less than all robots, so the median robot sets the unit.
@@ -124,7 +126,7 @@ def without_outliers(
         if now == alike or len(now) < MIN_ROBOTS:
             break
         alike = now
-    population = expectation_maximisation([evidence[number] for number in alike], population, usual)
+    population = expectation_maximisation([evidence[number] for number in alike], population, class_variances)
     return population, tuple(number for number in range(len(evidence)) if number not in alike)
 
 
@@ -136,7 +138,7 @@ def _nearest_to_median(evidence: Sequence[Information], start: Population) -> li
     median = x.median(0).values
     # The scatter is the median deviation, which outliers do not change, plus the uncertainty that the rows leave.
     scatter = (x - median).abs().median(0).values.square() + inverses.diagonal(dim1=1, dim2=2).mean(0)
-    population = Population(median, scatter.diag(), start.geometric)
+    population = Population(median, scatter.diag(), start.geometric_count)
     distances = [square / max(count, 1) for square, count in map(population.squared_distance, evidence)]
     order = sorted(range(len(evidence)), key=lambda number: distances[number])
     return sorted(order[: max(MIN_ROBOTS, len(evidence) // 2 + 1)])
@@ -145,7 +147,7 @@ def _nearest_to_median(evidence: Sequence[Information], start: Population) -> li
 def expectation_maximisation(
     evidence: Sequence[Information],
     start: Population,
-    usual: Float64[Tensor, " unknowns"],
+    class_variances: Float64[Tensor, " unknowns"],
     class_robots: float = _CLASS_ROBOTS,
     steps: int = _EM_STEPS,
 ) -> Population:
@@ -154,13 +156,15 @@ def expectation_maximisation(
     Args:
         evidence: information on every robot.
         start: initial population.
-        usual: variances of the robot class.
+        class_variances: variances of the robot class.
         class_robots: weight of the class, in robots.
         steps: number of steps.
     """
     population = start
     for _ in range(steps):
-        population = _maximised(evidence, population, class_robots * usual, class_robots + len(evidence))
+        population = _maximised(
+            evidence, population, class_robots * class_variances, class_robots + len(evidence)
+        )
     return population
 
 
@@ -177,7 +181,7 @@ def _maximised(
         of_class: sums of squares that the robot class contributes.
         robots: number of robots including the weight of the class.
     """
-    size, count = now.geometric, len(evidence)
+    size, count = now.geometric_count, len(evidence)
     precision = torch.linalg.inv(now.covariance)
     at_mean, x, scatter = precision @ now.mean, [], torch.zeros_like(precision)
     for first in range(0, count, _ROBOTS_PER_CHUNK):

@@ -27,8 +27,8 @@ class Posterior:
         prior: prior with estimated sizes.
         noise: standard deviation of the noise of every sensor [m or rad], or a factor on the stated noise.
         square: `Σ base x²` over the unknowns of every group.
-        determined: effective number of unknowns of every group that the data determine; the prior determines the
-            others.
+        determined_unknowns: effective number of unknowns of every group that the data determine; the prior determines
+            the others.
         misfit: `Σ (y - X x)²` for every sensor.
         effective_parameters: effective number of values of every sensor that the unknowns absorb.
     """
@@ -38,14 +38,14 @@ class Posterior:
     prior: GaussianPrior
     noise: tuple[float, ...]
     square: Float64[Tensor, " groups"]
-    determined: Float64[Tensor, " groups"]
+    determined_unknowns: Float64[Tensor, " groups"]
     misfit: tuple[float, ...]
     effective_parameters: tuple[float, ...]
 
     @property
     def effective_unknowns(self) -> float:
         """Effective number of unknowns that the data determine, including those without a prior."""
-        return float(self.determined.sum()) + int((self.prior.base == 0).sum())
+        return float(self.determined_unknowns.sum()) + int((self.prior.base == 0).sum())
 
 
 @dataclass(frozen=True)
@@ -54,15 +54,15 @@ class SensorCount:
 
     Attributes:
         values: number of independent values.
-        stated: whether the rows of the sensor state their noise, which is then a lower bound.
+        has_stated_noise: whether the rows of the sensor state their noise, which is then a lower bound.
         exact: whether the noise is exactly as stated.
-        repetition: see `SensorValues.repetition`.
+        repeat_variance_factor: see `SensorValues.repeat_variance_factor`.
     """
 
     values: float
-    stated: bool
+    has_stated_noise: bool
     exact: bool
-    repetition: float = 1.0
+    repeat_variance_factor: float = 1.0
 
 
 class AbstractRegression(ABC):
@@ -95,7 +95,7 @@ class AbstractRegression(ABC):
                 sigma = math.sqrt(
                     posterior.misfit[k] / max(sensor.values - posterior.effective_parameters[k], 1.0)
                 )
-                noise[k] = max(sigma, 1.0 if sensor.stated else SMALLEST_NOISE)
+                noise[k] = max(sigma, 1.0 if sensor.has_stated_noise else SMALLEST_NOISE)
         return tuple(noise)
 
     def maximise_evidence(
@@ -114,7 +114,7 @@ class AbstractRegression(ABC):
         """
         posterior = self.solve(prior, tuple(max(sigma, SMALLEST_NOISE) for sigma in noise))
         for _ in range(iterations):
-            prior = posterior.prior.updated(posterior.square, posterior.determined)
+            prior = posterior.prior.updated(posterior.square, posterior.determined_unknowns)
             following = self.solve(prior, self.updated_noise(posterior))
             gain = following.log_evidence - posterior.log_evidence
             posterior = following
@@ -132,6 +132,6 @@ def prior_size_columns(posterior: Posterior, root: CovarianceRoot) -> Float64[Te
     prior, x = posterior.prior, posterior.x
     groups = torch.zeros(len(x), len(prior.sizes), dtype=x.dtype, device=x.device)
     groups[torch.arange(len(x)), prior.group] = 1.0
-    certain = posterior.determined > MIN_EFFECTIVE
+    certain = posterior.determined_unknowns > MIN_EFFECTIVE
     moved = 2 * root.covariance_times((groups * (prior.precision * x)[:, None])[:, certain])
-    return moved * (2 * posterior.determined[certain]).rsqrt()
+    return moved * (2 * posterior.determined_unknowns[certain]).rsqrt()

@@ -24,30 +24,30 @@ class RoundedRoot:
 
     Attributes:
         unit: unit of every row of N, in the unit of the unknown.
-        numbers: N.
+        integers: N.
     """
 
     unit: Float64[Tensor, " unknowns"]
-    numbers: Int16[Tensor, "unknowns directions"]
+    integers: Int16[Tensor, "unknowns directions"]
 
     @cached_property
     def as_matrix(self) -> Float64[Tensor, "unknowns directions"]:
         """R as a matrix."""
-        return self.numbers.double() * self.unit[:, None]
+        return self.integers.double() * self.unit[:, None]
 
     def select(self, rows: list[int]) -> "RoundedRoot":
         """Return the root of some unknowns, by their indices."""
-        return RoundedRoot(self.unit[rows], self.numbers[rows])
+        return RoundedRoot(self.unit[rows], self.integers[rows])
 
     def among(self, rows: list[int], count: int) -> "RoundedRoot":
         """Return the root of `count` unknowns: `rows` are the unknowns of this root, the others are exact."""
-        unit, numbers = self.unit.new_zeros(count), self.numbers.new_zeros(count, self.numbers.shape[1])
-        unit[rows], numbers[rows] = self.unit, self.numbers
+        unit, numbers = self.unit.new_zeros(count), self.integers.new_zeros(count, self.integers.shape[1])
+        unit[rows], numbers[rows] = self.unit, self.integers
         return RoundedRoot(unit, numbers)
 
     def packed(self) -> bytes:
         """Compress the numbers on and below the diagonal, row by row."""
-        numbers = self.numbers.numpy()[np.tril_indices(len(self.numbers))].astype(np.int32)
+        numbers = self.integers.numpy()[np.tril_indices(len(self.integers))].astype(np.int32)
         # with the sign in the lowest bit most high bytes are 0, and compress better if they follow one another
         unsigned = numbers << 1 ^ numbers >> 31
         return bz2.compress(np.concatenate([unsigned & 255, unsigned >> 8]).astype(np.uint8).tobytes())
@@ -69,7 +69,7 @@ class RoundedRoot:
             raise ValueError(f"expected {len(cells[0]):,} compressed numbers, got a different number")
         low, high = np.frombuffer(planes, np.uint8).astype(np.int32).reshape(2, -1)
         unsigned = low | high << 8
-        result.numbers.numpy()[cells] = unsigned >> 1 ^ -(unsigned & 1)
+        result.integers.numpy()[cells] = unsigned >> 1 ^ -(unsigned & 1)
         return result
 
 

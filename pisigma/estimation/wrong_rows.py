@@ -32,14 +32,14 @@ class ExplainedRows(Generic[What]):
         values: the measured values; those of wrong configurations have larger noise.
         log_evidence: log evidence of the values, including the prior odds of the explanation.
         covariance: covariance of the values.
-        deviation: standard deviation of the noise of every value.
+        sigma: standard deviation of the noise of every value.
     """
 
     what: What
     values: LinearValues
     log_evidence: float
     covariance: Float64[Tensor, "values values"]
-    deviation: Float64[Tensor, " values"]
+    sigma: Float64[Tensor, " values"]
 
 
 def mark_wrong_rows(
@@ -59,7 +59,7 @@ def mark_wrong_rows(
         The best explanation.
     """
     configurations = len(torch.unique(explained.values.configuration))
-    while len(explained.values.wrong) + 1 <= _MAX_WRONG_SHARE * configurations:
+    while len(explained.values.wrong_configurations) + 1 <= _MAX_WRONG_SHARE * configurations:
         tried = [explain(wrong) for wrong in _suspects(explained)]
         best = max(tried, key=lambda one: one.log_evidence, default=explained)
         if best.log_evidence <= explained.log_evidence:
@@ -80,9 +80,9 @@ def _suspects(explained: ExplainedRows[What]) -> list[dict[int, float]]:
     tried: list[tuple[float, int, float]] = []
     for number in torch.unique(values.configuration).tolist():
         chosen = (values.configuration == number) & ~values.exact
-        if number in values.wrong or not bool(chosen.any()):
+        if number in values.wrong_configurations or not bool(chosen.any()):
             continue
-        sigma = explained.deviation[chosen]
+        sigma = explained.sigma[chosen]
         # The block of V^-1 is the precision of these values given all others, as if they were held out.
         eigenvalues, U = torch.linalg.eigh(inverse[chosen][:, chosen] * sigma * sigma[:, None])
         squares = (U.t() @ (a[chosen] * sigma)).square() / eigenvalues.clamp(min=1e-300)
@@ -93,4 +93,4 @@ def _suspects(explained: ExplainedRows[What]) -> list[dict[int, float]]:
     if len(tried) == len(torch.unique(values.configuration)):
         return []  # an explanation that does not fit any row is itself wrong
     tried = sorted(tried, reverse=True)[:_MAX_SUSPECTS]
-    return [{**values.wrong, number: factor} for _, number, factor in tried]
+    return [{**values.wrong_configurations, number: factor} for _, number, factor in tried]

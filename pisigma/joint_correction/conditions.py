@@ -126,16 +126,18 @@ class ConditionFeatures(AbstractFeature):
         return torch.cat(columns, -1)
 
     def scaled_conditions(
-        self, stated: Float[Tensor, "*batch conditions"]
+        self, stated_conditions: Float[Tensor, "*batch conditions"]
     ) -> Float[Tensor, "*batch conditions"]:
         """Return conditions [kg, deg C] in standard deviations from their means; 0 for NaN.
 
         A temperature beyond the measured values is replaced by the nearest measured value.
         """
-        low, high = stated.new_tensor(self.measured).unbind(-1)
-        kept = torch.tensor([name == "temperature_c" for name in self.names], device=stated.device)
-        inside = torch.where(kept, stated.clamp(low, high), stated)
-        scaled = (inside - stated.new_tensor(self.mean)) / stated.new_tensor(self.spread)
+        low, high = stated_conditions.new_tensor(self.measured).unbind(-1)
+        kept = torch.tensor([name == "temperature_c" for name in self.names], device=stated_conditions.device)
+        inside = torch.where(kept, stated_conditions.clamp(low, high), stated_conditions)
+        scaled = (inside - stated_conditions.new_tensor(self.mean)) / stated_conditions.new_tensor(
+            self.spread
+        )
         return torch.where(torch.isfinite(scaled), scaled, 0.0)
 
 
@@ -145,7 +147,7 @@ def learned_conditions(correction: JointCorrection) -> ConditionFeatures | None:
 
 
 def at_conditions(
-    correction: JointCorrection, scaled: Float64[Tensor, " conditions"]
+    correction: JointCorrection, scaled_conditions: Float64[Tensor, " conditions"]
 ) -> tuple[JointCorrection, Float64[Tensor, " dof"]]:
     """Convert a correction at fixed conditions to a correction that depends only on the joint values.
 
@@ -154,7 +156,7 @@ def at_conditions(
 
     Args:
         correction: correction with `ConditionFeatures`.
-        scaled: conditions in standard deviations from their means.
+        scaled_conditions: conditions in standard deviations from their means.
 
     Returns:
         The correction without `ConditionFeatures`, and the remaining offset of every joint [rad or m].
@@ -164,7 +166,9 @@ def at_conditions(
     assert found is not None
     learned, weight = found
     count = len(learned.names)
-    shift, sine, cosine = (weight[:, : 3 * count].view(-1, count, 3) * scaled[:, None]).sum(1).unbind(1)
+    shift, sine, cosine = (
+        (weight[:, : 3 * count].view(-1, count, 3) * scaled_conditions[:, None]).sum(1).unbind(1)
+    )
     slides = ~torch.tensor(robot.revolute)
     series = _weights_of(kept, FourierSeries(robot, 1), lambda other: isinstance(other, FourierSeries))
     harmonics = series.shape[1] // 2
@@ -177,7 +181,7 @@ def at_conditions(
     if "payload_kg" in learned.names:
         falling = GravityTorques(robot, learned.gravity)
         torques = _weights_of(kept, falling, lambda other: other.describe() == falling.describe())
-        torques[:, -4:] += weight[:, 3 * count :] * scaled[learned.names.index("payload_kg")]
+        torques[:, -4:] += weight[:, 3 * count :] * scaled_conditions[learned.names.index("payload_kg")]
     return _with_features(correction, kept), shift
 
 

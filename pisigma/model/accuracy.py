@@ -72,7 +72,7 @@ def sigma_of_rows(model: CalibratedModel, measurements: Measurements) -> Float64
     frame = known_names(model.bases, measurements.frame, "frame", measurements)
     target = known_names(model.tools, measurements.target, "target", measurements)
     at, arm = replace(measurements, frame=frame, target=target), model.hybrid
-    return model.uncertainty.deviation(at, None if arm is None else arm.correction)
+    return model.uncertainty.sigma(at, None if arm is None else arm.correction)
 
 
 def parameter_posterior(model: CalibratedModel) -> ParameterPosterior | None:

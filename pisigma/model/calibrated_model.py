@@ -252,7 +252,7 @@ def bases_of_rows(model: CalibratedModel, measurements: Measurements) -> Float64
 
 
 def known_names(
-    known: Frames, names: tuple[str, ...], what: str, measurements: Measurements
+    frames_of_model: Frames, names: tuple[str, ...], what: str, measurements: Measurements
 ) -> tuple[str, ...]:
     """Return the name that the model uses for the frame or target of every row.
 
@@ -260,7 +260,7 @@ def known_names(
     single name accepts rows without names.
 
     Args:
-        known: frames or targets of the model.
+        frames_of_model: frames or targets of the model.
         names: names of the rows' frames or targets.
         what: "frame" or "target".
         measurements: the rows, for messages.
@@ -268,7 +268,7 @@ def known_names(
     Raises:
         MeasurementError: the model was not calibrated for one of the names.
     """
-    if not set(known) - {""}:
+    if not set(frames_of_model) - {""}:
         if len(set(names)) > 1:
             other = next(row for row, name in enumerate(names) if name != names[0])
             raise MeasurementError(
@@ -280,17 +280,17 @@ def known_names(
                 remedy=f"give a file for each {what}",
             )
         return ("",) * len(names)
-    if len(known) == 1 and not any(names):
-        return tuple(known) * len(names)
+    if len(frames_of_model) == 1 and not any(names):
+        return tuple(frames_of_model) * len(names)
     for row, name in enumerate(names):
-        if name not in known:
-            crossed = (measurements.target if what == "frame" else measurements.frame)[row] in known
+        if name not in frames_of_model:
+            crossed = (measurements.target if what == "frame" else measurements.frame)[row] in frames_of_model
             hint = "check --fixed-camera if it is a camera; " if name and crossed else ""
             raise MeasurementError(
                 f"the model was not calibrated for {what} '{name}'",
                 value=name,
                 at=measurements.place_of(row, what),
-                remedy=f"{hint}{nearest_choice(name, known)}",
+                remedy=f"{hint}{nearest_choice(name, frames_of_model)}",
             )
     return names
 

@@ -175,7 +175,7 @@ def _coverage(model: CalibratedModel) -> arrays.Coverage:
         )
     own = model.hybrid.coverage
     return arrays.Coverage(
-        own.joint.numpy(), own.middle.numpy(), own.half.numpy(), own.angle_per_value.numpy()
+        own.joint.numpy(), own.middle.numpy(), own.half_width.numpy(), own.angle_per_value.numpy()
     )
 
 
@@ -234,7 +234,7 @@ def _network(model: CalibratedModel) -> arrays.Network:
         factors=np.array([terms for _, terms in inputs]).reshape(-1, dof),
         offset=np.concatenate([np.zeros(0), *(net.input_offset.numpy() for _, net in members)]),
         scale=np.concatenate([np.zeros(0), *(net.input_scale.numpy() for _, net in members)]),
-        reference=np.array([group.inputs.reference for group, _ in members]).reshape(-1, 3, 3),
+        reference=np.array([group.inputs.reference_rotation for group, _ in members]).reshape(-1, 3, 3),
         first=first.astype(np.int64),
         orders=orders,
         group=group_of.astype(np.int64),
@@ -266,7 +266,9 @@ class _Domain(NamedTuple):
         none = np.zeros(0, dtype=np.int64)
         if model.network is None or model.domain is None:
             return _Domain(np.zeros((0, 0)), none, np.zeros(0), 0)
-        references = [group.inputs.reference.tobytes() for group, _ in members for _ in group.inputs.names]
+        references = [
+            group.inputs.reference_rotation.tobytes() for group, _ in members for _ in group.inputs.names
+        ]
         scaling = [
             scale
             for _, net in members

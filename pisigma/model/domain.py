@@ -44,25 +44,25 @@ class Domain(nn.Module):
         self.register_buffer("radius", radius)
 
     @staticmethod
-    def from_rows(scaled: Float[Tensor, "rows inputs"], generator: torch.Generator) -> "Domain":
+    def from_rows(scaled_inputs: Float[Tensor, "rows inputs"], generator: torch.Generator) -> "Domain":
         """Return the region around training rows; at most `MAX_SAMPLES` rows, drawn at random, are kept."""
-        if scaled.shape[0] > MAX_SAMPLES:
-            sampled = torch.randperm(scaled.shape[0], generator=generator)[:MAX_SAMPLES]
-            scaled = scaled[sampled.to(scaled.device)]
-        distances = _distances(scaled, scaled)
+        if scaled_inputs.shape[0] > MAX_SAMPLES:
+            sampled = torch.randperm(scaled_inputs.shape[0], generator=generator)[:MAX_SAMPLES]
+            scaled_inputs = scaled_inputs[sampled.to(scaled_inputs.device)]
+        distances = _distances(scaled_inputs, scaled_inputs)
         nearest = torch.where(distances > REPEAT, distances, torch.inf).amin(-1)
         spacing = torch.where(torch.isfinite(nearest), nearest, REPEAT).amax()
-        return Domain(scaled, spacing * MARGIN)
+        return Domain(scaled_inputs, spacing * MARGIN)
 
-    def measure(self, scaled: Float[Tensor, "*batch inputs"]) -> Float[Tensor, "*batch"]:
+    def measure(self, scaled_inputs: Float[Tensor, "*batch inputs"]) -> Float[Tensor, "*batch"]:
         """Compute the distance from the nearest training row divided by the radius; NaN where an input is NaN."""
-        chunks = torch.split(scaled.reshape(-1, scaled.shape[-1]), _CHUNK)
+        chunks = torch.split(scaled_inputs.reshape(-1, scaled_inputs.shape[-1]), _CHUNK)
         nearest = torch.cat([_distances(chunk, self.samples).amin(-1) for chunk in chunks])
-        return (nearest / self.radius).reshape(scaled.shape[:-1])
+        return (nearest / self.radius).reshape(scaled_inputs.shape[:-1])
 
-    def contains(self, scaled: Float[Tensor, "*batch inputs"]) -> Bool[Tensor, "*batch"]:
+    def contains(self, scaled_inputs: Float[Tensor, "*batch inputs"]) -> Bool[Tensor, "*batch"]:
         """Return whether poses are inside the domain; False where an input is NaN."""
-        return self.measure(scaled) <= 1
+        return self.measure(scaled_inputs) <= 1
 
 
 def _distances(

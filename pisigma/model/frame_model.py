@@ -103,7 +103,7 @@ def frames_of_model(model: CalibratedModel, rows: Measurements, only: FrameChoic
 
 def _exact_arm(fit: FrameFit) -> Float64[Tensor, "frames directions"]:
     """Return the root of `_arm_root` for an arm without a stated uncertainty."""
-    return torch.zeros(len(fit.frames), 0, dtype=torch.float64)
+    return torch.zeros(len(fit.frame_indices), 0, dtype=torch.float64)
 
 
 def _arm_root(known: ArmUncertainty, fit: FrameFit) -> Float64[Tensor, "frames directions"]:
@@ -114,7 +114,7 @@ def _arm_root(known: ArmUncertainty, fit: FrameFit) -> Float64[Tensor, "frames d
     """
     problem = fit.solved.problem
     spread = known.spread(fit.solved, fit.used_rows, problem.active.tolist())
-    change = fit.solved.geometry.coordinate_jacobian[fit.frames][:, problem.active]
+    change = fit.solved.geometry.coordinate_jacobian[fit.frame_indices][:, problem.active]
     root: Tensor = -change @ fit.basis @ torch.linalg.pinv(fit.values.X) @ spread
     return root
 
@@ -187,7 +187,7 @@ def _uncertainty(
     unknowns = {} if fits_base else known.geometry.unknowns
     space = ParameterSpace(old.robot, tuple(bases), tuple(tools), () if fits_base else old.unknowns)
     arm = _with_first(known.geometry.robot, {"bases": bases, "tools": tools})
-    own = torch.cat([arm_root, fit.solved.root[fit.frames]], 1)
+    own = torch.cat([arm_root, fit.solved.root[fit.frame_indices]], 1)
     weights, directions = known.root[len(old.parameters) :], known.root.shape[1]
     root = torch.zeros(len(space.parameters) + len(weights), own.shape[1], dtype=torch.float64)
     positions = positions_by_key(space.parameters)

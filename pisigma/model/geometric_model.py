@@ -11,7 +11,7 @@ from pisigma.calibration.geometric.result import CalibrationResult
 from pisigma.calibration.hybrid.result import HybridResult
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel, Provenance
-from pisigma.model.stored_starts import nearest_branch, spread_rows
+from pisigma.model.stored_starts import evenly_spaced_rows, nearest_branch
 from pisigma.model.training_rows import stored_training_rows
 from pisigma.robot.description import Robot
 from pisigma.robot.kinematics.closed_form import closed_form_solver
@@ -47,7 +47,7 @@ def model_of_calibration(
         versions=Provenance.installed_versions(),
     )
     robot = nominal.with_geometry(base=result.robot.base, tool=result.robot.tool)
-    starts = spread_rows(torch.unique(measurements.q.cpu(), dim=0))
+    starts = evenly_spaced_rows(torch.unique(measurements.q.cpu(), dim=0))
     return CalibratedModel(
         name=name,
         kind="geometric_calibration",

@@ -123,7 +123,7 @@ class ModelPosterior:
 
     def positions_in(self, space: ParameterSpace) -> list[int]:
         """Return the indices of the parameters in a space that contains all their frames, targets and owners."""
-        positions = list(range(self.space.arm_size))
+        positions = list(range(self.space.arm_parameter_count))
         for group, names, among, size in (
             ("base", self.space.frames, space.frames, 6),
             ("tool", self.space.targets, space.targets, 6),

@@ -63,7 +63,7 @@ def middle_of_starts(starts: Float64[Tensor, "starts dof"]) -> Float64[Tensor, "
     return (lower + upper).double() / 2
 
 
-def spread_rows(q: Float64[Tensor, "rows dof"]) -> Float64[Tensor, "starts dof"]:
+def evenly_spaced_rows(q: Float64[Tensor, "rows dof"]) -> Float64[Tensor, "starts dof"]:
     """Return all rows, or `MAX_STARTS` evenly spaced rows if there are more."""
     return q[torch.linspace(0, len(q) - 1, min(len(q), MAX_STARTS)).round().long()].clone()
 

@@ -53,14 +53,14 @@ def without_known_rows(model: CalibratedModel, rows: Measurements) -> tuple[Meas
 
 
 def repeated_row_warnings(
-    rows: Measurements, known: Bool[Tensor, " rows"], model_name: str
+    rows: Measurements, is_known: Bool[Tensor, " rows"], model_name: str
 ) -> tuple[str, ...]:
     """Return a warning that names repeated rows, which are left out; empty if there are none."""
-    count = int(known.sum())
+    count = int(is_known.sum())
     if not count:
         return ()
     verbs = "repeats {}, and counts" if count == 1 else "repeat {}, and count"
-    places = places_text(rows.as_fields(), known)
+    places = places_text(rows.as_fields(), is_known)
     return (f"{count} of {rows.rows} rows {verbs.format(model_name)} only once: {places}.",)
 
 

@@ -41,7 +41,7 @@ def energy_gradient(
 def pull_back(
     output_gradient: Float[Tensor, "patterns *models"],
     x: Float[Tensor, "patterns inputs"],
-    weighted: Float[Tensor, "patterns *models units"],
+    weighted_sums: Float[Tensor, "patterns *models units"],
     fixed: Float[Tensor, "*models units"],
     orders: Sequence[int],
 ) -> tuple[Float[Tensor, "*models units inputs"], Float[Tensor, "*models units"]]:
@@ -50,21 +50,21 @@ def pull_back(
     Args:
         output_gradient: derivative of any quantity with respect to every output of every pattern.
         x: scaled inputs.
-        weighted: `W_j h_j` of the summing units, see `weigh_sums`.
+        weighted_sums: `W_j h_j` of the summing units, see `weigh_sums`.
         fixed: fixed weights W.
         orders: number of summing units of every product unit.
 
     Returns:
         The derivatives with respect to weights and biases: `J^T output_gradient` without forming J.
     """
-    sum_gradient = output_gradient[..., None] * products_of_others(weighted, orders) * fixed
+    sum_gradient = output_gradient[..., None] * products_of_others(weighted_sums, orders) * fixed
     weight_gradient = sum_gradient.reshape(x.shape[0], -1).mT @ x
     return weight_gradient.reshape(*sum_gradient.shape[1:], x.shape[-1]), sum_gradient.sum(0)
 
 
 def output_jacobian(
     x: Float[Tensor, "patterns inputs"],
-    weighted: Float[Tensor, "patterns *models units"],
+    weighted_sums: Float[Tensor, "patterns *models units"],
     fixed: Float[Tensor, "*models units"],
     orders: Sequence[int],
 ) -> Float[Tensor, "*models patterns parameters"]:
@@ -72,14 +72,14 @@ def output_jacobian(
 
     Args:
         x: scaled inputs.
-        weighted: `W_j h_j` of the summing units, see `weigh_sums`.
+        weighted_sums: `W_j h_j` of the summing units, see `weigh_sums`.
         fixed: fixed weights W.
         orders: number of summing units of every product unit.
 
     Returns:
         For each summing unit, the derivatives with respect to its weights and then to its bias.
     """
-    sum_gradient = (products_of_others(weighted, orders) * fixed).movedim(0, -2)
+    sum_gradient = (products_of_others(weighted_sums, orders) * fixed).movedim(0, -2)
     with_bias = torch.cat([x, x.new_ones((x.shape[0], 1))], -1)
     return (sum_gradient[..., None] * with_bias[:, None, :]).flatten(-2)
 

@@ -30,16 +30,16 @@ class Inputs:
     Attributes:
         names: names of the inputs in order.
         joint_names: names of the robot's joints.
-        reference: rotation to which roll, pitch and yaw are relative: `R = reference · RotZ · RotY · RotX`.
+        reference_rotation: rotation to which roll, pitch and yaw are relative: `R = reference · RotZ · RotY · RotX`.
     """
 
     names: tuple[str, ...]
     joint_names: tuple[str, ...]
-    reference: Float64[np.ndarray, "3 3"]
+    reference_rotation: Float64[np.ndarray, "3 3"]
 
     @staticmethod
     def from_names(
-        robot: Robot, names: Sequence[str], reference: Float64[np.ndarray, "3 3"] | None = None
+        robot: Robot, names: Sequence[str], reference_rotation: Float64[np.ndarray, "3 3"] | None = None
     ) -> "Inputs":
         """Return the inputs with the given names for a robot.
 
@@ -48,7 +48,7 @@ class Inputs:
                 or cosine of a length.
         """
         joints = tuple(joint.name for joint in robot.joints)
-        chosen = Inputs(tuple(names), joints, np.eye(3) if reference is None else reference)
+        chosen = Inputs(tuple(names), joints, np.eye(3) if reference_rotation is None else reference_rotation)
         meanings: dict[tuple[str, tuple[float, ...]], str] = {}
         for name in names:
             if name in POSE_INPUTS and name in joints:
@@ -78,7 +78,7 @@ class Inputs:
         """
         rpy: tuple[Tensor, ...] = ()
         if set(self.names) & set(POSE_INPUTS[3:]):
-            reference = torch.as_tensor(self.reference, dtype=T.dtype, device=T.device)
+            reference = torch.as_tensor(self.reference_rotation, dtype=T.dtype, device=T.device)
             rpy = rpy_from_rotation(reference.mT @ T[..., :3, :3]).unbind(-1)
         columns = []
         for name in self.names:

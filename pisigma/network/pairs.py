@@ -24,7 +24,7 @@ class TrainingPairs:
         T: measured poses T_base_tool.
         q_nominal: nominal joint values of these poses on the branch nearest to the commanded values [rad or m].
         target: `Δ = q - q_nominal`, wrapped to (-pi, pi] for revolute joints.
-        used: mask of the rows that are used for training.
+        used_rows: mask of the rows that are used for training.
         singular: mask of the rows that are left out because they are near a singularity.
         unreachable: mask of the rows that are left out because the nominal robot cannot reach the measured pose.
         branches: names of the branches of the used rows, most frequent first; empty without a closed-form inverse.
@@ -33,7 +33,7 @@ class TrainingPairs:
     T: Float64[Tensor, "rows 4 4"]
     q_nominal: Float64[Tensor, "rows dof"]
     target: Float64[Tensor, "rows dof"]
-    used: Bool[Tensor, " rows"]
+    used_rows: Bool[Tensor, " rows"]
     singular: Bool[Tensor, " rows"]
     unreachable: Bool[Tensor, " rows"]
     branches: tuple[str, ...]

@@ -43,7 +43,7 @@ def build_network(
         IdentificationError: an input does not vary in the used rows, so nothing can be learned from it.
     """
     names = [joint.name for joint in robot.joints]
-    used = pairs.used
+    used = pairs.used_rows
     groups, networks = [], []
     for section in sections:
         inputs = Inputs.from_names(robot, section.inputs, np.array(section.reference, dtype=np.float64))
@@ -81,12 +81,14 @@ def build_patterns(
     Raises:
         IdentificationError: there are fewer fitted rows than free parameters of the network per joint.
     """
-    validation = _draw_validation(pairs.used, groups_of_rows, validation_share, generator)[pairs.used]
+    validation = _draw_validation(pairs.used_rows, groups_of_rows, validation_share, generator)[
+        pairs.used_rows
+    ]
     patterns = []
     for group, net in network.members():
         _check_count(group, net, int((~validation).sum()))
-        x = net.scale_inputs(group.inputs(pairs.T, pairs.q_nominal))[pairs.used]
-        d = net.scale_targets(pairs.target[:, list(group.joints)])[pairs.used]
+        x = net.scale_inputs(group.inputs(pairs.T, pairs.q_nominal))[pairs.used_rows]
+        d = net.scale_targets(pairs.target[:, list(group.joints)])[pairs.used_rows]
         patterns.append(Patterns(x, d, validation))
     return patterns
 

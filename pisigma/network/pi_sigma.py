@@ -105,9 +105,9 @@ class PiSigma(nn.Module):
         """Return target outputs scaled for comparison with the products."""
         return (y - self.output_offset) / self.output_scale
 
-    def products(self, scaled: Float[Tensor, "*batch inputs"]) -> Float[Tensor, "*batch outputs"]:
+    def products(self, scaled_inputs: Float[Tensor, "*batch inputs"]) -> Float[Tensor, "*batch outputs"]:
         """Compute scaled outputs of scaled inputs: eqs (1) and (2)."""
-        return sum_of_products(weigh_sums(scaled, self.weight, self.bias, self.fixed), self.orders)
+        return sum_of_products(weigh_sums(scaled_inputs, self.weight, self.bias, self.fixed), self.orders)
 
     def forward(self, x: Float[Tensor, "*batch inputs"]) -> Float[Tensor, "*batch outputs"]:
         """Compute outputs of inputs, both in physical units."""
@@ -133,11 +133,11 @@ def weigh_sums(
 
 
 def sum_of_products(
-    weighted: Float[Tensor, "*batch units"], orders: Sequence[int]
+    weighted_sums: Float[Tensor, "*batch units"], orders: Sequence[int]
 ) -> Float[Tensor, "*batch"]:
     """Return the sum of the product units (eq. 2), whose summing units are consecutive."""
     total: Tensor | None = None
-    for unit in torch.split(weighted, list(orders), dim=-1):
+    for unit in torch.split(weighted_sums, list(orders), dim=-1):
         factors = unit.unbind(-1)
         value = factors[0]
         for factor in factors[1:]:
@@ -148,14 +148,14 @@ def sum_of_products(
 
 
 def products_of_others(
-    weighted: Float[Tensor, "*batch units"], orders: Sequence[int]
+    weighted_sums: Float[Tensor, "*batch units"], orders: Sequence[int]
 ) -> Float[Tensor, "*batch units"]:
     """Return the product of the other summing units in each one's product unit, exact even for zero factors.
 
     This is `Π_{i≠j} W_ki h_i` in the derivative of eq. (4).
     """
     columns: list[Tensor] = []
-    for unit in torch.split(weighted, list(orders), dim=-1):
+    for unit in torch.split(weighted_sums, list(orders), dim=-1):
         factors = unit.unbind(-1)
         ones = torch.ones_like(factors[0])
         before, after = [ones], [ones]

@@ -61,8 +61,8 @@ class RemainingError:
 
 
 def accuracy_curve(
-    B: Float64[Tensor, "candidates values directions"],
-    D: Float64[Tensor, "tasks 3 directions"],
+    candidate_derivatives: Float64[Tensor, "candidates values directions"],
+    task_derivatives: Float64[Tensor, "tasks 3 directions"],
     chosen: Int64[Tensor, " chosen"],
     counts: Sequence[int],
     seed: int = 0,
@@ -70,41 +70,54 @@ def accuracy_curve(
     """Predict the accuracy as a function of the number of poses.
 
     Args:
-        B: derivatives of the measured values of the candidates under the prior; see `RobotPosterior.sensitivities`.
-        D: derivatives of the tool's position over the task; see `RobotPosterior.tool`.
+        candidate_derivatives: derivatives of the measured values of the candidates under the prior; see
+            `RobotPosterior.sensitivities`.
+        task_derivatives: derivatives of the tool's position over the task; see `RobotPosterior.tool_derivatives`.
         chosen: indices of the selected candidates, in their order.
         counts: numbers of poses.
         seed: random seed of the random selections.
     """
     generator = torch.Generator().manual_seed(seed)
-    orders = [torch.randperm(len(B), generator=generator) for _ in range(_RANDOM_SELECTIONS)]
+    orders = [
+        torch.randperm(len(candidate_derivatives), generator=generator) for _ in range(_RANDOM_SELECTIONS)
+    ]
     points = []
     for count in counts:
-        after = multiply_updated_root(D, B[chosen[:count]].flatten(0, 1))
+        after = multiply_updated_root(task_derivatives, candidate_derivatives[chosen[:count]].flatten(0, 1))
         random = torch.stack(
-            [multiply_updated_root(D, B[order[:count]].flatten(0, 1)).square().sum() for order in orders]
+            [
+                multiply_updated_root(task_derivatives, candidate_derivatives[order[:count]].flatten(0, 1))
+                .square()
+                .sum()
+                for order in orders
+            ]
         )
         points.append(
             ExpectedAccuracy(
-                count, rms_of(after), p95_of(after, seed), float((random.mean() / len(D)).sqrt())
+                count,
+                rms_of(after),
+                p95_of(after, seed),
+                float((random.mean() / len(task_derivatives)).sqrt()),
             )
         )
     return tuple(points)
 
 
-def rms_of(D: Float64[Tensor, "tasks 3 directions"]) -> float:
-    """Compute the RMS position error over the task [m] from the derivatives D of `RobotPosterior.tool`."""
-    return float((D.square().sum() / len(D)).sqrt())
+def rms_of(task_derivatives: Float64[Tensor, "tasks 3 directions"]) -> float:
+    """Compute the RMS position error over the task [m] from the derivatives D of `RobotPosterior.tool_derivatives`."""
+    return float((task_derivatives.square().sum() / len(task_derivatives)).sqrt())
 
 
-def p95_of(D: Float64[Tensor, "tasks 3 directions"], seed: int = 0) -> float:
+def p95_of(task_derivatives: Float64[Tensor, "tasks 3 directions"], seed: int = 0) -> float:
     """Compute the 95 % quantile of the position errors over the task [m] from `DRAWS` robots of the posterior."""
-    return float(torch.quantile(_drawn_errors(D, DRAWS, seed).flatten(), 0.95))
+    return float(torch.quantile(_drawn_errors(task_derivatives, DRAWS, seed).flatten(), 0.95))
 
 
-def p95_at(D: Float64[Tensor, "tasks 3 directions"], seed: int = 0) -> Float64[Tensor, " tasks"]:
+def p95_at(
+    task_derivatives: Float64[Tensor, "tasks 3 directions"], seed: int = 0
+) -> Float64[Tensor, " tasks"]:
     """Compute the 95 % quantile of the position error at each pose [m] from `DRAWS_AT_POSE` robots of the posterior."""
-    return _drawn_errors(D, DRAWS_AT_POSE, seed).quantile(0.95, dim=1)
+    return _drawn_errors(task_derivatives, DRAWS_AT_POSE, seed).quantile(0.95, dim=1)
 
 
 def _drawn_errors(
@@ -122,11 +135,15 @@ def remaining_errors(
 ) -> tuple[RemainingError, ...]:
     """Compute the contributions of groups of unknowns to the remaining error, largest first.
 
-    With D as in `RobotPosterior.tool` and R_g the rows of the root that belong to a group, knowing the group exactly
-    would remove the projection of D on the directions of R_g (conditioning of a normal distribution).
+    With D as in `RobotPosterior.tool_derivatives` and R_g the rows of the root that belong to a group, knowing the
+    group exactly would remove the projection of D on the directions of R_g (conditioning of a normal distribution).
     """
     known = posterior.uncertainty
-    D, root, total = posterior.tool(task), known.root, rms_of(posterior.tool(task)) ** 2
+    D, root, total = (
+        posterior.tool_derivatives(task),
+        known.root,
+        rms_of(posterior.tool_derivatives(task)) ** 2,
+    )
     errors = []
     for name, rows in _groups(posterior).items():
         # directions in which the group hardly varies are rounding errors
@@ -195,7 +212,7 @@ class CameraProspects:
         q, sight = candidates.q[chosen], views.sight
 
         def rms(better: RobotPosterior) -> float:
-            return rms_of(better.after_measuring(q).tool(task))
+            return rms_of(better.after_measuring(q).tool_derivatives(task))
 
         def posterior_with(corner_noise: float, repeatability: Repeatability) -> RobotPosterior:
             better = replace(sight, corner_noise=corner_noise, repeatability=repeatability)
@@ -206,13 +223,19 @@ class CameraProspects:
         others[chosen] = False
         left = candidates.q[others]
         more = (
-            left[select_poses(after.sensitivities(left), after.tool(task), min(_MORE_IMAGES, len(left)))]
+            left[
+                select_poses(
+                    after.sensitivities(left), after.tool_derivatives(task), min(_MORE_IMAGES, len(left))
+                )
+            ]
             if len(left)
             else left
         )
         return CameraProspects(
-            rms_of(after.tool(task)),
-            rms_of(after.after_measuring(more).tool(task)) if len(more) else rms_of(after.tool(task)),
+            rms_of(after.tool_derivatives(task)),
+            rms_of(after.after_measuring(more).tool_derivatives(task))
+            if len(more)
+            else rms_of(after.tool_derivatives(task)),
             rms(posterior_with(_EXACT_CORNERS, sight.repeatability)),
             rms(posterior_with(sight.corner_noise, _EXACT_ROBOT)),
             float(views.margin_in_image(arm, q).min()),

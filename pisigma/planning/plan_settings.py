@@ -68,15 +68,15 @@ _FILES = ("candidates_from", "task", "measured")
 """Names of the settings that are paths of files."""
 
 
-def parse_box(stated: str) -> tuple[float, ...]:
+def parse_box(text: str) -> tuple[float, ...]:
     """Return the lowest and the highest x, y, z [mm] from "X,Y,Z,X,Y,Z"."""
     try:
-        numbers = tuple(map(float, stated.split(",")))
+        numbers = tuple(map(float, text.split(",")))
     except ValueError:
         numbers = ()
     if len(numbers) != 6:
         raise PlanningError(
-            expected="six numbers, such as -500,200,100,500,900,800", value=stated, option="box"
+            expected="six numbers, such as -500,200,100,500,900,800", value=text, option="box"
         )
     return numbers
 

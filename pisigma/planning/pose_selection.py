@@ -26,8 +26,8 @@ _MAX_PASSES = 3
 
 
 def select_poses(
-    B: Float64[Tensor, "candidates values directions"],
-    D: Float64[Tensor, "tasks 3 directions"],
+    candidate_derivatives: Float64[Tensor, "candidates values directions"],
+    task_derivatives: Float64[Tensor, "tasks 3 directions"],
     count: int,
     criterion: Criterion = "I",
 ) -> Int64[Tensor, " count"]:
@@ -44,8 +44,10 @@ def select_poses(
     and Guestrin 2008, JMLR 9, 235-284; for robots Borm and Menq 1991 select poses by observability.
 
     Args:
-        B: derivatives of the measured values of the candidates under the prior; see `RobotPosterior.sensitivities`.
-        D: derivatives of the tool's position over the task under the prior; see `RobotPosterior.tool`.
+        candidate_derivatives: derivatives of the measured values of the candidates under the prior; see
+            `RobotPosterior.sensitivities`.
+        task_derivatives: derivatives of the tool's position over the task under the prior; see
+            `RobotPosterior.tool_derivatives`.
         count: number of poses to select.
         criterion: "D" or "I", see the description above.
 
@@ -55,45 +57,54 @@ def select_poses(
     Raises:
         PlanningError: there are fewer candidates than poses, or there is no task.
     """
-    if not 1 <= count <= len(B):
+    if not 1 <= count <= len(candidate_derivatives):
         raise PlanningError(
-            expected=f"1 to {len(B)} poses to select from {len(B)} candidates",
+            expected=f"1 to {len(candidate_derivatives)} poses to select from {len(candidate_derivatives)} candidates",
             value=count,
             option="count",
             remedy="select fewer poses or draw more candidates",
         )
-    if not len(D):
+    if not len(task_derivatives):
         raise PlanningError(
             expected="joint values of the task",
             value=Phrase("none"),
             option="task",
             remedy="add poses to the task",
         )
-    goal = condense_derivatives(D)
-    first = PoseSelection(B, goal, "D")
+    goal = condense_derivatives(task_derivatives)
+    first = PoseSelection(candidate_derivatives, goal, "D")
     first.add_until(count)
     chosen = torch.tensor(first.chosen)
     remaining = (
-        PoseSelection(B, goal, criterion, first.chosen).gains().argsort(descending=True)[: len(B) - count]
+        PoseSelection(candidate_derivatives, goal, criterion, first.chosen)
+        .gains()
+        .argsort(descending=True)[: len(candidate_derivatives) - count]
     )
     few = torch.cat([chosen, remaining[: max(_MAX_EXCHANGED - count, 0)]])
-    choice = PoseSelection(B[few], goal, "D", range(count))
+    choice = PoseSelection(candidate_derivatives[few], goal, "D", range(count))
     choice.exchange_candidates()
     if criterion == "I":
-        both = [PoseSelection(B[few], goal, "I", start) for start in (range(count), choice.chosen)]
+        both = [
+            PoseSelection(candidate_derivatives[few], goal, "I", start)
+            for start in (range(count), choice.chosen)
+        ]
         for one in both:
             one.exchange_candidates()
         choice = min(both, key=lambda one: one.variance)
     chosen = few[torch.tensor(choice.chosen)]
-    ordered = PoseSelection(B[chosen], goal, criterion)
+    ordered = PoseSelection(candidate_derivatives[chosen], goal, criterion)
     ordered.add_until(count)
     result: Tensor = chosen[torch.tensor(ordered.chosen)]
     return result
 
 
-def condense_derivatives(D: Float64[Tensor, "tasks 3 directions"]) -> Float64[Tensor, "rank directions"]:
+def condense_derivatives(
+    task_derivatives: Float64[Tensor, "tasks 3 directions"],
+) -> Float64[Tensor, "rank directions"]:
     """Compute a few rows W with the same mean variance, `W^T W = mean(D_i^T D_i)`, up to `DROPPED_VARIANCE`."""
-    values, vectors = torch.linalg.eigh(torch.einsum("tcd,tce->de", D, D) / len(D))
+    values, vectors = torch.linalg.eigh(
+        torch.einsum("tcd,tce->de", task_derivatives, task_derivatives) / len(task_derivatives)
+    )
     left_out = values.clamp(min=0).cumsum(0)
     kept = left_out > DROPPED_VARIANCE * left_out[-1]
     rows: Tensor = values[kept].sqrt()[:, None] * vectors[:, kept].t()
@@ -248,8 +259,8 @@ class PoseSelection:
 
 
 def complete_selection(
-    B: Float64[Tensor, "candidates values directions"],
-    D: Float64[Tensor, "tasks 3 directions"],
+    candidate_derivatives: Float64[Tensor, "candidates values directions"],
+    task_derivatives: Float64[Tensor, "tasks 3 directions"],
     kept: Int64[Tensor, " kept"],
     others: Int64[Tensor, " others"],
     count: int,
@@ -258,8 +269,8 @@ def complete_selection(
     """Add the most useful of the other candidates to a selection, and sort all of them; see `select_poses`.
 
     Args:
-        B: derivatives of the measured values of the candidates under the prior.
-        D: derivatives of the tool's position over the task under the prior.
+        candidate_derivatives: derivatives of the measured values of the candidates under the prior.
+        task_derivatives: derivatives of the tool's position over the task under the prior.
         kept: indices of the candidates that are already selected.
         others: indices of the candidates to choose from.
         count: number of poses to select, including those already selected.
@@ -269,11 +280,14 @@ def complete_selection(
         Indices of candidates, the most useful first.
     """
     if not len(kept):
-        return others[select_poses(B[others], D, count, criterion)]
+        return others[select_poses(candidate_derivatives[others], task_derivatives, count, criterion)]
     if added := count - len(kept):
         # the value of a candidate is what it adds to the poses already selected, so B and D are taken under their
         # posterior
-        measured = B[kept].flatten(0, 1)
-        after, task = multiply_updated_root(B[others], measured), multiply_updated_root(D, measured)
+        measured = candidate_derivatives[kept].flatten(0, 1)
+        after, task = (
+            multiply_updated_root(candidate_derivatives[others], measured),
+            multiply_updated_root(task_derivatives, measured),
+        )
         kept = torch.cat([kept, others[select_poses(after, task, added, criterion)]])
-    return kept[select_poses(B[kept], D, count, criterion)]
+    return kept[select_poses(candidate_derivatives[kept], task_derivatives, count, criterion)]

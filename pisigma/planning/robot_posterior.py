@@ -101,7 +101,10 @@ class RobotPosterior:
         if hybrid:
             torques = GravityTorques(robot, to_first_row_frame(robot, gravity))
             series = FourierSeries(robot, usual.harmonics)
-            sizes += [_weight_sizes(torques, (usual.gravity,)), _weight_sizes(series, usual.bands)]
+            sizes += [
+                _weight_sizes(torques, (usual.gravity_sigma,)),
+                _weight_sizes(series, usual.series_sigmas),
+            ]
             features = torques, series
         if instrument.kind == "distance":  # distances do not change with rotations about the anchor
             sizes[0][[*space.indices_of("base")][3:]] = 0.0
@@ -168,18 +171,18 @@ class RobotPosterior:
             moved: Tensor = q + self.correction(q)
         return moved
 
-    def columns(self, q: Float64[Tensor, "poses dof"]) -> Float64[Tensor, "poses 6 unknowns"]:
+    def pose_derivatives(self, q: Float64[Tensor, "poses dof"]) -> Float64[Tensor, "poses 6 unknowns"]:
         """Compute derivatives of the target's position [m] and rotation [rad] with respect to all unknowns."""
-        return self.uncertainty.columns(JointState(q), self.corrected_joints(q))
+        return self.uncertainty.pose_derivatives(JointState(q), self.corrected_joints(q))
 
-    def tool(self, q: Float64[Tensor, "poses dof"]) -> Float64[Tensor, "poses 3 directions"]:
+    def tool_derivatives(self, q: Float64[Tensor, "poses dof"]) -> Float64[Tensor, "poses 3 directions"]:
         """Compute the derivative D of the target's position with respect to standard normal numbers.
 
         The covariance of the position is `D D^T`. The position is in the measuring frame or, for distances, which do
         not determine where the robot is, in the robot's base frame. For a camera, a rigid motion of all poses together
         is ignored, because the pose of the board's frame is known only through the arm.
         """
-        columns = self.columns(q)[:, :3]
+        columns = self.pose_derivatives(q)[:, :3]
         if self.instrument.sight is not None:
             # Project out the rigid motions of all points: shifts, and rotations about their mean for good conditioning.
             points = forward_kinematics(self.uncertainty.geometry.robot, self.corrected_joints(q))[:, :3, 3]
@@ -196,7 +199,7 @@ class RobotPosterior:
         return torch.cat([self._measured(some) for some in torch.split(q, _POSES_PER_CHUNK)])
 
     def _measured(self, q: Float64[Tensor, "poses dof"]) -> Float64[Tensor, "poses values directions"]:
-        columns, instrument = self.columns(q), self.instrument
+        columns, instrument = self.pose_derivatives(q), self.instrument
         if instrument.kind == "distance":
             geometry = self.uncertainty.geometry
             away = forward_kinematics(geometry.robot, self.corrected_joints(q))[:, :3, 3] - q.new_tensor(
@@ -240,7 +243,7 @@ class RobotPosterior:
         robot = before.geometry.robot.with_geometry(base=base, tool=tool)
         geometry = IdentifiedGeometry(robot, {"": base}, {"": tool}, {})
         space = ParameterSpace(before.space.robot)
-        arm, weights = before.root[: space.arm_size], before.root[len(before.space.parameters) :]
+        arm, weights = before.root[: space.arm_parameter_count], before.root[len(before.space.parameters) :]
         wide = torch.diag(torch.tensor(_WIDE_PRIOR, dtype=torch.float64))
         blank = arm.new_zeros(len(wide), arm.shape[1])
         zeros = [rows.new_zeros(len(rows), len(wide)) for rows in (arm, weights)]
@@ -251,18 +254,18 @@ class RobotPosterior:
             self, uncertainty=replace(before, space=space, geometry=geometry, covariance_root=root)
         )
 
-    def deviation(self, q: Float64[Tensor, "poses dof"]) -> Float64[Tensor, " poses"]:
+    def sigma(self, q: Float64[Tensor, "poses dof"]) -> Float64[Tensor, " poses"]:
         """Compute the standard deviation of the predicted position [m], `sqrt(σx² + σy² + σz²)`."""
-        return self.tool(q).square().sum((1, 2)).sqrt()
+        return self.tool_derivatives(q).square().sum((1, 2)).sqrt()
 
 
 def _geometric_sizes(space: ParameterSpace) -> Float64[Tensor, " parameters"]:
     """Return the prior standard deviations of all parameters of a robot that was never measured [m or rad]."""
     of_class, sizes = RobotClass.from_robot(space.robot), []
-    arm = zip(space.parameters[: space.arm_size], space.robot.dh.ravel().tolist(), strict=True)
+    arm = zip(space.parameters[: space.arm_parameter_count], space.robot.dh.ravel().tolist(), strict=True)
     for parameter, value in arm:
-        group = PriorGroup(prior_group_of(parameter.group, abs(value) > of_class.usual.length))
-        sizes.append(of_class.usual.size_of(group))
+        group = PriorGroup(prior_group_of(parameter.group, abs(value) > of_class.prior_sizes.length))
+        sizes.append(of_class.prior_sizes.size_of(group))
     return torch.tensor([*sizes, *_WIDE_PRIOR], dtype=torch.float64)
 
 

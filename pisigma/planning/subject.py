@@ -30,7 +30,7 @@ _MAX_PITCH = 1.52
 
 
 @dataclass(frozen=True, eq=False)
-class Subject:
+class RobotOrModel:
     """The robot or model for which a measurement is planned.
 
     Attributes:
@@ -48,7 +48,7 @@ class Subject:
         subject: Robot | CalibratedModel | HasModel | str | os.PathLike[str],
         base: str | None = None,
         tip: str | None = None,
-    ) -> "Subject":
+    ) -> "RobotOrModel":
         """Load a robot or a model.
 
         Args:
@@ -62,20 +62,20 @@ class Subject:
             ModelError: the folder cannot be used.
         """
         if isinstance(subject, Robot):
-            return Subject(subject)
+            return RobotOrModel(subject)
         if isinstance(subject, HasModel):
             subject = subject.model
         if not isinstance(subject, CalibratedModel):
             if not Path(subject).is_dir():
-                return Subject(Robot.load(subject, base, tip))
-            return replace(Subject.load(load_model(Path(subject))), folder=Path(subject))
+                return RobotOrModel(Robot.load(subject, base, tip))
+            return replace(RobotOrModel.load(load_model(Path(subject))), folder=Path(subject))
         if subject.nominal is None:
             raise PlanningError(
                 f"model '{subject.name}' does not store the nominal robot",
                 value=subject.name,
                 remedy="plan for its robot instead",
             )
-        return Subject(subject.nominal, subject)
+        return RobotOrModel(subject.nominal, subject)
 
     def arm(self, surroundings: Surroundings | None) -> ArmInSurroundings:
         """Return the robot in its surroundings; target and board come from the surroundings or from the model."""

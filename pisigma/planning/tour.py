@@ -32,19 +32,19 @@ class Pace:
 
     Attributes:
         speed: speed of every revolute joint [rad/s]; the slowest joint determines the duration.
-        slide: speed of every prismatic joint [m/s].
+        prismatic_speed: speed of every prismatic joint [m/s].
         settling: time at every pose until the robot is at rest and measured [s].
     """
 
     speed: float = math.radians(30.0)
-    slide: float = 0.25
+    prismatic_speed: float = 0.25
     settling: float = 3.0
 
     def __post_init__(self) -> None:
         """Refuse values outside their valid range."""
         for option, speed, factor, unit in (
             ("speed", self.speed, math.degrees(1.0), "deg/s"),
-            ("slide", self.slide, 1e3, "mm/s"),
+            ("slide", self.prismatic_speed, 1e3, "mm/s"),
         ):
             if not _MIN_SPEED <= speed < math.inf:
                 expected, value = f"a speed >= {factor * _MIN_SPEED:.2g} {unit}", f"{factor * speed:g} {unit}"
@@ -57,7 +57,7 @@ class Pace:
         self, robot: Robot, start: Float64[Tensor, "*#batch dof"], end: Float64[Tensor, "*#batch dof"]
     ) -> Float64[Tensor, "*_batch"]:
         """Compute the duration of joint motions [s], determined by the slowest joint, without acceleration."""
-        speed = torch.where(torch.tensor(robot.revolute), self.speed, self.slide)
+        speed = torch.where(torch.tensor(robot.revolute), self.speed, self.prismatic_speed)
         seconds: Tensor = ((end - start).abs() / speed).amax(-1)
         return seconds
 
@@ -68,13 +68,13 @@ class Tour:
 
     Attributes:
         order: indices of the poses in their order, without poses that no free motion reaches.
-        before: waypoints before each pose in this order [rad or m]; usually none.
+        waypoints_before: waypoints before each pose in this order [rad or m]; usually none.
         left_out: indices of the poses to which no free motion was found.
         seconds: total duration [s].
     """
 
     order: Int64[Tensor, " poses"]
-    before: tuple[Float64[Tensor, "_points dof"], ...]
+    waypoints_before: tuple[Float64[Tensor, "_points dof"], ...]
     left_out: Int64[Tensor, " others"]
     seconds: float
 
@@ -111,15 +111,15 @@ def plan_tour(
     return _with_waypoints(motions, poses, order, pace, start is not None)
 
 
-def order_of_use(chosen: int, check: int) -> Int64[Tensor, " poses"]:
+def order_of_use(calibration_poses: int, test_poses: int) -> Int64[Tensor, " poses"]:
     """Return an order in which test poses are evenly distributed among the others, which are sorted by usefulness.
 
     Args:
-        chosen: number of poses to calibrate with, numbered from 0.
-        check: number of test poses, numbered after these.
+        calibration_poses: number of poses to calibrate with, numbered from 0.
+        test_poses: number of test poses, numbered after these.
     """
-    between = (torch.arange(check) + 0.5) * chosen / max(check, 1)
-    return torch.cat([torch.arange(chosen) + 0.0, between]).argsort(stable=True)
+    between = (torch.arange(test_poses) + 0.5) * calibration_poses / max(test_poses, 1)
+    return torch.cat([torch.arange(calibration_poses) + 0.0, between]).argsort(stable=True)
 
 
 def stage_ends(poses: int) -> tuple[int, ...]:

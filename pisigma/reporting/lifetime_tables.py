@@ -45,14 +45,14 @@ def difference_table(differences: ParameterDifferences, names: tuple[str, str]) 
         names: names of the models.
     """
     columns = ("parameter", "unit", *names, "shift alone", "± 95 %", "p")
-    shown = [one for one in differences.parameters if one.difference or any(one.deviations)]
+    shown = [one for one in differences.parameters if one.difference or any(one.sigmas)]
     return Table(columns, tuple(_difference_row(one) for one in shown))
 
 
 def _difference_row(one: ParameterDifference) -> tuple[str, ...]:
     """Return the row of a parameter; without a test, the cells of its shift are empty."""
     values = (f"{value:.4f}" for value in (one.first, one.second))
-    if one.shift is None or one.deviation is None or one.p is None:
+    if one.shift is None or one.sigma is None or one.p is None:
         return (one.name, one.unit, *values, _NO_VALUE, _NO_VALUE, _NO_VALUE)
     p = "<0.0001" if one.p < 1e-4 else f"{one.p:.2g}"
-    return (one.name, one.unit, *values, f"{one.shift:z.4f}", f"{NORMAL_95 * one.deviation:.4f}", p)
+    return (one.name, one.unit, *values, f"{one.shift:z.4f}", f"{NORMAL_95 * one.sigma:.4f}", p)

@@ -31,12 +31,12 @@ def joint_origins(robot: Robot) -> tuple[list[Frame], Frame]:
 
 
 def robot_of_origins(
-    like: Robot, origins: list[Frame], end: Frame, nearly_parallel: float = NEARLY_PARALLEL
+    similar_robot: Robot, origins: list[Frame], end: Frame, nearly_parallel: float = NEARLY_PARALLEL
 ) -> Robot:
     """Return a robot with the given joint frames, and with base, tool, names and limits of another robot.
 
     Args:
-        like: the other robot, with the same number of joints.
+        similar_robot: the other robot, with the same number of joints.
         origins: joint frames as returned by `joint_origins`.
         end: transform from the last joint to the frame to which the tool is attached.
         nearly_parallel: see `rows_of_chain`.
@@ -53,11 +53,14 @@ def robot_of_origins(
             row.lower,
             row.upper,
         )
-        for row, origin in zip(like.joints, origins, strict=True)
+        for row, origin in zip(similar_robot.joints, origins, strict=True)
     )
-    fields = rows_of_chain(Chain(like.name, "", "", joints, end, ""), nearly_parallel).fields
-    moved = replace(like, rows=like.joints, dh=fields.dh, urdf=None)
-    base, tool = frame_of(like.base) @ frame_of(fields.base), frame_of(fields.tool) @ frame_of(like.tool)
+    fields = rows_of_chain(Chain(similar_robot.name, "", "", joints, end, ""), nearly_parallel).fields
+    moved = replace(similar_robot, rows=similar_robot.joints, dh=fields.dh, urdf=None)
+    base, tool = (
+        frame_of(similar_robot.base) @ frame_of(fields.base),
+        frame_of(fields.tool) @ frame_of(similar_robot.tool),
+    )
     return moved.with_geometry(base=xyzrpy_of(base), tool=xyzrpy_of(tool))
 
 
@@ -79,13 +82,13 @@ class PendantPose:
         value: the controller's value of that axis [rad or m].
         tool: pose of the tool in the base frame: x, y, z [m], roll, pitch, yaw [rad] of
             `Trans(x, y, z) · RotZ(roll) · RotY(pitch) · RotX(yaw)`.
-        inside: whether all controller values are within the limits.
+        is_within_limits: whether all controller values are within the limits.
     """
 
     axis: Row | None
     value: float
     tool: Float64[np.ndarray, " 6"]
-    inside: bool
+    is_within_limits: bool
 
     @property
     def in_file_unit(self) -> float:
@@ -101,7 +104,7 @@ class PendantPose:
         """Return the pose as plain values for JSON."""
         unit = "deg" if self.axis is None else self.axis.file_unit
         moved: dict[str, object] = {"axis": self.axis and self.axis.name, f"value_{unit}": self.in_file_unit}
-        return moved | self.tool_in_file_units | {"within_limits": self.inside}
+        return moved | self.tool_in_file_units | {"within_limits": self.is_within_limits}
 
 
 def pendant_poses(

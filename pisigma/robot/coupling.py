@@ -111,7 +111,7 @@ class Coupling:
             )
 
     @property
-    def passive(self) -> bool:
+    def has_passive_joints(self) -> bool:
         """Whether there are more joints than axes, so that some joints only follow others."""
         return len(self.matrix) > len(self.axes)
 

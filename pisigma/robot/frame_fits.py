@@ -255,7 +255,7 @@ def _affine_base_and_tool(
     return transform(R_base, shift[..., :3]), transform(R_tool, shift[..., 3:])
 
 
-def frame_columns(
+def frame_jacobian(
     T: Float64[Tensor, "*batch rows 4 4"],
     measured: MeasuredPoses,
     base: Float64[Tensor, "*batch #rows 4 4"],
@@ -297,7 +297,7 @@ def base_and_tool_step(
         free: translation [m] and rotation [rad] of every row's pose per unit of an unknown of that row, which is
             eliminated (variable projection, Golub and Pereyra 1973); None for no such unknown.
     """
-    J, error = frame_columns(T, measured, base[..., None, :, :], tool[..., None, :, :])
+    J, error = frame_jacobian(T, measured, base[..., None, :, :], tool[..., None, :, :])
     residual = error[..., None]
     if free is not None:
         weight = measured.lever * measured.has_rotation.to(T)[..., None]

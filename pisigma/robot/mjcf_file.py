@@ -28,17 +28,17 @@ class MovedBody:
         element: the body.
         joint: attributes of the joint, including defaults of its classes.
         name: name of the joint.
-        between: pose of the body's parent in the preceding moved body, or in the base.
+        parent_pose: pose of the body's parent in the preceding moved body, or in the base.
         pose: pose of the body in its parent.
-        attached: frame of the row's axis in the body: z is the joint's axis, in the direction of the robot's row.
+        axis_frame: frame of the row's axis in the body: z is the joint's axis, in the direction of the robot's row.
     """
 
     element: Any
     joint: Mapping[str, str]
     name: str
-    between: Frame
+    parent_pose: Frame
     pose: Frame
-    attached: Frame
+    axis_frame: Frame
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +104,7 @@ class MjcfDrawing:
         return MjcfDrawing(path, root, compiler, defaults)
 
     @property
-    def degree(self) -> float:
+    def angle_unit(self) -> float:
         """Unit of the file's angles [rad]."""
         return 1.0 if self.compiler.get("angle", "degree") == "radian" else math.pi / 180
 
@@ -174,14 +174,14 @@ class MjcfDrawing:
         elif (text := body.get("euler")) is not None:
             order = self.compiler.get("eulerseq", "xyz")
             turns = [
-                rotation("xyz".index(a.lower()), v * self.degree)
+                rotation("xyz".index(a.lower()), v * self.angle_unit)
                 for a, v in zip(order, numbers(text), strict=True)
             ]
             for turn in turns if order.islower() else turns[::-1]:
                 T = T @ turn
         elif (text := body.get("axisangle")) is not None:
             *axis, angle = numbers(text)
-            half, unit = angle * self.degree / 2, np.array(axis) / np.linalg.norm(axis)
+            half, unit = angle * self.angle_unit / 2, np.array(axis) / np.linalg.norm(axis)
             T[:3, :3] = _rotation(np.array([math.cos(half), *(math.sin(half) * unit)]))
         elif body.get("xyaxes") is not None:
             x, y = np.array(numbers(body.get("xyaxes"))).reshape(2, 3)

@@ -33,18 +33,18 @@ class GeometricSizes:
     Attributes:
         joint_offset: size for theta [rad].
         length: size for d and a with a nonzero nominal value [m].
-        no_length: size for d and a with a nominal value of 0 [m].
-        between_axes: size for alpha and beta [rad].
+        zero_length: size for d and a with a nominal value of 0 [m].
+        axis_angle: size for alpha and beta [rad].
     """
 
     joint_offset: float
     length: float
-    no_length: float
-    between_axes: float
+    zero_length: float
+    axis_angle: float
 
     def size_of(self, group: int) -> float:
         """Return the size of the errors of a group of parameters [m or rad]."""
-        return (self.joint_offset, self.length, self.no_length, self.between_axes)[group]
+        return (self.joint_offset, self.length, self.zero_length, self.axis_angle)[group]
 
 
 @dataclass(frozen=True)
@@ -72,25 +72,25 @@ class RobotClass:
 
     Attributes:
         name: name of the class, a value of the setting `robot_class`.
-        usual: prior standard deviations of geometric errors.
-        gravity: prior standard deviation of the weights of `GravityTorques` [rad].
-        bands: prior standard deviations of the weights of `FourierSeries` [rad], by band of `BAND_STARTS`.
+        prior_sizes: prior standard deviations of geometric errors.
+        gravity_sigma: prior standard deviation of the weights of `GravityTorques` [rad].
+        series_sigmas: prior standard deviations of the weights of `FourierSeries` [rad], by band of `BAND_STARTS`.
         harmonics: number of harmonics of the series.
-        largest: standard deviations of geometric errors that no robot of the class exceeds.
-        change: largest changes due to wear or a collision.
-        remaining: errors after a calibration, as a share of the reach, that no robot of the class exceeds.
+        max_sizes: standard deviations of geometric errors that no robot of the class exceeds.
+        max_changes: largest changes due to wear or a collision.
+        max_remaining_share: errors after a calibration, as a share of the reach, that no robot of the class exceeds.
         joint_repeatability: standard deviation of the values of a revolute joint from image to image [rad]; 0 if the
             pose repeatability stated for images includes it.
     """
 
     name: ClassName
-    usual: GeometricSizes
-    gravity: float
-    bands: tuple[float, ...]
+    prior_sizes: GeometricSizes
+    gravity_sigma: float
+    series_sigmas: tuple[float, ...]
     harmonics: int
-    largest: GeometricSizes
-    change: ChangeLimits
-    remaining: float
+    max_sizes: GeometricSizes
+    max_changes: ChangeLimits
+    max_remaining_share: float
     joint_repeatability: float = 0.0
 
     @staticmethod
@@ -106,18 +106,18 @@ class RobotClass:
 
     def allows(self, sizes: Sequence[tuple[int, float]]) -> bool:
         """Return whether errors of these sizes [m or rad], by group of parameters, are possible in this class."""
-        return all(size <= self.largest.size_of(group) for group, size in sizes)
+        return all(size <= self.max_sizes.size_of(group) for group, size in sizes)
 
 
 INDUSTRIAL: Final = RobotClass(
     name="industrial",
-    usual=GeometricSizes(joint_offset=1.5e-3, length=0.55e-3, no_length=0.37e-3, between_axes=0.7e-3),
-    gravity=2.7e-4,
-    bands=(2.4e-4, 2.4e-4, 4e-6, 4e-6, 1.5e-4, 2e-6, 2e-6),
+    prior_sizes=GeometricSizes(joint_offset=1.5e-3, length=0.55e-3, zero_length=0.37e-3, axis_angle=0.7e-3),
+    gravity_sigma=2.7e-4,
+    series_sigmas=(2.4e-4, 2.4e-4, 4e-6, 4e-6, 1.5e-4, 2e-6, 2e-6),
     harmonics=15,
-    largest=GeometricSizes(joint_offset=10e-3, length=10e-3, no_length=10e-3, between_axes=10e-3),
-    change=ChangeLimits(joint_zero=0.1, length=0.005, angle=0.01),
-    remaining=2.5e-3,
+    max_sizes=GeometricSizes(joint_offset=10e-3, length=10e-3, zero_length=10e-3, axis_angle=10e-3),
+    max_changes=ChangeLimits(joint_zero=0.1, length=0.005, angle=0.01),
+    max_remaining_share=2.5e-3,
 )
 """Arms whose joints have one eccentricity, one ovality and one gear ripple each.
 
@@ -130,17 +130,17 @@ factor it is 0.74, 0.93 and 1.1. The largest sizes are twice those of the worst 
 COBOT: Final = replace(
     INDUSTRIAL,
     name="cobot",
-    largest=replace(INDUSTRIAL.largest, joint_offset=20e-3),
-    change=ChangeLimits(joint_zero=0.1, length=0.008, angle=0.02),
+    max_sizes=replace(INDUSTRIAL.max_sizes, joint_offset=20e-3),
+    max_changes=ChangeLimits(joint_zero=0.1, length=0.008, angle=0.02),
 )
 """Light arms with harmonic drives, whose zeros are set by hand after a repair and slip in a collision. Gear errors are
 those of industrial arms unless arms of the manufacturer were measured."""
 
 UNIVERSAL_ROBOTS: Final = replace(
     COBOT,
-    usual=GeometricSizes(joint_offset=0.9e-3, length=0.45e-3, no_length=0.1e-3, between_axes=1.5e-3),
-    gravity=4e-4,
-    bands=(2e-4, 2e-4, 6e-5, 3e-5, 5e-5, 5e-5, 5e-5, 4e-5, 3e-5),
+    prior_sizes=GeometricSizes(joint_offset=0.9e-3, length=0.45e-3, zero_length=0.1e-3, axis_angle=1.5e-3),
+    gravity_sigma=4e-4,
+    series_sigmas=(2e-4, 2e-4, 6e-5, 3e-5, 5e-5, 5e-5, 5e-5, 4e-5, 3e-5),
     harmonics=31,
 )
 """Arms of Universal Robots, with sizes between the two that maximise the evidence of hybrid calibrations of the
@@ -150,10 +150,10 @@ robots cannot distinguish."""
 HOBBY: Final = replace(
     COBOT,
     name="hobby",
-    usual=GeometricSizes(joint_offset=30e-3, length=1e-3, no_length=1e-3, between_axes=5e-3),
-    largest=GeometricSizes(joint_offset=100e-3, length=20e-3, no_length=20e-3, between_axes=20e-3),
-    change=ChangeLimits(joint_zero=0.3, length=0.02, angle=0.1),
-    remaining=7.5e-3,
+    prior_sizes=GeometricSizes(joint_offset=30e-3, length=1e-3, zero_length=1e-3, axis_angle=5e-3),
+    max_sizes=GeometricSizes(joint_offset=100e-3, length=20e-3, zero_length=20e-3, axis_angle=20e-3),
+    max_changes=ChangeLimits(joint_zero=0.3, length=0.02, angle=0.1),
+    max_remaining_share=7.5e-3,
 )
 """Arms without a reliable zero: arms built by hobbyists or in a laboratory, surgical arms with potentiometers, and old
 arms that were reassembled. Their zeros are wrong by 20 to 50 mrad."""
@@ -161,9 +161,9 @@ arms that were reassembled. Their zeros are wrong by 20 to 50 mrad."""
 SERVO: Final = replace(
     HOBBY,
     name="servo",
-    usual=replace(HOBBY.usual, joint_offset=0.1),
-    largest=replace(HOBBY.largest, joint_offset=0.3),
-    remaining=0.04,
+    prior_sizes=replace(HOBBY.prior_sizes, joint_offset=0.1),
+    max_sizes=replace(HOBBY.max_sizes, joint_offset=0.3),
+    max_remaining_share=0.04,
     joint_repeatability=math.radians(0.5),
 )
 """Arms built from servos, whose zeros are set by eye in the middle of the range and are wrong by up to 17 deg
@@ -179,4 +179,4 @@ def plausible_share(robot: Robot) -> float:
 
     They are larger for arms whose joints scatter by more, such as arms of servos.
     """
-    return max(_PLAUSIBLE_SHARE, RobotClass.from_robot(robot).remaining)
+    return max(_PLAUSIBLE_SHARE, RobotClass.from_robot(robot).max_remaining_share)

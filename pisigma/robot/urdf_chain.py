@@ -79,7 +79,7 @@ def read_chain(path: str | os.PathLike[str], base: str | None = None, tip: str |
     """
     from lxml import etree
 
-    root = parse_xml(path, everything=True)
+    root = parse_xml(path, keep_comments=True)
     urdf, place = read_urdf(path, root)
     links = list(urdf.link_map)
     _check_tree(urdf, place)

@@ -67,12 +67,12 @@ def read_urdf(path: str | os.PathLike[str], root: Any = None) -> tuple[Any, Call
     return _parse_urdf(reduced), lambda joint: Place(path, lines["joint", joint])
 
 
-def parse_xml(path: str | os.PathLike[str], everything: bool = False) -> Any:
+def parse_xml(path: str | os.PathLike[str], keep_comments: bool = False) -> Any:
     """Parse a URDF file with lxml, and return its root element `robot`.
 
     Args:
         path: the file.
-        everything: whether to keep comments and processing instructions.
+        keep_comments: whether to keep comments and processing instructions.
 
     Raises:
         RobotError: see `read_urdf`.
@@ -80,7 +80,7 @@ def parse_xml(path: str | os.PathLike[str], everything: bool = False) -> Any:
     from lxml import etree
 
     content = read_input(path, RobotError)
-    removed = {"remove_comments": not everything, "remove_pis": not everything}
+    removed = {"remove_comments": not keep_comments, "remove_pis": not keep_comments}
     parser = etree.XMLParser(resolve_entities=False, no_network=True, load_dtd=False, **removed)
     try:
         root = etree.fromstring(content, parser)

@@ -28,7 +28,7 @@ from pisigma.simulation.errors.source import (
     AbstractJointSource,
     AbstractPlaySource,
     JointErrorFunction,
-    OneOf,
+    RegisteredSection,
 )
 from pisigma.simulation.errors.transmission import TransmissionHarmonics
 
@@ -45,7 +45,7 @@ ERROR_SOURCES: dict[str, type[AbstractErrorSource]] = {
 }
 """Classes of all error sources by kind."""
 
-ErrorSource = Annotated[AbstractErrorSource, OneOf(ERROR_SOURCES)]
+ErrorSource = Annotated[AbstractErrorSource, RegisteredSection(ERROR_SOURCES)]
 """A recipe section of any registered error source, distinguished by `kind`."""
 
 Source = TypeVar("Source", bound=AbstractErrorSource)

@@ -288,7 +288,10 @@ def export(cell: Cell, form: Form, files: Mapping[str, Path]) -> Outcome:
         f"{what} written to {out.name}{exported.details}.", "", "test every program at low speed.", "File"
     )
     left: Any = exported.facts.get("left_alone", [])
-    alone, changed = [(str(one["line"]), str(one["reason"])) for one in left], side_by_side(exported.shown)
+    alone, changed = (
+        [(str(one["line"]), str(one["reason"])) for one in left],
+        side_by_side(exported.leading_text),
+    )
     blocks = (
         sentences("remarks", exported.remarks),
         table_block("What was changed", ("line", "before", "after"), changed),

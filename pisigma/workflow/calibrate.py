@@ -281,7 +281,7 @@ def calibrator_of(
     """
     length, angle = settings.prior_length, settings.prior_angle
     usual = _class_of(settings, robot)
-    zeros = max(angle, usual.usual.joint_offset) if usual is SERVO else angle
+    zeros = max(angle, usual.prior_sizes.joint_offset) if usual is SERVO else angle
     geometric = GeometricCalibrator(
         robot,
         free=settings.free,

@@ -89,7 +89,7 @@ class ComparedModels:
             "models": [{"name": name, "kind": model.kind} for name, model in self.models.items()],
             "robot": first.robot.name,
             "frames": self.settings.frames,
-            "level": differences.level,
+            "level": differences.significance_level,
             "differs": [one.to_json() for one in differences.differing],
             "parameters": [_parameter_json(one) for one in differences.parameters],
             "frames_moved": [one.to_json() for one in differences.frames],
@@ -130,7 +130,7 @@ class ComparedModels:
             f"{where}, at most by {figures['max_mm']:.3f} mm."
         ]
         if self.program is not None:
-            figures, largest = self.program.errors.figures.figures_by_name, self.program.largest
+            figures, largest = self.program.errors.figures.figures_by_name, self.program.index_of_largest
             lines.append(
                 f"The poses of {self.program.source}, taught with {first}, are off by {figures['rms_mm']:.3f} mm (RMS) "
                 f"under {second}, at most by {figures['max_mm']:.3f} mm at pose {int(self.program.number[largest])}."
@@ -234,7 +234,7 @@ def _parameters_in_words(differences: ParameterDifferences, first: str, second: 
             "A model has no posterior of its parameters, so the significance of their differences is unknown; "
             "make it with `pisigma calibrate`.",
         )
-    level = f"at a significance level of {differences.level:.2g} for all parameters together"
+    level = f"at a significance level of {differences.significance_level:.2g} for all parameters together"
     lines = [f"No parameter of {second} differs from {first} beyond its uncertainty, {level}."]
     if differences.differing:
         shifts = "; ".join(one.sentence for one in differences.differing)
@@ -256,10 +256,10 @@ def _parameter_json(one: ParameterDifference) -> dict[str, Any]:
         "first": one.first,
         "second": one.second,
         "difference": one.difference,
-        "first_deviation": one.deviations[0],
-        "second_deviation": one.deviations[1],
+        "first_deviation": one.sigmas[0],
+        "second_deviation": one.sigmas[1],
         "shift": one.shift,
-        "shift_deviation": one.deviation,
+        "shift_deviation": one.sigma,
     }
     with_unit = {f"{name}_{one.unit}": value for name, value in figures.items()}
     return {"name": one.name, **with_unit, "p": one.p, "equivalent": list(one.equivalent)}

@@ -21,7 +21,7 @@ from pisigma.model.calibrated_model import CalibratedModel, Provenance
 from pisigma.model.domain import Domain
 from pisigma.model.folder.model_folder import load_model
 from pisigma.model.inverse.corrected_ik import CorrectedIK
-from pisigma.model.stored_starts import spread_rows
+from pisigma.model.stored_starts import evenly_spaced_rows
 from pisigma.reporting.derived_cards import write_distilled_card
 from pisigma.robot.description import Robot
 from pisigma.robot.kinematics.closed_form import closed_form_solver
@@ -140,7 +140,7 @@ def distill(
         network=network,
         domain=Domain.from_rows(scaled[:_DOMAIN_SAMPLES], generator),
         branches=() if solver is None else solver.most_frequent_branches(every.branch),
-        starts=spread_rows((every.q_nominal + every.correction)[fitted]),
+        starts=evenly_spaced_rows((every.q_nominal + every.correction)[fitted]),
         bases=parent.bases,
         tools=parent.tools,
         provenance=_provenance(parent, sha256, settings),

@@ -39,7 +39,7 @@ from pisigma.planning.session.state import (
     SessionState,
     coverage,
 )
-from pisigma.planning.subject import Subject
+from pisigma.planning.subject import RobotOrModel
 from pisigma.planning.task import task_poses
 from pisigma.robot.se3 import transform_from_xyzrpy
 from pisigma.workflow.settings.measuring import MeasureSettings
@@ -77,7 +77,7 @@ class MeasuringSession:
         self._lock, self._compute = threading.RLock(), compute_here
         self._settings = settings
         candidates = find_candidates(plan.settings, plan.arm)
-        subject = Subject(plan.arm.nominal) if plan.model is None else Subject.load(plan.model)
+        subject = RobotOrModel(plan.arm.nominal) if plan.model is None else RobotOrModel.load(plan.model)
         self._against = subject.model or plan.arm.robot
         self._task = task_poses(plan.arm, plan.settings, candidates.workspace, subject.model)
         self._further = FurtherPoses.from_plan(plan, candidates, self._task)
@@ -198,7 +198,7 @@ class MeasuringSession:
         """Look for a fault of the setup that affects all rows, and return the fault if it is new."""
         with self._lock:
             rows, usable, before = self._rows, self._judged.usable, self._setup
-            counts = self._judged.judgement.counts
+            counts = self._judged.judgement.used_rows
         if rows is None or self._looked_at == rows.rows:
             return ()
         found = self._compute(partial(setup_sentence, rows.select(usable), counts, self._against))

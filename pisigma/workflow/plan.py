@@ -33,7 +33,7 @@ from pisigma.planning.plan_inputs import allow_measured_poses, check_measured, f
 from pisigma.planning.plan_settings import PlanSettings
 from pisigma.planning.pose_selection import complete_selection
 from pisigma.planning.robot_posterior import RobotPosterior
-from pisigma.planning.subject import Subject
+from pisigma.planning.subject import RobotOrModel
 from pisigma.planning.surroundings.arm_in_surroundings import ArmInSurroundings
 from pisigma.planning.surroundings.motion import Motions
 from pisigma.planning.surroundings.surroundings import Surroundings, read_surroundings
@@ -164,7 +164,7 @@ def check_files(
 
 
 def plan(
-    subject: Robot | CalibratedModel | HasModel | Subject | str | os.PathLike[str],
+    subject: Robot | CalibratedModel | HasModel | RobotOrModel | str | os.PathLike[str],
     settings: PlanSettings | None = None,
     surroundings: Surroundings | str | os.PathLike[str] | None = None,
     progress: Progress = lambda what: None,
@@ -187,7 +187,7 @@ def plan(
         PlanningError: the surroundings cannot be used, or too few poses are possible in them.
     """
     started, settings = time.perf_counter(), settings or PlanSettings()
-    subject = subject if isinstance(subject, Subject) else Subject.load(subject)
+    subject = subject if isinstance(subject, RobotOrModel) else RobotOrModel.load(subject)
     if surroundings is not None and not isinstance(surroundings, Surroundings):
         surroundings = read_surroundings(surroundings, subject.robot)
     arm = allow_measured_poses(settings, subject.arm(surroundings))
@@ -234,7 +234,7 @@ class _Problem:
         task: joint values at which the robot must be accurate [rad or m].
     """
 
-    subject: Subject
+    subject: RobotOrModel
     settings: PlanSettings
     arm: ArmInSurroundings
     candidates: Candidates
@@ -253,8 +253,8 @@ class _Problem:
 
     @cached_property
     def tool(self) -> Float64[Tensor, "tasks 3 directions"]:
-        """Return the uncertainty of the position of the tool over the task; see `RobotPosterior.tool`."""
-        return self.posterior.tool(self.task)
+        """Return the uncertainty of the position of the tool over the task; see `RobotPosterior.tool_derivatives`."""
+        return self.posterior.tool_derivatives(self.task)
 
     @property
     def has_measurements(self) -> bool:
@@ -295,7 +295,7 @@ class _Problem:
         folder = self.subject.folder
         return (
             kept,
-            StoredPlan(self.arm, self.settings, folder, q[ordered], is_check, number, way.before),
+            StoredPlan(self.arm, self.settings, folder, q[ordered], is_check, number, way.waypoints_before),
             way,
         )
 

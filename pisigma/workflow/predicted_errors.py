@@ -38,5 +38,5 @@ def predicted_errors(model: CalibratedModel) -> PredictedErrors:
         IdentificationError: the model stores no posterior.
     """
     posterior, (q, _) = RobotPosterior.from_model(model), samples_of_workspace(model)
-    p95 = [p95_at(posterior.tool(some)) for some in torch.split(q, _POSES_PER_CHUNK)]
+    p95 = [p95_at(posterior.tool_derivatives(some)) for some in torch.split(q, _POSES_PER_CHUNK)]
     return PredictedErrors(tool_positions(model, q), torch.cat(p95))

@@ -236,7 +236,9 @@ def _kept_model(
         fitted = fit_if_better if choice.rms["scratch"] is None else fit
         result = fitted(calibrator, rows, progress)
         assert isinstance(result, HybridResult)
-        return replace(model_of_hybrid(parent.name, calibrator.geometric.robot, result, rows), kind=KIND)
+        return replace(
+            model_of_hybrid(parent.name, calibrator.geometric_calibrator.robot, result, rows), kind=KIND
+        )
     if choice.kept == "old":
         adaptation = adapt(adaptation.problem.with_fixed_arm(), adaptation.drift.noise)
     return recalibrated_model(parent, adaptation, rows)

@@ -17,7 +17,7 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import groups_of_equal_joints
 from pisigma.model.calibrated_model import CalibratedModel, Provenance
 from pisigma.model.domain import Domain
-from pisigma.model.stored_starts import spread_rows
+from pisigma.model.stored_starts import evenly_spaced_rows
 from pisigma.network.pairs import TrainingPairs, build_pairs
 from pisigma.network.patterns import build_network, build_patterns
 from pisigma.network.sections import LevenbergMarquardtSection
@@ -276,7 +276,7 @@ def train_networks(
         logs=settings.logs,
     )
     network.requires_grad_(False)
-    used = pairs.used
+    used = pairs.used_rows
     model = CalibratedModel(
         name=recipe.name,
         kind="inverse_calibration",
@@ -284,7 +284,7 @@ def train_networks(
         network=network,
         domain=Domain.from_rows(network.scaled_inputs(pairs.T[used], pairs.q_nominal[used]), generator),
         branches=pairs.branches,
-        starts=spread_rows(measurements.q[used]),
+        starts=evenly_spaced_rows(measurements.q[used]),
         provenance=_provenance(recipe, measurements, pairs, recipe_sha256),
     )
     other = JointErrors.from_model(model, held_out) if held_out else None
@@ -370,10 +370,10 @@ def _held_out_pairs(name: str, robot: Robot, held_out: Measurements) -> Training
         RecipeError: the nominal robot cannot reach some of the poses.
     """
     pairs = build_pairs(robot, held_out, None)
-    if not pairs.used.all():
-        unreached = int((~pairs.used).sum())
+    if not pairs.used_rows.all():
+        unreached = int((~pairs.used_rows).sum())
         raise RecipeError(
-            f"recipe '{name}': the nominal robot cannot reach {unreached} of {len(pairs.used)} poses of "
+            f"recipe '{name}': the nominal robot cannot reach {unreached} of {len(pairs.used_rows)} poses of "
             "data.held_out, so they have no joint error; change their region.",
             value=unreached,
         )
@@ -390,8 +390,8 @@ def _provenance(
         if isinstance(recipe.data, SimulatedData)
         else Path(measurements.source).name,
         data_sha256=measurements.content_hash(),
-        rows=int(pairs.used.sum()),
-        rows_left_out=int((~pairs.used).sum()),
+        rows=int(pairs.used_rows.sum()),
+        rows_left_out=int((~pairs.used_rows).sum()),
         rule=pairs.left_out,
         seed=recipe.fit.seed,
         versions=Provenance.installed_versions(),

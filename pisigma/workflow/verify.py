@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from pisigma.lifetime.monitoring.session import Session
-from pisigma.lifetime.recalibration.motion import judged_motion, motion_sentence, motion_warnings
+from pisigma.lifetime.recalibration.motion import find_motion, motion_sentence, motion_warnings
 from pisigma.measurement.camera.camera_files import CameraFiles
 from pisigma.measurement.camera.corner_file import MeasurementFiles, read_rows
 from pisigma.measurement.dataset import Measurements
@@ -245,7 +245,7 @@ def _motion(
     """Return the moved parts; None if another setup fault or the nominal robot explains the rows better."""
     if any(not _MOTIONS.issuperset(fault.kinds) for fault in faults):
         return None
-    motion = judged_motion(model, rows, fitted)
+    motion = find_motion(model, rows, fitted)
     nominal = comparison.models[0].position.statistics["rms"] * 1e-3
     return motion if motion is not None and motion.rms_after < nominal else None
 

@@ -60,7 +60,7 @@ def test_scale_is_robust_to_wrong_rows(components: int, generator: torch.Generat
     distance = r.norm(dim=-1)
     scale = loss.scale(distance, components, 0.0)
     assert 0.2 < scale < 0.25
-    assert_close(loss.deviation(distance, components, 0.0, 0.2), 0.2, rtol=0.03)
+    assert_close(loss.sigma(distance, components, 0.0, 0.2), 0.2, rtol=0.03)
     assert SquaredLoss().scale(distance, components, 0.0) > 5
 
 

@@ -67,7 +67,7 @@ def test_packed_numbers_are_the_same_and_few() -> None:
     content = rounded.packed()
     assert len(content) < 8 * root.numel() / 10
     again = RoundedRoot.unpacked(content, rounded.unit)
-    assert torch.equal(again.numbers, rounded.numbers)
+    assert torch.equal(again.integers, rounded.integers)
     assert torch.equal(again.as_matrix, rounded.as_matrix)
     chosen = [0, *range(3, UNKNOWNS)]
     placed = rounded.select(chosen).among(chosen, UNKNOWNS).as_matrix

@@ -22,17 +22,17 @@ def explained(off: float, seed: int = 0) -> ExplainedRows[DriftSearch]:
     y[15:18] += off * torch.tensor([0.6, 0.8, 0.0]).double()
     noise = torch.tensor([NOISE]).double()
     configuration = torch.arange(CONFIGURATIONS).repeat_interleave(3)
-    counts = (SensorCount(float(count), stated=False, exact=False),)
+    counts = (SensorCount(float(count), has_stated_noise=False, exact=False),)
     groups = [DriftGroup("joint 1", torch.tensor([0]), torch.ones(1).double())]
     groups += [DriftGroup("correction", torch.arange(1, count + 1), torch.ones(count).double())]
 
     values = LinearValues(X, y, torch.zeros(count, dtype=torch.int64), configuration, counts)
 
     def explain(wrong) -> ExplainedRows[DriftSearch]:
-        there = replace(values, wrong=wrong)
+        there = replace(values, wrong_configurations=wrong)
         search = DriftSearch(there, 1e-6 * X, groups, noise, noise)
         search.estimate_sizes()
-        return ExplainedRows(search, there, search.log_evidence, search.covariance, search.deviation)
+        return ExplainedRows(search, there, search.log_evidence, search.covariance, search.sigma)
 
     return mark_wrong_rows(explain({}), explain)
 
@@ -40,14 +40,14 @@ def explained(off: float, seed: int = 0) -> ExplainedRows[DriftSearch]:
 @pytest.mark.parametrize("off", [0.005, 0.5])
 def test_a_wrong_configuration_is_found_despite_a_drift(off):
     result = explained(off)
-    assert list(result.values.wrong) == [5]
+    assert list(result.values.wrong_configurations) == [5]
     assert [group.what for group in result.what.drift.groups if group.size] == ["joint 1"]
     assert_close(result.what.estimate_shift(0)[0], torch.tensor([MOVED]), rtol=0.05)
     expected = result.what.drift.noise * torch.ones(36).double()
-    assert_close(result.deviation[:15], expected[:15])
-    assert float(result.deviation[15]) > 10 * NOISE
+    assert_close(result.sigma[:15], expected[:15])
+    assert float(result.sigma[15]) > 10 * NOISE
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_no_configuration_is_wrong_if_all_are_correct(seed):
-    assert not explained(0.0, seed).values.wrong
+    assert not explained(0.0, seed).values.wrong_configurations

@@ -81,7 +81,7 @@ def test_weights_count_for_the_causes_of_a_misfit():
     assert known is not None
     assert model.hybrid is not None
     fit = fit_frames(model.hybrid.robot, rows, "tool", model.hybrid_bases)
-    assert bool(ArmUncertainty(known, rows).spread(fit.solved, fit.used_rows, fit.frames).any())
+    assert bool(ArmUncertainty(known, rows).spread(fit.solved, fit.used_rows, fit.frame_indices).any())
 
 
 def test_direction_that_is_held_is_uncertain_in_the_model():
@@ -92,7 +92,7 @@ def test_direction_that_is_held_is_uncertain_in_the_model():
     found = frames_of_model(model, rows, "tool")
     assert found.fit.undetermined
     assert found.model.uncertainty is not None
-    deviation = found.model.uncertainty.deviation(rows)
+    deviation = found.model.uncertainty.sigma(rows)
     assert float(deviation.norm(dim=1).min()) > 0.05
 
 

@@ -7,7 +7,7 @@ from testing.refusals import refused
 from pisigma.files.errors import PlanningError
 from pisigma.model.folder.model_folder import model_or_folder
 from pisigma.model.inverse.corrected_ik import CorrectedIK
-from pisigma.planning.subject import Subject
+from pisigma.planning.subject import RobotOrModel
 from pisigma.workflow.evaluate import models_by_label
 
 
@@ -20,4 +20,4 @@ def test_the_model_of_a_corrected_ik_is_taken():
     assert model_or_folder("models/kiro3") == "models/kiro3"
     assert list(models_by_label(["nominal", ik]).values()) == ["nominal", model]
     with refused(PlanningError, value=model.name):
-        Subject.load(ik)
+        RobotOrModel.load(ik)

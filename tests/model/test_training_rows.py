@@ -11,7 +11,7 @@ from testing.refusals import numbers_in, refused
 from pisigma.files.errors import MeasurementError
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.folder.model_folder import load_model, save_model
-from pisigma.model.stored_starts import MAX_STARTS, rows_at_starts, spread_rows
+from pisigma.model.stored_starts import MAX_STARTS, evenly_spaced_rows, rows_at_starts
 from pisigma.model.training_rows import (
     known_rows,
     stored_training_rows,
@@ -94,7 +94,7 @@ def test_half_of_many_rows_are_recognised_by_the_stored_ones(made):
     """Of many rows a model stores some, at even spacing."""
     q = torch.rand(3 * MAX_STARTS, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     half = q[torch.randperm(len(q), generator=torch.Generator().manual_seed(1))[: len(q) // 2]]
-    assert 200 < rows_at_starts(spread_rows(q), half) < 312
+    assert 200 < rows_at_starts(evenly_spaced_rows(q), half) < 312
 
 
 def test_rows_that_a_table_rounded_are_recognised(made):

@@ -30,7 +30,7 @@ def test_the_target_is_the_joint_error_of_the_true_robot(generator):
     error = torch.tensor([0.01, -0.02, 0.005, 0.03, -0.01, 0.02], dtype=torch.float64)
     measurements = measure(robot, q, -error)
     pairs = build_pairs(robot, measurements, None)
-    assert pairs.used.all()
+    assert pairs.used_rows.all()
     assert_close(pairs.target, error.expand_as(q), atol=1e-10)
     assert_close(pairs.q_nominal, q - error, atol=1e-10)
     assert_close(forward_kinematics(robot, pairs.q_nominal), pairs.T, atol=1e-12)
@@ -63,9 +63,9 @@ def test_singular_rows_are_left_out_and_reported(generator):
     pairs = build_pairs(robot, measurements, 0.02)
     assert pairs.singular[:7].all()
     assert torch.equal(pairs.singular, expected)
-    assert torch.equal(pairs.used, ~expected)
+    assert torch.equal(pairs.used_rows, ~expected)
     assert pairs.left_out == f"{int(expected.sum())} near a singularity"
-    assert build_pairs(robot, measurements, None).used.all()
+    assert build_pairs(robot, measurements, None).used_rows.all()
     with refused(IdentificationError, file="made up", value=60):
         build_pairs(robot, measurements, 10.0)
 
@@ -79,7 +79,7 @@ def test_unreachable_rows_are_left_out_and_reported(generator):
     far = Measurements(q=q, position=position, rotation=measurements.rotation, source="made up")
     pairs = build_pairs(robot, far, None)
     assert pairs.unreachable.nonzero().flatten().tolist() == [3]
-    assert not pairs.used[3]
+    assert not pairs.used_rows[3]
     assert pairs.left_out == "1 not reachable by the nominal robot"
     assert torch.isfinite(pairs.target).all()
     assert torch.isfinite(pairs.q_nominal).all()
@@ -112,7 +112,7 @@ def test_a_measured_ur10(shared_data):
     assert np.abs(robot.base - nominal.base).max() > 1e-3
     assert np.abs(robot.tool - nominal.tool).max() > 1e-3
     pairs = build_pairs(robot, measurements, 0.02)
-    used = pairs.used
+    used = pairs.used_rows
     assert_close(forward_kinematics(robot, pairs.q_nominal[used]), measurements.T[used], atol=1e-9)
     assert_close(pairs.target, measurements.q - pairs.q_nominal, atol=1e-12)
     assert 0 < float(pairs.target[used].abs().max()) < math.radians(3)

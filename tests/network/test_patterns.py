@@ -29,7 +29,7 @@ def pairs(generator) -> TrainingPairs:
 
 def patterns_of(pairs: TrainingPairs, share: float = 0.25, groups: torch.Tensor | None = None, seed: int = 0):
     network = build_network(Robot.load("kiro3"), [SECTION], pairs)
-    rows = torch.arange(len(pairs.used)) if groups is None else groups
+    rows = torch.arange(len(pairs.used_rows)) if groups is None else groups
     generator = torch.Generator().manual_seed(seed)
     return network, build_patterns(network, pairs, share, rows, generator)[0]
 
@@ -47,9 +47,9 @@ def test_used_rows_are_scaled_to_their_range(pairs):
 
 
 def test_unused_rows_have_no_effect(pairs):
-    used = pairs.used.clone()
+    used = pairs.used_rows.clone()
     used[:10] = False
-    clean = dataclasses.replace(pairs, used=used)
+    clean = dataclasses.replace(pairs, used_rows=used)
     T, target = pairs.T.clone(), pairs.target.clone()
     T[:10], target[:10] = 1e6, -1e6
     spoilt = dataclasses.replace(clean, T=T, target=target)
@@ -81,16 +81,16 @@ def test_one_group_is_always_fitted(pairs):
 
 @pytest.mark.parametrize("rows", [1, 2])
 def test_too_few_rows_are_rejected(pairs, rows):
-    few = dataclasses.replace(pairs, used=torch.arange(40) < rows)
+    few = dataclasses.replace(pairs, used_rows=torch.arange(40) < rows)
     with refused(IdentificationError, value="x" if rows == 1 else 2):
         patterns_of(few, 0.0)
 
 
 def test_as_many_rows_as_free_parameters_are_enough(pairs):
-    five = dataclasses.replace(pairs, used=torch.arange(40) < 5)
+    five = dataclasses.replace(pairs, used_rows=torch.arange(40) < 5)
     assert patterns_of(five, 0.0)[1].x.shape == (5, 2)
     with refused(IdentificationError, expected="at least 5 rows", value=4):
-        patterns_of(dataclasses.replace(pairs, used=torch.arange(40) < 4), 0.0)
+        patterns_of(dataclasses.replace(pairs, used_rows=torch.arange(40) < 4), 0.0)
 
 
 def test_a_constant_input_is_rejected(pairs):

@@ -59,7 +59,7 @@ def test_without_noise_the_papers_parameters_come_back(recipe):
     assert measurements.rows == 96
     for frames, count in ((("jig_1",), 17), (("jig_2",), 17), (("jig_1", "jig_2"), 23)):
         found = calibrate_on(stated, measurements, frames)
-        assert len(found.result.free) == count
+        assert len(found.result.free_parameters) == count
         assert list(found.bases) == list(frames)
         true = stated.true_robot().geometry
         assert_close(found.arm.dh, true.dh, atol=1e-9)
@@ -77,7 +77,7 @@ def test_a_third_jig_adds_six_unknowns(recipe):
     third = JigPlacement(name="jig_3", base=believed, true_base=true)
     stated = small(recipe, noise=exact, placements=(*recipe.placements, third))
     found = calibrate_on(stated, stated.measure(stated.draw_touches(0), 0), stated.frames)
-    assert len(found.result.free) == 29
+    assert len(found.result.free_parameters) == 29
     assert_close(found.arm.dh, stated.true_robot().geometry.dh, atol=1e-9)
     difference = torch.from_numpy(found.bases["jig_3"] - third.true_base.to_si())
     difference[3:] = wrap_to_pi(difference[3:])

@@ -43,7 +43,7 @@ def variance(B: torch.Tensor, goal: torch.Tensor) -> float:
 def test_gains_and_exchange_are_those_of_the_criterion(
     posterior: RobotPosterior, criterion: Criterion
 ) -> None:
-    q, goal = random_joints(40, 0), condense_derivatives(posterior.tool(random_joints(50, 1)))
+    q, goal = random_joints(40, 0), condense_derivatives(posterior.tool_derivatives(random_joints(50, 1)))
     # Base and tool are known to a millimetre here, so that determinants are right to the last digits.
     B = posterior.sensitivities(q).clamp(-30, 30)
     choice = PoseSelection(B, goal, criterion)
@@ -68,9 +68,9 @@ def test_gains_and_exchange_are_those_of_the_criterion(
 def test_condensed_rows_keep_the_variance_after_measuring(hybrid: bool) -> None:
     # before it is all where base and tool are, metres against tenths of a millimetre
     posterior, task = RobotPosterior.from_robot(Robot.load("ur5"), hybrid=hybrid), random_joints(50, 1)
-    q, goal = random_joints(60, 0), condense_derivatives(posterior.tool(task))
+    q, goal = random_joints(60, 0), condense_derivatives(posterior.tool_derivatives(task))
     for count in (5, 20, 60):
-        left = rms_of(posterior.after_measuring(q[:count]).tool(task)) ** 2
+        left = rms_of(posterior.after_measuring(q[:count]).tool_derivatives(task)) ** 2
         assert_close(variance(posterior.sensitivities(q[:count]), goal), left, rtol=0.01)
 
 
@@ -82,20 +82,20 @@ def test_criterion_i_leaves_less_error_of_the_tool_than_criterion_d_and_random_p
     )
     for count in (10, 25):
         chosen = [
-            select_poses(posterior.sensitivities(q), posterior.tool(task), count, "I"),
-            select_poses(posterior.sensitivities(q), posterior.tool(task), count, "D"),
+            select_poses(posterior.sensitivities(q), posterior.tool_derivatives(task), count, "I"),
+            select_poses(posterior.sensitivities(q), posterior.tool_derivatives(task), count, "D"),
             torch.arange(count),
         ]
-        left, *others = (rms_of(posterior.after_measuring(q[rows]).tool(task)) for rows in chosen)
+        left, *others = (rms_of(posterior.after_measuring(q[rows]).tool_derivatives(task)) for rows in chosen)
         assert left < 0.9 * min(others)
 
 
 def test_selected_poses_are_sorted_greedily(posterior: RobotPosterior) -> None:
     q, task = random_joints(60, 2), random_joints(40, 3)
-    chosen = select_poses(posterior.sensitivities(q), posterior.tool(task), 12, "I")
+    chosen = select_poses(posterior.sensitivities(q), posterior.tool_derivatives(task), 12, "I")
     assert len(set(chosen.tolist())) == 12
     choice = PoseSelection(
-        posterior.sensitivities(q[chosen]), condense_derivatives(posterior.tool(task)), "I"
+        posterior.sensitivities(q[chosen]), condense_derivatives(posterior.tool_derivatives(task)), "I"
     )
     choice.add_until(12)
     assert choice.chosen == list(range(12))
@@ -103,7 +103,7 @@ def test_selected_poses_are_sorted_greedily(posterior: RobotPosterior) -> None:
 
 def test_a_completed_selection_keeps_poses_and_leaves_little_more_error(posterior: RobotPosterior) -> None:
     q, task = random_joints(150, 2), random_joints(40, 3)
-    B, D = posterior.sensitivities(q), posterior.tool(task)
+    B, D = posterior.sensitivities(q), posterior.tool_derivatives(task)
     best = select_poses(B, D, 20)
     unreachable = best[::3]
     kept = best[~torch.isin(best, unreachable)]
@@ -113,7 +113,7 @@ def test_a_completed_selection_keeps_poses_and_leaves_little_more_error(posterio
     assert not torch.isin(chosen, unreachable).any()
     assert torch.isin(kept, chosen).all()
     left, least, first, alone = (
-        rms_of(posterior.after_measuring(q[rows]).tool(task))
+        rms_of(posterior.after_measuring(q[rows]).tool_derivatives(task))
         for rows in (chosen, best, torch.cat([kept, others[: 20 - len(kept)]]), kept)
     )
     assert least < left < min(1.1 * least, first, alone)
@@ -123,11 +123,11 @@ def test_a_completed_selection_keeps_poses_and_leaves_little_more_error(posterio
 
 def test_the_curve_is_the_covariance_after_the_poses(posterior: RobotPosterior) -> None:
     q, task = random_joints(80, 4), random_joints(40, 5)
-    chosen = select_poses(posterior.sensitivities(q), posterior.tool(task), 20)
-    points = accuracy_curve(posterior.sensitivities(q), posterior.tool(task), chosen, (10, 20))
+    chosen = select_poses(posterior.sensitivities(q), posterior.tool_derivatives(task), 20)
+    points = accuracy_curve(posterior.sensitivities(q), posterior.tool_derivatives(task), chosen, (10, 20))
     for point in points:
         after = posterior.after_measuring(q[chosen[: point.poses]])
-        assert_close(point.rms, float(after.deviation(task).square().mean().sqrt()), rtol=1e-6)
+        assert_close(point.rms, float(after.sigma(task).square().mean().sqrt()), rtol=1e-6)
         assert point.rms < point.p95 < 3 * point.rms
         assert point.rms < point.random_rms
     assert points[1].rms < points[0].rms
@@ -152,6 +152,6 @@ def test_remaining_errors_are_attributed_to_groups(posterior: RobotPosterior) ->
 def test_impossible_selections_are_refused(posterior: RobotPosterior) -> None:
     q = random_joints(5, 0)
     with refused(PlanningError, option="count", value=6):
-        select_poses(posterior.sensitivities(q), posterior.tool(q), 6)
+        select_poses(posterior.sensitivities(q), posterior.tool_derivatives(q), 6)
     with refused(PlanningError, option="task"):
-        select_poses(posterior.sensitivities(q), posterior.tool(q[:0]), 2)
+        select_poses(posterior.sensitivities(q), posterior.tool_derivatives(q[:0]), 2)

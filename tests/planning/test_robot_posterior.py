@@ -50,7 +50,7 @@ def test_noise_of_an_arm_of_servos_includes_the_repeatability_of_its_joints(kind
     B = RobotPosterior.from_robot(so101, instrument).sensitivities(q)
     exact = RobotPosterior.from_robot(replace(so101, maker=""), instrument)
     joints = [exact.uncertainty.space.index(f"theta_{number}") for number in range(1, 6)]
-    for row, values in enumerate(exact.columns(q)[:, :3]):
+    for row, values in enumerate(exact.pose_derivatives(q)[:, :3]):
         away = forward_kinematics(so101, q[row])[:3, 3] - torch.tensor(instrument.anchor)
         X = values if kind == "position" else (away / away.norm())[None] @ values
         J = X[:, joints]
@@ -62,15 +62,15 @@ def test_noise_of_an_arm_of_servos_includes_the_repeatability_of_its_joints(kind
 def test_conditioning_agrees_with_a_normal_distribution(robot: Robot) -> None:
     posterior = RobotPosterior.from_robot(robot, hybrid=False)
     q, task = random_joints(robot, 20, 1), random_joints(robot, 30, 2)
-    A = posterior.columns(q)[:, :3].flatten(0, 1)
+    A = posterior.pose_derivatives(q)[:, :3].flatten(0, 1)
     C = posterior.uncertainty.root.square()
     expected = torch.linalg.inv(torch.linalg.inv(C) + A.t() @ A / posterior.instrument.sigma**2)
     root = posterior.after_measuring(q).uncertainty.root
     scale = expected.diagonal().sqrt()
     assert_close(root @ root.t() / scale / scale[:, None], expected / scale / scale[:, None], atol=1e-6)
     # What is measured first and what is measured second may be exchanged.
-    halves = posterior.after_measuring(q[:8]).after_measuring(q[8:]).deviation(task)
-    assert_close(halves, posterior.after_measuring(q).deviation(task), rtol=1e-6)
+    halves = posterior.after_measuring(q[:8]).after_measuring(q[8:]).sigma(task)
+    assert_close(halves, posterior.after_measuring(q).sigma(task), rtol=1e-6)
 
 
 def test_few_rows_are_conditioned_on_without_a_fit(robot: Robot) -> None:
@@ -78,15 +78,15 @@ def test_few_rows_are_conditioned_on_without_a_fit(robot: Robot) -> None:
     rows = Measurements(q=q, position=forward_kinematics(robot, q)[:, :3, 3])
     task = random_joints(robot, 5, 4)
     assert_close(
-        posterior.updated_with(rows).deviation(task), posterior.after_measuring(q).deviation(task), rtol=1e-9
+        posterior.updated_with(rows).sigma(task), posterior.after_measuring(q).sigma(task), rtol=1e-9
     )
 
 
 def test_distances_do_not_determine_the_pose_of_the_base(robot: Robot) -> None:
     known = RobotPosterior.from_robot(robot, Instrument("distance", anchor=(1.5, -1.0, 0.3)), hybrid=False)
     q = torch.rand(40, robot.dof, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
-    after = known.after_measuring(q).deviation(q)
-    assert bool((after < 0.5 * known.deviation(q)).all())
+    after = known.after_measuring(q).sigma(q)
+    assert bool((after < 0.5 * known.sigma(q)).all())
     assert float(after.max()) < 5e-3
 
 
@@ -97,7 +97,7 @@ def test_unknown_base_and_tool_have_a_wide_prior(robot: Robot) -> None:
     unknown = RobotPosterior.from_robot(robot, hybrid=False).with_unknown_base_and_tool(base, tool)
     expected = RobotPosterior.from_robot(robot.with_geometry(base=base, tool=tool), hybrid=False)
     for D, reference in (
-        (unknown.tool(q), expected.tool(q)),
+        (unknown.tool_derivatives(q), expected.tool_derivatives(q)),
         (unknown.sensitivities(q), expected.sensitivities(q)),
     ):
         assert_close(D @ D.mT, reference @ reference.mT, rtol=1e-9)

@@ -75,9 +75,10 @@ def test_every_motion_is_collision_free():
     pool = draw_candidates(arm, 60, 0).q
     way = plan_tour(Motions(arm, pool), pool[:5], PACE)
     assert not len(way.left_out)
-    assert sum(map(len, way.before)) == 1, "the test wants a motion that is blocked"
+    assert sum(map(len, way.waypoints_before)) == 1, "the test wants a motion that is blocked"
     stops = [
-        torch.cat([points, pool[[int(pose)]]]) for pose, points in zip(way.order, way.before, strict=True)
+        torch.cat([points, pool[[int(pose)]]])
+        for pose, points in zip(way.order, way.waypoints_before, strict=True)
     ]
     path = torch.cat(stops)
     assert bool(is_free(arm, path[:-1], path[1:]).all())

@@ -23,4 +23,4 @@ def test_the_maker_determines_the_class(name: str, expected: RobotClass) -> None
 
 @pytest.mark.parametrize("usual", [INDUSTRIAL, UNIVERSAL_ROBOTS])
 def test_every_band_of_the_series_has_a_prior(usual: RobotClass) -> None:
-    assert len(usual.bands) == len(FourierSeries(Robot.load("ur5"), usual.harmonics).group_names)
+    assert len(usual.series_sigmas) == len(FourierSeries(Robot.load("ur5"), usual.harmonics).group_names)

@@ -22,10 +22,10 @@ class Drift(AbstractJointSource):
     joint: str
     share: float
 
-    def bind(self, robot: Robot, place: str) -> JointErrorFunction:
+    def bind(self, robot: Robot, place_in_recipe: str) -> JointErrorFunction:
         """Return the drift as a function of the joint values."""
         factor = torch.zeros(robot.dof, dtype=torch.float64)
-        factor[joint_index(robot, self.joint, place)] = self.share
+        factor[joint_index(robot, self.joint, place_in_recipe)] = self.share
         return lambda q: factor.to(q) * q
 
 

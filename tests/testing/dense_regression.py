@@ -78,7 +78,7 @@ class DenseRegression(AbstractDesignRegression):
             prior=prior,
             noise=noise,
             square=prior.sum_by_group(prior.base * x.square()),
-            determined=prior.sum_by_group(1 - precision * covariance.diagonal()),
+            determined_unknowns=prior.sum_by_group(1 - precision * covariance.diagonal()),
             misfit=self._by_sensor(residual.square()),
             effective_parameters=self._by_sensor(used),
         )
@@ -118,7 +118,7 @@ class DenseRegression(AbstractDesignRegression):
             count = len(error) - own.shape[1]
             error = free @ error * (len(error) / max(count, 1)) ** 0.5
             variance = (free @ (torch.eye(len(error)).double() + X @ root @ (X @ root).t()) @ free).diagonal()
-            repetition = error.new_tensor([one.repetition for one in self.sensors])[sensor]
+            repetition = error.new_tensor([one.repeat_variance_factor for one in self.sensors])[sensor]
             spread = (1 + repetition * (variance - 1).clamp(min=0)).sqrt()
             parts.append(HeldOutErrors(error * repetition.sqrt(), spread, sensor))
         return HeldOutErrors.concatenate(parts)

@@ -47,7 +47,7 @@ def assert_same_posterior(
             covariance(found, here) / deviation / deviation[:, None], correlation, atol=max(exactness, 1e-6)
         )
         assert_close(here.square, there.square, rtol=exactness, atol=1e-9)
-        assert_close(here.determined, there.determined, atol=max(exactness, 1e-6))
+        assert_close(here.determined_unknowns, there.determined_unknowns, atol=max(exactness, 1e-6))
         assert_close(np.array(here.misfit), np.array(there.misfit), rtol=exactness)
         assert_close(
             np.array(here.effective_parameters),

@@ -53,7 +53,7 @@ def report_eliminations(
         compared.append(
             {
                 "removed": list(removed),
-                "parameters": len(found.free),
+                "parameters": len(found.free_parameters),
                 "status": found.status.value,
                 "rmse_mm": [value * 1e3 for value in found.rms_path],
                 "held_out_rms_mm": errors["rms_mm"],
@@ -75,7 +75,7 @@ def calibrate_without(
     """
     robot = Robot.load(recipe.robot)
     space = ParameterSpace(robot, (recipe.measurements.frame,), ("",))
-    arm = [parameter.name for parameter in space.parameters[: space.arm_size]]
+    arm = [parameter.name for parameter in space.parameters[: space.arm_parameter_count]]
     for name in removed:
         if name not in arm:
             raise RecipeError(

@@ -111,7 +111,7 @@ def report_jigs(run: JigRun) -> dict[str, Any]:
         "touches_per_jig": recipe.touches.count,
         "noise": recipe.noise.model_dump(),
         "parameters_estimated": {
-            name: len(calibration.result.free)
+            name: len(calibration.result.free_parameters)
             for name, calibration in run.calibrations.items()
             if calibration.result is not None
         },

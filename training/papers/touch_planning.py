@@ -104,14 +104,14 @@ def build_planning_problem(
         )
     space = ParameterSpace(robot)
     arm = [space.index(name) for name in free]
-    if wrong := [name for name, index in zip(free, arm, strict=True) if index >= space.arm_size]:
+    if wrong := [name for name, index in zip(free, arm, strict=True) if index >= space.arm_parameter_count]:
         raise IdentificationError(
             f"'{wrong[0]}' is not a parameter of the arm; the tool's position and every base are always planned for",
             option="free",
             value=wrong[0],
             remedy="omit it",
         )
-    tool = space.arm_size + 6
+    tool = space.arm_parameter_count + 6
     columns = [*arm, tool, tool + 1, tool + 2]
     usual = torch.from_numpy(space.usual_errors)[columns]
     free_of_base = robot.with_geometry(base=np.zeros(6))

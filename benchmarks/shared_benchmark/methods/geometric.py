@@ -14,7 +14,7 @@ def fit(task: Task) -> Predict:
     solved = result.solved
     known = PositionUncertainty(solved.problem.space, solved.geometry, (), CovarianceRoot(solved.root), 1.0)
     noise = {one.sensor: one.sigma for one in result.noise}
-    return predict_with(result.predicted_poses, known.deviation, noise)
+    return predict_with(result.predicted_poses, known.sigma, noise)
 
 
 METHOD = Method(

@@ -13,7 +13,7 @@ def fit(task: Task) -> Predict:
     noise = {one.sensor: one.sigma for one in result.geometric.noise}
     if result.learned is not None:
         noise = result.learned.noise
-    return predict_with(result.predicted_poses, result.deviation, noise)
+    return predict_with(result.predicted_poses, result.sigma, noise)
 
 
 METHOD = Method(

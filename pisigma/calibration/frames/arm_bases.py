@@ -9,13 +9,18 @@ from jaxtyping import Float64
 from scipy.stats import chi2
 from torch import Tensor
 
-from pisigma.calibration.frames.initial_bases import COLLINEAR, fitted_pose, in_base, initial_bases
+from pisigma.calibration.frames.initial_bases import (
+    COLLINEAR,
+    fitted_pose,
+    initial_bases,
+    shared_object_in_base,
+)
 from pisigma.calibration.frames.shared_joints import (
     axis_difference,
-    shared_count,
-    shared_counts,
-    updated,
+    most_shared_joints,
+    shared_joint_count,
     with_common_joints,
+    with_values,
 )
 from pisigma.calibration.frames.shared_objects import (
     JOINT,
@@ -75,10 +80,10 @@ class ArmBases:
         conditioned: the joint posterior; its x are shifts of the bases of all other arms along, and rotations about,
             the axes of the first arm's base [m and rad], followed by `tips`; its z the directions of the roots of all
             arms.
-        equations: per equation, the index of the shared object.
-        distances: per shared object, the largest distance between its positions by two arms [m].
-        system: derivatives of the equations with respect to z and x, their misclosure at z = 0, and their standard
-            deviations.
+        object_of_equation: per equation, the index of the shared object.
+        max_distances: per shared object, the largest distance between its positions by two arms [m].
+        equation_system: derivatives of the equations with respect to z and x, their misclosure at z = 0, and their
+            standard deviations.
     """
 
     arms: tuple[ArmPosterior, ...]
@@ -86,9 +91,9 @@ class ArmBases:
     T_first_base: Float64[Tensor, "arms 4 4"]
     tips: dict[Tip, Float64[Tensor, " 3"]]
     conditioned: ConditionedUnknowns
-    equations: tuple[int, ...]
-    distances: tuple[float, ...]
-    system: tuple[Tensor, Tensor, Tensor, Tensor]
+    object_of_equation: tuple[int, ...]
+    max_distances: tuple[float, ...]
+    equation_system: tuple[Tensor, Tensor, Tensor, Tensor]
 
     @property
     def covariance_root(self) -> Float64[Tensor, "arms 6 directions"]:
@@ -109,7 +114,7 @@ class ArmBases:
             The pose, and the covariance of its shift along and rotation about the axes of the base of arm `first` [m
             and rad].
         """
-        first, second = (self.reference(number) for number in (first, second))
+        first, second = (self.reference_arm(number) for number in (first, second))
         T = invert(self.T_first_base[first]) @ self.T_first_base[second]
         away = self.T_first_base[second, :3, 3] - self.T_first_base[first, :3, 3]
         moved = self.covariance_root[second] - self.covariance_root[first]
@@ -122,11 +127,11 @@ class ArmBases:
 
     def joints_in_common(self, first: int, second: int) -> int:
         """Return the number of joints of a torso that two arms share."""
-        return shared_count(self.arms[first], self.arms[second])
+        return shared_joint_count(self.arms[first], self.arms[second])
 
-    def reference(self, number: int) -> int:
+    def reference_arm(self, number: int) -> int:
         """Return the index of the arm whose base and shared joints an arm has."""
-        while (before := shared_counts(self.arms)[number][0]) != number:
+        while (before := most_shared_joints(self.arms)[number][0]) != number:
             number = before
         return number
 
@@ -137,15 +142,15 @@ class ArmBases:
         parts = zip(
             torch.split(self.conditioned.z, sizes),
             torch.split(self.conditioned.z_root, sizes),
-            shared_counts(self.arms),
+            most_shared_joints(self.arms),
             strict=True,
         )
         arms: list[ArmPosterior] = []
         for number, (z, z_root, (before, count)) in enumerate(parts):
             arm, own = self.arms[number], len(self.arms[number].space.parameters)
-            arm = updated(arm, arm.values + arm.root[:own] @ z, arm.root @ z_root)
+            arm = with_values(arm, arm.values + arm.root[:own] @ z, arm.root @ z_root)
             if count:
-                root = self.reference(number)
+                root = self.reference_arm(number)
                 T, steps = self.T_first_base, self.covariance_root
                 arm = with_common_joints(
                     arm, arms[before], (T[number], T[root]), (steps[number], steps[root]), count
@@ -165,8 +170,8 @@ class ArmBases:
         if self.probability >= _FALSE_ALARMS:
             return ()
         found = []
-        B, G, r, closure = self.system
-        number = torch.tensor(self.equations)
+        B, G, r, closure = self.equation_system
+        number = torch.tensor(self.object_of_equation)
         for index, shared in enumerate(self.shared):
             others = number != index
             if int(torch.linalg.matrix_rank(G[others], rtol=COLLINEAR)) < G.shape[1]:
@@ -177,7 +182,7 @@ class ArmBases:
                 freedom = self.conditioned.redundancy - left.redundancy
             probability = float(chi2.sf(drop, freedom))
             if probability < _FALSE_ALARMS / len(self.shared):
-                found.append(Disagreement(shared, self.distances[index], probability))
+                found.append(Disagreement(shared, self.max_distances[index], probability))
         return tuple(sorted(found, key=lambda one: (one.probability, -one.distance)))
 
 
@@ -314,7 +319,7 @@ def _equations(
             def values(rows: Sequence[int], number: int = number) -> Tensor:
                 return parts[number][[places[number][row] for row in rows]]
 
-            pose, more = in_base(arms[number], one.key, values)
+            pose, more = shared_object_in_base(arms[number], one.key, values)
             seen.append((bases[number] @ pose, more))
         for pose, more in seen[1:]:
             if one.kind == JOINT:

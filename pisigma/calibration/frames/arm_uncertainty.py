@@ -28,24 +28,24 @@ class ArmUncertainty:
     rows: Measurements
 
     def spread(
-        self, solved: SolvedCalibration, used: Collection[int], fitted: Collection[int]
+        self, solved: SolvedCalibration, used_rows: Collection[int], fitted_parameters: Collection[int]
     ) -> Float64[Tensor, "values directions"]:
         """Return a root of the covariance of the measured values, in standard deviations of their noise.
 
         Args:
             solved: fit of some rows.
-            used: indices of these rows.
-            fitted: indices of the fitted parameters, whose uncertainty in the model does not matter.
+            used_rows: indices of these rows.
+            fitted_parameters: indices of the fitted parameters, whose uncertainty in the model does not matter.
         """
         root, fit_space = self.known.root, solved.problem.space
         positions = positions_by_key(self.known.space.parameters)
         pairs = [
             (index, positions[key])
             for key, index in positions_by_key(fit_space.parameters).items()
-            if index not in fitted and key in positions
+            if index not in fitted_parameters and key in positions
         ]
         values = WhitenedValues.at_solution(solved, [index for index, _ in pairs])
-        rows = self.rows.select(torch.tensor(list(used))).select(solved.setup.rows)
+        rows = self.rows.select(torch.tensor(list(used_rows))).select(solved.setup.rows)
         weights = values.weight_columns(self.known.features, JointState.from_measurements(rows))
         parameters = len(self.known.space.parameters)
         of_parameters = values.X @ root[[number for _, number in pairs]]

@@ -60,12 +60,12 @@ class WeakDirection:
 
     Attributes:
         combination: the combination as text, in units of 1 mm and 1 mrad (0.057 deg).
-        deviation: its standard deviation in these units; infinite if the rows contain no information on it.
+        sigma: its standard deviation in these units; infinite if the rows contain no information on it.
         is_held: whether it keeps its previous value, because the rows do not determine it.
     """
 
     combination: str
-    deviation: float
+    sigma: float
     is_held: bool
 
 
@@ -92,7 +92,7 @@ class FrameFit:
     tools: Frames
 
     @property
-    def frames(self) -> list[int]:
+    def frame_indices(self) -> list[int]:
         """Indices of the coordinates of bases and tools that the fit was asked for."""
         return _frames(self.solved)
 
@@ -114,12 +114,12 @@ class FrameFit:
 
     @property
     def covariance(self) -> Float64[np.ndarray, "frames frames"]:
-        """Covariance of `frames` due to the noise of the rows, with the arm treated as exact [m² or rad²].
+        """Covariance of `frame_indices` due to the noise of the rows, with the arm treated as exact [m² or rad²].
 
         The noise is that of the residuals. Directions that the rows do not determine have a standard deviation of at
         most 1 m or 1 rad.
         """
-        covariance: np.ndarray = self.solved.covariance[np.ix_(self.frames, self.frames)]
+        covariance: np.ndarray = self.solved.covariance[np.ix_(self.frame_indices, self.frame_indices)]
         return covariance
 
     @cached_property
@@ -139,7 +139,7 @@ class FrameFit:
         vectors, deviation = self._directions
         held = vectors[:, : self._held] * deviation[: self._held].clamp(max=LARGEST_DEVIATION)
         uncertain = (held.norm(dim=1) > _HARDLY_DETERMINED).tolist()
-        return frozenset(index for index, yes in zip(self.frames, uncertain, strict=True) if yes)
+        return frozenset(index for index, yes in zip(self.frame_indices, uncertain, strict=True) if yes)
 
     @property
     def _held(self) -> int:
@@ -151,30 +151,32 @@ class FrameFit:
     def _directions(self) -> tuple[Float64[Tensor, "frames frames"], Float64[Tensor, " frames"]]:
         """Return unit vectors in the user's coordinates, with standard deviations in mm and mrad, weakest first."""
         found, held = (
-            FrameDirections.at_solution(self.solved, self.frames),
+            FrameDirections.at_solution(self.solved, self.frame_indices),
             self.solved.problem.held_directions,
         )
         if held is not None:  # with the deviation that was judged
-            found = replace(found, deviation=torch.cat([held.deviation, found.deviation[self._held :]]))
+            found = replace(found, sigma=torch.cat([held.sigma, found.sigma[self._held :]]))
         vectors, length = found.in_user_coordinates(self.solved)
-        return vectors[self.frames], found.deviation * length
+        return vectors[self.frame_indices], found.sigma * length
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
         """Coordinates of bases and tools that the fit was asked for."""
-        return tuple(self.solved.problem.space.parameters[index] for index in self.frames)
+        return tuple(self.solved.problem.space.parameters[index] for index in self.frame_indices)
 
     @property
     def estimates(self) -> Float64[np.ndarray, " frames"]:
         """Values of `parameters` in the user's coordinates [m or rad]."""
-        values: np.ndarray = self.solved.geometry.values_of(self.solved.problem.space).numpy()[self.frames]
+        values: np.ndarray = self.solved.geometry.values_of(self.solved.problem.space).numpy()[
+            self.frame_indices
+        ]
         return values
 
     @property
-    def before(self) -> Float64[np.ndarray, " frames"]:
+    def previous_values(self) -> Float64[np.ndarray, " frames"]:
         """Values of `parameters` before the fit [m or rad]."""
         values = initial_parameters(self.solved.problem.space, self.bases, self.tools)
-        before: np.ndarray = values.numpy()[self.frames]
+        before: np.ndarray = values.numpy()[self.frame_indices]
         return before
 
 
@@ -295,13 +297,13 @@ def hold_undetermined(
         The fit; `problem.held_directions` contains the held directions, if any.
     """
     found, space = FrameDirections.at_solution(solved, frames), solved.problem.space
-    unknown = int(torch.isinf(found.deviation).sum())
+    unknown = int(torch.isinf(found.sigma).sum())
     before, rows = initial_parameters(space, bases, tools), solved.problem.rows
     distance = found.distances(solved, before).abs()
-    plausible = distance <= _IMPROBABLE * found.deviation + rows * found.deviation**2 / _LEVER
+    plausible = distance <= _IMPROBABLE * found.sigma + rows * found.sigma**2 / _LEVER
     # The least determined directions come first, so once one is not held, none of the following are.
-    weak = int(((found.deviation * rows**0.5 > _LARGEST_SPREAD) & plausible).cumprod(0).sum())
-    deviation = found.deviation.hypot(distance)
+    weak = int(((found.sigma * rows**0.5 > _LARGEST_SPREAD) & plausible).cumprod(0).sum())
+    deviation = found.sigma.hypot(distance)
     for count in range(weak, 0, -1):
         held = _with_held(solved, frames, deviation[:count], before)
         if count <= unknown or not _contradicts(held, solved):
@@ -341,7 +343,7 @@ def _with_held(
 
 def _contradicts(held: SolvedCalibration, free: SolvedCalibration) -> bool:
     """Return whether the residuals are much larger with directions held than with all directions free."""
-    variances = sensor_view_of(free.refined).variances
+    variances = sensor_view_of(free.refined_linearisation).variances
     squares = [
         float((torch.stack([part.distance.square().sum() for part in view.contributions]) / variances).sum())
         for view in (sensor_view_of(held.solution.linearisation), sensor_view_of(free.solution.linearisation))

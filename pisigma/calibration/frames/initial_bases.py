@@ -19,7 +19,7 @@ COLLINEAR = 1e-3
 rotation."""
 
 
-def in_base(
+def shared_object_in_base(
     arm: ArmPosterior, key: tuple[str, str], values: Callable[[Sequence[int]], Tensor]
 ) -> tuple[Tensor, Tensor]:
     """Return the pose of a shared object in the base of an arm, and the other unknowns of its sensor."""
@@ -34,15 +34,20 @@ def in_base(
 
 
 def fitted_pose(
-    arms: Sequence[ArmPosterior], number: int, one: SharedObject, tips: Sequence[TipPositions | None]
+    arms: Sequence[ArmPosterior],
+    number: int,
+    shared_object: SharedObject,
+    tips: Sequence[TipPositions | None],
 ) -> Float64[Tensor, "4 4"]:
     """Return the pose of a shared object in the base of an arm, according to the fit of this arm."""
     arm, touched = arms[number], tips[number]
-    if one.kind == TOUCH:
+    if shared_object.kind == TOUCH:
         assert arm.touches is not None
         assert touched is not None
-        return transform(torch.eye(3).to(arm.root), touched.position[arm.touches.names.index(one.name)])
-    return in_base(arm, one.key, lambda rows: arm.values[list(rows)])[0]
+        return transform(
+            torch.eye(3).to(arm.root), touched.position[arm.touches.names.index(shared_object.name)]
+        )
+    return shared_object_in_base(arm, shared_object.key, lambda rows: arm.values[list(rows)])[0]
 
 
 def initial_bases(

@@ -76,7 +76,7 @@ def _residuals(
     """Return the residuals with the stated intrinsics, linearised in everything that may cause them."""
     space, setup = solved.problem.space, solved.setup
     unknowns = setup.free_unknowns
-    arm = list(range(space.arm_size))
+    arm = list(range(space.arm_parameter_count))
     frames = [*space.indices_of("base"), *space.indices_of("tool")]
     values = WhitenedValues.at_solution(solved, [*arm, *frames, *unknowns])
     X_arm, X_frames, X_unknowns = torch.split(values.X, [len(arm), len(frames), len(unknowns)], 1)
@@ -95,8 +95,8 @@ def _residuals(
         known = torch.cat([known, uncertainty.spread(solved, fit.used_rows, {*frames, *unknowns})], 1)
     return FitResiduals.from_fit(
         y=unit * (values.y + X_unknowns @ moved),
-        fitted=unit[:, None] * X_frames,
-        known=unit[:, None] * known,
+        fitted_columns=unit[:, None] * X_frames,
+        known_root=unit[:, None] * known,
         exact=values.exact,
         is_stated=bool(rows.is_measured("corner").any()),
         causes={name: unit[:, None] * Z for name, Z in causes.items()},
@@ -112,7 +112,7 @@ def _usual_error(kind: str, name: str) -> float:
 
 def _noise_units(solved: SolvedCalibration, values: WhitenedValues) -> Float64[Tensor, " values"]:
     """Return the factors that undo the estimated noise in rows that state their own noise (corners of images)."""
-    deviation = sensor_view_of(solved.refined).variances.sqrt()
+    deviation = sensor_view_of(solved.refined_linearisation).variances.sqrt()
     noise = solved.setup.measurements.readings.get("corner_noise")
     factors = []
     for (one, _), sigma in zip(values.sensors, deviation, strict=True):

@@ -92,10 +92,12 @@ def with_common_joints(
 
     at = torch.cat([reference.values[:shared], arm.values, torch.zeros(12).to(arm.values)])
     roots = torch.cat([reference.root[:shared], arm.root[:own], *step_roots])
-    return updated(arm, combined(at), torch.cat([torch.func.jacrev(combined)(at) @ roots, arm.root[own:]]))
+    return with_values(
+        arm, combined(at), torch.cat([torch.func.jacrev(combined)(at) @ roots, arm.root[own:]])
+    )
 
 
-def updated(
+def with_values(
     arm: ArmPosterior, values: Float64[Tensor, " parameters"], root: Float64[Tensor, "unknowns directions"]
 ) -> ArmPosterior:
     """Return the posterior of an arm with other values and another root."""
@@ -121,16 +123,18 @@ def geometry_at(space: ParameterSpace, values: Float64[Tensor, " parameters"]) -
     )
 
 
-def shared_count(arm: ArmPosterior, other: ArmPosterior) -> int:
+def shared_joint_count(arm: ArmPosterior, other: ArmPosterior) -> int:
     """Return the number of joints of a torso that two arms share."""
     pairs = zip(arm.torso, other.torso, strict=False)
     return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))
 
 
-def shared_counts(arms: Sequence[ArmPosterior]) -> list[tuple[int, int]]:
+def most_shared_joints(arms: Sequence[ArmPosterior]) -> list[tuple[int, int]]:
     """Return, for every arm, the earlier arm with which it shares most joints and the number of these joints.
 
     An arm that shares no joint with an earlier one is its own reference, with 0 joints.
     """
-    counts = [[shared_count(arm, before) for before in arms[:number]] for number, arm in enumerate(arms)]
+    counts = [
+        [shared_joint_count(arm, before) for before in arms[:number]] for number, arm in enumerate(arms)
+    ]
     return [(of.index(max(of)), max(of)) if any(of) else (number, 0) for number, of in enumerate(counts)]

@@ -31,15 +31,15 @@ class Postures:
 
     Attributes:
         state: commanded joint values and stated conditions.
-        q_moved: joint values with their corrections [rad or m].
+        q_corrected: joint values with their corrections [rad or m].
     """
 
     state: JointState
-    q_moved: Float64[Tensor, "postures dof"]
+    q_corrected: Float64[Tensor, "postures dof"]
 
     def __getitem__(self, chosen: Tensor) -> "Postures":
         """Return the postures that a mask selects."""
-        return Postures(self.state[chosen], self.q_moved[chosen])
+        return Postures(self.state[chosen], self.q_corrected[chosen])
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +59,7 @@ class Touches:
     postures: Postures
 
     @staticmethod
-    def from_measurements(rows: Measurements, q_moved: Float64[Tensor, "rows dof"]) -> "Touches":
+    def from_measurements(rows: Measurements, q_corrected: Float64[Tensor, "rows dof"]) -> "Touches":
         """Return the touches in rows with `socket`, `target` and `sigma_position`."""
         assert rows.socket is not None
         assert rows.sigma_position is not None
@@ -67,7 +67,7 @@ class Touches:
             rows.socket,
             rows.target,
             rows.sigma_position,
-            Postures(JointState.from_measurements(rows), q_moved),
+            Postures(JointState.from_measurements(rows), q_corrected),
         )
 
 
@@ -160,13 +160,13 @@ class ArmPosterior:
         if tip is not None:
             tools[self.space.targets[0]] = np.array([*tip.tolist(), 0.0, 0.0, 0.0])
             known = replace(known, geometry=replace(known.geometry, tools=tools))
-        columns = known.columns(postures.state, postures.q_moved, target=number)[:, :3].clone()
+        columns = known.pose_derivatives(postures.state, postures.q_corrected, target=number)[:, :3].clone()
         base, tool = self.space.indices_of("base"), self.space.indices_of("tool")
         columns[..., base.start : base.stop if tip is None else tool.stop] = 0.0
         robot = known.geometry.robot
         T_base = transform_from_xyzrpy(torch.from_numpy(robot.base.copy()))
         bare = robot.with_geometry(base=np.zeros(6), tool=tools[self.space.targets[number]])
-        return forward_kinematics(bare, postures.q_moved), T_base[:3, :3].mT @ columns
+        return forward_kinematics(bare, postures.q_corrected), T_base[:3, :3].mT @ columns
 
 
 def is_determined(root: Float64[Tensor, "6 directions"]) -> bool:

@@ -22,11 +22,11 @@ def tool_to_tool_deviation(bases: ArmBases, first: int, second: int, postures: t
         postures: postures of every arm; the n-th postures of both arms form a pair, in which the shared joints of a
             torso have the values of the first arm.
     """
-    count = min(len(postures[number].q_moved) for number in (first, second))
+    count = min(len(postures[number].q_corrected) for number in (first, second))
     one, other = (postures[number][torch.arange(count)] for number in (first, second))
     shared = bases.joints_in_common(first, second)
-    q, moved = other.state.q.clone(), other.q_moved.clone()
-    q[:, :shared], moved[:, :shared] = one.state.q[:, :shared], one.q_moved[:, :shared]
+    q, moved = other.state.q.clone(), other.q_corrected.clone()
+    q[:, :shared], moved[:, :shared] = one.state.q[:, :shared], one.q_corrected[:, :shared]
     other = Postures(JointState(q, other.state.stated), moved)
     apart = _tool_root(bases, second, other) - _tool_root(bases, first, one)
     return float(apart.square().sum((1, 2)).mean().sqrt())

@@ -22,12 +22,12 @@ class TipPositions:
     Attributes:
         position: positions [m].
         directions: derivatives along the directions of the arm's root.
-        turned: rotation of the last row, by which an unknown tip moves with its coordinates.
+        rotation: rotation of the last row, by which an unknown tip moves with its coordinates.
     """
 
     position: Float64[Tensor, "touches 3"]
     directions: Float64[Tensor, "touches 3 directions"]
-    turned: Float64[Tensor, "touches 3 3"]
+    rotation: Float64[Tensor, "touches 3 3"]
 
 
 def initial_tips(arms: Sequence[ArmPosterior]) -> dict[Tip, Float64[Tensor, " 3"]]:
@@ -115,7 +115,7 @@ def touch_equations(
                 G[k, :, 6 * number - 6 : 6 * number] = sign * torch.cat([torch.eye(3).to(T), -skew(away)], 1)
             if (number, rows.tips[row]) in tips:
                 place = 6 * (len(arms) - 1) + 3 * list(tips).index((number, rows.tips[row]))
-                G[k, :, place : place + 3] = sign * R @ at.turned[row]
+                G[k, :, place : place + 3] = sign * R @ at.rotation[row]
     return B.flatten(0, 1), G.flatten(0, 1), closed.flatten()
 
 

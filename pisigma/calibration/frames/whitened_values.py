@@ -47,7 +47,7 @@ class WhitenedValues:
             solved: the calibration.
             parameters: indices of the parameters with respect to which to differentiate.
         """
-        problem, here = solved.problem.with_active(list(parameters)), solved.refined
+        problem, here = solved.problem.with_active(list(parameters)), solved.refined_linearisation
         deviation = sensor_view_of(here).variances.sqrt()
         scaled = [
             (one, one.root / float(sigma))
@@ -95,11 +95,11 @@ class FrameDirections:
 
     Attributes:
         directions: the directions, orthonormal in units of 1 mm and 1 mrad, in the coordinates of the problem.
-        deviation: standard deviation of every direction in these units; infinite if the rows contain no information.
+        sigma: standard deviation of every direction in these units; infinite if the rows contain no information.
     """
 
     directions: Float64[Tensor, "active frames"]
-    deviation: Float64[Tensor, " frames"]
+    sigma: Float64[Tensor, " frames"]
 
     @staticmethod
     def at_solution(solved: SolvedCalibration, frames: Sequence[int]) -> "FrameDirections":

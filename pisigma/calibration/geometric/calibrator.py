@@ -153,7 +153,7 @@ class GeometricCalibrator:
         rough, findings, active = self._solve_roughly(setup, findings, candidates, active)
         problem = setup.problem.with_active(active)
         start = rough.linearisation
-        if findings.extended or len(sensor_view_of(start).contributions[0].distance) < problem.rows:
+        if findings.added_parameters or len(sensor_view_of(start).contributions[0].distance) < problem.rows:
             start = problem.linearise(start.point, start)
         else:
             start = problem.combine_contributions(start.point, sensor_view_of(start))
@@ -169,7 +169,7 @@ class GeometricCalibrator:
         self, setup: CalibrationSetup, problem: CalibrationProblem, found: Solution[Tensor]
     ) -> tuple[CalibrationSetup, CalibrationProblem, Solution[Tensor]]:
         """Continue a search with images weighted by the joints of the arm that it found, and by their scatter."""
-        corners = setup.corners_of(setup.measurements)
+        corners = setup.corner_sensor(setup.measurements)
         if corners is None:
             return setup, problem, found
         for number in range(_WEIGHTINGS):
@@ -195,7 +195,7 @@ class GeometricCalibrator:
         options = SetupOptions(
             free_base=self._finds("base"),
             free_tool=self._finds("tool"),
-            turn_tool=self.tool == "free",
+            free_rotation=self.tool == "free",
             base_guesses={name: tuple(base) for name, base in self.base_guesses.items()},
             socket_distances=self.socket_distances,
             socket_sigma=self.socket_sigma,
@@ -228,7 +228,7 @@ class GeometricCalibrator:
         tools = list(space.indices_of("tool")) if self.tool != "fixed" else []
         chosen |= {i for k, i in enumerate(tools) if self.tool == "free" or k % 6 < 3}
         if self.free == "identifiable":
-            chosen |= set(range(space.arm_size))
+            chosen |= set(range(space.arm_parameter_count))
         elif self.free == "joint_offsets":
             for row in self.robot.joint_rows:
                 chosen.add(5 * row + (1 if self.robot.rows[row].type == "prismatic" else 0))
@@ -292,10 +292,10 @@ class GeometricCalibrator:
         unknowns, here = setup.free_unknowns, rough.linearisation
         kept = sorted(set(active) - set(unknowns))
         others = [i for i in candidates if i not in set(kept)]
-        most = problem.space.most_independent(problem.needs_rotation)
+        most = problem.space.max_identifiable(problem.needs_rotation)
         if self.elimination != "exact" or not others or len(kept) >= most:
             return rough, findings, active
         now = information(problem, here.point, unknowns + kept + others, sensor_view_of(here))
         columns = additional_columns(without_sensor_unknowns(setup, now), len(kept))
         extended = [(kept + others)[i] for i in columns]
-        return rough, replace(findings, extended=extended), [*active, *extended]
+        return rough, replace(findings, added_parameters=extended), [*active, *extended]

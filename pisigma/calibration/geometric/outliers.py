@@ -20,7 +20,7 @@ class Outlier:
         place: file and line, or source and row, as in error messages.
         sensor: kind of sensor of the value.
         residual: length of the residual [m or rad].
-        deviations: length of the residual in standard deviations of one value.
+        residual_in_sigmas: length of the residual in standard deviations of one value.
         unit: "m" or "rad".
     """
 
@@ -28,7 +28,7 @@ class Outlier:
     place: str
     sensor: str
     residual: float
-    deviations: float
+    residual_in_sigmas: float
     unit: Literal["m", "rad"]
 
 
@@ -38,7 +38,7 @@ def outliers_of(
     sensor: AbstractSensor,
     rows: Int64[Tensor, " values"],
     length: Float64[Tensor, " values"],
-    deviations: Float64[Tensor, " values"],
+    residual_in_sigmas: Float64[Tensor, " values"],
     weight: Float64[Tensor, " values"],
 ) -> list[Outlier]:
     """Return the rows of a sensor with less than half of the full weight.
@@ -49,12 +49,14 @@ def outliers_of(
         sensor: the sensor.
         rows: indices of the rows in the problem.
         length: lengths of the residuals of these rows [m or rad].
-        deviations: length of the residual in standard deviations of one value.
+        residual_in_sigmas: length of the residual in standard deviations of one value.
         weight: weights of the rows.
     """
     outliers = []
     for k in (weight < 0.5).nonzero()[:, 0].tolist():
         row = int(setup.rows[rows[k]])
         where = measurements.place(row)
-        outliers.append(Outlier(row, where, sensor.name, float(length[k]), float(deviations[k]), sensor.unit))
+        outliers.append(
+            Outlier(row, where, sensor.name, float(length[k]), float(residual_in_sigmas[k]), sensor.unit)
+        )
     return outliers

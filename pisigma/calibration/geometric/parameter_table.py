@@ -152,7 +152,7 @@ def parameter_table(
     columns = (nominal.tolist(), values.tolist(), change.tolist())
     for index, (parameter, before, after, moved) in enumerate(zip(space.parameters, *columns, strict=True)):
         free = index in active or bool(errors[index] > 0)
-        remark, label = _remark(parameter.name, free, index in findings.extended, findings.redundancy)
+        remark, label = _remark(parameter.name, free, index in findings.added_parameters, findings.redundancy)
         if free and label == "identified" and index in sums:
             remark, label = f"identified only in a sum with {' and '.join(sums[index])}", "in a sum"
         if free and held[index]:
@@ -175,7 +175,7 @@ def _sums_with_bases(
     The dependencies are those in the axes of the robot's base; here they are converted to those of the measuring frame.
     """
     space, redundancy = problem.space, findings.redundancy
-    extended = {space.names[index] for index in findings.extended}
+    extended = {space.names[index] for index in findings.added_parameters}
     left = [name for name in redundancy.removed if name not in extended]
     unchanged = torch.zeros(len(space.parameters), len(left), dtype=torch.float64)
     for number, name in enumerate(left):

@@ -36,7 +36,7 @@ from pisigma.calibration.geometric.problem.least_squares import (
     SolutionStatus,
     covariance_of,
 )
-from pisigma.calibration.geometric.problem.noise import parameters_used, sensor_view_of
+from pisigma.calibration.geometric.problem.noise import parameters_by_sensor, sensor_view_of
 from pisigma.calibration.geometric.problem.problem import CalibrationProblem
 from pisigma.calibration.geometric.problem.setup import CalibrationSetup, IdentifiedGeometry
 from pisigma.measurement.dataset import Measurements
@@ -98,7 +98,7 @@ class SolvedCalibration:
         return CalibrationResult(geometry.robot, geometry.bases, geometry.tools, geometry.unknowns, self)
 
     @cached_property
-    def refined(self) -> Linearisation[Tensor]:
+    def refined_linearisation(self) -> Linearisation[Tensor]:
         """The problem linearised at its solution, with the noise estimated from all rows without outliers."""
         return self.problem.with_refined_noise(self.solution.linearisation)
 
@@ -129,11 +129,13 @@ class SolvedCalibration:
     def _covariances(self) -> tuple[Float64[Tensor, "active active"], Float64[Tensor, "active held"]]:
         """Return the covariance of the estimated directions, and a root of the covariance of the held directions."""
         estimated, held, scale = (
-            covariance_of(self.refined.normal).cpu(),
+            covariance_of(self.refined_linearisation.normal).cpu(),
             self.problem.held_directions,
             self.problem.step_scale,
         )
-        return estimated, scale.new_zeros(len(scale), 0).cpu() if held is None else held.root(scale.cpu())
+        return estimated, scale.new_zeros(len(scale), 0).cpu() if held is None else held.covariance_root(
+            scale.cpu()
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,7 +162,12 @@ class CalibrationResult:
         """Table of all parameters, free or not."""
         solved = self.solved
         return parameter_table(
-            solved.setup, solved.problem, solved.findings, solved.refined, solved.geometry, solved.covariance
+            solved.setup,
+            solved.problem,
+            solved.findings,
+            solved.refined_linearisation,
+            solved.geometry,
+            solved.covariance,
         )
 
     @property
@@ -201,20 +208,20 @@ class CalibrationResult:
         return find_pairwise_redundancy(findings.information, findings.sizes)
 
     @property
-    def extended(self) -> tuple[str, ...]:
+    def added_parameters(self) -> tuple[str, ...]:
         """Names of parameters that were added because the data determine them at the solution."""
         names = self.solved.problem.space.names
-        return tuple(names[i] for i in self.solved.findings.extended)
+        return tuple(names[i] for i in self.solved.findings.added_parameters)
 
     @cached_property
     def weak_directions(self) -> tuple[str, ...]:
         """Sentences about weakly identifiable directions, which remain near their nominal values."""
-        return find_weak_directions(self.solved.problem, self.solved.refined)
+        return find_weak_directions(self.solved.problem, self.solved.refined_linearisation)
 
     @cached_property
     def observability(self) -> Observability:
         """Indices O1 to O5 of the free parameters at the solution."""
-        problem, here = self.solved.problem, self.solved.refined
+        problem, here = self.solved.problem, self.solved.refined_linearisation
         gram = sum(
             (part.normal for part in sensor_view_of(here).contributions), torch.zeros_like(here.normal)
         )
@@ -230,7 +237,7 @@ class CalibrationResult:
     @property
     def cost(self) -> float:
         """Cost at the solution: sum of squared residuals divided by variances, with loss and prior."""
-        return float(self.solved.refined.cost)
+        return float(self.solved.refined_linearisation.cost)
 
     @property
     def status(self) -> SolutionStatus:
@@ -258,7 +265,7 @@ class CalibrationResult:
     @cached_property
     def prior_ratios(self) -> tuple[PriorRatio, ...]:
         """Ratios of estimated errors to their prior standard deviations, by group of parameters with a prior."""
-        return prior_ratios_of(self.solved.problem, self.solved.refined)
+        return prior_ratios_of(self.solved.problem, self.solved.refined_linearisation)
 
     @property
     def rank(self) -> int:
@@ -274,7 +281,7 @@ class CalibrationResult:
         return self.observability.condition_number
 
     @property
-    def free(self) -> tuple[str, ...]:
+    def free_parameters(self) -> tuple[str, ...]:
         """Names of the parameters that were estimated."""
         return tuple(parameter.name for parameter in self.parameters if parameter.free)
 
@@ -309,7 +316,7 @@ class CalibrationResult:
 
 def _warnings(solved: SolvedCalibration) -> tuple[CalibrationWarning, ...]:
     """Return warnings about angles that disagree with lengths, and about frames that do not fit."""
-    disagreement = float(sensor_view_of(solved.refined).disagreement.max())
+    disagreement = float(sensor_view_of(solved.refined_linearisation).angle_variance_factor.max())
     warnings = []
     if disagreement > _DISAGREEING:
         sentence = (
@@ -318,7 +325,7 @@ def _warnings(solved: SolvedCalibration) -> tuple[CalibrationWarning, ...]:
             "orientation error of the sensor that depends on the pose."
         )
         warnings.append(CalibrationWarning("angle_disagreement", "", sentence))
-    return (*warnings, *misfitting_frames(solved.problem, solved.refined))
+    return (*warnings, *misfitting_frames(solved.problem, solved.refined_linearisation))
 
 
 def _residuals(solved: SolvedCalibration) -> dict[str, Float64[np.ndarray, "rows components"]]:
@@ -326,7 +333,9 @@ def _residuals(solved: SolvedCalibration) -> dict[str, Float64[np.ndarray, "rows
     measurements, setup, problem = solved.measurements, solved.setup, solved.problem
     R = setup.anchors.bases[:, :3, :3].to(problem.frame.device)[problem.frame]
     residuals = {}
-    for sensor, part in zip(problem.sensors, sensor_view_of(solved.refined).contributions, strict=True):
+    for sensor, part in zip(
+        problem.sensors, sensor_view_of(solved.refined_linearisation).contributions, strict=True
+    ):
         own = part.residual.t()
         if sensor.components == 3:
             own = (R @ own[..., None])[..., 0]
@@ -338,7 +347,7 @@ def _residuals(solved: SolvedCalibration) -> dict[str, Float64[np.ndarray, "rows
 
 def _outliers(solved: SolvedCalibration) -> tuple[Outlier, ...]:
     found = []
-    view = sensor_view_of(solved.refined)
+    view = sensor_view_of(solved.refined_linearisation)
     for number, (sensor, part) in enumerate(zip(solved.problem.sensors, view.contributions, strict=True)):
         deviations = part.distance / view.scales[number]
         weight = solved.problem.loss_for_sensor(sensor).weight(deviations, sensor.components)
@@ -346,14 +355,14 @@ def _outliers(solved: SolvedCalibration) -> tuple[Outlier, ...]:
         found += outliers_of(
             solved.setup, solved.measurements, sensor, rows, part.residual.norm(dim=0), deviations, weight
         )
-    return tuple(sorted(found, key=lambda outlier: -outlier.deviations))
+    return tuple(sorted(found, key=lambda outlier: -outlier.residual_in_sigmas))
 
 
 def _noise(solved: SolvedCalibration) -> tuple[SensorNoise, ...]:
     noise = []
-    problem, here = solved.problem, solved.refined
+    problem, here = solved.problem, solved.refined_linearisation
     view = sensor_view_of(here)
-    used = parameters_used(view, covariance_of(here.normal)).tolist()
+    used = parameters_by_sensor(view, covariance_of(here.normal)).tolist()
     for k, (sensor, part) in enumerate(zip(problem.sensors, view.contributions, strict=True)):
         if sensor.certain:
             continue

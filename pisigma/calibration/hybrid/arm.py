@@ -25,14 +25,14 @@ class JointCoverage:
     Attributes:
         joint: index of the joint of every range.
         middle: middle of every range [rad].
-        half: half the length of every range [rad].
+        half_width: half the length of every range [rad].
         angle_per_value: angle per joint value, per joint [rad/rad or rad/m].
         is_periodic: whether values of a joint that differ by 2π are equivalent, per joint.
     """
 
     joint: Int64[Tensor, " stretches"]
     middle: Float64[Tensor, " stretches"]
-    half: Float64[Tensor, " stretches"]
+    half_width: Float64[Tensor, " stretches"]
     angle_per_value: Float64[Tensor, " dof"]
     is_periodic: tuple[bool, ...]
 
@@ -55,7 +55,9 @@ class JointCoverage:
         angles = []
         for j in range(len(self.is_periodic)):
             of_joint = [(q[:, j] * self.angle_per_value[j]).cpu()]
-            for middle, half in zip(self.middle[self.joint == j], self.half[self.joint == j], strict=True):
+            for middle, half in zip(
+                self.middle[self.joint == j], self.half_width[self.joint == j], strict=True
+            ):
                 steps = 2 + int(2 * float(half) / _LARGEST_GAP)
                 of_joint.append(middle + half * torch.linspace(-1, 1, steps, dtype=torch.float64))
             angles.append(torch.cat(of_joint))
@@ -70,7 +72,7 @@ class JointCoverage:
             off = angle[..., j, None] - self.middle[here].to(q)
             if turns:
                 off = off - 2 * math.pi * torch.round(off / (2 * math.pi))
-            columns.append((off.abs() - self.half[here].to(q)).clamp(min=0).amin(-1))
+            columns.append((off.abs() - self.half_width[here].to(q)).clamp(min=0).amin(-1))
         return torch.stack(columns, -1)
 
     def contains(self, q: Float[Tensor, "*batch dof"]) -> Bool[Tensor, "*batch"]:

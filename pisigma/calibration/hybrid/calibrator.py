@@ -118,7 +118,7 @@ class HybridCalibrator:
             )
 
     @property
-    def geometric(self) -> GeometricCalibrator:
+    def geometric_calibrator(self) -> GeometricCalibrator:
         """Geometric calibrator whose prior, loss and sensor settings are used."""
         return GeometricCalibrator(self.robot) if isinstance(self.robot, Robot) else self.robot
 
@@ -135,7 +135,7 @@ class HybridCalibrator:
             IdentificationError: see `GeometricCalibrator.solve`.
             PoseError: the joint values do not fit the robot.
         """
-        solved = self.geometric.solve(measurements)
+        solved = self.geometric_calibrator.solve(measurements)
         group = held_out_groups(solved.setup.measurements)
         choice = self._chosen(solved, group, progress)
         if not choice.best.design.features:
@@ -150,7 +150,7 @@ class HybridCalibrator:
         refined = serving.refined if whole else refine(solved.problem, group, choice)
         if refined.regression.effective_share(refined.posterior) > choice.best.largest_share:
             return _geometric_alone(solved, choice, _TOO_FEW_ROWS)
-        falling = gravity_sentence(self.geometric.robot, choice.best.design.features)
+        falling = gravity_sentence(self.geometric_calibrator.robot, choice.best.design.features)
         verdict, trials = " ".join(filter(None, (_kept_sentence(serving), falling))), choice.trials
         learned = self._learned(solved, refined)
         progress("predicting held-out rows")
@@ -170,7 +170,7 @@ class HybridCalibrator:
         return LearnedPart(
             geometry=with_aligned_frames(solved, refined),
             correction=refined.correction,
-            coverage=JointCoverage.from_joints(self.geometric.robot, solved.problem.q),
+            coverage=JointCoverage.from_joints(self.geometric_calibrator.robot, solved.problem.q),
             noise={sensor.name: sigma for sensor, sigma in noise if not sensor.certain},
             unknowns=refined.design.unknowns,
             effective_unknowns=refined.posterior.effective_unknowns,
@@ -210,7 +210,7 @@ class HybridCalibrator:
             # The geometry explains exact data, so features would only fit the errors of the linearisation.
             search = FeatureSearch(rows, noise, prior_scale, [], progress)
             return search.try_derived_feature(search.geometry, None)
-        robot = self.geometric.robot
+        robot = self.geometric_calibrator.robot
         gravity = self.gravity or gravity_by_evidence(robot, rows, noise, prior_scale)
         directions = dict.fromkeys((gravity, self.gravity or USUAL))
         tried = [self._features(solved, problem, to_first_row_frame(robot, one)) for one in directions]
@@ -251,7 +251,9 @@ class HybridCalibrator:
         growing: list[AbstractFeature] = []
         others: list[AbstractFeature] = []
         for name in self.features:
-            tried = feature_by_name(name).candidates(self.geometric.robot, options, solved.problem.state)
+            tried = feature_by_name(name).candidates(
+                self.geometric_calibrator.robot, options, solved.problem.state
+            )
             if not any(feature.size for feature in tried):
                 others += tried
             elif growing:
@@ -275,15 +277,15 @@ def _outliers(solved: SolvedCalibration, refined: RefinedFit) -> tuple[Outlier, 
         length, sensor = one.residual.norm(dim=1), problem.sensors[number]
         deviations = length * one.root / refined.posterior.noise[number]
         found += outliers_of(setup, solved.measurements, sensor, one.row, length, deviations, weight)
-    return tuple(sorted(found, key=lambda outlier: -outlier.deviations))
+    return tuple(sorted(found, key=lambda outlier: -outlier.residual_in_sigmas))
 
 
 def _kept_sentence(serving: FinalCorrection) -> str:
     """Return a sentence about the chosen correction and the resulting prediction of held-out rows."""
     best = serving.choice.best
     return (
-        f"A joint correction was kept ({best.name}): held-out rows are predicted with {serving.held_out:.2f} times the "
-        "error of the geometric calibration."
+        f"A joint correction was kept ({best.name}): held-out rows are predicted with "
+        f"{serving.held_out_ratio:.2f} times the error of the geometric calibration."
     )
 
 

@@ -48,22 +48,24 @@ class SensorErrors:
 
     Attributes:
         group: index of every row's group, see `Rows.group`.
-        fitted: lengths of the errors of all rows [m or rad], or in standard deviations if the rows state them.
-        held_out: lengths of the errors in fits without the row's fold; NaN for rows that were not held out.
+        fitted_errors: lengths of the errors of all rows [m or rad], or in standard deviations if the rows state them.
+        held_out_errors: lengths of the errors in fits without the row's fold; NaN for rows that were not held out.
         weight: robust weight, 1 for full weight and 0 for rejected rows.
     """
 
     group: Int64[Tensor, " values"]
-    fitted: Float64[Tensor, " values"]
-    held_out: Float64[Tensor, " values"]
+    fitted_errors: Float64[Tensor, " values"]
+    held_out_errors: Float64[Tensor, " values"]
     weight: Float64[Tensor, " values"]
 
     def compare(self, before: "SensorErrors") -> "Comparison":
         """Return the comparison with errors under another fit, for the rows that either fit uses."""
         weight = torch.maximum(self.weight, before.weight)
-        judged = torch.isfinite(before.held_out)  # a fit that predicts no value is worse than any other fit
-        fitted = [(weight * one.fitted.square()).sum() for one in (self, before)]
-        squares = [(weight * one.held_out.square())[judged] for one in (self, before)]
+        judged = torch.isfinite(
+            before.held_out_errors
+        )  # a fit that predicts no value is worse than any other fit
+        fitted = [(weight * one.fitted_errors.square()).sum() for one in (self, before)]
+        squares = [(weight * one.held_out_errors.square())[judged] for one in (self, before)]
         gain = torch.zeros(int(self.group.max()) + 1 if len(self.group) else 0).to(weight)
         gain = gain.index_add(0, self.group[judged], squares[1] - squares[0])
         return Comparison(
@@ -78,22 +80,22 @@ class Comparison:
     """Ratios of the errors of a sensor under two fits.
 
     Attributes:
-        fitted: ratio of the RMS errors of all rows.
-        held_out: ratio of the RMS errors of held-out rows.
+        fitted_ratio: ratio of the RMS errors of all rows.
+        held_out_ratio: ratio of the RMS errors of held-out rows.
         gain: decrease of the held-out squares [standard errors], with independent groups.
     """
 
-    fitted: float
-    held_out: float
+    fitted_ratio: float
+    held_out_ratio: float
     gain: float
 
     @property
     def is_worse(self) -> bool:
         """Whether the errors of all rows or of held-out rows are larger."""
-        return not (self.fitted <= TOLERANCE and self.held_out <= TOLERANCE)
+        return not (self.fitted_ratio <= TOLERANCE and self.held_out_ratio <= TOLERANCE)
 
 
-def held_out_rows(
+def held_out_row_errors(
     design: Design,
     posterior: Posterior,
     group: Int64[Tensor, " rows"],
@@ -200,13 +202,13 @@ class FinalCorrection:
     Attributes:
         choice: the choice, with the final features as its best.
         refined: the model fitted to the rows of the search.
-        held_out: ratio of the held-out RMS errors with the correction and of the geometric calibration, for the
+        held_out_ratio: ratio of the held-out RMS errors with the correction and of the geometric calibration, for the
             sensor with the largest gain [1].
     """
 
     choice: FeatureChoice
     refined: RefinedFit
-    held_out: float
+    held_out_ratio: float
 
 
 def choose_final_correction(
@@ -232,20 +234,22 @@ def choose_final_correction(
         )
     folds = replace(choice.rows, group=group).folds(_FOLDS if count > FEW_GROUPS else _FOLDS_OF_FEW, count)
     updates = int(count <= _MANY_GROUPS)
-    before = held_out_rows(Design(problem, ()), _geometric_posterior(solved, choice), group, folds, updates)
+    before = held_out_row_errors(
+        Design(problem, ()), _geometric_posterior(solved, choice), group, folds, updates
+    )
     for part in _parts(choice):
         progress(f"held-out rows, {part.best.name}")
         refined = refine(problem, choice.rows.group, part)
-        errors = held_out_rows(refined.design, refined.posterior, group, folds, updates)
+        errors = held_out_row_errors(refined.design, refined.posterior, group, folds, updates)
         compared = _compared(errors, before)
         if not any(one.is_worse for one in compared) and any(one.gain > CLEAR_GAIN for one in compared):
-            return FinalCorrection(part, refined, min(one.held_out for one in compared))
+            return FinalCorrection(part, refined, min(one.held_out_ratio for one in compared))
     return None
 
 
 def _held_out_in_search(choice: FeatureChoice) -> float:
     """Return the ratio of held-out errors that the search computed with linearised rows."""
-    return [trial.held_out for trial in choice.trials if trial.kept][-1]
+    return [trial.held_out_ratio for trial in choice.trials if trial.kept][-1]
 
 
 def _compared(errors: Errors, before: Errors) -> list[Comparison]:

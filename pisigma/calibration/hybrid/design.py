@@ -176,7 +176,10 @@ class Rows:
         """Number of values of every sensor."""
         return tuple(
             SensorCount(
-                sensor.residual.numel() / sensor.repetition, sensor.stated, sensor.certain, sensor.repetition
+                sensor.residual.numel() / sensor.repeat_variance_factor,
+                sensor.has_stated_noise,
+                sensor.certain,
+                sensor.repeat_variance_factor,
             )
             for sensor in self.values
         )
@@ -194,14 +197,14 @@ class Rows:
         kept = [sensor.select(slice(0, 0)) if sensor.certain else sensor for sensor in rows.values]
         return replace(rows, values=tuple(kept))
 
-    def folds(self, count: int, most_groups: int) -> tuple[Int64[Tensor, " _groups"], ...]:
+    def folds(self, count: int, max_groups: int) -> tuple[Int64[Tensor, " _groups"], ...]:
         """Return the groups of every fold, drawn with a fixed random seed.
 
         Args:
             count: number of folds; one per group if there are fewer groups.
-            most_groups: largest number of groups that are held out.
+            max_groups: largest number of groups that are held out.
         """
-        order = torch.randperm(self.groups, generator=torch.Generator().manual_seed(0))[:most_groups]
+        order = torch.randperm(self.groups, generator=torch.Generator().manual_seed(0))[:max_groups]
         count = min(count, len(order))
         return tuple(order[k::count] for k in range(count))
 
@@ -262,14 +265,14 @@ def chunks(count: int, size: int | None = None) -> list[slice]:
 
 
 def robust_weights(
-    problem: CalibrationProblem, values: Sequence[SensorValues], effective: float
+    problem: CalibrationProblem, values: Sequence[SensorValues], effective_unknowns: float
 ) -> tuple[Float64[Tensor, " values"], ...]:
     """Compute the robust weights of all rows of every sensor from their residuals.
 
     Args:
         problem: the problem with the loss functions; the scale is estimated.
         values: unweighted values.
-        effective: effective number of unknowns.
+        effective_unknowns: effective number of unknowns.
 
     Raises:
         IdentificationError: a residual is not finite.
@@ -288,7 +291,7 @@ def robust_weights(
         if sensor.certain or isinstance(loss, SquaredLoss):
             weights.append(torch.ones_like(distance))
             continue
-        taken = effective * counts[number] / max(sum(counts), 1.0)
+        taken = effective_unknowns * counts[number] / max(sum(counts), 1.0)
         scale = max(float(loss.scale(distance, sensor.components, taken)), 1e-10)
         weights.append(loss.weight(distance / scale, sensor.components))
     return tuple(weights)

@@ -21,32 +21,42 @@ class CalibrationNoise:
     Attributes:
         value: standard deviation of the readings by sensor [m or rad]; a factor on the stated standard deviations if
             the rows state them. Also that of `JOINT`, if images show that joints scatter.
-        stated: median of the stated standard deviations [m or rad], by sensor whose rows state them; None for
-            folders of earlier versions, which do not store it.
+        median_stated_sigma: median of the stated standard deviations [m or rad], by sensor whose rows state them; None
+            for folders of earlier versions, which do not store it.
     """
 
     value: Mapping[str, float] = field(default_factory=dict)
-    stated: Mapping[str, float] | None = field(default_factory=dict)
+    median_stated_sigma: Mapping[str, float] | None = field(default_factory=dict)
 
     def is_factor(self, name: str) -> bool:
         """Return whether the value of a sensor is a factor on stated standard deviations."""
-        return self.value[name] > _MAX_ABSOLUTE if self.stated is None else name in self.stated
+        return (
+            self.value[name] > _MAX_ABSOLUTE
+            if self.median_stated_sigma is None
+            else name in self.median_stated_sigma
+        )
 
     def standard_deviation(self, name: str) -> float:
         """Return the standard deviation of a sensor [m or rad]; NaN if it is unknown."""
         if name not in self.value or not self.is_factor(name):
             return self.value.get(name, math.nan)
-        return math.nan if self.stated is None else self.value[name] * self.stated[name]
+        return (
+            math.nan
+            if self.median_stated_sigma is None
+            else self.value[name] * self.median_stated_sigma[name]
+        )
 
     def updated(self, other: "CalibrationNoise") -> "CalibrationNoise":
         """Return the noise, with the noise of the sensors in `other` replaced."""
         value = {**self.value, **other.value}
         if (
-            self.stated is None and value.keys() != other.value.keys()
+            self.median_stated_sigma is None and value.keys() != other.value.keys()
         ):  # unknown for the sensors that are kept
             return CalibrationNoise(value, None)
-        kept = {name: sigma for name, sigma in (self.stated or {}).items() if name not in other.value}
-        return CalibrationNoise(value, kept | dict(other.stated or {}))
+        kept = {
+            name: sigma for name, sigma in (self.median_stated_sigma or {}).items() if name not in other.value
+        }
+        return CalibrationNoise(value, kept | dict(other.median_stated_sigma or {}))
 
     def noise_of_earlier_rows(self, sensor: AbstractSensor) -> float | None:
         """Return the noise of earlier rows of a sensor, in the form required by its new rows; None for a new sensor.

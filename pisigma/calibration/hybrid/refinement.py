@@ -115,14 +115,14 @@ def evaluate_in_chunks(correction: JointCorrection) -> Shift:
 
 
 def linearise_rows(
-    design: Design, x: Float64[Tensor, " unknowns"], effective: float, group: Int64[Tensor, " rows"]
+    design: Design, x: Float64[Tensor, " unknowns"], effective_unknowns: float, group: Int64[Tensor, " rows"]
 ) -> Rows:
     """Return all rows linearised at given unknowns, with robust weights from their residuals.
 
     Args:
         design: design of the unknowns.
         x: the unknowns, with parameters relative to nominal.
-        effective: effective number of unknowns.
+        effective_unknowns: effective number of unknowns.
         group: see `Rows.group`.
     """
     problem = design.problem
@@ -130,7 +130,9 @@ def linearise_rows(
     values = sensor_values(
         problem, point, evaluate_in_chunks(correction_from_weights(design, x)) if design.features else None
     )
-    return Rows.from_linearisation(design, x, values, robust_weights(problem, values, effective), group)
+    return Rows.from_linearisation(
+        design, x, values, robust_weights(problem, values, effective_unknowns), group
+    )
 
 
 def with_aligned_frames(solved: SolvedCalibration, refined: RefinedFit) -> IdentifiedGeometry:

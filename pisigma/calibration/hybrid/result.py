@@ -95,7 +95,7 @@ class HybridResult:
         T = self.predicted_poses(measurements)
         return measured_errors(T, measurements, self.learned.geometry.unknowns)
 
-    def deviation(self, measurements: Measurements) -> Float64[Tensor, "rows 3"]:
+    def sigma(self, measurements: Measurements) -> Float64[Tensor, "rows 3"]:
         """Compute the standard deviation of predicted positions along the axes of the row's frame [m], without noise.
 
         It is the standard deviation of the posterior, within the measured joint ranges and outside.
@@ -103,9 +103,7 @@ class HybridResult:
         Raises:
             IdentificationError: no value was measured in metres.
         """
-        return self.uncertainty.deviation(
-            measurements, None if self.learned is None else self.learned.correction
-        )
+        return self.uncertainty.sigma(measurements, None if self.learned is None else self.learned.correction)
 
     def _moved_joints(self, measurements: Measurements) -> Float64[Tensor, "rows dof"]:
         """Compute the joint values of rows with their corrections [rad or m]."""

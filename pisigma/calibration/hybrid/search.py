@@ -66,7 +66,7 @@ class Trial:
         name: features, such as "gravity + series 56 + products".
         unknowns: number of unknowns.
         log_evidence: log evidence up to a constant of the data.
-        held_out: ratio of the held-out RMS error to that of the geometric calibration [1].
+        held_out_ratio: ratio of the held-out RMS error to that of the geometric calibration [1].
         seconds: duration [s].
         kept: whether the trial was better than all previous trials.
     """
@@ -74,7 +74,7 @@ class Trial:
     name: str
     unknowns: int
     log_evidence: float
-    held_out: float
+    held_out_ratio: float
     seconds: float
     kept: bool
 

@@ -30,12 +30,12 @@ class SensorValues:
         joints: derivative of the predicted values with respect to the joint values.
         residual: measured minus predicted values.
         root: 1 / standard deviation if the rows state it, otherwise 1.
-        stated: whether the rows state their standard deviations.
+        has_stated_noise: whether the rows state their standard deviations.
         certain: whether the values are given, not measured.
         other_row: index of the other row for distances between the targets of two rows; otherwise None.
         other_joints: derivative with respect to the joint values of the other row.
-        repetition: factor >= 1 on the variance, because values of several targets in one configuration share the
-            errors of the model (design effect, Kish 1965).
+        repeat_variance_factor: factor >= 1 on the variance, because values of several targets in one configuration
+            share the errors of the model (design effect, Kish 1965).
     """
 
     name: str
@@ -44,11 +44,11 @@ class SensorValues:
     joints: Float64[Tensor, "values components dof"]
     residual: Float64[Tensor, "values components"]
     root: Float64[Tensor, " values"]
-    stated: bool
+    has_stated_noise: bool
     certain: bool
     other_row: Int64[Tensor, " values"] | None = None
     other_joints: Float64[Tensor, "values components dof"] | None = None
-    repetition: float = 1.0
+    repeat_variance_factor: float = 1.0
 
     @property
     def row_derivatives(self) -> list[tuple[Tensor, Tensor]]:
@@ -59,17 +59,17 @@ class SensorValues:
         return sides
 
     def feature_columns(
-        self, chosen: AbstractFeature, state: JointState, rows: slice
+        self, feature: AbstractFeature, state: JointState, rows: slice
     ) -> Float64[Tensor, "values components weights"]:
         """Compute the derivative of the predicted values with respect to the weights of the used columns of a feature.
 
         Args:
-            chosen: the feature.
+            feature: the feature.
             state: joint state of all rows of the problem.
             rows: rows of this sensor to use.
         """
         blocks = [
-            weight_columns(joints[rows], chosen, state[row[rows]]) for row, joints in self.row_derivatives
+            weight_columns(joints[rows], feature, state[row[rows]]) for row, joints in self.row_derivatives
         ]
         return blocks[0] if len(blocks) == 1 else blocks[0] + blocks[1]
 
@@ -144,7 +144,7 @@ class SensorValues:
         square = float((self.residual.square() * weight[:, None]).sum()) / len(key)
         shared = float((summed.square().sum(1) / total).sum()) / groups
         repetition = max(shared / max(square, 1e-300), 1.0)
-        return replace(self, repetition=repetition, root=self.root * repetition**-0.5)
+        return replace(self, repeat_variance_factor=repetition, root=self.root * repetition**-0.5)
 
     def _sights(self, pose: Int64[Tensor, " values"]) -> Int64[Tensor, " values"]:
         """Return, for every row, the first row of its pose that has about the same derivatives."""
@@ -159,17 +159,17 @@ class SensorValues:
 
 
 def weight_columns(
-    joints: Float64[Tensor, "values components dof"], chosen: AbstractFeature, state: JointState
+    joints: Float64[Tensor, "values components dof"], feature: AbstractFeature, state: JointState
 ) -> Float64[Tensor, "values components _weights"]:
     """Compute the derivative with respect to the weights of the used columns of a feature, concatenated for all joints.
 
     Args:
         joints: derivative with respect to the joint values.
-        chosen: the feature.
+        feature: the feature.
         state: joint state of every row.
     """
-    used = chosen.used.flatten()
-    block = (joints[..., None] * chosen.columns(state)[:, None]).flatten(2)
+    used = feature.used.flatten()
+    block = (joints[..., None] * feature.columns(state)[:, None]).flatten(2)
     return block if bool(used.all()) else block[..., used]
 
 
@@ -210,7 +210,7 @@ def sensor_values(
                 joints=joints - other * direction if paired else joints,
                 residual=r.contiguous(),
                 root=root,
-                stated=sensor.sigma is not None,
+                has_stated_noise=sensor.sigma is not None,
                 certain=sensor.certain,
                 other_row=row + 1 if paired else None,
                 other_joints=other * direction if paired else None,

@@ -22,7 +22,7 @@ BLOCK = 64
 
 
 def find_spectral_lines(
-    design: Design, rows: Rows, posterior: Posterior, lowest: int
+    design: Design, rows: Rows, posterior: Posterior, lowest_order: int
 ) -> tuple[tuple[int, ...], ...]:
     """Find the orders of the spectral lines of every joint, strongest first.
 
@@ -38,7 +38,7 @@ def find_spectral_lines(
         design: design of a first model.
         rows: linearised rows.
         posterior: posterior of the first model.
-        lowest: lowest order [1/turn].
+        lowest_order: lowest order [1/turn].
 
     Returns:
         Orders per joint [1/turn] (for a prismatic joint per twice its travel).
@@ -47,7 +47,7 @@ def find_spectral_lines(
     angle = design.problem.q * torch.from_numpy(angle_per_joint_value(design.problem.space.robot)).to(slope)
     least = log_number_of_orders(angle.shape[1])
     columns = zip(angle.t(), slope.t(), curvature.t(), strict=True)
-    return tuple(_lines_of_joint(*column, lowest, least) for column in columns)
+    return tuple(_lines_of_joint(*column, lowest_order, least) for column in columns)
 
 
 def log_number_of_orders(joints: int) -> float:

@@ -84,7 +84,7 @@ class PositionUncertainty:
         free: list[int] = self.root[:parameters].any(1).nonzero()[:, 0].tolist()
         return [*free, *range(parameters, len(self.root))]
 
-    def deviation(
+    def sigma(
         self, measurements: Measurements, correction: JointCorrection | None = None
     ) -> Float64[Tensor, "rows 3"]:
         """Compute the standard deviation of every row's position along the axes of its frame [m].
@@ -136,7 +136,7 @@ class PositionUncertainty:
         pairs = sorted({(f % frames, f % targets) for f in range(min(max(frames, targets), _PROBED_FRAMES))})
         probes = []
         for frame, target in pairs:
-            here, there = (self.columns(one, one.q, frame, target) for one in (rows, others))
+            here, there = (self.pose_derivatives(one, one.q, frame, target) for one in (rows, others))
             probes += [here, there, here - there]
         return torch.cat(probes).flatten(0, 1)
 
@@ -145,7 +145,7 @@ class PositionUncertainty:
     ) -> Float64[Tensor, "rows 3"]:
         with torch.no_grad():
             q_moved = state.q if correction is None else state.q + correction(state)
-        columns = self.columns(state, q_moved, frame, target)[:, :3]
+        columns = self.pose_derivatives(state, q_moved, frame, target)[:, :3]
         variance: Tensor = self.covariance_root.left_multiply(columns).square().sum(-1)
         if correction is not None:
             joints = columns[..., joint_columns(self.space)] * columns.new_tensor(self.space.robot.directions)
@@ -153,24 +153,27 @@ class PositionUncertainty:
             variance = variance + unstated.square().sum(-1)
         return variance.sqrt()
 
-    def columns(
-        self, state: JointState, q_moved: Float64[Tensor, "rows dof"], frame: int = 0, target: int = 0
+    def pose_derivatives(
+        self, state: JointState, q_corrected: Float64[Tensor, "rows dof"], frame: int = 0, target: int = 0
     ) -> Float64[Tensor, "rows 6 unknowns"]:
         """Compute the derivative of a target's position [m] and rotation vector [rad] with respect to all unknowns.
 
         Args:
             state: commanded joint values and stated conditions.
-            q_moved: joint values with their corrections [rad or m].
+            q_corrected: joint values with their corrections [rad or m].
             frame: index of the frame.
             target: index of the target.
         """
         space = self.space
         base, tool = list(self.geometry.bases.values())[frame], list(self.geometry.tools.values())[target]
         robot = self.geometry.robot.with_geometry(base=base, tool=tool)
-        J = identification_jacobian(robot, q_moved)[1]
-        columns = J.new_zeros((len(q_moved), 6, len(self.covariance_root.directions)))
-        columns[..., : space.arm_size] = J[..., : space.arm_size]
-        for group, number, first in (("base", frame, space.arm_size), ("tool", target, space.arm_size + 6)):
+        J = identification_jacobian(robot, q_corrected)[1]
+        columns = J.new_zeros((len(q_corrected), 6, len(self.covariance_root.directions)))
+        columns[..., : space.arm_parameter_count] = J[..., : space.arm_parameter_count]
+        for group, number, first in (
+            ("base", frame, space.arm_parameter_count),
+            ("tool", target, space.arm_parameter_count + 6),
+        ):
             start = space.indices_of(group).start + 6 * number
             columns[..., start : start + 6] = J[..., first : first + 6]
         columns[..., len(space.parameters) :] = self._weight_columns(J, state)

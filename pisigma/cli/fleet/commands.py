@@ -87,7 +87,7 @@ def status(folder: Folder, page: Page = None, verbose: Verbose = False, as_json:
 
     Exits with status 3 if a cell needs attention, or `pisigma fleet run` has steps to carry out.
     """
-    if show_fleet(folder, page, verbose, as_json).action:
+    if show_fleet(folder, page, verbose, as_json).needs_action:
         raise typer.Exit(NOT_ACCEPTED)
 
 

@@ -113,7 +113,7 @@ class Exported:
         details: remainder of this sentence after the file's name.
         failure: fault of the input, although the file was written; None if there is none.
         missed_limit: sentence about a missed limit, although the file was written; None if no limit is missed.
-        shown: text that is printed first, such as a diff.
+        leading_text: text that is printed first, such as a diff.
     """
 
     content: str | bytes | Mapping[str, bytes]
@@ -124,7 +124,7 @@ class Exported:
     details: str = ""
     failure: str | None = None
     missed_limit: str | None = None
-    shown: str = ""
+    leading_text: str = ""
 
 
 @dataclass(frozen=True)

@@ -79,7 +79,7 @@ def joints_by_axes(robot: Robot) -> Float64[np.ndarray, "dof axes"]:
     """
     if robot.coupling is None:
         return np.diag(robot.directions)
-    if robot.coupling.passive or robot.coupling.four_bars:
+    if robot.coupling.has_passive_joints or robot.coupling.four_bars:
         raise RobotError(
             f"robot '{robot.name}' has joints that are passive or driven by a linkage, whose offsets are not offsets "
             "of an axis of the controller",

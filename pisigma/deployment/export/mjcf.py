@@ -240,17 +240,17 @@ def update_mjcf(
 
     drawing = MjcfDrawing.read(path)
     moved = drawing.moved_bodies(nominal, tip)
-    origins = [moved[0].pose @ moved[0].attached]
+    origins = [moved[0].pose @ moved[0].axis_frame]
     for before, body in itertools.pairwise(moved):
-        origins.append(inverse(before.attached) @ body.between @ body.pose @ body.attached)
+        origins.append(inverse(before.axis_frame) @ body.parent_pose @ body.pose @ body.axis_frame)
     frames = _row_frames(nominal, origins, path)
     ahead, *segments = _segments(calibrated)
     for i, body in enumerate(moved[1:], 1):
-        joint_frame = moved[i - 1].attached @ frames[i - 1] @ segments[i - 1] @ inverse(frames[i])
-        _place(body.element, inverse(body.between) @ joint_frame @ inverse(body.attached))
+        joint_frame = moved[i - 1].axis_frame @ frames[i - 1] @ segments[i - 1] @ inverse(frames[i])
+        _place(body.element, inverse(body.parent_pose) @ joint_frame @ inverse(body.axis_frame))
     sites = (
         (CALIBRATED_FRAME, moved[0].element.getparent(), origins[0] @ frames[0] @ inverse(ahead)),
-        (CALIBRATED_TOOL, moved[-1].element, moved[-1].attached @ frames[-1] @ segments[-1]),
+        (CALIBRATED_TOOL, moved[-1].element, moved[-1].axis_frame @ frames[-1] @ segments[-1]),
     )
     for name, parent, T in sites:
         names = {site.get("name") for site in drawing.root.iter("site")}

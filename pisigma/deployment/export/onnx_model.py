@@ -76,7 +76,7 @@ def _add_inputs(graph: OnnxGraph, group: JointGroup, q: str, T: str | None) -> t
     coordinates = [i for i, (_, factors) in enumerate(terms) if not factors]
     if coordinates:
         assert T is not None
-        pose = _add_coordinates(graph, group.inputs.reference, T)
+        pose = _add_coordinates(graph, group.inputs.reference_rotation, T)
         parts += [pose[POSE_INPUTS.index(names[i])] for i in coordinates]
         order += coordinates
     return (parts[0] if len(parts) == 1 else graph.add_node("Concat", *parts, axis=1)), order
@@ -133,7 +133,7 @@ def add_distance_outside(graph: OnnxGraph, coverage: JointCoverage, q: str) -> s
     turning = np.array(coverage.is_periodic)[joint].astype(np.float64)
     turns = node("Round", node("Div", off, 2 * math.pi))
     off = node("Sub", off, node("Mul", turns, 2 * math.pi * turning))
-    beyond = node("Max", node("Sub", node("Abs", off), coverage.half.numpy()), 0.0)
+    beyond = node("Max", node("Sub", node("Abs", off), coverage.half_width.numpy()), 0.0)
     per_joint = [
         node("ReduceMin", graph.columns(beyond, np.flatnonzero(joint == j).tolist()), axes=[1], keepdims=1)
         for j in range(len(coverage.is_periodic))
@@ -280,7 +280,7 @@ def _domain(model: CalibratedModel) -> dict[str, Any]:
     if model.network is None and model.hybrid is not None:
         coverage = model.hybrid.coverage
         intervals: list[list[list[float]]] = [[] for _ in range(model.robot.dof)]
-        columns = (coverage.joint.tolist(), coverage.middle.tolist(), coverage.half.tolist())
+        columns = (coverage.joint.tolist(), coverage.middle.tolist(), coverage.half_width.tolist())
         for j, middle, half in zip(*columns, strict=True):
             rate = float(coverage.angle_per_value[j])
             intervals[j].append([(middle - half) / rate, (middle + half) / rate])

@@ -84,7 +84,7 @@ def targets_csv(targets: Targets) -> str:
     pose = millimetres_and_euler(targets.T)
     # The safe angle functions return finite angles for a matrix of NaN, so the gaps are taken from q.
     pose = torch.where(torch.isfinite(q).all(-1, keepdim=True), pose, torch.nan)
-    values = torch.cat([q, pose, targets.deviation[:, None] * 1e3], -1).tolist()
+    values = torch.cat([q, pose, targets.sigma[:, None] * 1e3], -1).tolist()
     for line, status, branch, row in zip(targets.line, targets.status, targets.branch, values, strict=True):
         cells = ["" if math.isnan(value) else repr(value) for value in row]
         writer.writerow([line, status.name.lower(), branch, *cells])
@@ -271,7 +271,7 @@ def _exported(
         summary=f"Program with {reached} corrected targets (by {shift:.3f} mm at most) "
         f"and {corrected.waypoints} waypoints",
         missed_limit=_shortfall(corrected, str(request.program)),
-        shown=diff,
+        leading_text=diff,
     )
 
 

@@ -182,7 +182,7 @@ def update_urdf(
     rows = rows_of_chain(chain)
     _check_same(rows.fields, nominal, str(path))
     urdf, _ = read_urdf(path)
-    root = parse_xml(path, everything=True)
+    root = parse_xml(path, keep_comments=True)
     elements = {element.get("name"): element for element in root.iterchildren("{*}joint")}
     for name, origin in _new_origins(chain, rows, calibrated, urdf).items():
         _set_origin(elements[name], origin)
@@ -223,7 +223,7 @@ def _check_same(described: RobotFields, nominal: Robot, path: str) -> None:
 
 def check_same_geometry(
     differences: Float64[np.ndarray, "rows parameters"],
-    largest: float,
+    max_difference: float,
     path: str | os.PathLike[str],
     remedy: str,
 ) -> None:
@@ -231,14 +231,14 @@ def check_same_geometry(
 
     Args:
         differences: differences of the DH parameters [m or rad].
-        largest: largest difference that is accepted [m or rad].
+        max_difference: largest difference that is accepted [m or rad].
         path: the file, for the message.
         remedy: action that corrects the fault, for the message.
 
     Raises:
         RobotError: a difference is larger.
     """
-    if (far := float(np.abs(differences).max(initial=0.0))) > largest:
+    if (far := float(np.abs(differences).max(initial=0.0))) > max_difference:
         raise RobotError(
             f"the geometry of the file differs from that of the nominal robot by {far:.2g} m or rad",
             expected="the geometry of the nominal robot",

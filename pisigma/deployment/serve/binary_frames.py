@@ -79,7 +79,7 @@ class BinaryFrames(AbstractProtocol):
         except RequestError:
             why = Refusal.MODEL_REFUSED if self._models.is_refused else Refusal.NO_SUCH_MODEL
             return self._refuse(name, why, begun)
-        if model.is_fast:
+        if model.has_compiled_solver:
             return self._solve(model, message, name, begun)
         return lambda: self._solve(model, message, name, begun)
 

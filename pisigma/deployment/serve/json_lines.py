@@ -165,7 +165,7 @@ class JsonLines(AbstractProtocol):
         if task == "ask":
             return *self._question(request), {}
         model = self._models.find_model(request.get("model"))
-        slow = not model.is_fast or task == "path" or read_flag(request, "accuracy")
+        slow = not model.has_compiled_solver or task == "path" or read_flag(request, "accuracy")
         solve = {"pose": _solve, "path": _follow}.get(task, _forward)
         names = model.short_name if request.get("brief") else model.full_name
         return (lambda: solve(model, request)), slow, names
@@ -189,7 +189,7 @@ class JsonLines(AbstractProtocol):
                 return (
                     lambda: ("urdf", {"model": model.name, "sha256": model.sha256, "urdf": model.urdf})
                 ), True
-            return (lambda: ("status", asdict(ModelStatus.of(model)))), True
+            return (lambda: ("status", asdict(ModelStatus.of_model(model)))), True
         return (lambda: ("reload", {"problems": self._models.reload(), "models": len(self._models)})), True
 
     def _carry_out(self, request: dict[str, Any], job: _Job, names: dict[str, str], begun: int) -> bytes:

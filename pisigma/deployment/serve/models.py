@@ -83,12 +83,12 @@ class ServedModel:
         return "q_deg" if self.ik.revolute.all() else "q"
 
     @cached_property
-    def is_fast(self) -> bool:
+    def has_compiled_solver(self) -> bool:
         """Whether compiled kernels solve poses in microseconds; for coupled joints, they do so in DH values."""
         controller = self.ik.controller
         if controller is None:
             return self.ik.compiled is not None
-        return controller.ik.compiled is not None and not controller.coupling.passive
+        return controller.ik.compiled is not None and not controller.coupling.has_passive_joints
 
     @cached_property
     def urdf(self) -> str:
@@ -158,7 +158,7 @@ class ModelStatus:
     reason: str = ""
 
     @staticmethod
-    def of(model: ServedModel) -> "ModelStatus":
+    def of_model(model: ServedModel) -> "ModelStatus":
         """Return the status of a model today, from the history of the cell that contains it."""
         cell = model.folder.absolute().parent.parent
         named = ModelStatus(model.name, model.sha256)

@@ -239,7 +239,7 @@ class _Robot:
 
         if model.sha256 == self._sha256 and time.monotonic() < self._next:
             return
-        status = await asyncio.to_thread(ModelStatus.of, model)
+        status = await asyncio.to_thread(ModelStatus.of_model, model)
         texts = {
             "Name": status.model,
             "Sha256": status.sha256,

@@ -89,7 +89,7 @@ class RsiAnswers:
 
     Attributes:
         counts: statistics so far.
-        finished: whether the corrections have fallen to 0 after `leave`.
+        finished: whether the corrections have fallen to 0 after `ramp_down`.
     """
 
     def __init__(self, ik: CorrectedIK, sender: str, max_correction_deg: float) -> None:
@@ -109,7 +109,7 @@ class RsiAnswers:
         self._last, self._cycle, self._leaving = 0, _MAX_CYCLE_MS, False
         self._weight, self._sent = 0.0, (0.0,) * len(AXES)
 
-    def leave(self) -> None:
+    def ramp_down(self) -> None:
         """Let the corrections fall to 0; `finished` is set when they have."""
         self._leaving = True
         self.finished = self.finished or self._first is None
@@ -253,7 +253,7 @@ class RsiServer:
     def stop(self) -> None:
         """Let `run` end after the corrections have fallen to 0, or immediately if called a second time."""
         self._stops += 1
-        self._answers.leave()
+        self._answers.ramp_down()
 
     def run(self, report: Callable[[str], None]) -> None:
         """Answer until `stop` is called.
@@ -295,7 +295,7 @@ class RsiServer:
         if not answers.finished:
             self._answers = self._begin()
         if self._stops:
-            self._answers.leave()
+            self._answers.ramp_down()
 
     def _newest(
         self, controller: str | None, counts: RsiCounts

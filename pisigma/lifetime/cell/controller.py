@@ -251,7 +251,7 @@ def _hash(active: dict[Contents, ActiveExport]) -> str:
     return active["joint_zeros"].export.sha256 if "joint_zeros" in active else ""
 
 
-def records(active: dict[Contents, ActiveExport]) -> list[dict[str, str]]:
+def export_records(active: dict[Contents, ActiveExport]) -> list[dict[str, str]]:
     """Return the active exports as plain values."""
     return [one.to_json() for one in active.values()]
 

@@ -130,9 +130,9 @@ def linux_mounts(mountinfo: str) -> list[tuple[str, str]]:
     return mounts
 
 
-def macos_mounts(printed: str) -> list[tuple[str, str]]:
+def macos_mounts(mount_output: str) -> list[tuple[str, str]]:
     """Return mount point and type of every file system in the output of the macOS command `mount`."""
-    return [(match["point"], match["type"]) for match in _MACOS_MOUNT.finditer(printed)]
+    return [(match["point"], match["type"]) for match in _MACOS_MOUNT.finditer(mount_output)]
 
 
 def file_system_type(path: str, mounts: Iterable[tuple[str, str]]) -> str | None:

@@ -53,8 +53,8 @@ class CellFacts:
         in_use: the model in use; None if there is none.
         limit_mm: limit on the 95 % quantile of the position errors [mm]; None if there is none.
         today: day (ISO 8601).
-        not_taken_in: names of the files in `sessions/` that are not yet in the history, by their dates.
-        not_read: names of the files in `sessions/` that are not measurement files and were not imported.
+        unrecorded_files: names of the files in `sessions/` that are not yet in the history, by their dates.
+        foreign_files: names of the files in `sessions/` that are not measurement files and were not imported.
         no_plan_reason: reason why no poses can be planned; "" if they can be planned.
         settings_sha256: SHA-256 of the current settings of a calibration; see `Check`.
         changed_models: names of the model in use and of the newest model, if these were changed or removed after they
@@ -74,8 +74,8 @@ class CellFacts:
     in_use: ModelEntry | None
     limit_mm: float | None
     today: str
-    not_taken_in: tuple[str, ...] = ()
-    not_read: tuple[str, ...] = ()
+    unrecorded_files: tuple[str, ...] = ()
+    foreign_files: tuple[str, ...] = ()
     no_plan_reason: str = ""
     settings_sha256: str = ""
     changed_models: tuple[str, ...] = ()
@@ -219,8 +219,8 @@ def _facts(folder: Path, history: History) -> CellFacts:
         in_use=in_use,
         limit_mm=stated.limit_mm,
         today=datetime.date.today().isoformat(),
-        not_taken_in=unrecorded_files(folder / SESSIONS, sessions),
-        not_read=foreign_files(folder / SESSIONS, sessions),
+        unrecorded_files=unrecorded_files(folder / SESSIONS, sessions),
+        foreign_files=foreign_files(folder / SESSIONS, sessions),
         no_plan_reason=stated.no_plan_reason(in_use),
         settings_sha256=stated.settings_hash(folder),
         changed_models=tuple(

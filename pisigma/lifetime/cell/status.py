@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from pisigma.lifetime.cell.controller import records
+from pisigma.lifetime.cell.controller import export_records
 from pisigma.lifetime.cell.events import ARM_EVENTS, CHANGING_EVENTS
 from pisigma.lifetime.cell.facts import NOT_TRUSTED, CellFacts, facts_of
 from pisigma.lifetime.cell.history import Check, ModelEntry
@@ -67,7 +67,7 @@ class CellStatus:
             "made_of": [] if model is None else list(model.made_of),
             "p95_mm": None if model is None else model.p95_mm,
             "limit_mm": facts.limit_mm,
-            "controller": records(facts.controller.active()),
+            "controller": export_records(facts.controller.active()),
             "plans": list(facts.plans),
             "sessions": [
                 {
@@ -75,14 +75,14 @@ class CellStatus:
                     "day": one.day,
                     "rows": one.rows,
                     "set_aside": one.set_aside or None,
-                    "controller": records(facts.controller.active_during(one)),
+                    "controller": export_records(facts.controller.active_during(one)),
                 }
                 for one in facts.sessions
             ],
             "events": [one.to_json() for one in facts.events],
             "models": [{"name": one.name, "remark": one.remark} for one in facts.models],
-            "not_taken_in": list(facts.not_taken_in),
-            "not_read": list(facts.not_read),
+            "not_taken_in": list(facts.unrecorded_files),
+            "not_read": list(facts.foreign_files),
             "next": self.step.to_json(),
         }
 
@@ -126,7 +126,7 @@ def due_step(facts: CellFacts) -> Step:
     return step
 
 
-def plans_check(facts: CellFacts) -> bool:
+def is_check_due(facts: CellFacts) -> bool:
     """Return whether a few poses for checking the current model are due, rather than the poses of a calibration."""
     return bool(facts.models) and due_step(facts).state != "outside_limit"
 
@@ -166,9 +166,9 @@ def _edited_session(facts: CellFacts) -> Step | None:
 
 
 def _file_to_take_in(facts: CellFacts) -> Step | None:
-    if not facts.not_taken_in:
+    if not facts.unrecorded_files:
         return None
-    name = facts.not_taken_in[0]
+    name = facts.unrecorded_files[0]
     command = facts.import_command(f"{facts.folder}/{SESSIONS}/{name}")
     refusals = [one for one in facts.checks if one.command == "import" and f"{one.session}.csv" == name]
     if refusals and refusals[-1].verdict == FOREIGN:

@@ -271,7 +271,7 @@ class Displacement:
         return Displacement(source, q[there], number + 1, place, errors, len(q) - len(number))
 
     @property
-    def largest(self) -> int:
+    def index_of_largest(self) -> int:
         """Index of the pose with the largest distance."""
         return int(self.errors.position.argmax())
 
@@ -281,14 +281,14 @@ class Displacement:
         Args:
             robot: robot that converts joint values to controller values.
         """
-        values = robot.to_controller(self.q[self.largest].numpy()).tolist()
+        values = robot.to_controller(self.q[self.index_of_largest].numpy()).tolist()
         return {
             "source": self.source,
             "poses": len(self.q),
             "poses_not_predicted": self.not_predicted,
             **self.errors.figures.figures_by_name,
-            "largest_at_pose": int(self.number[self.largest]),
-            "largest_at_mm": (self.position[self.largest] * 1e3).tolist(),
+            "largest_at_pose": int(self.number[self.index_of_largest]),
+            "largest_at_mm": (self.position[self.index_of_largest] * 1e3).tolist(),
             "largest_at_joints": [
                 axis.in_file_unit(value) for axis, value in zip(robot.axes, values, strict=True)
             ],

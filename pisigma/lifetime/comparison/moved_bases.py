@@ -27,36 +27,38 @@ class ArmBefore:
     Attributes:
         posterior: posterior of its model.
         T_first_base: its base relative to the base of the first arm, when its model was made.
-        current: its current bases, fitted with the arm of the model.
+        current_frames: its current bases, fitted with the arm of the model.
     """
 
     posterior: ArmPosterior
     T_first_base: Float64[Tensor, "4 4"]
-    current: FittedFrames
+    current_frames: FittedFrames
 
     @property
     def frames(self) -> tuple[str, ...]:
         """Frames in which the base was determined both before and now."""
         return tuple(
             name
-            for name in self.current.fit.solved.geometry.bases
+            for name in self.current_frames.fit.solved.geometry.bases
             if ("frame", name) in self.posterior.shared_objects and is_determined(self._noise(name))
         )
 
     def _rows(self, frame: str) -> list[int]:
         """Return the indices of the base in a frame among the fitted coordinates."""
-        parameters = self.current.fit.parameters
+        parameters = self.current_frames.fit.parameters
         return [k for k, one in enumerate(parameters) if one.group == "base" and one.owner == frame]
 
     def _noise(self, frame: str) -> Float64[Tensor, "6 directions"]:
         """Return a root of the covariance of the current base due to the noise of the rows."""
-        fit = self.current.fit
-        return fit.solved.root[[fit.frames[k] for k in self._rows(frame)]]
+        fit = self.current_frames.fit
+        return fit.solved.root[[fit.frame_indices[k] for k in self._rows(frame)]]
 
     @property
     def degrees_of_freedom(self) -> float:
         """Number of values from which the current noise was estimated, minus the parameters fitted to them."""
-        return sum(one.values - one.effective_parameters for one in self.current.fit.solved.result().noise)
+        return sum(
+            one.values - one.effective_parameters for one in self.current_frames.fit.solved.result().noise
+        )
 
     def displacement(self, frame: str) -> tuple[Float64[Tensor, " 6"], Float64[Tensor, "6 directions"]]:
         """Return the displacement of the base relative to a frame, with a root of its covariance.
@@ -67,7 +69,7 @@ class ArmBefore:
             of the root of the model, followed by those of the current noise.
         """
         before = self.posterior.values[list(self.posterior.base_rows(frame))]
-        now = torch.from_numpy(self.current.fit.solved.geometry.bases[frame].copy())
+        now = torch.from_numpy(self.current_frames.fit.solved.geometry.bases[frame].copy())
         T_first_frame = self.T_first_base @ invert(transform_from_xyzrpy(before))
 
         def motion(bases: Tensor) -> Tensor:
@@ -77,7 +79,7 @@ class ArmBefore:
 
         both = torch.stack([now, before])
         J = torch.func.jacrev(motion)(both)
-        arm = J[:, 0] @ self.current.arm_root[self._rows(frame)]
+        arm = J[:, 0] @ self.current_frames.arm_root[self._rows(frame)]
         arm = arm + J[:, 1] @ self.posterior.root[list(self.posterior.base_rows(frame))]
         noise = J[:, 0] @ self._noise(frame)
         return motion(both), torch.cat([arm, noise], 1)
@@ -112,22 +114,22 @@ class MovedBases:
         probability: probability of differences this large if nothing moved.
         bodies: arms, frames and joints, best explanation first, each as if only it had moved.
         is_one_body: whether the motion of the first body explains the differences; otherwise more than one body moved.
-        joint: the joint whose zero alone explains the differences as well as the motion of a body; None if there is
-            none.
+        explaining_joint: the joint whose zero alone explains the differences as well as the motion of a body; None if
+            there is none.
     """
 
     probability: float
     bodies: tuple[MovedBody, ...]
     is_one_body: bool
-    joint: MovedBody | None = None
+    explaining_joint: MovedBody | None = None
 
     @cached_property
     def likely_bodies(self) -> tuple[MovedBody, ...]:
         """The body whose motion explains the differences best; several if these cannot be distinguished, or none."""
         if self.probability >= _FALSE_ALARMS:
             return ()
-        if self.joint is not None:
-            return (self.joint,)
+        if self.explaining_joint is not None:
+            return (self.explaining_joint,)
         best = self.bodies[0].log_likelihood
         return tuple(one for one in self.bodies if one.log_likelihood > best - _CERTAIN)
 
@@ -154,7 +156,7 @@ def find_moved_bases(arms: Sequence[ArmBefore]) -> MovedBases:
             raise IdentificationError(
                 expected=f"rows of arm '{arm.posterior.name}' that determine its base in a named frame of its "
                 "calibration",
-                value=Phrase(", ".join(arm.current.fit.solved.geometry.bases)),
+                value=Phrase(", ".join(arm.current_frames.fit.solved.geometry.bases)),
                 remedy="use the same name in the column 'frame', and measure 6 different poses or more",
             )
         for frame in arm.frames:

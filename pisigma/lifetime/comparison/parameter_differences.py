@@ -33,10 +33,10 @@ class ParameterDifference:
         unit: "mm", "deg", "px" or "1", of all figures.
         first: value in the first model.
         second: value in the second model.
-        deviations: posterior standard deviations; None if a model stores no posterior.
+        sigmas: posterior standard deviations; None if a model stores no posterior.
         shift: estimated difference given the significant differences, with base and tool free if these are fitted; None
             without posteriors, or if the parameter moves the tool in the same way as those parameters.
-        deviation: standard deviation of the shift.
+        sigma: standard deviation of the shift.
         p: probability of a shift at least this large by chance, times the number of tested parameters (Bonferroni).
         equivalent: names of parameters with the same effect on the tool.
     """
@@ -45,9 +45,9 @@ class ParameterDifference:
     unit: ShownUnit
     first: float
     second: float
-    deviations: tuple[float | None, float | None]
+    sigmas: tuple[float | None, float | None]
     shift: float | None = None
-    deviation: float | None = None
+    sigma: float | None = None
     p: float | None = None
     equivalent: tuple[str, ...] = ()
 
@@ -80,17 +80,17 @@ class ParameterDifferences:
         differing: significant differences, estimated together; a joint zero counts in the direction of the joint.
         frames: distances and angles by which base and tool of the second model differ, for fitted frames only.
         remainder: test of the remaining displacement; None without posteriors.
-        level: family-wise significance level.
+        significance_level: family-wise significance level.
     """
 
     parameters: tuple[ParameterDifference, ...]
     differing: tuple[Difference, ...]
     frames: tuple[Movement, ...]
     remainder: Remainder | None
-    level: float
+    significance_level: float
 
 
-def parameter_differences(pair: ModelPair, level: float = _LEVEL) -> ParameterDifferences:
+def parameter_differences(pair: ModelPair, significance_level: float = _LEVEL) -> ParameterDifferences:
     """Test which parameters of two models differ.
 
     Differences e of the parameters displace the tool by `d = J e`. Under posteriors with covariances `C1` and `C2`, d
@@ -102,20 +102,23 @@ def parameter_differences(pair: ModelPair, level: float = _LEVEL) -> ParameterDi
 
     Args:
         pair: the models.
-        level: family-wise significance level.
+        significance_level: family-wise significance level.
     """
     parameters = _side_by_side(pair)
     if any(model.uncertainty is None and not _is_nominal(model) for model in (pair.first, pair.second)):
-        return ParameterDifferences(parameters, (), (), None, level)
+        return ParameterDifferences(parameters, (), (), None, significance_level)
     effects = ParameterEffects(pair)
-    threshold = NormalDist().inv_cdf(1 - level / (2 * max(len(effects.tested), 1)))
+    threshold = NormalDist().inv_cdf(1 - significance_level / (2 * max(len(effects.tested), 1)))
     chosen: list[int] = []
     while float((scores := effects.standard_scores(chosen)).abs().amax()) > threshold:
         chosen.append(int(scores.abs().argmax()))
     p = effects.unexplained_probability(chosen)
     tested = (_tested(effects, number, one, chosen, parameters) for number, one in enumerate(parameters))
     return ParameterDifferences(
-        tuple(tested), *effects.estimate_shifts(chosen), remainder=Remainder(p, p < level), level=level
+        tuple(tested),
+        *effects.estimate_shifts(chosen),
+        remainder=Remainder(p, p < significance_level),
+        significance_level=significance_level,
     )
 
 
@@ -137,7 +140,7 @@ def _tested(
     return replace(
         parameter,
         shift=shift * factor,
-        deviation=deviation * factor,
+        sigma=deviation * factor,
         p=min(chance, 1.0),
         equivalent=tuple(parameters[one].name for one in alike if one < len(parameters)),
     )
@@ -148,9 +151,9 @@ def _side_by_side(pair: ModelPair) -> tuple[ParameterDifference, ...]:
     space = ParameterSpace(nominal_robot(pair.first))
     models = pair.first, pair.second
     values = [model.identified.dh.ravel() for model in models]
-    known = [_deviations(model, space.arm_size) for model in models]
+    known = [_deviations(model, space.arm_parameter_count) for model in models]
     parameters = []
-    for number, parameter in enumerate(space.parameters[: space.arm_size]):
+    for number, parameter in enumerate(space.parameters[: space.arm_parameter_count]):
         unit, factor = SHOWN_UNITS[parameter.unit]
         first, second = (float(those[number]) * factor for those in values)
         own, other = (None if those is None else float(those[number]) * factor for those in known)

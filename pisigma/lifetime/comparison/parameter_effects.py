@@ -116,36 +116,36 @@ class ParameterEffects:
         """Return the other parameters with the same effect as a parameter."""
         return tuple(other for other in self._alike[number].nonzero()[:, 0].tolist() if other != number)
 
-    def shift(self, number: int, given: Sequence[int]) -> tuple[float, float] | None:
+    def shift(self, number: int, explained_parameters: Sequence[int]) -> tuple[float, float] | None:
         """Estimate the shift of a parameter given others, and its standard deviation [m or rad].
 
         Returns:
             The shift and its standard deviation; None if the parameter moves the tool in the same way as the given
             parameters.
         """
-        left, observable = self._left(given)
+        left, observable = self._left(explained_parameters)
         if not bool(observable[number]):
             return None
         size = float(left[:, number].norm())
         return float(left[:, number] @ self._y[:, 0]) / size**2, 1 / size
 
-    def standard_scores(self, given: Sequence[int]) -> Float64[Tensor, " parameters"]:
+    def standard_scores(self, explained_parameters: Sequence[int]) -> Float64[Tensor, " parameters"]:
         """Compute the ratio of shift to standard deviation of every tested parameter given others; 0 if not tested."""
-        left, observable = self._left(given)
+        left, observable = self._left(explained_parameters)
         tested = torch.zeros_like(observable)
         tested[self.tested] = True
         scores: Tensor = (left.t() @ self._y)[:, 0] / left.norm(dim=0).clamp(min=1e-300)
         scores[~(tested & observable)] = 0.0
         return scores
 
-    def unexplained_probability(self, given: Sequence[int]) -> float:
+    def unexplained_probability(self, explained_parameters: Sequence[int]) -> float:
         """Compute the probability that the displacement not explained by the given parameters is due to chance.
 
         The sum of squares is compared with that of normal values with the covariance of the posteriors, by
         Satterthwaite's approximation (1946, Biometrics Bulletin 2(6), 110-114).
         """
-        square = float(self._without(self._y, given).square().sum())
-        M = self._without(self._without(self._M, given).t(), given)
+        square = float(self._without(self._y, explained_parameters).square().sum())
+        M = self._without(self._without(self._M, explained_parameters).t(), explained_parameters)
         mean, half_variance = float(M.trace()), float(M.square().sum())
         if mean <= _ROUND_OFF * float(self._M.trace()):  # the given parameters explain all that is uncertain
             return float(square <= len(self._y))
@@ -264,7 +264,7 @@ def _spread(
         bases={**there.bases, list(there.bases)[number[0]]: base},
         tools={**there.tools, list(there.tools)[number[1]]: tool},
     )
-    columns = replace(known, geometry=geometry).columns(JointState(q), _corrected(model, q), *number)
+    columns = replace(known, geometry=geometry).pose_derivatives(JointState(q), _corrected(model, q), *number)
     return known.covariance_root.left_multiply(columns)
 
 

@@ -29,7 +29,7 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel, Provenance
 from pisigma.model.geometric_model import branches_of
 from pisigma.model.model_posterior import FLEET_PRIOR, ModelPosterior
-from pisigma.model.stored_starts import spread_rows
+from pisigma.model.stored_starts import evenly_spaced_rows
 from pisigma.planning.robot_posterior import Instrument, RobotPosterior
 from pisigma.robot.description import Robot
 
@@ -45,13 +45,13 @@ class FleetPrior:
         model: mean robot, with the uncertainty that applies to a further robot of the fleet.
         population: mean and covariance of the errors between robots.
         names: names of the geometric parameters.
-        odd: indices of robots that were not used, because they are inconsistent with the other robots.
+        inconsistent_robots: indices of robots that were not used, because they are inconsistent with the other robots.
     """
 
     model: CalibratedModel
     population: Population
     names: tuple[str, ...]
-    odd: tuple[int, ...]
+    inconsistent_robots: tuple[int, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,21 +101,21 @@ def fleet_prior(name: str, robot: Robot, fleet: Sequence[Measurements]) -> Fleet
     model = mean_robot(
         name, posterior, population.predictive_distribution(len(fleet) - len(odd)), fleet, noise
     )
-    return FleetPrior(model, population, space.names[: space.arm_size], odd)
+    return FleetPrior(model, population, space.names[: space.arm_parameter_count], odd)
 
 
 def robot_class_population(robot: Robot) -> Population:
     """Return the distribution of errors of a robot's class, see `pisigma.robot.robot_class`."""
     uncertainty = RobotPosterior.from_robot(robot).uncertainty
     usual = select_arm_rows(uncertainty.root, uncertainty.space).square().sum(1)
-    return Population(torch.zeros_like(usual), usual.diag(), uncertainty.space.arm_size)
+    return Population(torch.zeros_like(usual), usual.diag(), uncertainty.space.arm_parameter_count)
 
 
 def select_arm_rows(
     root: Float64[Tensor, "unknowns directions"], space: ParameterSpace
 ) -> Float64[Tensor, "arm directions"]:
     """Return the rows of a root for the arm's parameters and weights, without rows of base, tool and sensors."""
-    return torch.cat([root[: space.arm_size], root[len(space.parameters) :]])
+    return torch.cat([root[: space.arm_parameter_count], root[len(space.parameters) :]])
 
 
 def mean_robot(
@@ -134,16 +134,16 @@ def mean_robot(
         fleet: rows of robots, which define the measured joint values.
         noise: noise of each sensor, see `Adaptation.noise`.
     """
-    usual, size = posterior.uncertainty, population.geometric
+    usual, size = posterior.uncertainty, population.geometric_count
     space, nominal = usual.space, usual.space.robot
     dh = nominal.dh + population.mean[:size].numpy().reshape(nominal.dh.shape)
     mean = nominal.with_geometry(dh=dh)
     correction = _correction(nominal, usual.features, population.mean[size:])
     q = torch.cat([rows.q.cpu() for rows in fleet])
-    starts = spread_rows(torch.unique(q, dim=0))
+    starts = evenly_spaced_rows(torch.unique(q, dim=0))
     root = torch.zeros(len(usual.root), len(population.mean), dtype=torch.float64)
     factor = torch.linalg.cholesky(population.covariance)
-    root[: space.arm_size], root[len(space.parameters) :] = factor[:size], factor[size:]
+    root[: space.arm_parameter_count], root[len(space.parameters) :] = factor[:size], factor[size:]
     frames = {"": np.array(nominal.base)}, {"": np.array(nominal.tool)}
     return CalibratedModel(
         name=name,
@@ -200,10 +200,10 @@ def evidence_of(
     problem = replace(problem, groups=tuple(group for group in problem.groups if group.fixed_size))
     adaptation = adapt(problem)
     values, space = adaptation.values, problem.design.problem.space
-    deviation = values.deviation(adaptation.drift.noise)
+    deviation = values.sigma(adaptation.drift.noise)
     X, y = values.X / deviation[:, None], values.y / deviation
-    others = X[:, space.arm_size : len(space.parameters)]
-    kept = torch.cat([X[:, : space.arm_size], X[:, len(space.parameters) :]], 1)
+    others = X[:, space.arm_parameter_count : len(space.parameters)]
+    kept = torch.cat([X[:, : space.arm_parameter_count], X[:, len(space.parameters) :]], 1)
     inner = others.t() @ others
     inner.diagonal().add_(RELOCATION_PRIOR["m"] ** -2)
     # Base, tool and sensor unknowns differ between robots, so they are eliminated (Schur complement).
@@ -258,7 +258,7 @@ class FleetConsistency:
         errors = torch.from_numpy(posterior.geometry.robot.dh - nominal.dh)
         mean = torch.cat([errors.flatten(), posterior.weights])
         evidence = evidence_of(model, mean, rows)
-        fleet = Population(mean, root @ root.t(), posterior.space.arm_size)
+        fleet = Population(mean, root @ root.t(), posterior.space.arm_parameter_count)
         square, count = fleet.squared_distance(evidence)
         gain = fleet.log_evidence(evidence) - robot_class_population(nominal).log_evidence(evidence)
         return FleetConsistency(float(chi2.sf(square, count)), gain)

@@ -12,7 +12,7 @@ from pisigma.model.model_posterior import FLEET_PRIOR
 from pisigma.validation.held_out.summary import AbstractSummary
 
 
-class CommonFigures(Section):
+class ParameterErrorFigures(Section):
     """Distribution of a parameter's error in the fleet.
 
     Attributes:
@@ -60,7 +60,7 @@ class FleetPriorSummary(AbstractSummary):
     refused: dict[str, str] = Field(default_factory=dict)
     remarks: tuple[str, ...] = ()
     rows: int
-    parameters: tuple[CommonFigures, ...]
+    parameters: tuple[ParameterErrorFigures, ...]
     spectrum: tuple[WeightSpreadFigures, ...]
 
     @property
@@ -85,8 +85,8 @@ def summarise_prior(prior: FleetPrior, ids: Sequence[str]) -> FleetPriorSummary:
     for number, name in enumerate(prior.names):
         unit, scale = SHOWN_UNITS[uncertainty.space.parameters[number].unit]
         mean, spread = float(population.mean[number]) * scale, float(deviation[number]) * scale
-        parameters.append(CommonFigures(name=name, unit=unit, mean=mean, deviation=spread))
-    weights, start, spectrum = deviation[population.geometric :], 0, []
+        parameters.append(ParameterErrorFigures(name=name, unit=unit, mean=mean, deviation=spread))
+    weights, start, spectrum = deviation[population.geometric_count :], 0, []
     for feature in uncertainty.features:
         group = feature.group[feature.used]
         chosen = weights[start : start + len(group)]
@@ -95,8 +95,8 @@ def summarise_prior(prior: FleetPrior, ids: Sequence[str]) -> FleetPriorSummary:
             size = float(chosen[group == number].square().mean().sqrt())
             spectrum.append(WeightSpreadFigures(group=f"{feature.name}: {what}", deg=math.degrees(size)))
     return FleetPriorSummary(
-        robots=len(ids) - len(prior.odd),
-        odd=tuple(ids[number] for number in prior.odd),
+        robots=len(ids) - len(prior.inconsistent_robots),
+        odd=tuple(ids[number] for number in prior.inconsistent_robots),
         rows=prior.model.provenance.rows,
         parameters=tuple(parameters),
         spectrum=tuple(spectrum),

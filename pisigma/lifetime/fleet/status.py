@@ -62,7 +62,7 @@ class FleetStatus:
         return tuple(sorted(known, key=lambda one: -(one[1].rms_mm or 0.0)))
 
     @property
-    def action(self) -> bool:
+    def needs_action(self) -> bool:
         """Whether a cell needs attention, has steps that `pisigma fleet run` carries out, or cannot be read."""
         return bool(self.unreadable) or any(one.step.state in ATTENTION or one.is_due for one in self.cells)
 

@@ -49,7 +49,7 @@ class Chart:
         what: charted quantity, such as "joint 2" or "error".
         unit: unit of the values.
         values: value in each session; NaN if the session does not determine it.
-        deviations: standard deviations of the values if nothing changes.
+        sigmas: standard deviations of the values if nothing changes.
         scores: scores of the sessions, which are independent with standard deviation 1 if nothing changes.
         limits: limits of EWMA and CUSUM.
         one_sided: whether only an increase counts.
@@ -58,7 +58,7 @@ class Chart:
     what: str
     unit: ShownUnit
     values: Float64[Tensor, " sessions"]
-    deviations: Float64[Tensor, " sessions"]
+    sigmas: Float64[Tensor, " sessions"]
     scores: Float64[Tensor, " sessions"]
     limits: Limits
     one_sided: bool = False
@@ -118,7 +118,7 @@ class Chart:
         """Return the chart as plain values, with NaN as None; `dates` are the dates of the sessions."""
         values = {
             f"values_{self.unit}": self.values,
-            f"deviations_{self.unit}": self.deviations,
+            f"deviations_{self.unit}": self.sigmas,
             "scores": self.scores,
             "ewma_of_limit": self.ewma_of_limit,
             "cusum_of_limit": self.cusum_of_limit,
@@ -203,7 +203,7 @@ _MIN_SQUARE = 1e-9
 
 
 @dataclass(frozen=True)
-class Event:
+class SeriesChange:
     """A change in a series of values.
 
     Attributes:
@@ -244,12 +244,12 @@ class Series:
         return (of_coefficients @ A.t() @ y)[:, 0].tolist(), of_coefficients.diagonal().sqrt().tolist()
 
     def with_events(
-        self, columns: Float64[Tensor, "values columns"], events: tuple[Event, ...]
+        self, columns: Float64[Tensor, "values columns"], events: tuple[SeriesChange, ...]
     ) -> Float64[Tensor, "values more"]:
         """Append the columns of events."""
         return torch.cat([columns, *(one.column(len(self.values))[:, None] for one in events)], 1)
 
-    def events(self, base_columns: Tensor, drift: Tensor) -> tuple[tuple[Event, ...], bool]:
+    def events(self, base_columns: Tensor, drift: Tensor) -> tuple[tuple[SeriesChange, ...], bool]:
         """Find the events, and whether there is also a drift.
 
         Both with and without a drift, events are added one by one, each time the event that explains most, as long as
@@ -265,9 +265,9 @@ class Series:
         drifts = left_with_drift + drift.shape[1] * math.log(len(self.values)) < left
         return (drift_events, True) if drifts else (steady_events, False)
 
-    def _added(self, columns: Tensor) -> tuple[tuple[Event, ...], float]:
+    def _added(self, columns: Tensor) -> tuple[tuple[SeriesChange, ...], float]:
         """Add events to columns; return the events, and the remaining sum of squares plus a penalty."""
-        count, chosen = len(self.values), tuple[Event, ...]()
+        count, chosen = len(self.values), tuple[SeriesChange, ...]()
         penalty = 2 * math.log(max(len(self._tried), 1)) + math.log(count)
         while columns.shape[1] + len(chosen) + _MIN_DEGREES_OF_FREEDOM < count and len(chosen) < _MAX_EVENTS:
             best, gain = self._best(columns, chosen)
@@ -277,7 +277,7 @@ class Series:
         left, _ = self._left(columns, chosen)
         return chosen, float(left.square().sum()) + penalty * len(chosen)
 
-    def _exchanged(self, columns: Tensor, chosen: tuple[Event, ...]) -> tuple[Event, ...]:
+    def _exchanged(self, columns: Tensor, chosen: tuple[SeriesChange, ...]) -> tuple[SeriesChange, ...]:
         """Return the events after exchanging them for better ones until no exchange improves the fit."""
         for _ in range(_MAX_EXCHANGES):
             before = chosen
@@ -288,7 +288,7 @@ class Series:
                 break
         return chosen
 
-    def _best(self, columns: Tensor, chosen: tuple[Event, ...]) -> tuple[Event, float]:
+    def _best(self, columns: Tensor, chosen: tuple[SeriesChange, ...]) -> tuple[SeriesChange, float]:
         """Return the event that explains most given other events, and the resulting decrease of the sum of squares."""
         left, Q = self._left(columns, chosen)
         tried = self.whiten(torch.stack([one.column(len(self.values)) for one in self._tried], 1))
@@ -300,17 +300,17 @@ class Series:
         number = int(gain.argmax())
         return self._tried[number], float(gain[number])
 
-    def _left(self, columns: Tensor, events: tuple[Event, ...]) -> tuple[Tensor, Tensor]:
+    def _left(self, columns: Tensor, events: tuple[SeriesChange, ...]) -> tuple[Tensor, Tensor]:
         """Return the whitened residuals of the values, and an orthonormal basis of the fitted columns."""
         y, A = self.whiten(self.values[:, None])[:, 0], self.whiten(self.with_events(columns, events))
         Q = torch.linalg.qr(A)[0]
         return y - Q @ (Q.t() @ y), Q
 
     @cached_property
-    def _tried(self) -> tuple[Event, ...]:
+    def _tried(self) -> tuple[SeriesChange, ...]:
         """Candidate events: jumps before every value except the first, and single values except the first and last."""
         count = len(self.values)
         return (
-            *(Event(number, False) for number in range(1, count)),
-            *(Event(number, True) for number in range(1, count - 1)),
+            *(SeriesChange(number, False) for number in range(1, count)),
+            *(SeriesChange(number, True) for number in range(1, count - 1)),
         )

@@ -22,7 +22,7 @@ _SESSION = TypeAdapter(Session)
 _VALUES = ("numbers", "steps", "kind", "file")
 _ZEROS = {
     "shift": "shift",
-    "deviation": "deviation",
+    "sigma": "deviation",
     "model_sensitivity": "influence",
     "session_covariance": "own",
 }
@@ -60,7 +60,7 @@ class Record:
             "date": self.date,
             "rows": session.rows,
             "verdict": session.verdict,
-            "unchanged_probability": session.unchanged,
+            "unchanged_probability": session.unchanged_probability,
             "moved": [one.to_json() for one in session.moved],
             "candidates": [{"what": what, "probability": share} for what, share in session.candidates],
             "unobservable": [f"joint {k}" for k, seen in enumerate(session.observable, 1) if not seen],
@@ -120,10 +120,10 @@ def _entry(model: str, record: Record) -> MonitoredSession:
         rows=session.rows,
         temperature_c=record.temperature_c,
         verdict=session.verdict,
-        unchanged=session.unchanged,
+        unchanged=session.unchanged_probability,
         rms_mm=session.rms * 1e3,
         rms_after_mm=session.rms_after * 1e3,
-        session=_SESSION.dump_json(session).decode(),
+        session=_SESSION.dump_json(session, by_alias=True).decode(),
         arrays=_packed(record.zeros, record.values),
     )
 

@@ -4,14 +4,15 @@ import math
 from collections.abc import Mapping, Set
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
 from jaxtyping import Float64
+from pydantic import Field
 from torch import Tensor
 
 from pisigma.calibration.hybrid.refinement import linearise_rows
-from pisigma.estimation.alternatives import Explanation, Motion, SessionEvidence
+from pisigma.estimation.alternatives import Explanation, GroupMotion, SessionEvidence
 from pisigma.estimation.drift import Drift, DriftGroup, LinearValues, PosteriorUpdate
 from pisigma.estimation.wrong_rows import ExplainedRows, mark_wrong_rows
 from pisigma.files.errors import IdentificationError
@@ -53,14 +54,14 @@ class JointZeros:
 
     Attributes:
         shift: shifts [rad or m].
-        deviation: standard deviations, including the uncertainty of the model and the prior of about 1 deg [rad or m].
+        sigma: standard deviations, including the uncertainty of the model and the prior of about 1 deg [rad or m].
         model_sensitivity: derivatives of the shifts with respect to the directions of the model's uncertainty, which
             all sessions share.
         session_covariance: covariance due to the noise and the moved bases and tools of this session.
     """
 
     shift: Float64[Tensor, " dof"]
-    deviation: Float64[Tensor, " dof"]
+    sigma: Float64[Tensor, " dof"]
     model_sensitivity: Float64[Tensor, "dof directions"]
     session_covariance: Float64[Tensor, "dof dof"]
 
@@ -71,7 +72,7 @@ class Session:
 
     Attributes:
         rows: number of rows.
-        unchanged: probability that no part moved.
+        unchanged_probability: probability that no part moved.
         moved: movements; movements of the arm come first.
         candidates: names and probabilities of possible movements if these are ambiguous; otherwise empty.
         rms: RMS position error under the model, with the current base and tool [m].
@@ -80,7 +81,7 @@ class Session:
             measured.
         error_score: RMS of the errors divided by their standard deviations; about 1 if nothing changed.
         values: number of measured values.
-        standing: names of bases and tools that were moved since the model was made.
+        relocated_frames: names of bases and tools that were moved since the model was made.
         observable: whether the rows determine the zero of each joint.
         outliers: file and line of rows that are not used because they contradict the other rows under any movement.
         score_ratio: for images, whose poses have more noise than error, RMS ratio of values to their standard
@@ -88,7 +89,7 @@ class Session:
     """
 
     rows: int
-    unchanged: float
+    unchanged_probability: Annotated[float, Field(alias="unchanged")]  # histories store the keys
     moved: tuple[HistoryMovement, ...]
     candidates: tuple[tuple[str, float], ...]
     rms: float
@@ -96,7 +97,7 @@ class Session:
     rotation_ratio: float
     error_score: float
     values: int
-    standing: tuple[str, ...]
+    relocated_frames: Annotated[tuple[str, ...], Field(alias="standing")]
     observable: tuple[bool, ...]
     outliers: tuple[str, ...] = ()
     score_ratio: float = 1.0
@@ -140,7 +141,7 @@ class Session:
         last, sentences = len(self.observable), []
         for number, observable in enumerate(self.observable, 1):
             frame = {1: "base", last: "tool"}.get(number, "")
-            if not observable and frame and any(name.split()[0] == frame for name in self.standing):
+            if not observable and frame and any(name.split()[0] == frame for name in self.relocated_frames):
                 sentences.append(
                     f"The zero of joint {number} cannot be distinguished from the {frame}, which has been moved "
                     "since the model was made."
@@ -159,7 +160,7 @@ def judge_session(
     model: CalibratedModel,
     posterior: ModelPosterior,
     rows: Measurements,
-    stated: Set[FrameKey] | None = None,
+    relocated: Set[FrameKey] | None = None,
 ) -> tuple[Session, JointZeros]:
     """Compare, by their evidence, all movements that may have happened since a model was made.
 
@@ -167,7 +168,7 @@ def judge_session(
         model: the model.
         posterior: posterior of the model.
         rows: rows of one session, frames and targets by the names of the model.
-        stated: bases and tools that were moved since the model was made; None to find them by evidence.
+        relocated: bases and tools that were moved since the model was made; None to find them by evidence.
 
     Returns:
         The result of the session, and the zeros of all joints for charts.
@@ -176,9 +177,9 @@ def judge_session(
         IdentificationError: there are no usable rows, or too few to guess a moved base or tool.
         PoseError: the joint values do not fit the robot.
     """
-    solved = _solve(model, posterior, rows, stated or frozenset())
-    probabilities = dict.fromkeys(stated or (), 1.0)
-    if stated is None and solved.frame_moved:
+    solved = _solve(model, posterior, rows, relocated or frozenset())
+    probabilities = dict.fromkeys(relocated or (), 1.0)
+    if relocated is None and solved.frame_moved:
         solved, probabilities = _with_relocated(model, posterior, rows, solved)
     return _judged(solved, probabilities), _zeros(solved)
 
@@ -216,7 +217,7 @@ class _Solved:
         return self.explanation.noise_factor <= _MAX_NOISE_FACTOR
 
     @property
-    def probable_movements(self) -> tuple[Motion, ...]:
+    def probable_movements(self) -> tuple[GroupMotion, ...]:
         """Movements, or only the most probable one if they are ambiguous."""
         return self.explanation.motions or self.explanation.candidates[:1]
 
@@ -236,7 +237,7 @@ class _Solved:
 
     def score_ratio(self, before: tuple[DriftGroup, ...], after: tuple[DriftGroup, ...]) -> float:
         """Compute the ratio of the RMS standardised residuals that two sets of movements leave."""
-        values, deviation = self.values, self.values.deviation(self.noise)
+        values, deviation = self.values, self.values.sigma(self.noise)
         left = [values.y - values.X @ (self.unknowns(those) - self.problem.mean) for those in (before, after)]
         first, second = (float((one / deviation).square().mean().sqrt()) for one in left)
         return first / second if second > 0 else 1.0
@@ -260,10 +261,10 @@ def _solve(
     wrong: Mapping[int, float] = {}
     for _ in range(_MAX_LINEARISATIONS):
         values = linear_values(problem, linearise_rows(problem.design, x, 0.0, group))
-        solved = _explained(problem, noise, replace(values, wrong=wrong))
-        values, wrong = solved.values, solved.values.wrong
+        solved = _explained(problem, noise, replace(values, wrong_configurations=wrong))
+        values, wrong = solved.values, solved.values.wrong_configurations
         there = solved.unknowns(tuple(_sized(one) for one in solved.probable_movements))
-        step = values.X @ (there - x) / values.deviation(noise)
+        step = values.X @ (there - x) / values.sigma(noise)
         x = there
         if float(step.square().mean().sqrt()) < _CONVERGENCE_TOLERANCE or (
             solved.frame_moved and not relocated
@@ -285,16 +286,16 @@ def _explained(
         solved = _Solved(problem, there, noise, evidence, explanation)
         factor = explanation.noise_factor
         V = evidence.covariance([_sized(one) for one in solved.probable_movements], factor)
-        return ExplainedRows(solved, there, explanation.log_evidence, V, factor * there.deviation(noise))
+        return ExplainedRows(solved, there, explanation.log_evidence, V, factor * there.sigma(noise))
 
-    return mark_wrong_rows(explain(values.wrong), explain).what
+    return mark_wrong_rows(explain(values.wrong_configurations), explain).what
 
 
-def _sized(motion: Motion) -> DriftGroup:
+def _sized(motion: GroupMotion) -> DriftGroup:
     return replace(motion.group, size=motion.size)
 
 
-def _freed(motion: Motion) -> DriftGroup:
+def _freed(motion: GroupMotion) -> DriftGroup:
     """Return the group of a movement, with a prior of at least `ZERO_PRIOR`."""
     return replace(motion.group, size=max(motion.size, ZERO_PRIOR))
 
@@ -310,13 +311,13 @@ def _judged(solved: _Solved, relocated: dict[FrameKey, float]) -> Session:
     before = solved.arm_with(frames)
     (rms, angle), (rms_after, angle_after) = (_rms(arm, rows) for arm in (before, solved.arm_with(motions)))
     count = len(solved.values.y)
-    determined = sum(len(group.index) for group in of_arm if group.single)
+    determined = sum(len(group.index) for group in of_arm if group.is_one_motion)
     optimism = math.sqrt(
         count / max(count - determined, 1)
     )  # residuals are too small, because the rows determined the movement
     return Session(
         rows=every.rows,
-        unchanged=explanation.unchanged,
+        unchanged_probability=explanation.unchanged_probability,
         moved=_moved(solved, relocated),
         candidates=tuple((one.group.what, one.probability) for one in explanation.candidates),
         rms=rms,
@@ -325,7 +326,7 @@ def _judged(solved: _Solved, relocated: dict[FrameKey, float]) -> Session:
         score_ratio=solved.score_ratio(frames, motions) / optimism if "corner" in every.kinds else 1.0,
         error_score=evidence.with_moved(solved.moved_frames).error_score(),
         values=len(solved.values.y),
-        standing=tuple(" ".join(owner).strip() for owner in relocated),
+        relocated_frames=tuple(" ".join(owner).strip() for owner in relocated),
         observable=tuple(
             float(evidence.estimate_shift([group], explanation.noise_factor)[1].sqrt())
             < _UNOBSERVABLE * float(group.scale)

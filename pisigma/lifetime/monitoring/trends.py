@@ -11,7 +11,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from pisigma.estimation.drift import NOISE_SPREAD
-from pisigma.lifetime.monitoring.charts import Chart, Event, Series, innovations, limits_of
+from pisigma.lifetime.monitoring.charts import Chart, Series, SeriesChange, innovations, limits_of
 from pisigma.lifetime.monitoring.history import Record
 from pisigma.lifetime.recalibration.movement import CLEAR, NORMAL_95
 from pisigma.measurement.sensors.sensor import SHOWN_UNITS, ShownUnit
@@ -35,30 +35,30 @@ class Trend:
         per: "month" or "kelvin".
         unit: unit of the change per month or kelvin.
         slope: change per month or kelvin [`unit`].
-        deviation: standard deviation of the slope [`unit`].
+        sigma: standard deviation of the slope [`unit`].
     """
 
     what: str
     per: Literal["month", "kelvin"]
     unit: ShownUnit
     slope: float
-    deviation: float
+    sigma: float
 
     @property
     def is_significant(self) -> bool:
         """Whether the drift is significant."""
-        return abs(self.slope) > CLEAR * self.deviation
+        return abs(self.slope) > CLEAR * self.sigma
 
     @property
     def interval(self) -> tuple[float, float]:
         """95 % confidence interval of the slope."""
-        half = NORMAL_95 * self.deviation
+        half = NORMAL_95 * self.sigma
         return self.slope - half, self.slope + half
 
     @property
     def sentence(self) -> str:
         """Sentence that states the drift."""
-        half = NORMAL_95 * self.deviation
+        half = NORMAL_95 * self.sigma
         return f"{self.what} drifts by {self.slope:.4f} ± {half:.4f} {self.unit} per {self.per}"
 
     def to_json(self) -> dict[str, Any]:
@@ -80,7 +80,7 @@ class Jump:
         what: quantity that jumped, such as "joint 2".
         unit: unit of the jump.
         size: size of the jump [`unit`].
-        deviation: standard deviation of the size [`unit`].
+        sigma: standard deviation of the size [`unit`].
         before: date of the last session before the jump.
         after: date of the first session after the jump.
         is_single_session: whether only that session deviates.
@@ -89,7 +89,7 @@ class Jump:
     what: str
     unit: ShownUnit
     size: float
-    deviation: float
+    sigma: float
     before: str
     after: str
     is_single_session: bool = False
@@ -97,7 +97,7 @@ class Jump:
     @property
     def sentence(self) -> str:
         """Sentence that states the change."""
-        half = NORMAL_95 * self.deviation
+        half = NORMAL_95 * self.sigma
         if self.is_single_session:
             return f"{self.what} deviated by {self.size:.4f} ± {half:.4f} {self.unit} on {self.after} only"
         return f"{self.what} jumped by {self.size:.4f} ± {half:.4f} {self.unit} between {self.before} and {self.after}"
@@ -107,7 +107,7 @@ class Jump:
         return {
             "what": self.what,
             f"size_{self.unit}": self.size,
-            f"deviation_{self.unit}": self.deviation,
+            f"deviation_{self.unit}": self.sigma,
             "before": self.before,
             "after": self.after,
             "is_single_session": self.is_single_session,
@@ -247,7 +247,7 @@ class _Zero:
     series: Series
     sessions: list[int]
     columns: Float64[Tensor, "values columns"]
-    events: tuple[Event, ...]
+    events: tuple[SeriesChange, ...]
     drifts: bool
 
     @staticmethod

@@ -102,7 +102,7 @@ class Adaptation:
         """Root of the posterior covariance of all unknowns in the user's coordinates, parameters first."""
         root = torch.cat([self.update.root(), self.problem.fixed_root], 1)
         active = self.problem.design.active
-        return torch.cat([self.problem.change @ root[:active], root[active:]])
+        return torch.cat([self.problem.coordinate_change @ root[:active], root[active:]])
 
     @property
     def noise(self) -> CalibrationNoise:
@@ -121,36 +121,36 @@ class Adaptation:
 
 def adapt(
     problem: RecalibrationProblem,
-    usual: Float64[Tensor, " sensors"] | None = None,
+    initial_noise: Float64[Tensor, " sensors"] | None = None,
     start: Drift | None = None,
 ) -> Adaptation:
     """Adapt a model to new rows.
 
     Args:
         problem: rows and prior.
-        usual: noise of each sensor [m or rad], or a factor if the rows state it; None for `usual_noise`.
+        initial_noise: noise of each sensor [m or rad], or a factor if the rows state it; None for `usual_noise`.
         start: initial sizes and noise, for example from other rows of the session; None for zero drift.
     """
     design, mean = problem.design, problem.mean
-    usual = usual_noise(problem) if usual is None else usual
+    initial_noise = usual_noise(problem) if initial_noise is None else initial_noise
     group = held_out_groups(problem.setup.measurements)
     x, effective = mean, 0.0
     wrong: Mapping[int, float] = {}
-    drift = start or Drift(problem.groups, usual)
+    drift = start or Drift(problem.groups, initial_noise)
     drift = replace(drift, groups=_with_sizes(problem.groups, drift.groups))
     rounds = 0
     while rounds < _MAX_LINEARISATIONS:
         rounds += 1
         rows = linearise_rows(design, x, effective, group)
-        values = replace(linear_values(problem, rows), wrong=wrong)
+        values = replace(linear_values(problem, rows), wrong_configurations=wrong)
         # Sizes of the drift and wrong rows are estimated first, because both determine how far the posterior may follow
         # the values.
-        search = _searched(problem, values, drift, usual)
-        drift, wrong = search.drift, search.values.wrong
-        values = replace(values, wrong=wrong)
+        search = _searched(problem, values, drift, initial_noise)
+        drift, wrong = search.drift, search.values.wrong_configurations
+        values = replace(values, wrong_configurations=wrong)
         update = PosteriorUpdate(problem.root, values, drift)
         # Convergence is assessed with predicted values, because poorly determined unknowns may still wander.
-        step = values.X @ (mean + update.shift - x) / values.deviation(drift.noise)
+        step = values.X @ (mean + update.shift - x) / values.sigma(drift.noise)
         x, effective = mean + update.shift, update.effective_unknowns
         if float(step.square().mean().sqrt()) < _CONVERGENCE_TOLERANCE:
             break
@@ -211,9 +211,9 @@ def _searched(
     A = values.X @ problem.root
 
     def explain(wrong: Mapping[int, float]) -> ExplainedRows[DriftSearch]:
-        there = replace(values, wrong=wrong)
+        there = replace(values, wrong_configurations=wrong)
         search = DriftSearch(there, A, drift.groups, drift.noise, usual)
         search.estimate_sizes()
-        return ExplainedRows(search, there, search.log_evidence, search.covariance, search.deviation)
+        return ExplainedRows(search, there, search.log_evidence, search.covariance, search.sigma)
 
-    return mark_wrong_rows(explain(values.wrong), explain).what
+    return mark_wrong_rows(explain(values.wrong_configurations), explain).what

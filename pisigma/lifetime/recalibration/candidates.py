@@ -27,7 +27,7 @@ from pisigma.measurement.splits import k_folds
 from pisigma.model.calibrated_model import CalibratedModel, Frames, Provenance
 from pisigma.model.geometric_model import branches_of
 from pisigma.model.model_posterior import FLEET_PRIOR
-from pisigma.model.stored_starts import spread_rows
+from pisigma.model.stored_starts import evenly_spaced_rows
 from pisigma.model.training_rows import stored_training_rows
 from pisigma.robot.robot_class import plausible_share
 from pisigma.robot.se3 import invert, transform_from_xyzrpy, xyzrpy_from_transform
@@ -77,7 +77,7 @@ class CandidateChoice:
     names: Mapping[Kept, str] = field(default_factory=lambda: NAMES)
 
     @property
-    def updates(self) -> bool:
+    def updates_model(self) -> bool:
         """Whether the recalibrated model predicts held-out rows better than the old model by more than 5 %."""
         old, new = self.rms["old"], self.rms["recalibrated"]
         return old is not None and new is not None and self.kept != "old" and old > MIN_RATIO * new
@@ -221,7 +221,7 @@ def recalibrated_model(model: CalibratedModel, adaptation: Adaptation, rows: Mea
     solved = adaptation.arm.geometry
     geometry = IdentifiedGeometry(solved.robot, solved.bases, solved.tools, solved.unknowns)
     calibrated, bases, tools = geometry.robot, geometry.bases, geometry.tools
-    starts = spread_rows(torch.unique(torch.cat([model.starts.double(), rows.q.cpu()]), dim=0))
+    starts = evenly_spaced_rows(torch.unique(torch.cat([model.starts.double(), rows.q.cpu()]), dim=0))
     hybrid = None
     if model.hybrid is not None and adaptation.arm.correction is not None:
         assert model.calibrated is not None
@@ -291,31 +291,31 @@ def _transforms(frames: Mapping[str, np.ndarray]) -> dict[str, torch.Tensor]:
 
 def recalibration_diagnostics(
     parent: CalibratedModel,
-    judged: CandidateChoice,
+    choice: CandidateChoice,
     rows: Measurements,
     adaptation: Adaptation,
-    wrong: Sequence[int],
+    wrong_rows: Sequence[int],
     moved: Sequence[Movement],
 ) -> tuple[Diagnostic, ...]:
     """Return findings that state why the result is implausible although the checks of the rows found nothing.
 
     Args:
         parent: model that was recalibrated.
-        judged: errors of held-out rows.
+        choice: errors of held-out rows.
         rows: all rows.
         adaptation: adaptation of the model to the rows that were not left out.
-        wrong: indices of the rows that were left out.
+        wrong_rows: indices of the rows that were left out.
         moved: movements that were found.
     """
-    if len(wrong) > MIN_WRONG_SHARE * rows.rows:
+    if len(wrong_rows) > MIN_WRONG_SHARE * rows.rows:
         chosen = torch.zeros(rows.rows, dtype=torch.bool)
-        chosen[list(wrong)] = True
+        chosen[list(wrong_rows)] = True
         return (too_many_wrong_rows(rows, chosen),)
-    if judged.kept == "scratch" and (
+    if choice.kept == "scratch" and (
         implausible := check_rows(rows, parent.nominal or parent.robot).implausible
     ):
         return implausible
-    return (*_large_errors(parent, judged, adaptation), *excessive_change_diagnostics(parent.robot, moved))
+    return (*_large_errors(parent, choice, adaptation), *excessive_change_diagnostics(parent.robot, moved))
 
 
 def _large_errors(

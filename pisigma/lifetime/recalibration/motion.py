@@ -28,7 +28,7 @@ _MAX_ROWS = 60
 """Largest number of rows that are used, because the covariance of all their values is needed."""
 
 
-def judged_motion(
+def find_motion(
     model: CalibratedModel, rows: Measurements, fitted: Collection[FrameKind] = ()
 ) -> Session | None:
     """Find the joints, lengths, base or tool that have moved since a model was made; see `judge_session`.
@@ -128,11 +128,11 @@ def excessive_change_diagnostics(robot: Robot, moved: Sequence[Movement]) -> tup
     Bases, tools and the zero of a single joint may move by any amount.
 
     Args:
-        robot: robot, whose class states the limits; see `RobotClass.change`.
+        robot: robot, whose class states the limits; see `RobotClass.max_changes`.
         moved: movements that were found.
     """
     of_class = RobotClass.from_robot(robot)
-    far = [one for one in moved if not is_frame(one.what) and _is_beyond(one, of_class.change)]
+    far = [one for one in moved if not is_frame(one.what) and _is_beyond(one, of_class.max_changes)]
     if not far or (len(far) == 1 and far[0].what.startswith("joint ")):
         return ()
     changes = join_words(f"{one.what} by {one.size}" for one in far)

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import numpy as np
 import torch
 from jaxtyping import Float64
-from pydantic import BeforeValidator, PlainSerializer
+from pydantic import BeforeValidator, Field, PlainSerializer
 from torch import Tensor
 
 from pisigma.calibration.geometric.problem.setup import IdentifiedGeometry
@@ -32,32 +32,32 @@ class Movement:
         what: name of what moved, such as "joint 3", "a_2", "base" or "tool".
         shift: signed change of a joint zero or parameter [`unit`]; a joint zero counts in the positive direction of the
             joint. For a base or a tool, the distance between its origins or the angle of its rotation.
-        deviation: standard deviation of the shift [`unit`].
+        sigma: standard deviation of the shift [`unit`].
         unit: "mm" or "deg"; a base or a tool has a movement in each unit.
         probability: posterior probability of this explanation among all others; None if it was not computed.
     """
 
     what: str
     shift: float
-    deviation: float
+    sigma: Annotated[float, Field(alias="deviation")]  # histories store the key
     unit: ShownUnit
     probability: float | None = None
 
     @property
     def interval(self) -> tuple[float, float]:
         """95 % confidence interval of the shift [`unit`]."""
-        half = NORMAL_95 * self.deviation
+        half = NORMAL_95 * self.sigma
         return self.shift - half, self.shift + half
 
     @property
     def is_significant(self) -> bool:
         """Whether the shift is above `CLEAR` standard deviations."""
-        return abs(self.shift) > CLEAR * self.deviation
+        return abs(self.shift) > CLEAR * self.sigma
 
     @property
     def size(self) -> str:
         """Shift, half-width of its 95 % interval and unit, such as "0.25 ± 0.01 deg"."""
-        half = NORMAL_95 * self.deviation
+        half = NORMAL_95 * self.sigma
         digits = min(max(1 - math.floor(math.log10(max(half, 1e-6))), 0), 4)
         shown = max(half, 10.0**-digits)  # never an uncertainty of 0
         return f"{self.shift:.{digits}f} ± {shown:.{digits}f} {self.unit}"

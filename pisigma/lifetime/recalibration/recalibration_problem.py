@@ -70,7 +70,8 @@ class RecalibrationProblem:
         design: unknowns: all parameters of the model and the rows, and the weights of the correction.
         mean: prior mean of the unknowns, with parameters relative to `design.problem.nominal`.
         root: root of the prior covariance of the unknowns, with parameters relative to the anchors of the setup.
-        change: derivative of the parameters in the user's coordinates with respect to the problem's parameters.
+        coordinate_change: derivative of the parameters in the user's coordinates with respect to the problem's
+            parameters.
         groups: groups that may drift, with size 0, and moved bases and tools.
         fixed_root: root of the covariance of unknowns that are held fixed.
     """
@@ -80,7 +81,7 @@ class RecalibrationProblem:
     design: Design
     mean: Float64[Tensor, " unknowns"]
     root: Float64[Tensor, "unknowns directions"]
-    change: Float64[Tensor, "parameters parameters"]
+    coordinate_change: Float64[Tensor, "parameters parameters"]
     groups: tuple[DriftGroup, ...]
     fixed_root: Float64[Tensor, "unknowns _directions"]
 
@@ -93,7 +94,7 @@ class RecalibrationProblem:
         """Return the mask of rows that are not used: rejected by the loss, or of wrong configurations."""
         wrong = ~torch.isin(self.configuration, values.configuration)
         wrong[torch.tensor([*values.rejected], dtype=torch.int64)] = True
-        return wrong | torch.isin(self.configuration, torch.tensor([*values.wrong]))
+        return wrong | torch.isin(self.configuration, torch.tensor([*values.wrong_configurations]))
 
     def with_fixed_arm(self) -> "RecalibrationProblem":
         """Return the problem with the arm held fixed, in which only moved bases and tools are unknown."""
@@ -275,7 +276,7 @@ def _groups(
         index = torch.arange(parameters, len(root))
         scale = _CORRECTION_SCALE * posterior.rms_weights
         groups.append(
-            DriftGroup("correction", index, scale, log_prior_penalty=_CORRECTION_PENALTY, single=False)
+            DriftGroup("correction", index, scale, log_prior_penalty=_CORRECTION_PENALTY, is_one_motion=False)
         )
     return tuple(group for group in groups if len(group.index))
 
@@ -297,7 +298,7 @@ def _arm_groups(space: ParameterSpace, free: Bool[Tensor, " parameters"]) -> lis
         DriftGroup(f"joint {number}", torch.tensor([index]), torch.tensor([scale], dtype=torch.float64))
         for number, (index, scale) in enumerate(zeros.items(), 1)
     ]
-    others = [index for index in range(space.arm_size) if bool(free[index]) and index not in zeros]
+    others = [index for index in range(space.arm_parameter_count) if bool(free[index]) and index not in zeros]
     for what, lengths in (("lengths", True), ("angles", False)):
         chosen = [one for one in others if (space.parameters[one].group in LENGTHS) is lengths]
         scale = torch.ones(len(chosen), dtype=torch.float64)

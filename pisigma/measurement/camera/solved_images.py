@@ -136,7 +136,7 @@ def corner_noise(poses: Sequence[BoardPose], loss: AbstractLoss) -> float:
     distance = torch.from_numpy(np.concatenate([pose.distance for pose in poses]))
     used = float(POSE * len(poses))
     scale = max(float(loss.scale(distance, 2, used)), MIN_NOISE)
-    return max(float(loss.deviation(distance, 2, used, scale)), MIN_NOISE)
+    return max(float(loss.sigma(distance, 2, used, scale)), MIN_NOISE)
 
 
 @dataclass(frozen=True, eq=False)

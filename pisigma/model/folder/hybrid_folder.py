@@ -71,7 +71,9 @@ def hybrid_sections(model: CalibratedModel) -> dict[str, Any]:
             "features": [chosen.name for chosen in known.features],
             "prior_scale": known.prior_scale,
             "noise": dict(known.noise.value),
-            "stated_noise": None if known.noise.stated is None else dict(known.noise.stated),
+            "stated_noise": None
+            if known.noise.median_stated_sigma is None
+            else dict(known.noise.median_stated_sigma),
         }
     return result
 
@@ -87,7 +89,9 @@ def hybrid_tensors(model: CalibratedModel) -> dict[str, Tensor]:
     if (arm := model.hybrid) is not None:
         result |= _geometry("learned", arm.robot)
         result |= {f"correction.{key}": value for key, value in arm.correction.state_dict().items()}
-        result |= {f"coverage.{name}": getattr(arm.coverage, name) for name in ("joint", "middle", "half")}
+        coverage = arm.coverage
+        result |= {"coverage.joint": coverage.joint, "coverage.middle": coverage.middle}
+        result["coverage.half"] = coverage.half_width
     if (known := model.uncertainty) is not None:
         if (rounded := known.covariance_root.rounded) is None:
             result["uncertainty.root"] = known.root[known.uncertain_unknowns]
@@ -98,13 +102,13 @@ def hybrid_tensors(model: CalibratedModel) -> dict[str, Tensor]:
     return result
 
 
-def check_size(document: ModelDocument, robot: Robot, stored: int) -> None:
+def check_size(document: ModelDocument, robot: Robot, stored_values: int) -> None:
     """Check that the file has enough values for the description, before weights are allocated.
 
     Args:
         document: description of the model.
         robot: robot of the description.
-        stored: number of values in the weights file.
+        stored_values: number of values in the weights file.
 
     Raises:
         MisfitError: the description requires more values.
@@ -115,9 +119,9 @@ def check_size(document: ModelDocument, robot: Robot, stored: int) -> None:
         required += robot.dof * (robot.dof * sum(learned.orders) + 2 * harmonics)
     if document.uncertainty is not None and InputProducts.name in document.uncertainty.features:
         required += robot.dof * math.comb(robot.dof, 2)
-    if required > stored:
+    if required > stored_values:
         raise MisfitError(
-            f"the description requires at least {required:,} weights, but the file has {stored:,} numbers",
+            f"the description requires at least {required:,} weights, but the file has {stored_values:,} numbers",
             column="orders",
             value=required,
         )

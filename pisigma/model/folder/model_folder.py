@@ -70,7 +70,7 @@ def save_model(model: CalibratedModel, folder: Path) -> None:
             "joints": [model.robot.joints[index].name for index in group.joints],
             "inputs": list(group.inputs.names),
             "orders": list(network.orders),
-            "reference": group.inputs.reference.tolist(),
+            "reference": group.inputs.reference_rotation.tolist(),
         }
         for group, network in (model.network.members() if model.network else ())
     ]
@@ -92,10 +92,10 @@ def save_model(model: CalibratedModel, folder: Path) -> None:
     (folder / WEIGHTS).write_bytes(weights)
     if model.robot.urdf is not None:
         (folder / DRAWING).write_bytes(model.robot.urdf)
-    describe(document_text(document), model, folder)
+    write_description(document_text(document), model, folder)
 
 
-def describe(text: str, model: CalibratedModel, folder: Path) -> None:
+def write_description(text: str, model: CalibratedModel, folder: Path) -> None:
     """Write the description of a model whose weights are in the folder, and the arrays of the compiled kernels.
 
     Args:

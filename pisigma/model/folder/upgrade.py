@@ -26,7 +26,7 @@ from pisigma.model.folder.model_document import (
     stated_format,
     write_document,
 )
-from pisigma.model.folder.model_folder import describe, load_model, read_weights
+from pisigma.model.folder.model_folder import load_model, read_weights, write_description
 from pisigma.robot.kernels.description_file import read_description
 
 _RENAMED = {
@@ -128,7 +128,7 @@ def upgrade_folder(folder: str | os.PathLike[str], check: Callable[[CalibratedMo
         text = _text_of(document)
         write_document(text, None, scratch / DESCRIPTION)
         model = load_model(scratch)
-        describe(text, model, scratch)
+        write_description(text, model, scratch)
         check(model, scratch)
     return Upgrade(model.name, before, FORMAT, changes)
 
@@ -147,7 +147,7 @@ def _with_new_kernels(
         with staged_folder(path, overwrite=True, names=MODEL_FILES | others) as scratch:
             for name in sorted(others):
                 (scratch / name).write_bytes(read_model_file(path, name))
-            describe(_text_of(document), model, scratch)
+            write_description(_text_of(document), model, scratch)
             check(model, scratch)
     return Upgrade(model.name, FORMAT, FORMAT, changes)
 

@@ -165,7 +165,7 @@ class CompiledIK:
         threads: int | None = None,
         throw: bool = True,
         approach: Any = None,
-        single: bool = False,
+        is_float32: bool = False,
         axes: TaskAxes | None = None,
     ) -> Solution:
         """Find corrected joint values for poses `(*batch, 4, 4)`, using several threads.
@@ -177,7 +177,7 @@ class CompiledIK:
             threads: number of threads; None for one per processor that this process may use.
             throw: see `solve`; if False, invalid rows get the status INVALID_POSE and other rows are solved.
             approach: `(*batch, dof)` or `(dof,)`: see `solve`.
-            single: whether the poses were rounded to float32, which widens the tolerances for rounding.
+            is_float32: whether the poses were rounded to float32, which widens the tolerances for rounding.
             axes: see `solve`.
 
         Raises:
@@ -191,7 +191,7 @@ class CompiledIK:
             self._rows(near, batch, "near", throw),
             self._rows(approach, batch, "approach", True),
         )
-        out = self._solve_rows(T, near_rows, sides, self._branch(branch), 1, threads, throw, single, task)
+        out = self._solve_rows(T, near_rows, sides, self._branch(branch), 1, threads, throw, is_float32, task)
         return self._solution(out.reshape(*batch, out.shape[-1]), task)
 
     def all_branches(
@@ -200,7 +200,7 @@ class CompiledIK:
         threads: int | None = None,
         throw: bool = True,
         approach: Any = None,
-        single: bool = False,
+        is_float32: bool = False,
         axes: TaskAxes | None = None,
     ) -> Solution:
         """Find solutions `(*batch, branches)` of poses `(*batch, 4, 4)` on every branch; see `solve_batch`.
@@ -213,7 +213,9 @@ class CompiledIK:
         sides = self._rows(approach, T.shape[:-2], "approach", True)
         several = not self.description.forms.closed_forms and not self.description.network.used
         count = MAX_SOLUTIONS if several else len(self.branches)
-        out = self._solve_rows(T, self._none, sides, arrays.EVERY_BRANCH, count, threads, throw, single, task)
+        out = self._solve_rows(
+            T, self._none, sides, arrays.EVERY_BRANCH, count, threads, throw, is_float32, task
+        )
         return self._solution(out.reshape(*T.shape[:-2], count, out.shape[-1]), task)
 
     def forward(self, q: Any, arm: int | None = None, approach: Any = None) -> tuple[Any, Any, Any, Any]:

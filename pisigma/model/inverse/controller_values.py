@@ -51,7 +51,7 @@ class ControllerValues:
         Raises:
             PoseError: the arm has passive joints, which are solved only in the default axes.
         """
-        if self.coupling.passive:
+        if self.coupling.has_passive_joints:
             raise PoseError(
                 "axes other than the default ones are not supported for an arm with passive joints",
                 value=axes.ignored,
@@ -71,7 +71,7 @@ class ControllerValues:
             options: other options of `CorrectedIK.__call__`.
         """
         sides = options.get("approach")
-        if self.coupling.passive:
+        if self.coupling.has_passive_joints:
             return self._solve_passive(T, near, owner).with_approach(sides)
         options = self._with_dh_approach(options)
         near_rows = None if near is None else self.coupling.to_dh(np.asarray(near, dtype=np.float64))
@@ -86,7 +86,7 @@ class ControllerValues:
     def all_branches(self, T: Any, owner: Any, **options: Any) -> Solution:
         """Find the controller's values on every branch; see `CorrectedIK.all_branches`."""
         sides = options.get("approach")
-        if self.coupling.passive:
+        if self.coupling.has_passive_joints:
             return self._solve_passive(T[..., None, :, :], None, owner).with_approach(sides, of_branches=True)
         every = self.ik.all_branches(T, **self._with_dh_approach(options))
         q, _ = self._inside(np.asarray(as_array(every.q)), None)
@@ -135,8 +135,8 @@ class ControllerValues:
             np.zeros(batch, dtype=int),
             self.ik.branches[:1],
             np.where(found.reached, int(Status.REACHED), int(Status.UNREACHABLE)).reshape(batch),
-            found.mask_unreached(found.position).reshape(batch),
-            found.mask_unreached(found.rotation).reshape(batch),
+            found.mask_unreached(found.position_error).reshape(batch),
+            found.mask_unreached(found.rotation_error).reshape(batch),
             np.full(batch, np.nan),
             owner,
         )
@@ -215,14 +215,15 @@ class ReachedPoses:
     Attributes:
         q: the controller's values [rad or m].
         reached: whether the pose is reached in all axes that the arm can control.
-        position: distance from the target position [m].
-        rotation: angle to the target orientation [rad], which arms with fewer than six axes control only partially.
+        position_error: distance from the target position [m].
+        rotation_error: angle to the target orientation [rad], which arms with fewer than six axes control only
+            partially.
     """
 
     q: Values
     reached: Bool[np.ndarray, " rows"]
-    position: Float64[np.ndarray, " rows"]
-    rotation: Float64[np.ndarray, " rows"]
+    position_error: Float64[np.ndarray, " rows"]
+    rotation_error: Float64[np.ndarray, " rows"]
 
     def mask_unreached(self, values: np.ndarray) -> np.ndarray:
         """Return values with NaN for poses that are not reached."""

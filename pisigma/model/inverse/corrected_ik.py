@@ -172,7 +172,7 @@ class CorrectedIK(AbstractInverse):
             solution = kernels.solve(T, near, branch, throw, approach, self, axes)
         else:
             solution = (kernels or self.numeric).solve_batch(
-                T, near=near, branch=branch, throw=throw, approach=approach, single=single, axes=axes
+                T, near=near, branch=branch, throw=throw, approach=approach, is_float32=single, axes=axes
             )
         return self._like(tensor, solution, axes).with_approach(approach)
 
@@ -186,7 +186,7 @@ class CorrectedIK(AbstractInverse):
             return self.controller.all_branches(T_base_tool, self, approach=approach)
         T, single, tensor = pose_array(T_base_tool)
         route = self.compiled or self.numeric
-        every = route.all_branches(T, approach=approach, single=single, axes=self.task_axes)
+        every = route.all_branches(T, approach=approach, is_float32=single, axes=self.task_axes)
         return self._like(tensor, every, self.task_axes).with_approach(approach, of_branches=True)
 
     def path(

@@ -93,7 +93,7 @@ class NumericIK:
         branch: str | None = None,
         throw: bool = True,
         approach: Any = None,
-        single: bool | None = None,
+        is_float32: bool | None = None,
         axes: TaskAxes | None = None,
     ) -> Solution:
         """Find corrected joint values for poses; see `CorrectedIK` for arguments, errors and solutions.
@@ -104,13 +104,13 @@ class NumericIK:
             branch: name of the branch to use.
             throw: whether invalid poses and joint values raise an error.
             approach: joint values or directions, `(*batch, dof)` or `(dof,)`.
-            single: whether the poses were rounded to float32; None to infer it from their type.
+            is_float32: whether the poses were rounded to float32; None to infer it from their type.
             axes: axes of the tool that are constrained; None for `task_axes`.
         """
         if branch is not None:
             check_choice(PoseError, "branch", branch, self.branches)
         requested = self.order if branch is None else (self.branches.index(branch),)
-        poses = _Poses.from_values(T_base_tool, single, throw)
+        poses = _Poses.from_values(T_base_tool, is_float32, throw)
         valid, near_rows = poses.valid, None
         if near is not None:
             near_rows = self._joint_rows(near, "near", poses, throw)
@@ -128,11 +128,11 @@ class NumericIK:
         T_base_tool: Any,
         *,
         approach: Any = None,
-        single: bool | None = None,
+        is_float32: bool | None = None,
         axes: TaskAxes | None = None,
     ) -> Solution:
         """Find solutions on every branch, `(*batch, branches)`; a robot that is solved numerically has one branch."""
-        poses = _Poses.from_values(T_base_tool, single, True)
+        poses = _Poses.from_values(T_base_tool, is_float32, True)
 
         def solve(ik: "NumericIK", rows: Tensor) -> Solution:
             every = ik._candidates(poses.T[rows], poses.single, None, ik.order)

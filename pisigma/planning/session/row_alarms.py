@@ -37,7 +37,7 @@ def alarm_of_all_rows(sentence: str) -> Alarm:
     return Alarm(1, "setup", f"line 1: {sentence} Correct this before you continue measuring.", repeat=False)
 
 
-def cleared_message(line: int) -> Alarm:
+def withdrawn_alarm(line: int) -> Alarm:
     """Return the message that withdraws an alarm."""
     text = f"line {line}: later rows agree with it, so the row counts after all."
     return Alarm(line, "cleared", text, repeat=False, counts=True)
@@ -131,7 +131,7 @@ def contradiction_alarm(
     assert judgement.errors is not None
     line, errors = rows.line[row], judgement.errors
     length, angle = float(errors.length[row]), float(errors.angle[row].rad2deg())
-    usual = float(errors.length[judgement.counts].nanmedian()) * 1e3
+    usual = float(errors.length[judgement.used_rows].nanmedian()) * 1e3
     parts = [f"{length * 1e3:.2f} mm"] if length == length else []
     parts += [f"{angle:.3f} deg in orientation"] if angle == angle else []
     what = f"line {line}: the measured value is {' and '.join(parts) or 'far'} from the prediction of the other rows"
@@ -184,5 +184,5 @@ def joint_differences(
 def is_wrong(judgement: RowJudgement) -> Tensor:
     """Return the mask of rows that are contradicted by the others."""
     if judgement.errors is None:
-        return torch.zeros_like(judgement.counts)
-    return ~judgement.counts & (judgement.errors.p_value < FALSE_ALARMS)
+        return torch.zeros_like(judgement.used_rows)
+    return ~judgement.used_rows & (judgement.errors.p_value < FALSE_ALARMS)

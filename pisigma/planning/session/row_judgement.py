@@ -252,9 +252,14 @@ class RowModel:
     def _size(self) -> Float64[Tensor, " unknowns"]:
         """Prior standard deviation of the unknowns; infinite if there is no prior."""
         of_class = RobotClass.from_robot(self.setup.problem.space.robot)
-        prior = self.design.prior([of_class.usual.size_of(group) / USUAL_LENGTH for group in PriorGroup])
+        prior = self.design.prior(
+            [of_class.prior_sizes.size_of(group) / USUAL_LENGTH for group in PriorGroup]
+        )
         sizes = torch.cat(
-            [prior.sizes[: prior.classes], prior.sizes.new_tensor([of_class.gravity, *of_class.bands])]
+            [
+                prior.sizes[: prior.classes],
+                prior.sizes.new_tensor([of_class.gravity_sigma, *of_class.series_sigmas]),
+            ]
         )
         return replace(prior, sizes=sizes).precision.rsqrt()
 
@@ -299,7 +304,7 @@ def _noise(
     blocks = []
     for sensor, one in zip(setup.problem.sensors, values, strict=True):
         usual = _USUAL_NOISE[sensor.unit] if sigma is None or sensor.unit == "rad" else sigma
-        noise = 1 / one.root if one.stated else torch.full_like(one.root, usual)
+        noise = 1 / one.root if one.has_stated_noise else torch.full_like(one.root, usual)
         noise = (noise.square() + _REPEATABILITY[sensor.unit] ** 2).sqrt()
         if isinstance(sensor, CornerSensor):  # the weights of corners include the repeatability
             noise = torch.as_tensor(setup.measurements.readings[NOISE_COLUMN])[one.row]
@@ -312,12 +317,12 @@ class RowJudgement:
     """Result of checking rows against each other.
 
     Attributes:
-        counts: mask of the rows that the others do not contradict.
+        used_rows: mask of the rows that the others do not contradict.
         model: model of the used rows; None if there are too few to fit base and tool.
         errors: errors of all rows under this model; None if there is no model.
     """
 
-    counts: Bool[Tensor, " rows"]
+    used_rows: Bool[Tensor, " rows"]
     model: RowModel | None = None
     errors: LeaveOneOutErrors | None = None
 

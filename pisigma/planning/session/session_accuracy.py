@@ -70,7 +70,7 @@ def session_accuracy(
             posterior, checked = _calibrated(plan.arm.robot, before, rows, check, progress)
         except (IdentificationError, MeasurementError):
             return None
-    D = posterior.tool(task)
+    D = posterior.tool_derivatives(task)
     point = AccuracyPoint(rows.rows, rms_of(D), p95_of(D), checked_rms=checked[0], checked_p95=checked[1])
     return SessionAccuracy(point, posterior, rows if plan.model is None else None)
 
@@ -120,7 +120,7 @@ def with_cross_validation(
 
 def expected_accuracy(
     posterior: RobotPosterior,
-    measured: int,
+    measured_poses: int,
     poses: Float64[Tensor, "poses dof"],
     candidates: Float64[Tensor, "candidates dof"],
     task: Float64[Tensor, "tasks dof"],
@@ -130,7 +130,7 @@ def expected_accuracy(
 
     Args:
         posterior: posterior given the rows so far.
-        measured: number of poses so far.
+        measured_poses: number of poses so far.
         poses: joint values of the remaining poses, beginning with the next [rad or m].
         candidates: joint values of poses that could be measured instead [rad or m].
         task: joint values at which the robot must be accurate [rad or m].
@@ -139,10 +139,10 @@ def expected_accuracy(
     counts = [*range(step, len(poses), step), len(poses)] if len(poses) else []
     both = torch.cat([poses, candidates])
     points = accuracy_curve(
-        posterior.sensitivities(both), posterior.tool(task), torch.arange(len(poses)), counts
+        posterior.sensitivities(both), posterior.tool_derivatives(task), torch.arange(len(poses)), counts
     )
     return tuple(
-        AccuracyPoint(measured + point.poses, point.rms, point.p95, random_rms=point.random_rms)
+        AccuracyPoint(measured_poses + point.poses, point.rms, point.p95, random_rms=point.random_rms)
         for point in points
     )
 

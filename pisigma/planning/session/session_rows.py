@@ -18,13 +18,13 @@ from pisigma.planning.plan_file import StoredPlan
 from pisigma.planning.pose_selection import select_poses
 from pisigma.planning.session.row_alarms import (
     NEAR_POSE,
-    cleared_message,
     contradiction_alarm,
     is_wrong,
     joint_differences,
     other_joint_values,
     stale_readings,
     unreadable_alarm,
+    withdrawn_alarm,
 )
 from pisigma.planning.session.row_judgement import FEW_ROWS, RowJudgement, judge_rows
 from pisigma.planning.session.session_accuracy import SessionAccuracy
@@ -76,7 +76,7 @@ class SessionRows:
     def used_rows(self) -> Bool[Tensor, " rows"]:
         """Rows that are usable and not contradicted by others."""
         counting = self.usable.clone()
-        counting[self.usable] = self.judgement.counts
+        counting[self.usable] = self.judgement.used_rows
         return counting
 
     def add(
@@ -118,9 +118,9 @@ class SessionRows:
         """Check all usable rows, and return the new alarms."""
         numbers = self.usable.nonzero()[:, 0]
         usable, judgement = rows.select(numbers), self.judgement
-        for upto in _steps(len(judgement.counts), len(numbers)):
+        for upto in _steps(len(judgement.used_rows), len(numbers)):
             trusted = torch.zeros(upto, dtype=torch.bool)
-            trusted[: len(judgement.counts)] = judgement.counts
+            trusted[: len(judgement.used_rows)] = judgement.used_rows
             some = usable.select(torch.arange(upto))
             judgement = judge_rows(self._robot, some, self._sigma, trusted)
         self.judgement = judgement
@@ -128,7 +128,7 @@ class SessionRows:
             int(numbers[row]): contradiction_alarm(usable, judgement, row, planned, names)
             for row in is_wrong(judgement).nonzero()[:, 0].tolist()
         }
-        agreed = [cleared_message(rows.line[row]) for row in self._contradicted if row not in wrong]
+        agreed = [withdrawn_alarm(rows.line[row]) for row in self._contradicted if row not in wrong]
         new = [alarm for row, alarm in wrong.items() if row not in self._contradicted]
         self._contradicted = {row: self._contradicted.get(row, alarm) for row, alarm in wrong.items()}
         return [*new, *agreed]
@@ -166,7 +166,7 @@ def _steps(known: int, count: int) -> Iterator[int]:
 
 
 def setup_sentence(
-    rows: Measurements, counts: Bool[Tensor, " rows"], reference: Robot | CalibratedModel
+    rows: Measurements, used_rows: Bool[Tensor, " rows"], reference: Robot | CalibratedModel
 ) -> str:
     """Return a sentence about a fault that all rows have in common; "" if there is none.
 
@@ -174,10 +174,10 @@ def setup_sentence(
 
     Args:
         rows: all usable rows.
-        counts: rows that are not contradicted by others.
+        used_rows: rows that are not contradicted by others.
         reference: the nominal robot, or the planned model.
     """
-    some = rows.select(counts) if counts.double().mean() > 1 - MIN_WRONG_SHARE else rows
+    some = rows.select(used_rows) if used_rows.double().mean() > 1 - MIN_WRONG_SHARE else rows
     found = check_rows(some, reference, may_move=MOVES).implausible
     return found[0].sentence if found else ""
 
@@ -238,7 +238,7 @@ class FurtherPoses:
         # The robot is already on its way to the next pose, which counts as measured unless it only tests the model.
         if not bool(plan.check[first]):
             posterior = posterior.after_measuring(plan.q[first])
-        seen, tool = posterior.sensitivities(self.q), posterior.tool(self.task)
+        seen, tool = posterior.sensitivities(self.q), posterior.tool_derivatives(self.task)
         for _ in range(_MAX_REPLACEMENTS):
             if count > len(new):
                 return None
@@ -260,7 +260,7 @@ class FurtherPoses:
             q=torch.cat([plan.q[first], q[way.order]]),
             check=torch.cat([plan.check[first], use[way.order] >= count]),
             candidate=torch.cat([plan.candidate[first], number[way.order]]),
-            waypoints=(plan.waypoints[int(first)], *way.before),
+            waypoints=(plan.waypoints[int(first)], *way.waypoints_before),
             number=(),
         )
 

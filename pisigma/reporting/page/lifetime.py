@@ -139,7 +139,7 @@ def draw_values(
     """Return a chart of a quantity over the sessions with 95 % intervals, marked days, and its limit."""
     with drawing_style():
         figure, axes = make_panel()
-        values, half = chart.values.numpy(), NORMAL_95 * chart.deviations.numpy()
+        values, half = chart.values.numpy(), NORMAL_95 * chart.sigmas.numpy()
         if chart.one_sided:
             axes.errorbar(days, values, half, fmt="none", color=AFTER, capsize=2, linewidth=1.2)  # type: ignore[arg-type]
         else:
@@ -286,7 +286,7 @@ def comparison_page(
         robot=models[first].robot,
         parameters=difference_table(parameters, (first, second)),
         differs=bool(parameters.differing),
-        level=f"{parameters.level:.2g}",
+        level=f"{parameters.significance_level:.2g}",
         maps=[draw_displacement(what, one) for what, one in displacements.items()],
         displacements=pose_rows({what: one.errors.figures for what, one in displacements.items()}),
         rows=() if rows is None else comparison_tables(rows, "the rows", _PAGE_WIDTH),

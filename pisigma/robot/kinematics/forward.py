@@ -59,16 +59,16 @@ class RowFrames:
 
     Attributes:
         before: frame before the row; its z axis is the joint's axis.
-        turned: frame after RotZ(theta + q); its x axis is the common normal.
-        moved: frame after RotZ and Trans(a, 0, d).
-        twisted: frame after RotZ, Trans and RotX(alpha); beta rotates about its y axis.
+        after_theta: frame after RotZ(theta + q); its x axis is the common normal.
+        after_translation: frame after RotZ and Trans(a, 0, d).
+        after_alpha: frame after RotZ, Trans and RotX(alpha); beta rotates about its y axis.
         after: frame after the whole row, which is `before` of the next row.
     """
 
     before: Frame
-    turned: Frame
-    moved: Frame
-    twisted: Frame
+    after_theta: Frame
+    after_translation: Frame
+    after_alpha: Frame
     after: Frame
 
 

@@ -44,7 +44,7 @@ class ToolMotion:
         position: position of the tool in the measuring frame [m].
         rotation: rotation of the tool in the measuring frame.
         derivative: for every parameter, the tool's translation [m] and, if requested, its rotation [rad], both in the
-            measuring frame, in the order of `motion_order`.
+            measuring frame, in the order of `parameter_order`.
     """
 
     position: Float[Tensor, "3 poses"]
@@ -52,7 +52,7 @@ class ToolMotion:
     derivative: Float[Tensor, "parameters components poses"]
 
 
-def motion_order(rows: int) -> list[int]:
+def parameter_order(rows: int) -> list[int]:
     """Return the index of every parameter in `ToolMotion.derivative`, where rotations precede translations.
 
     The rotation axes are every third vector of `_walk_rows`; some of them belong to no parameter.
@@ -87,7 +87,7 @@ def identification_jacobian(
     robot.check_joint_count(q.shape[-1])
     flat = q.reshape(-1, robot.dof)
     base, tool = (flat.new_tensor(frame)[:, None] for frame in (robot.base, robot.tool))
-    order = motion_order(len(robot.rows))
+    order = parameter_order(len(robot.rows))
     T = flat.new_zeros((flat.shape[0], 4, 4))
     T[:, 3, 3] = 1
     J = flat.new_empty((flat.shape[0], 6, len(order)))

@@ -122,7 +122,7 @@ def default_axes(joints: int) -> TaskAxes:
 
 
 def task_axes(
-    usual: TaskAxes,
+    defaults: TaskAxes,
     ignore_axes: Sequence[str] | None = None,
     tolerance_mm: float | Sequence[float] | None = None,
     tolerance_deg: float | Sequence[float] | None = None,
@@ -131,7 +131,7 @@ def task_axes(
     """Make the task from a user's options; see `CorrectedIK.__call__`.
 
     Args:
-        usual: task whose values are used where an option is not stated.
+        defaults: task whose values are used where an option is not stated.
         ignore_axes: names of `AXES` to ignore.
         tolerance_mm: tolerance of x, y and z [mm], one number or three.
         tolerance_deg: tolerance of roll, pitch and yaw [deg], one number or three.
@@ -140,7 +140,7 @@ def task_axes(
     Raises:
         PoseError: an axis does not exist, or a tolerance is not a number >= 0.
     """
-    tolerance = list(usual.tolerance)
+    tolerance = list(defaults.tolerance)
     if ignore_axes is not None:
         names = [ignore_axes] if isinstance(ignore_axes, str) else list(ignore_axes)
         for name in names:
@@ -153,7 +153,7 @@ def task_axes(
         if stated is not None:
             for axis, value in enumerate(_three(what, stated), first):
                 tolerance[axis] = tolerance[axis] if tolerance[axis] == math.inf else value * unit
-    return TaskAxes(tuple(tolerance), usual.elbow_angle if elbow_angle is None else elbow_angle)
+    return TaskAxes(tuple(tolerance), defaults.elbow_angle if elbow_angle is None else elbow_angle)
 
 
 def _three(what: str, stated: float | Sequence[float]) -> list[float]:

@@ -40,30 +40,30 @@ class TrueBoard:
     of the farthest corner.
 
     Attributes:
-        stated: the board as described in its file.
+        described_board: the board as described in its file.
         scale: ratio of true to described lengths.
         bow: height of the farthest corners above the plane at the centre [m], along z.
     """
 
-    stated: Board
+    described_board: Board
     scale: float = 1.0
     bow: float = 0.0
 
     @property
     def corners(self) -> Float64[np.ndarray, "corners 3"]:
         """True positions of the corners in the board's frame [m]."""
-        flat = self.scale * self.stated.corners[:, :2]
+        flat = self.scale * self.described_board.corners[:, :2]
         return np.concatenate([flat, self.height(flat)[:, None]], 1)
 
     @property
     def pattern(self) -> Pattern:
         """Printed pattern of the board at its true size."""
-        stated = board_pattern(self.stated)
+        stated = board_pattern(self.described_board)
         return Pattern(self.scale * stated.black, self.scale * stated.sheet)
 
     def height(self, xy: Float64[np.ndarray, "*batch 2"]) -> Float64[np.ndarray, "*batch"]:
         """Return z of the surface [m] at points of the plane [m]."""
-        corners = self.scale * self.stated.corners[:, :2]
+        corners = self.scale * self.described_board.corners[:, :2]
         middle = corners.mean(0)
         farthest = np.square(corners - middle).sum(1).max()
         z: np.ndarray = self.bow * np.square(xy - middle).sum(-1) / farthest

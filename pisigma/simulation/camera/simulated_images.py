@@ -68,7 +68,7 @@ class RandomViews(Section):
         Raises:
             RecipeError: the robot has no closed-form inverse kinematics, or reaches fewer views than requested.
         """
-        solver, rng = self.check(robot), np.random.default_rng(self.seed)
+        solver, rng = self.closed_form(robot), np.random.default_rng(self.seed)
         chosen, needed = list[Tensor](), _CANDIDATES * self.count
         for _ in range(_MAX_ATTEMPTS * needed):
             T_board_camera = self._view(board, rng)
@@ -89,7 +89,7 @@ class RandomViews(Section):
             remedy="check the positions of board and camera, and the distances",
         )
 
-    def check(self, robot: Robot) -> AbstractClosedForm:
+    def closed_form(self, robot: Robot) -> AbstractClosedForm:
         """Return the closed-form inverse kinematics for the views.
 
         Raises:

@@ -34,7 +34,7 @@ class Backlash(AbstractPlaySource):
     play_mm: dict[str, Annotated[float, Field(ge=0)]] = Field(default_factory=dict)
     seed: Seed = 0
 
-    def half_play(self, robot: Robot, place: str) -> Float64[np.ndarray, " dof"]:
+    def half_play(self, robot: Robot, place_in_recipe: str) -> Float64[np.ndarray, " dof"]:
         """Return half the play of every joint [rad or m]; see `AbstractPlaySource.half_play`."""
-        stated = joint_values(robot, self.play_deg, self.play_mm, ("play_deg", "play_mm"), place)
+        stated = joint_values(robot, self.play_deg, self.play_mm, ("play_deg", "play_mm"), place_in_recipe)
         return np.where(robot.revolute, np.deg2rad(stated), stated / 1e3) / 2

@@ -28,12 +28,12 @@ class CouplingDeviation(AbstractJointSource):
     kind: Literal["coupling"]
     coupling: tuple[CoupledJointSection, ...] = Field(min_length=1)
 
-    def bind(self, robot: Robot, place: str) -> JointErrorFunction:
+    def bind(self, robot: Robot, place_in_recipe: str) -> JointErrorFunction:
         """Return the joint errors as a function of the joint values; see `AbstractJointSource.bind`."""
         if robot.coupling is None:
             raise RecipeError(
                 f"robot '{robot.name}' has no coupled joints",
-                option=place,
+                option=place_in_recipe,
                 value=robot.name,
                 remedy="omit the source",
             )
@@ -47,7 +47,7 @@ class CouplingDeviation(AbstractJointSource):
         if other := sorted(stated.keys() - nominal.keys()):
             raise RecipeError(
                 f"joint '{other[0]}' of robot '{robot.name}' is not coupled",
-                option=place,
+                option=place_in_recipe,
                 value=other[0],
                 remedy=nearest_choice(other[0], nominal),
             )
@@ -58,7 +58,7 @@ class CouplingDeviation(AbstractJointSource):
         try:
             true = rows_and_coupling(rows, tuple((nominal | stated).values()))[1]
         except RobotError as problem:
-            raise RecipeError(f"{place}: {problem}") from None
+            raise RecipeError(f"{place_in_recipe}: {problem}") from None
         assert true is not None
 
         def error(q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch dof"]:

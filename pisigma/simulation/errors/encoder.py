@@ -39,10 +39,10 @@ class EncoderQuantisation(AbstractJointSource):
         """Names of the joints that have an encoder."""
         return frozenset(self.pulses_per_revolution) | frozenset(self.step_mm)
 
-    def bind(self, robot: Robot, place: str) -> JointErrorFunction:
+    def bind(self, robot: Robot, place_in_recipe: str) -> JointErrorFunction:
         """Return the quantisation error as a function of the joint values; see `AbstractJointSource.bind`."""
         fields = ("pulses_per_revolution", "step_mm")
-        stated = joint_values(robot, self.pulses_per_revolution, self.step_mm, fields, place)
+        stated = joint_values(robot, self.pulses_per_revolution, self.step_mm, fields, place_in_recipe)
         quantised = torch.from_numpy(stated > 0)
         safe = np.where(stated > 0, stated, 1.0)
         step = torch.from_numpy(np.where(robot.revolute, 2 * np.pi / safe, safe / 1e3))

@@ -36,11 +36,11 @@ class GeometricDeviation(AbstractGeometrySource):
     base: FrameSection = FrameSection()
     tool: FrameSection = FrameSection()
 
-    def parameter_errors(self, robot: Robot, place: str) -> GeometryChange:
+    def parameter_errors(self, robot: Robot, place_in_recipe: str) -> GeometryChange:
         """Return the stated errors [rad or m]; see `AbstractGeometrySource.parameter_errors`."""
         dh = np.zeros_like(robot.dh)
         for name, error in self.rows.items():
-            dh[row_index(robot, name, place)] = error.to_si()
+            dh[row_index(robot, name, place_in_recipe)] = error.to_si()
         return GeometryChange(dh, self.base.to_si(), self.tool.to_si())
 
 
@@ -81,7 +81,7 @@ class RandomGeometricDeviation(AbstractGeometrySource):
     tool_length_mm: float = Field(default=0.0, ge=0)
     tool_angle_deg: float = Field(default=0.0, ge=0)
 
-    def parameter_errors(self, robot: Robot, place: str) -> GeometryChange:
+    def parameter_errors(self, robot: Robot, place_in_recipe: str) -> GeometryChange:
         """Return the random errors [rad or m], identical for every call; see `AbstractGeometrySource`."""
         generator = torch.Generator().manual_seed(self.seed)
         dh = self._draw(generator, len(robot.rows), 5)

@@ -59,13 +59,13 @@ class Guide(AbstractJointSource):
     along: str
     waves: tuple[GuideWave, ...] = Field(min_length=1)
 
-    def bind(self, robot: Robot, place: str) -> JointErrorFunction:
+    def bind(self, robot: Robot, place_in_recipe: str) -> JointErrorFunction:
         """Return the joint errors as a function of the joint values; see `AbstractJointSource.bind`."""
         names = [axis.name for axis in robot.axes]
         if self.along not in names:
             raise RecipeError(
                 f"robot '{robot.name}' has no axis '{self.along}'",
-                option=place,
+                option=place_in_recipe,
                 value=self.along,
                 remedy=nearest_choice(self.along, names),
             )
@@ -73,10 +73,10 @@ class Guide(AbstractJointSource):
         travel = float(np.diff(robot.axis_limits[index])[0])
         if robot.axes[index].type != "prismatic" or not np.isfinite(travel):
             raise RecipeError(
-                option=place, expected="the name of a prismatic axis with limits", value=self.along
+                option=place_in_recipe, expected="the name of a prismatic axis with limits", value=self.along
             )
         amplitudes = [
-            amplitude_of(robot, wave.joint, wave.amplitude_deg, wave.amplitude_mm, place)
+            amplitude_of(robot, wave.joint, wave.amplitude_deg, wave.amplitude_mm, place_in_recipe)
             for wave in self.waves
         ]
         amplitude = torch.from_numpy(np.stack(amplitudes))

@@ -58,12 +58,14 @@ class JointCompliance(AbstractJointSource):
     payload: LinkMass = LinkMass(mass_kg=0.0)
     gravity_m_per_s2: Triple = (0.0, 0.0, -9.81)
 
-    def bind(self, robot: Robot, place: str) -> JointErrorFunction:
+    def bind(self, robot: Robot, place_in_recipe: str) -> JointErrorFunction:
         """Return the deflection as a function of the joint values; see `AbstractJointSource.bind`."""
         fields = ("compliance_rad_per_Nm", "compliance_m_per_N")
-        stated = joint_values(robot, self.compliance_rad_per_Nm, self.compliance_m_per_N, fields, place)
+        stated = joint_values(
+            robot, self.compliance_rad_per_Nm, self.compliance_m_per_N, fields, place_in_recipe
+        )
         compliance = torch.from_numpy(stated)
-        links = {row_index(robot, name, place): mass for name, mass in self.links.items()}
+        links = {row_index(robot, name, place_in_recipe): mass for name, mass in self.links.items()}
         payload, gravity = self.payload, self.gravity_m_per_s2
         return lambda q: compliance.to(q) * gravity_load(robot, q, links, payload, gravity)
 

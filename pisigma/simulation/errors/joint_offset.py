@@ -28,8 +28,10 @@ class JointOffset(AbstractJointSource):
     offset_deg: dict[str, float] = Field(default_factory=dict)
     offset_mm: dict[str, float] = Field(default_factory=dict)
 
-    def bind(self, robot: Robot, place: str) -> JointErrorFunction:
+    def bind(self, robot: Robot, place_in_recipe: str) -> JointErrorFunction:
         """Return the offsets as a function of the joint values; see `AbstractJointSource.bind`."""
-        stated = joint_values(robot, self.offset_deg, self.offset_mm, ("offset_deg", "offset_mm"), place)
+        stated = joint_values(
+            robot, self.offset_deg, self.offset_mm, ("offset_deg", "offset_mm"), place_in_recipe
+        )
         offset = torch.from_numpy(np.where(robot.revolute, np.deg2rad(stated), stated / 1e3))
         return lambda q: torch.zeros_like(q) + offset.to(q)

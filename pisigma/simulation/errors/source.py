@@ -52,12 +52,12 @@ class AbstractGeometrySource(AbstractErrorSource):
     """Base class of sources that change geometric parameters; the changes of several sources are added."""
 
     @abstractmethod
-    def parameter_errors(self, robot: Robot, place: str) -> GeometryChange:
+    def parameter_errors(self, robot: Robot, place_in_recipe: str) -> GeometryChange:
         """Return the errors of the geometric parameters of the nominal robot.
 
         Args:
             robot: the nominal robot.
-            place: position of the source in its recipe, for messages.
+            place_in_recipe: position of the source in its recipe, for messages.
 
         Raises:
             RecipeError: the source does not fit the robot.
@@ -73,12 +73,12 @@ class AbstractJointSource(AbstractErrorSource):
         return frozenset()
 
     @abstractmethod
-    def bind(self, robot: Robot, place: str) -> JointErrorFunction:
+    def bind(self, robot: Robot, place_in_recipe: str) -> JointErrorFunction:
         """Return the errors as a function of the commanded joint values of one robot.
 
         Args:
             robot: the nominal robot.
-            place: position of the source in its recipe, for messages.
+            place_in_recipe: position of the source in its recipe, for messages.
 
         Raises:
             RecipeError: the source does not fit the robot.
@@ -95,35 +95,35 @@ class AbstractPlaySource(AbstractErrorSource):
     seed: int
 
     @abstractmethod
-    def half_play(self, robot: Robot, place: str) -> Float64[np.ndarray, " dof"]:
+    def half_play(self, robot: Robot, place_in_recipe: str) -> Float64[np.ndarray, " dof"]:
         """Return the distance by which every joint stops short of the commanded value [rad or m].
 
         Args:
             robot: the nominal robot.
-            place: position of the source in its recipe, for messages.
+            place_in_recipe: position of the source in its recipe, for messages.
 
         Raises:
             RecipeError: the source does not fit the robot.
         """
 
 
-def row_index(robot: Robot, name: str, place: str) -> int:
+def row_index(robot: Robot, name: str, place_in_recipe: str) -> int:
     """Return the index of the row `name`.
 
     Args:
         robot: the robot.
         name: name of the row.
-        place: position in the recipe, for messages.
+        place_in_recipe: position in the recipe, for messages.
 
     Raises:
         RecipeError: the robot has no such row; the message states the nearest name.
     """
-    return _index(robot, [row.name for row in robot.rows], name, "row", place)
+    return _index(robot, [row.name for row in robot.rows], name, "row", place_in_recipe)
 
 
-def joint_index(robot: Robot, name: str, place: str) -> int:
+def joint_index(robot: Robot, name: str, place_in_recipe: str) -> int:
     """Return the index of the joint `name` among the rows that are not fixed; see `row_index`."""
-    return _index(robot, [joint.name for joint in robot.joints], name, "joint", place)
+    return _index(robot, [joint.name for joint in robot.joints], name, "joint", place_in_recipe)
 
 
 def _index(robot: Robot, names: list[str], name: str, what: str, place: str) -> int:
@@ -141,8 +141,8 @@ def stated_joints(
     robot: Robot,
     for_revolute: Mapping[str, Value],
     for_prismatic: Mapping[str, Value],
-    fields: tuple[str, str],
-    place: str,
+    field_names: tuple[str, str],
+    place_in_recipe: str,
     axes: bool = False,
 ) -> dict[int, Value]:
     """Return the values of two mappings in a recipe by joint index.
@@ -151,8 +151,8 @@ def stated_joints(
         robot: the robot.
         for_revolute: values of revolute joints, by name.
         for_prismatic: values of prismatic joints, by name.
-        fields: keys of the two mappings in the recipe, revolute first.
-        place: position in the recipe, for messages.
+        field_names: keys of the two mappings in the recipe, revolute first.
+        place_in_recipe: position in the recipe, for messages.
         axes: whether the mappings are by names of the controller's axes, `robot.axes`, instead of joints.
 
     Raises:
@@ -160,15 +160,15 @@ def stated_joints(
     """
     values: dict[int, Value] = {}
     joints = robot.axes if axes else robot.joints
-    kinds = ((for_revolute, *fields, "revolute"), (for_prismatic, *fields[::-1], "prismatic"))
+    kinds = ((for_revolute, *field_names, "revolute"), (for_prismatic, *field_names[::-1], "prismatic"))
     for mapping, field, other, kind in kinds:
         for name, value in mapping.items():
-            index = _index(robot, [joint.name for joint in joints], name, "joint", place)
+            index = _index(robot, [joint.name for joint in joints], name, "joint", place_in_recipe)
             actual = joints[index].type
             if actual != kind:
                 raise RecipeError(
                     f"joint '{name}' in {field} is {actual}",
-                    option=place,
+                    option=place_in_recipe,
                     value=name,
                     remedy=f"move it to {other}",
                 )
@@ -180,16 +180,16 @@ def joint_values(
     robot: Robot,
     for_revolute: Mapping[str, float],
     for_prismatic: Mapping[str, float],
-    fields: tuple[str, str],
-    place: str,
+    field_names: tuple[str, str],
+    place_in_recipe: str,
 ) -> Float64[np.ndarray, " dof"]:
     """Return one value per joint [rad or m], 0 if not stated; see `stated_joints`."""
-    stated = stated_joints(robot, for_revolute, for_prismatic, fields, place)
+    stated = stated_joints(robot, for_revolute, for_prismatic, field_names, place_in_recipe)
     return np.array([stated.get(index, 0.0) for index in range(robot.dof)])
 
 
 def amplitude_of(
-    robot: Robot, joint: str, deg: float | None, mm: float | None, place: str
+    robot: Robot, joint: str, deg: float | None, mm: float | None, place_in_recipe: str
 ) -> Float64[np.ndarray, " dof"]:
     """Return one value per joint: the amplitude of a wave [rad or m] for its joint, 0 for other joints.
 
@@ -198,20 +198,20 @@ def amplitude_of(
         joint: name of the joint with the error.
         deg: amplitude of a revolute joint [deg].
         mm: amplitude of a prismatic joint [mm].
-        place: position in the recipe, for messages.
+        place_in_recipe: position in the recipe, for messages.
     """
     stated = joint_values(
         robot,
         {} if deg is None else {joint: deg},
         {} if mm is None else {joint: mm},
         ("amplitude_deg", "amplitude_mm"),
-        place,
+        place_in_recipe,
     )
     return np.where(robot.revolute, np.deg2rad(stated), stated / 1e3)
 
 
 @dataclass(frozen=True, eq=False)
-class OneOf:
+class RegisteredSection:
     """Annotation of a value that is a section of a registry, selected by its `kind`.
 
     `Annotated[AbstractErrorSource, OneOf(ERROR_SOURCES)]` reads `{kind: encoder, ...}` as the section that is

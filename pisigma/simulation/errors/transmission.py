@@ -75,9 +75,9 @@ class TransmissionHarmonics(AbstractJointSource):
     kind: Literal["transmission"]
     terms: tuple[Harmonic, ...] = Field(min_length=1)
 
-    def bind(self, robot: Robot, place: str) -> JointErrorFunction:
+    def bind(self, robot: Robot, place_in_recipe: str) -> JointErrorFunction:
         """Return the joint errors as a function of the joint values; see `AbstractJointSource.bind`."""
-        places = [f"{place}, terms[{index}]" for index in range(len(self.terms))]
+        places = [f"{place_in_recipe}, terms[{index}]" for index in range(len(self.terms))]
         stated = list(zip(self.terms, places, strict=True))
         # (terms, dof): amplitudes of the joint errors, and multiples of the joint values inside the sine
         amplitudes = [

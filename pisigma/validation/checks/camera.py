@@ -142,7 +142,7 @@ def _tool(images: Measurements, rows: Measurements, result: CalibrationResult) -
 
 def _limit(images: Measurements, result: CalibrationResult) -> Iterator[Diagnostic]:
     """Warn that the images limit the accuracy, with the shares of the predicted error due to intrinsics and boards."""
-    problem, view = result.solved.problem, sensor_view_of(result.solved.refined)
+    problem, view = result.solved.problem, sensor_view_of(result.solved.refined_linearisation)
     number = next(k for k, sensor in enumerate(problem.sensors) if sensor.name == "corner")
     ratio = view.noise[number] / float(torch.as_tensor(images.readings[NOISE_COLUMN]).median())
     if ratio >= _EXPLAINED:
@@ -169,9 +169,9 @@ def _predicted_error(result: CalibrationResult) -> tuple[float, dict[str, float]
     generator = torch.Generator().manual_seed(0)
     draws = torch.rand(_POSTURES, len(limits), generator=generator, dtype=torch.float64)
     q = limits[:, 0] + draws * (limits[:, 1] - limits[:, 0])
-    J = identification_jacobian(result.robot, q)[1][:, :3, : result.solved.problem.space.arm_size].flatten(
-        0, 1
-    )
+    J = identification_jacobian(result.robot, q)[1][
+        :, :3, : result.solved.problem.space.arm_parameter_count
+    ].flatten(0, 1)
     posterior = result.posterior
     total = _square(J, posterior.root)
     groups = {"camera": "the intrinsics", "board": "the scale of the board"}

@@ -73,7 +73,7 @@ def narrowest_robot_class(
     if usual.allows(at_least) or checked.calibrator.robot_class is not None:
         return usual if usual.allows(at_least) else None
     if any(
-        group != PriorGroup.JOINT_OFFSET for group, size in at_least if size > usual.largest.size_of(group)
+        group != PriorGroup.JOINT_OFFSET for group, size in at_least if size > usual.max_sizes.size_of(group)
     ):
         return None
     names = list(CLASSES)
@@ -147,7 +147,7 @@ def check_joint_zero(checked: CheckedCalibration) -> Iterator[Diagnostic]:
     if setup_diagnostics(checked.robot, checked.rows):
         return
     usual = checked.robot_class
-    far = usual.largest.joint_offset if usual is SERVO else FAR
+    far = usual.max_sizes.joint_offset if usual is SERVO else FAR
     for one in checked.geometric.parameters:
         joint = one.name.removeprefix("theta_")
         if joint == one.name or not one.free or abs(one.change) - _CERTAIN * one.standard_error < far:

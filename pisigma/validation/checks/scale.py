@@ -125,7 +125,7 @@ def common_scale(result: CalibrationResult) -> CommonScale | None:
     Returns:
         The factor; None if no nominally nonzero length was estimated.
     """
-    problem, here = result.solved.problem, result.solved.refined
+    problem, here = result.solved.problem, result.solved.refined_linearisation
     precision = (
         sensor_view_of(here).scaled_precision(problem.precision[problem.active], problem.prior_group).numpy()
     )

@@ -23,7 +23,7 @@ def check_search(checked: CheckedCalibration) -> Iterator[Diagnostic]:
 def check_few_rows(checked: CheckedCalibration) -> Iterator[Diagnostic]:
     """Warn if parameters of the arm were requested, but only base and tool were fitted."""
     problem = checked.geometric.solved.problem
-    if checked.calibrator.free and not bool((problem.active < problem.space.arm_size).any()):
+    if checked.calibrator.free and not bool((problem.active < problem.space.arm_parameter_count).any()):
         yield Diagnostic(
             kind="few_rows",
             severity="warning",

@@ -28,7 +28,7 @@ def check_stated_noise(checked: CheckedCalibration) -> Iterator[Diagnostic]:
     solved = checked.geometric.solved
     learned = None if checked.hybrid is None else checked.hybrid.learned
     for sensor, part in zip(
-        solved.problem.sensors, sensor_view_of(solved.refined).contributions, strict=True
+        solved.problem.sensors, sensor_view_of(solved.refined_linearisation).contributions, strict=True
     ):
         if sensor.sigma is None or sensor.certain or sensor.components not in _CHI_MEDIAN:
             continue

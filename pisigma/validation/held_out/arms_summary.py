@@ -231,7 +231,7 @@ def arms_summary(
                 arms=tuple(names[number] for number in one.arms),
                 distance_mm=distance * 1e3,
             )
-            for one, distance in zip(bases.shared, bases.distances, strict=True)
+            for one, distance in zip(bases.shared, bases.max_distances, strict=True)
         ),
         misfit=bases.conditioned.misfit,
         redundancy=bases.conditioned.redundancy,

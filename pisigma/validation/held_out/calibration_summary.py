@@ -312,7 +312,7 @@ def _outliers(outliers: Sequence[Outlier]) -> tuple[OutlierFigures, ...]:
     rows = []
     for outlier in outliers:
         unit, factor = SHOWN_UNITS[outlier.unit]
-        figures = {"deviations": outlier.deviations, f"residual_{unit}": outlier.residual * factor}
+        figures = {"deviations": outlier.residual_in_sigmas, f"residual_{unit}": outlier.residual * factor}
         rows.append(OutlierFigures(row=outlier.row, place=outlier.place, sensor=outlier.sensor, **figures))
     return tuple(rows)
 
@@ -331,7 +331,7 @@ def _hybrid(result: HybridResult) -> HybridFigures:
             name=trial.name,
             unknowns=trial.unknowns,
             log_evidence=_or_none(trial.log_evidence),
-            left_out=trial.held_out,
+            left_out=trial.held_out_ratio,
             seconds=round(trial.seconds, 3),
             kept=trial.kept,
         )

@@ -94,10 +94,10 @@ def coordinate_figures(fit: FrameFit, arm_variance: tuple[float, ...]) -> tuple[
     lost, variances = fit.undetermined, fit.covariance.diagonal()
     figures = []
     for number, (parameter, before, estimate) in enumerate(
-        zip(fit.parameters, fit.before, fit.estimates, strict=True)
+        zip(fit.parameters, fit.previous_values, fit.estimates, strict=True)
     ):
         unit, factor = SHOWN_UNITS[parameter.unit]
-        known = fit.frames[number] not in lost
+        known = fit.frame_indices[number] not in lost
         figures.append(
             CoordinateFigures(
                 name=parameter.name,
@@ -116,10 +116,10 @@ def coordinate_figures(fit: FrameFit, arm_variance: tuple[float, ...]) -> tuple[
 def weak_direction_sentences(fit: FrameFit) -> tuple[str, ...]:
     """Return a sentence for every direction that the rows hardly determine."""
     return tuple(
-        f"the rows do not determine {one.combination} (in mm and mrad; {_deviation_text(one.deviation)}); it keeps its "
+        f"the rows do not determine {one.combination} (in mm and mrad; {_deviation_text(one.sigma)}); it keeps its "
         "previous value; measure other orientations"
         if one.is_held
-        else f"the rows determine {one.combination} (in mm and mrad) only to {one.deviation:.2g}"
+        else f"the rows determine {one.combination} (in mm and mrad) only to {one.sigma:.2g}"
         for one in fit.weak_directions
     )
 
@@ -134,7 +134,7 @@ def _cause_figures(cause: Cause) -> CauseFigures:
         log_bayes_factor=cause.log_bayes_factor,
         share=cause.explained_share,
         size=size_text(cause),
-        named=cause.named,
+        named=cause.is_supported,
     )
 
 

@@ -268,7 +268,7 @@ def predicted_spread(result: HybridResult, measurements: Measurements) -> Predic
     judged = measurements.select(chosen)
     noise = _noise(result, judged)
     spread.error[chosen] = errors[chosen].detach().cpu()
-    spread.sigma[chosen] = (result.deviation(judged).square() + noise.square()).sqrt()
+    spread.sigma[chosen] = (result.sigma(judged).square() + noise.square()).sqrt()
     return spread
 
 
@@ -297,12 +297,12 @@ def predicted_at_other_poses(
         alone.select(every), q=q[None].take_along_dim(orders, 1).flatten(0, 1).to(measurements.q)
     )
     if isinstance(result, HybridResult):
-        deviation = result.deviation(others)
+        deviation = result.sigma(others)
     else:
         solved = result.solved
         root = CovarianceRoot(solved.root)
         known = PositionUncertainty(solved.problem.space, solved.geometry, (), root, 1.0)
-        deviation = known.deviation(others)
+        deviation = known.sigma(others)
     rms = float((deviation.square() + _noise(result, others).square()).sum(1).mean().sqrt())
     return rms if math.isfinite(rms) else None
 

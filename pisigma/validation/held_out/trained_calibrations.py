@@ -32,7 +32,7 @@ Result = CalibrationResult | HybridResult
 
 def geometric_of(calibrator: Calibrator) -> GeometricCalibrator:
     """Return the geometric calibrator, which a hybrid calibrator contains."""
-    return calibrator.geometric if isinstance(calibrator, HybridCalibrator) else calibrator
+    return calibrator.geometric_calibrator if isinstance(calibrator, HybridCalibrator) else calibrator
 
 
 def geometric_result(result: Result) -> CalibrationResult:
@@ -101,7 +101,7 @@ def drop_missing_frames(
         held_out: further socket distances to remove.
     """
     if isinstance(calibrator, HybridCalibrator):
-        geometric = drop_missing_frames(calibrator.geometric, rows, all_rows, held_out)
+        geometric = drop_missing_frames(calibrator.geometric_calibrator, rows, all_rows, held_out)
         assert isinstance(geometric, GeometricCalibrator)
         return replace(calibrator, robot=geometric)
     no_frame = set(all_rows.frame) - set(rows.frame)

@@ -45,7 +45,11 @@ class JointErrors:
     @staticmethod
     def from_model(model: CalibratedModel, pairs: TrainingPairs) -> "JointErrors":
         """Return the joint errors of the rows used for training, before and after the model's correction."""
-        T, q, before = pairs.T[pairs.used], pairs.q_nominal[pairs.used], pairs.target[pairs.used]
+        T, q, before = (
+            pairs.T[pairs.used_rows],
+            pairs.q_nominal[pairs.used_rows],
+            pairs.target[pairs.used_rows],
+        )
         return JointErrors(T, before, before - model.correction(T, q))
 
 

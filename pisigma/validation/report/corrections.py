@@ -299,7 +299,7 @@ def measured_intervals(
     result = []
     for j, limits in enumerate(map(tuple, model.robot.limits.tolist())):
         of_joint, rate = coverage.joint == j, float(coverage.angle_per_value[j])
-        middle, half = coverage.middle[of_joint].tolist(), coverage.half[of_joint].tolist()
+        middle, half = coverage.middle[of_joint].tolist(), coverage.half_width[of_joint].tolist()
         ends = [((m - h) / rate, (m + h) / rate) for m, h in zip(middle, half, strict=True)]
         result.append(_in_range(ends, limits, 2 * math.pi / rate if coverage.is_periodic[j] else None))
     return result

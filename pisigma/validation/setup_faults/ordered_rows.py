@@ -107,7 +107,11 @@ class OrderedRows:
         learned = result.learned if isinstance(result, HybridResult) else None
         geometric = result.geometric if isinstance(result, HybridResult) else result
         solved = geometric.solved
-        data, view, rows = solved.measurements, sensor_view_of(solved.refined), solved.setup.rows.cpu()
+        data, view, rows = (
+            solved.measurements,
+            sensor_view_of(solved.refined_linearisation),
+            solved.setup.rows.cpu(),
+        )
         errors = None if learned is None else result.errors_of(data)
         present = [sensor.present for sensor in solved.problem.sensors if sensor.name in SENSORS]
         if not present:
@@ -117,8 +121,8 @@ class OrderedRows:
         some = some[np.argsort(np.argsort(order_of_rows(data))[rows[some]])]
         problem = replace(solved.problem, pairs=0).select(some)
         whole, every = slice(0, len(some)), torch.arange(len(problem.space.parameters))
-        motion = problem.motion(solved.refined.point, whole, every)
-        unknowns = problem.space.sensor_unknowns(solved.refined.point)
+        motion = problem.motion(solved.refined_linearisation.point, whole, every)
+        unknowns = problem.space.sensor_unknowns(solved.refined_linearisation.point)
         R = solved.setup.anchors.bases[:, :3, :3][problem.frame]
         residuals, derivatives, values, noise = [], [], 0, []
         for k, sensor in enumerate(problem.sensors):
@@ -211,7 +215,7 @@ class OrderedRows:
         """Prior precision (1 / variance) of the parameters and of the weights."""
         robot = self.problem.space.robot
         active = self.problem.precision[self.problem.active]
-        view = sensor_view_of(self.result.solved.refined)
+        view = sensor_view_of(self.result.solved.refined_linearisation)
         if self.sizes:
             view = replace(view, prior_scale=view.prior_scale.clamp(min=MIN_USUAL_SCALE))
         precision = view.scaled_precision(active, self.problem.prior_group).cpu().numpy()

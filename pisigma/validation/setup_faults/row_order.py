@@ -211,7 +211,8 @@ class _Search:
                 index = np.flatnonzero(group == number)
                 yield _Candidate(moved, number, index, Z[index], np.ones((len(index), 1)))
         if len(space.targets) > 1:
-            arms = space.split(self.rows.result.solved.refined.point)[2][:, :3].cpu().numpy()[group]
+            point = self.rows.result.solved.refined_linearisation.point
+            arms = space.split(point)[2][:, :3].cpu().numpy()[group]
             lever = np.cross(np.eye(3)[:, None], arms)  # e_k × p, (3, rows, 3)
             turned = np.einsum("nvx,knx->nvk", Z[:, :, :3], lever)
             both = np.concatenate([Z[:, :, :3], turned], 2)

@@ -18,7 +18,7 @@ from pisigma.files.yaml_file import Section, place_of_key, read_yaml
 from pisigma.files.yaml_writing import yaml_text
 from pisigma.lifetime.cell.facts import CellFacts
 from pisigma.lifetime.cell.layout import CELL_FILE, is_cell_of_arms
-from pisigma.lifetime.cell.status import VERIFICATION_POSES, plans_check
+from pisigma.lifetime.cell.status import VERIFICATION_POSES, is_check_due
 from pisigma.planning.plan_settings import PlanSettings
 from pisigma.planning.surroundings.arm_in_surroundings import ArmInSurroundings
 from pisigma.planning.surroundings.surroundings import Surroundings
@@ -254,7 +254,7 @@ class CellFile:
         settings: PlanSettings = self.settings_of_step("plan", **changed)
         stated = self.stated_values("plan").keys() | changed.keys()
         default: dict[str, Any] = {"seed": settings.seed + len(facts.plans)}
-        if plans_check(facts):
+        if is_check_due(facts):
             default |= {"count": VERIFICATION_POSES, "check": 0}
         return replace(settings, **{key: value for key, value in default.items() if key not in stated})
 

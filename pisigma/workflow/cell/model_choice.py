@@ -138,7 +138,7 @@ def check_entry(
     if session.rows < _MIN_ROWS:
         return check
     tried = recalibrate(monitoring.model, rows.rows, rows.settings_to_recalibrate(settings))
-    if not (tried.trusted and tried.gate.updates):
+    if not (tried.trusted and tried.gate.updates_model):
         return check
     return replace(check, recalibrate=True, summary=f"{judged.sentence} {tried.gate.sentence}")
 

@@ -61,7 +61,7 @@ def advance_cell(
     cell.sessions.one_by_one = True
     done: set[str] = set()
     while True:
-        step = next_step(replace(facts_of(cell.folder), not_taken_in=()))
+        step = next_step(replace(facts_of(cell.folder), unrecorded_files=()))
         if step.verb is not None and step.command not in done:
             done.add(step.command)
             progress(step.verb)
@@ -318,7 +318,10 @@ def parameters_of(model: "CalibratedModel") -> list[ParameterValue]:
     from pisigma.measurement.sensors.sensor import SHOWN_UNITS
 
     space, values = posterior.space, posterior.geometry.robot.dh.ravel()
-    changes, deviations = values - space.robot.dh.ravel(), posterior.root[: space.arm_size].norm(dim=1)
+    changes, deviations = (
+        values - space.robot.dh.ravel(),
+        posterior.root[: space.arm_parameter_count].norm(dim=1),
+    )
     parameters = []
     for number in deviations.nonzero()[:, 0].tolist():
         unit, scale = SHOWN_UNITS[space.parameters[number].unit]

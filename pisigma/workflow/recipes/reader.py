@@ -123,7 +123,7 @@ def _network_checks(recipe: InverseRecipe, robot: Robot) -> Iterator[Check]:
 def _where_checks(keys: Key, section: SimulatedPoses, robot: Robot) -> Iterator[Check]:
     """Yield the checks of a section of simulated poses."""
     if isinstance(section, SimulatedImages):
-        yield (*keys, "poses"), partial(section.poses.check, robot)
+        yield (*keys, "poses"), partial(section.poses.closed_form, robot)
     elif isinstance(section.poses, JointsRandom):
         yield (*keys, "poses"), partial(section.poses.joints, robot)
     elif section.branch is not None:

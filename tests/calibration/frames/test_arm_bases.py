@@ -240,7 +240,7 @@ def test_arms_that_touch_are_connected(tip):
 def test_wrong_touch_is_named():
     left, right = touching_arms(1, "")
     assert right.touches is not None
-    q = right.touches.postures.q_moved.clone()
+    q = right.touches.postures.q_corrected.clone()
     q[7, 1] += 2e-3
     state = JointState.from_measurements(Measurements(q=q))
     wrong = replace(right, touches=replace(right.touches, postures=Postures(state, q)))

@@ -91,9 +91,7 @@ def test_coordinate_that_no_touch_determines_keeps_its_value(count, noise):
         fit = fit_frames(TURNED, touches(q, noise * random_noise(count, seed)), "tool")
         (weak,) = fit.weak_directions
         assert (weak.combination, weak.is_held) == ("tool_x", True)
-        assert (40 < weak.deviation < np.inf) == bool(
-            noise
-        )  # noise turns the tip, which looks like information
+        assert (40 < weak.sigma < np.inf) == bool(noise)  # noise turns the tip, which looks like information
         assert fit.undetermined == {fit.solved.problem.space.index("tool_x")}
         assert_close(fit.estimates[0], TURNED.tool[0], atol=1e-4)
         assert_close(fit.estimates[1:], TIP[1:3], atol=1e-9 + 6 * NOISE * noise)
@@ -137,7 +135,7 @@ def test_value_before_that_the_rows_contradict_is_not_held():
         Measurements(q=near, position=place),
         "base",
     )
-    assert fit.weak_directions[0].deviation > 25
+    assert fit.weak_directions[0].sigma > 25
     assert not any(one.is_held for one in fit.weak_directions)
     assert_close(fit.solved.geometry.robot.base[3:], BASE[3:], atol=0.2)
 

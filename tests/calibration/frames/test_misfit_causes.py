@@ -38,14 +38,14 @@ def causes_of(kind: str, seed: int) -> tuple[Cause, ...]:
 def test_cause_is_named(kind):
     first, *_ = causes_of(kind, 1)
     assert first.name == kind
-    assert first.named
+    assert first.is_supported
     assert first.log_bayes_factor > 2 * CLEAR
     assert 0.3 < first.explained_share <= 1.0
 
 
 def test_no_fault_is_named_for_valid_rows():
     causes = causes_of("nothing", 2)
-    assert not any(one.named for one in causes)
+    assert not any(one.is_supported for one in causes)
     assert all(one.log_bayes_factor < CLEAR for one in causes)
 
 
@@ -56,7 +56,7 @@ def test_evidence_is_that_of_the_marginal_likelihood():
     none = torch.zeros(30, dtype=torch.bool)
     residuals = FitResiduals.from_fit(y, fitted, Z[:, :0], none, False, {"wrong": Z, "other": Z.flip(0)})
     wrong, other = residuals.compare()
-    assert (wrong.name, wrong.named, other.named) == ("wrong", True, False)
+    assert (wrong.name, wrong.is_supported, other.is_supported) == ("wrong", True, False)
     # the same with a wide prior of what was fitted instead of the projection
     sizes, noise = torch.logspace(-3, 1.5, 28).double(), torch.logspace(-2, 2, 41).double()
 

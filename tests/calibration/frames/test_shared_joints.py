@@ -47,7 +47,7 @@ def test_arms_have_one_base_and_equal_parameters_of_the_shared_joints(tmp_path, 
         q = measured.q[:20] * 0.5
         geometry = arm.uncertainty.geometry.robot
         error = forward_kinematics(geometry, q)[:, :3, 3] - forward_kinematics(robot, q)[:, :3, 3]
-        deviation = arm.uncertainty.deviation(replace(measured.select(torch.arange(20)), q=q))
+        deviation = arm.uncertainty.sigma(replace(measured.select(torch.arange(20)), q=q))
         assert 0.5 < float(error.norm() / deviation.norm()) < 1.6
         assert float(deviation.max()) < 3 * NOISE
 
@@ -76,11 +76,9 @@ def test_errors_of_both_tools_are_those_of_one_fit_of_all_rows(tmp_path, joints)
     true, rows, fits, found = fitted(tmp_path, 1, joints)
     few = [one.select(torch.arange(12)) for one in rows]
     bound = bound_of_tools(true, rows, fits, [one.q for one in few], joints)
-    stated = [
-        arm.uncertainty.deviation(one).numpy() for arm, one in zip(found.updated_arms, few, strict=True)
-    ]
+    stated = [arm.uncertainty.sigma(one).numpy() for arm, one in zip(found.updated_arms, few, strict=True)]
     assert_close(np.array(stated) / bound, 1.0, atol=0.02)
-    alone = [arm.uncertainty.deviation(one).numpy() for arm, one in zip(found.arms, few, strict=True)]
+    alone = [arm.uncertainty.sigma(one).numpy() for arm, one in zip(found.arms, few, strict=True)]
     assert float(np.mean(stated) / np.mean(alone)) < 0.98
 
 

@@ -36,7 +36,7 @@ def test_the_table_fits_the_robot(result: CalibrationResult) -> None:
             else difference
         )
         assert_close(parameter.change, float(turn), atol=1e-15)
-        assert parameter.free == (parameter.name in result.free)
+        assert parameter.free == (parameter.name in result.free_parameters)
     assert table["d_2"].remark == "d_2 + d_3 + d_4 is identified; the individual values are not"
     assert table["a_2"].remark == "identified"
     assert result.parameter("a_2") is table["a_2"]
@@ -53,7 +53,9 @@ def test_noise_is_recovered_and_counted(result: CalibrationResult) -> None:
     assert [noise.sensor for noise in result.noise] == ["position", "rotation"]
     assert_close(result.noise[0].sigma, 5e-5, rtol=0.15)
     assert_close(result.noise[1].sigma, 1e-4, rtol=0.15)
-    assert_close(sum(noise.effective_parameters for noise in result.noise), len(result.free), atol=1.0)
+    assert_close(
+        sum(noise.effective_parameters for noise in result.noise), len(result.free_parameters), atol=1.0
+    )
     assert_close(result.noise[0].rms, result.rms_path[-1], rtol=1e-6)
 
 

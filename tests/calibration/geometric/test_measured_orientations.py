@@ -59,7 +59,7 @@ def position_errors(seed: int, wobble: float) -> tuple[float, float, Calibration
 
 def factor_of(result: CalibrationResult) -> float:
     """By how much the variance of the orientations was enlarged."""
-    return sensor_view_of(result.solved.solution.linearisation).disagreement[1]
+    return sensor_view_of(result.solved.solution.linearisation).angle_variance_factor[1]
 
 
 def ratio(wobble: float) -> tuple[float, list[float]]:
@@ -116,4 +116,4 @@ def test_angles_alone_and_lengths_alone_keep_their_variance() -> None:
     for rows in (Measurements(q, T[:, :3, 3]), Measurements(q, rotation=T[:, :3, :3])):
         solved = GeometricCalibrator(robot).solve(rows)
         view: SensorView = sensor_view_of(solved.solution.linearisation)
-        assert view.disagreement.tolist() == [1.0]
+        assert view.angle_variance_factor.tolist() == [1.0]

@@ -64,6 +64,6 @@ def test_values_that_were_not_kept_are_nan(result: CalibrationResult) -> None:
     space = solved.problem.space
     bare = solved.geometry.__class__(result.robot, result.bases, result.tools, {})
     posterior = ParameterPosterior.from_geometry(space, bare, solved.root)
-    first = space.arm_size + 6 * (len(space.frames) + len(space.targets))
+    first = space.arm_parameter_count + 6 * (len(space.frames) + len(space.targets))
     assert_close(posterior.mean[:first], result.posterior.mean[:first])
     assert bool(posterior.mean[first:].isnan().all())

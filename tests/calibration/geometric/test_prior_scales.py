@@ -22,7 +22,7 @@ from pisigma.validation.checks.prior_ratio import UNUSUAL
 def groups(**options: object) -> dict[str, int]:
     """Group of every parameter of the welding robot."""
     setup = GeometricCalibrator(true_robot().nominal, **options).build(touch_data())  # type: ignore[arg-type]
-    problem = setup.problem.with_active(range(setup.problem.space.arm_size))
+    problem = setup.problem.with_active(range(setup.problem.space.arm_parameter_count))
     return dict(zip(problem.space.names, problem.prior_group.tolist(), strict=False))
 
 

@@ -75,7 +75,7 @@ def test_23_parameters_come_back_from_exact_touches_without_a_guess() -> None:
     calibrator = GeometricCalibrator(arm.nominal, free=ARM, tool="position", prior=None, loss=SquaredLoss())
     solved = calibrator.solve(touch_data())
     result, at_start = solved.result(), solved.findings.information
-    assert len(result.free) == result.rank == 23
+    assert len(result.free_parameters) == result.rank == 23
     of_arm = at_start.eliminate([k for k, p in enumerate(at_start.parameters) if p.group in ("base", "tool")])
     assert find_redundancy(of_arm, np.zeros(len(of_arm.parameters))).rank == len(ARM)
     assert result.status.is_minimum
@@ -100,7 +100,7 @@ def test_base_names_mean_every_frame_and_a_further_jig_costs_six() -> None:
         )
         result = calibrator.fit(touch_data(frames))
         assert_close(result.robot.dh, arm.geometric_robot.dh, atol=1e-9)
-        counts.append(len(result.free))
+        counts.append(len(result.free_parameters))
     assert counts == [17, 23, 29]
 
 

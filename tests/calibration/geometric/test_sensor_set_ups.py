@@ -161,13 +161,13 @@ def test_nothing_depends_on_where_the_base_of_a_floating_frame_starts() -> None:
     off = robot.with_geometry(base=np.array([0.7, -1.0, 0.4, 2.0, -0.6, 1.1]))
     distances = {(f"{name}/0", f"{name}/1"): 0.05 for name in ("plate", "low", "high")}
     solved = [GeometricCalibrator(one, socket_distances=distances).solve(data) for one in (robot, off)]
-    arm = slice(solved[0].problem.space.arm_size)
+    arm = slice(solved[0].problem.space.arm_parameter_count)
     first, other = (one.solution.linearisation.point[arm] for one in solved)
     assert_close(other, first, atol=1e-9)
     for one in solved:
         result = one.result()
         assert one.solution.status.is_minimum
         assert {f"base_{column}" for column in FRAME_COLUMNS} <= set(result.redundancy.no_effect)
-        assert not any(name.startswith("base") for name in result.free)
+        assert not any(name.startswith("base") for name in result.free_parameters)
         errors = [p.standard_error for p in result.parameters if p.name.startswith("socket")]
         assert max(errors) < 1e-3

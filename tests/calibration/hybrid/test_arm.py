@@ -84,7 +84,7 @@ def test_one_row_is_a_stretch_of_no_length() -> None:
     robot = Robot.load("ur5")
     q = torch.full((1, 6), 0.4, dtype=torch.float64)
     found = JointCoverage.from_joints(robot, q)
-    assert_close(found.half, torch.zeros(6))
+    assert_close(found.half_width, torch.zeros(6))
     assert found.contains(q).tolist() == [True]
     assert found.contains(q + 0.5).tolist() == [False]
     assert found.contains(q[0]).shape == ()

@@ -39,7 +39,7 @@ def test_errors_of_a_sensor_are_compared_by_groups():
     before = SensorErrors(group, 2 * small, 3 * small, torch.ones_like(small))
     better = SensorErrors(group, small, small, torch.ones_like(small))
     assert not better.compare(before).is_worse
-    assert better.compare(before).held_out == pytest.approx(1 / 3)
+    assert better.compare(before).held_out_ratio == pytest.approx(1 / 3)
     assert better.compare(before).gain > 3
     assert before.compare(better).is_worse
     assert before.compare(better).gain < -3

@@ -63,7 +63,7 @@ def test_posterior_is_that_of_normal_variables(seed: int) -> None:
     assert_close(found.x, covariance @ columns.T @ targets, atol=1e-12)
     told = 1 - prior().precision.numpy() * covariance.diagonal()
     assert_close(found.effective_unknowns, told.sum(), rtol=1e-10)
-    assert_close(found.determined, np.bincount(GROUP, told), rtol=1e-10)
+    assert_close(found.determined_unknowns, np.bincount(GROUP, told), rtol=1e-10)
     assert_close(found.square, np.bincount(GROUP, prior().base.numpy() * found.x.numpy() ** 2), rtol=1e-12)
 
 

@@ -119,7 +119,9 @@ def test_downweighted_values_have_larger_errors_than_their_weight() -> None:
     sensor = torch.tensor([0, 0, 0, 1, 1, 1])
     counts = [SensorCount(3.0, False, False), SensorCount(1.0, False, False, 3.0)]
     M = torch.linalg.inv(S)
-    alone = HeldOutErrors.from_fit(M, M @ y, sensor, [counts[0], replace(counts[1], repetition=1.0)])
+    alone = HeldOutErrors.from_fit(
+        M, M @ y, sensor, [counts[0], replace(counts[1], repeat_variance_factor=1.0)]
+    )
     found = HeldOutErrors.from_fit(M, M @ y, sensor, counts)
     assert_close(alone.error, y, atol=1e-12)
     assert_close(alone.spread, S.diagonal().sqrt(), rtol=1e-12)

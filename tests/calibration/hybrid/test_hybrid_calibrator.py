@@ -69,11 +69,11 @@ def test_all_errors_of_a_simulated_robot_are_learned_from_150_positions() -> Non
 def test_95_percent_intervals_cover_about_as_many_new_poses() -> None:
     simulated, result = fitted()
     errors = result.errors_of(simulated.test)["position"]
-    inside = errors.abs() < 1.96 * result.deviation(simulated.test)
+    inside = errors.abs() < 1.96 * result.sigma(simulated.test)
     assert 0.90 < float(inside.double().mean()) < 0.99
     geometric_only, plain = fitted(geometry_only=True)
     errors = plain.errors_of(geometric_only.test)["position"]
-    inside = errors.abs() < 1.96 * plain.deviation(geometric_only.test)
+    inside = errors.abs() < 1.96 * plain.sigma(geometric_only.test)
     assert 0.90 < float(inside.double().mean()) < 0.995
 
 
@@ -95,8 +95,8 @@ def test_a_kept_correction_is_in_the_table_of_what_was_tried() -> None:
     _, result = fitted()
     assert [trial.name for trial in result.trials[:2]] == ["geometry", "gravity"]
     kept = [trial for trial in result.trials if trial.kept]
-    assert kept[0].held_out == 1.0
-    assert kept[-1].held_out < 0.5
+    assert kept[0].held_out_ratio == 1.0
+    assert kept[-1].held_out_ratio < 0.5
     assert all(b.log_evidence > a.log_evidence for a, b in itertools.pairwise(kept))
     assert all(b.unknowns > kept[0].unknowns for b in result.trials[1:])
 
@@ -125,7 +125,7 @@ def test_two_fits_are_equal_and_progress_is_reported() -> None:
     said: list[str] = []
     second = calibrator(simulated.robot).fit(simulated.train, said.append)
     assert bool((first.predicted_poses(simulated.test) == second.predicted_poses(simulated.test)).all())
-    assert bool((first.deviation(simulated.test) == second.deviation(simulated.test)).all())
+    assert bool((first.sigma(simulated.test) == second.sigma(simulated.test)).all())
     assert said[0] == "gravity"
     assert any(what.startswith("gravity + series 8") for what in said)
     assert "solving for all parameters" in said
@@ -150,7 +150,7 @@ def test_product_units_are_kept_where_joints_act_on_each_other() -> None:
     assert set(result.learned.correction.orders) == {2}
     assert "+ products)" in result.verdict or "(products)" in result.verdict
     assert rms(result, test) < 0.3 * rms(result.geometric, test)
-    errors, deviation = result.errors_of(test)["position"], result.deviation(test)
+    errors, deviation = result.errors_of(test)["position"], result.sigma(test)
     assert 0.85 < float((errors.abs() < 1.96 * deviation).double().mean()) < 0.995
     names = [trial.name for trial in result.trials]
     assert any(name.endswith("products") for name in names)
@@ -205,7 +205,7 @@ def test_choosing_on_a_part_of_the_rows_takes_pairs_with_both_rows(monkeypatch: 
     """Every row of the searched ones has the group that it has among all."""
     monkeypatch.setattr("pisigma.calibration.hybrid.calibrator.SEARCHED_ROWS", 60)
     made = calibrator(true_robot().nominal, features=("joints",))
-    solved = made.geometric.solve(join([touch_data(), pair_data(40)]))
+    solved = made.geometric_calibrator.solve(join([touch_data(), pair_data(40)]))
     group = held_out_groups(solved.setup.measurements)
     choice = made._chosen(solved, group, lambda what: None)
     q = choice.rows.problem.q
@@ -296,7 +296,7 @@ def test_sockets_with_geometry_only_are_the_geometric_calibration() -> None:
     geometric = GeometricCalibrator(nominal, socket_distances=known)
     result = HybridCalibrator(geometric, harmonics=(8,), products=False).fit(data)
     assert result.learned is None
-    assert bool(torch.isfinite(result.deviation(data)).all())
+    assert bool(torch.isfinite(result.sigma(data)).all())
 
 
 @pytest.mark.parametrize("rows", [60, 400])
@@ -310,7 +310,7 @@ def test_without_noise_errors_and_their_deviations_vanish(rows: int) -> None:
         held_out = tracker_data(robot, test, delta[1])
         assert rms(result.geometric, held_out) > 3e-5
         assert rms(result, held_out) < 3e-7
-        assert float(result.deviation(held_out).max()) < 3e-6
+        assert float(result.sigma(held_out).max()) < 3e-6
 
 
 @pytest.mark.parametrize("rows", [60, 400])

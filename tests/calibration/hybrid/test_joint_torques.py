@@ -174,7 +174,7 @@ def test_negative_compliances_are_named(joints, cause):
     rows = dataclasses.replace(measured(60, 1), torque=measured(60, 1).torque * signs)
     calibrator = HybridCalibrator(ROBOT, features=("torques",), products=False)
     result = calibrator.fit(rows)
-    found = [*check_torques(CheckedCalibration(calibrator.geometric, rows, {"hybrid": result}))]
+    found = [*check_torques(CheckedCalibration(calibrator.geometric_calibrator, rows, {"hybrid": result}))]
     assert [one.cause for one in found] == ([cause] if cause else [])
     if cause == "mixed_signs":
         assert found[0].values["joints"] == (2,)

@@ -50,7 +50,7 @@ def test_the_cases_are_what_they_are_for() -> None:
     assert len(values["pair"].row_derivatives) == 2
     assert len(poses().rows.values[0].root.unique()) > 20
     assert not bool(poses().design.features[1].used.all())
-    assert several_targets().rows.values[0].repetition > 1.2
+    assert several_targets().rows.values[0].repeat_variance_factor > 1.2
     assert len(CASES["few values"]().dense.y) < CASES["few values"]().design.unknowns / 4
 
 

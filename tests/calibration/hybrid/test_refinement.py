@@ -29,7 +29,7 @@ def refined(request: pytest.FixtureRequest) -> RefinedFit:
     if request.param:
         delta = delta + 1e-2 * q.sin() * q.cos().roll(1, 1)
     calibrator = HybridCalibrator(GeometricCalibrator(ROBOT), harmonics=(2,), products=request.param)
-    solved = calibrator.geometric.solve(tracker_data(ROBOT, q, delta, 3e-5))
+    solved = calibrator.geometric_calibrator.solve(tracker_data(ROBOT, q, delta, 3e-5))
     group = held_out_groups(solved.setup.measurements)
     choice = calibrator._chosen(solved, group, lambda what: None)
     return refine(solved.problem, group, choice)

@@ -123,7 +123,7 @@ def test_three_identical_targets_of_a_configuration_count_as_one() -> None:
     """The design effect: three times the values say as much as one of them."""
     copies = alike(3)
     found = copies.downweight_correlated(torch.arange(8).repeat_interleave(3))
-    assert_close(found.repetition, 3.0, rtol=1e-12)
+    assert_close(found.repeat_variance_factor, 3.0, rtol=1e-12)
     assert_close(found.root, copies.root / 3**0.5, rtol=1e-12)
     one = values_of(8)
     weight = found.root.square().view(8, 3).sum(1)
@@ -154,11 +154,11 @@ def test_targets_with_independent_errors_have_full_weight() -> None:
     values = values_of(3_000)
     values = replace(values, residual=values.residual / values.root[:, None])
     independent = values.downweight_correlated(torch.arange(1_000).repeat_interleave(3))
-    assert 1.0 <= independent.repetition < 1.1
+    assert 1.0 <= independent.repeat_variance_factor < 1.1
     opposite = alike(2)
     sign = torch.tensor([1.0, -1.0]).double().repeat(8)[:, None]
     opposite = replace(opposite, residual=opposite.residual * sign)
-    assert opposite.downweight_correlated(torch.arange(8).repeat_interleave(2)).repetition == 1.0
+    assert opposite.downweight_correlated(torch.arange(8).repeat_interleave(2)).repeat_variance_factor == 1.0
 
 
 def test_exact_values_pairs_and_single_targets_have_full_weight() -> None:
@@ -169,4 +169,4 @@ def test_exact_values_pairs_and_single_targets_have_full_weight() -> None:
     assert pair.downweight_correlated(configuration) is pair
     none = copies.select(slice(0, 0))
     assert none.downweight_correlated(configuration) is none
-    assert_close(copies.downweight_correlated(torch.arange(24)).repetition, 1.0, rtol=1e-12)
+    assert_close(copies.downweight_correlated(torch.arange(24)).repeat_variance_factor, 1.0, rtol=1e-12)

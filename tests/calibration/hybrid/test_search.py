@@ -52,7 +52,7 @@ def products() -> LinearisedArm:
 def test_geometry_is_the_first_line_and_the_unit(series: LinearisedArm) -> None:
     search = search_of(series)
     (line,) = search.trials
-    assert (line.name, line.held_out, line.kept) == ("geometry", 1.0, True)
+    assert (line.name, line.held_out_ratio, line.kept) == ("geometry", 1.0, True)
     assert search.geometry.name == "geometry"
     assert line.unknowns == search.geometry.design.active
     alone = series.fitted(())
@@ -66,7 +66,7 @@ def test_larger_series_are_tried_until_the_evidence_is_clearly_against_them(seri
     assert best.name.endswith("series 4")
     kept = [line for line in search.trials if line.kept]
     assert kept[-1].name == best.name
-    assert kept[-1].held_out < 0.4
+    assert kept[-1].held_out_ratio < 0.4
     assert all(b.log_evidence > a.log_evidence + CLEAR_EVIDENCE for a, b in itertools.pairwise(kept))
     assert [line.name for line in search.trials[1:]] == said
 
@@ -76,7 +76,7 @@ def test_products_come_last_and_stay_where_they_help(products: LinearisedArm) ->
     best = search.select_features(SERIES[:1], [SMALL], [PRODUCTS])
     assert best.name.endswith("products")
     assert search.trials[-1].kept
-    assert search.trials[-1].held_out < 0.6
+    assert search.trials[-1].held_out_ratio < 0.6
     moved = best.design.correction(best.posterior.x, search.rows.problem.state)[:, 1]
     q = search.rows.problem.q
     columns = torch.cat(
@@ -116,7 +116,7 @@ def test_few_rows_are_fitted_with_all_features_from_usual_sizes() -> None:
     *before, together, wider = search.trials
     assert not wider.kept  # the geometry is nominal here
     assert together.log_evidence > max(line.log_evidence for line in before) + CLEAR_EVIDENCE
-    assert together.held_out < 0.7 * min(line.held_out for line in before if line.kept)
+    assert together.held_out_ratio < 0.7 * min(line.held_out for line in before if line.kept)
 
 
 def test_what_does_not_help_leaves_the_geometry() -> None:

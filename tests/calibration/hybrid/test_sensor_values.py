@@ -192,7 +192,7 @@ def test_given_standard_deviations_are_the_rows_roots() -> None:
     values = sensor_values(problem.with_active([0, 1]), problem.nominal)
     found = {sensor.name: sensor for sensor in values}
     assert_close(found["position"].root, 1 / sigma[problem_rows(problem, data)], rtol=1e-12)
-    assert (found["position"].stated, found["rotation"].stated) == (True, False)
+    assert (found["position"].has_stated_noise, found["rotation"].has_stated_noise) == (True, False)
     assert_close(found["rotation"].root, torch.ones(data.rows))
 
 

@@ -132,7 +132,10 @@ def test_deviation_is_that_of_the_derivative_by_all_unknowns(arm: LinearisedArm)
             count = int(chosen.used.sum())
             correction.linear[k][chosen.used] = own[start : start + count]
             start += count
-        arm_part, rest = values[: space.arm_size], values[space.arm_size :].reshape(-1, 6)
+        arm_part, rest = (
+            values[: space.arm_parameter_count],
+            values[space.arm_parameter_count :].reshape(-1, 6),
+        )
         moved = replace(test, q=test.q + correction(test.q))
         bases = dict(zip(known.bases, rest[:2], strict=True))
         tools = dict(zip(known.tools, rest[2:], strict=True))
@@ -153,7 +156,7 @@ def test_deviation_is_that_of_the_derivative_by_all_unknowns(arm: LinearisedArm)
     predicted(parameters, weights)
     J = torch.stack(columns, -1)
     expected = (J @ found.root).square().sum(-1).sqrt()
-    got = found.deviation(test, correction)
+    got = found.sigma(test, correction)
     assert_close(got, expected, rtol=1e-5)
     assert float(got.min()) > 1e-6
     assert float(got.max()) < 1e-4
@@ -170,7 +173,7 @@ def test_deviation_is_that_of_drawn_calibrations(arm: LinearisedArm) -> None:
     draws = torch.linalg.cholesky(C) @ normal(len(C), 4000, seed=8)
     drawn = (X @ draws).std(-1) * found.prior_scale**0.5
     of_rows = arm.setup.measurements.select(values.row)
-    got = found.deviation(of_rows, correction)
+    got = found.sigma(of_rows, correction)
     # Drawn along the axes of the problem, told along those of the frame: the length is the same.
     assert_close(got.norm(dim=1), drawn.norm(dim=1), rtol=0.05)
 
@@ -182,7 +185,7 @@ def test_more_rows_reduce_the_widening_which_is_at_least_one() -> None:
         own = linearised(robot, tracker_data(robot, random_joints(robot, rows, 2), noise=3e-5))
         found, _, correction = uncertainty(own)
         test = tracker_data(robot, random_joints(robot, 200, 3))
-        deviations.append(float(found.deviation(test, correction).mean()))
+        deviations.append(float(found.sigma(test, correction).mean()))
         assert 1.0 <= found.prior_scale < 3.0
     assert 0.3 < deviations[1] / deviations[0] < 0.75
 
@@ -197,7 +200,7 @@ def test_sizes_and_noise_of_many_groups_are_those_of_all_rows(monkeypatch: pytes
     monkeypatch.setattr("pisigma.calibration.hybrid.uncertainty.CHUNK", 3)
     test = tracker_data(robot, random_joints(robot, 10, 3))
     found = uncertainty(own)[0]
-    whole = found.deviation(test)
+    whole = found.sigma(test)
     for k in range(10):
-        alone = found.deviation(test.select(torch.tensor([k])))
+        alone = found.sigma(test.select(torch.tensor([k])))
         assert_close(alone, whole[k : k + 1], rtol=1e-12)

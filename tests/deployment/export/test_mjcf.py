@@ -69,7 +69,7 @@ def pose_in(path, robot: Robot, q: np.ndarray) -> np.ndarray:
     for body, row, value in zip(moved, robot.joints, q, strict=True):
         turn = rotation(2, row.direction * value)
         motion = turn if row.type == "revolute" else translation(0.0, 0.0, row.direction * value)
-        T = T @ body.between @ body.pose @ body.attached @ motion @ np.linalg.inv(body.attached)
+        T = T @ body.parent_pose @ body.pose @ body.axis_frame @ motion @ np.linalg.inv(body.axis_frame)
     return T @ drawing.pose(tool)
 
 

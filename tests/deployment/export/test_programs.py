@@ -38,7 +38,7 @@ def targets_at(q: torch.Tensor, T: torch.Tensor | None = None, name: str = "rb5"
         branch=("only",) * len(q),
         q=q,
         T=forward_kinematics(robot, q) if T is None else T,
-        deviation=torch.full((len(q),), 1e-5, dtype=torch.float64),
+        sigma=torch.full((len(q),), 1e-5, dtype=torch.float64),
     )
     return replace(plain, **others)
 

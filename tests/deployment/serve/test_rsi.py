@@ -78,7 +78,7 @@ def test_corrections_rise_and_fall_without_a_jump(cycle, ik):
     stream, given = RsiAnswers(ik, "pisigma", 1.0), []
     for stamp in range(100, 100 + 3 * RAMP_MS, cycle):
         if stamp > 100 + 1.5 * RAMP_MS:
-            stream.leave()
+            stream.ramp_down()
         given.append(correction(stream.answer(packet(START, stamp)), stamp))
         if stream.finished:
             break

@@ -263,7 +263,7 @@ def test_a_cell_of_schema_1_keeps_every_entry_and_the_monitored_sessions_of_its_
     for one, record in zip(history.monitored_sessions(), read_sessions(history, model.sha256), strict=True):
         assert_close(one.rms_mm, record.session.rms * 1e3)
         assert_close(one.rms_after_mm, record.session.rms_after * 1e3)
-        assert (one.verdict, one.unchanged) == (record.session.verdict, record.session.unchanged)
+        assert (one.verdict, one.unchanged) == (record.session.verdict, record.session.unchanged_probability)
     assert not beside.exists()
     assert history.database.upgrade() == SCHEMA_VERSION
 

@@ -10,7 +10,7 @@ from pisigma.lifetime.cell.events import ARM_EVENTS, Event
 from pisigma.lifetime.cell.exports import ControllerEntry, ExportEntry
 from pisigma.lifetime.cell.facts import NOT_TRUSTED, CellFacts
 from pisigma.lifetime.cell.history import Check, ModelEntry, SessionEntry
-from pisigma.lifetime.cell.status import MAX_DAYS_UNVERIFIED, CellStatus, next_step, plans_check
+from pisigma.lifetime.cell.status import MAX_DAYS_UNVERIFIED, CellStatus, is_check_due, next_step
 from pisigma.lifetime.cell.step import State
 
 
@@ -57,12 +57,12 @@ CASES = {
     "no_plan": (EMPTY, "plan"),
     "not_measured": (PLANNED, "import"),
     "session_incomplete": (replace(MEASURED, incomplete="3 of 50 poses"), "import"),
-    "several_arms": (replace(PLANNED, not_taken_in=("a.csv",), has_several_arms=True), ""),
-    "not_taken_in": (replace(PLANNED, not_taken_in=("2026-01-10.csv",)), "import"),
+    "several_arms": (replace(PLANNED, unrecorded_files=("a.csv",), has_several_arms=True), ""),
+    "not_taken_in": (replace(PLANNED, unrecorded_files=("2026-01-10.csv",)), "import"),
     "file_refused": (
         replace(
             PLANNED,
-            not_taken_in=("2026-01-10.csv",),
+            unrecorded_files=("2026-01-10.csv",),
             checks=(check("import", "", "2026-01-10", "refused"),),
         ),
         "session",
@@ -152,7 +152,7 @@ def test_facts_lead_to_their_state_and_its_command(state):
 )
 def test_a_plan_that_was_made_is_measured_before_another_is_due(facts, checks_model):
     assert next_step(facts).command.split()[1:] == ["plan", "cell"]
-    assert plans_check(facts) is checks_model
+    assert is_check_due(facts) is checks_model
     made = check("plan", "", verdict="planned", at="2026-09-01T10:00:00+00:00")
     assert next_step(replace(facts, checks=(*facts.checks, made))).state == "not_measured"
     earlier = replace(made, checked="2026-01-01T10:00:00+00:00")

@@ -48,9 +48,9 @@ def test_models_of_disjoint_rows_differ_by_chance_only():
         assert differences.remainder is not None
         assert not differences.remainder.significant
         for one in differences.parameters:
-            if one.shift is not None and one.deviation is not None:
+            if one.shift is not None and one.sigma is not None:
                 tested += 1
-                outside += abs(one.shift) > NORMAL_95 * one.deviation
+                outside += abs(one.shift) > NORMAL_95 * one.sigma
     assert tested > 100
     assert outside <= 0.08 * tested
 
@@ -67,7 +67,7 @@ def test_a_nominal_robot_has_no_uncertainty():
     model = model_of(50)
     differences = parameter_differences(ModelPair.from_models(model, nominal_model(model, True), "fitted"))
     assert differences.differing
-    assert all(one.deviations[1] == 0.0 for one in differences.parameters)
+    assert all(one.sigmas[1] == 0.0 for one in differences.parameters)
 
 
 def test_a_displacement_that_is_explained_completely_is_due_to_chance():
@@ -84,4 +84,4 @@ def test_a_model_without_posterior_is_compared_without_tests():
         ModelPair.from_models(first, replace(model_of(51), uncertainty=None), "fitted")
     )
     assert differences.remainder is None
-    assert all(one.p is None and one.deviations[1] is None for one in differences.parameters)
+    assert all(one.p is None and one.sigmas[1] is None for one in differences.parameters)

@@ -32,7 +32,7 @@ def rms(errors):
 
 
 def test_an_inconsistent_robot_is_named_and_excluded(prior):
-    assert prior.odd == (ROBOTS - 1,)
+    assert prior.inconsistent_robots == (ROBOTS - 1,)
     summary = summarise_prior(prior, [f"r{k}" for k in range(ROBOTS)])
     assert (summary.robots, summary.odd) == (ROBOTS - 1, ("r7",))
     assert "r7" in summary.warnings[0]

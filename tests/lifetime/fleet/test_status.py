@@ -56,7 +56,7 @@ def test_cells_are_grouped_by_state_the_most_urgent_first(fleet):
         "not_taken_in": ("new",),
         "not_verified": ("measured",),
     }
-    assert fleet.action
+    assert fleet.needs_action
     assert dict(state_table(fleet).rows)["unreadable"] == "2"
 
 
@@ -81,7 +81,7 @@ def test_a_measured_fleet_needs_no_action(tmp_path, fleet):
     for name in ("new", "edited", "moved", "broken", "negative"):
         (tmp_path / name / "cell.yaml").unlink()
     seen = FleetStatus.read(tmp_path)
-    assert not seen.action
+    assert not seen.needs_action
     assert fleet_verdict(seen).trust.startswith("yes")
     (tmp_path / "measured" / "cell.yaml").unlink()
     with refused(PlanningError, value=str(tmp_path)):

@@ -40,7 +40,7 @@ def test_sessions_are_stored_once_and_sorted_by_date(tmp_path):
     assert [one.file for one in records] == ["rows_2.csv", "rows_1.csv", "rows_3.csv"]
     assert records[1].session == record(1).session
     assert (records[0].temperature_c, records[1].temperature_c) == (None, 21.5)
-    for name in ("shift", "deviation", "model_sensitivity", "session_covariance"):
+    for name in ("shift", "sigma", "model_sensitivity", "session_covariance"):
         assert_close(getattr(records[0].zeros, name), getattr(record(2).zeros, name))
 
 

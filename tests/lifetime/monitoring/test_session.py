@@ -33,8 +33,8 @@ def test_the_joint_that_moved_is_named_from_five_poses(joint):
     low, high = session.moved[0].interval
     assert low < degrees < high
     assert session.moved[0].probability > 0.9
-    assert session.unchanged < 0.01
-    assert abs(float(zeros.shift[joint - 1]) - math.radians(degrees)) < 4 * float(zeros.deviation[joint - 1])
+    assert session.unchanged_probability < 0.01
+    assert abs(float(zeros.shift[joint - 1]) - math.radians(degrees)) < 4 * float(zeros.sigma[joint - 1])
 
 
 def test_false_alarms_are_rare():
@@ -85,7 +85,7 @@ def test_a_moved_instrument_is_distinguished_from_a_joint(joint):
     expected = ["joint 3"] if joint else []
     assert [one.what for one in session.moved] == [*expected, "base", "base"]
     assert session.recalibrate == bool(joint)
-    assert "base" in session.standing
+    assert "base" in session.relocated_frames
     assert not session.observable[0]
     assert "joint 1" in session.unobservable[0]
     assert "base" in session.unobservable[0]
@@ -99,7 +99,7 @@ def test_a_small_motion_of_the_base_is_not_mistaken_for_a_joint():
 
 def test_moved_frames_can_be_stated():
     session, _ = judged(rows_after_change(12, 5), frozenset({("base", "")}))
-    assert session.standing == ("base",)
+    assert session.relocated_frames == ("base",)
     assert all(one.what == "base" for one in session.moved)
 
 

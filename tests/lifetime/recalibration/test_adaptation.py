@@ -100,7 +100,7 @@ def test_adapting_row_by_row_agrees_with_all_rows_at_once():
     test = rows_after_change(300, 50, noise=0.0)
     assert_close(rms_of(chain, test), rms_of(at_once, test), rtol=0.05)
     assert rms_of(chain, test) < rms_of(model, test)
-    deviations = [one.uncertainty.deviation(test).norm(dim=1).mean() for one in (chain, at_once, model)]
+    deviations = [one.uncertainty.sigma(test).norm(dim=1).mean() for one in (chain, at_once, model)]
     assert_close(deviations[0], deviations[1], rtol=0.1)
     assert deviations[1] < deviations[2]
 

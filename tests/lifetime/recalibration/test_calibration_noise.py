@@ -133,5 +133,5 @@ def test_other_rows_replace_the_noise_of_their_sensors_only():
     after = before.updated(CalibrationNoise({"position": 4e-5}))
     assert after == CalibrationNoise({"position": 4e-5, "rotation": 2.0}, {"rotation": 1e-4})
     older = CalibrationNoise({"position": 1.0, "rotation": 2.0}, None)
-    assert older.updated(CalibrationNoise({"position": 4e-5})).stated is None
-    assert older.updated(CalibrationNoise({"position": 4e-5, "rotation": 1e-4})).stated == {}
+    assert older.updated(CalibrationNoise({"position": 4e-5})).median_stated_sigma is None
+    assert older.updated(CalibrationNoise({"position": 4e-5, "rotation": 1e-4})).median_stated_sigma == {}

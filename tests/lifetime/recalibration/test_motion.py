@@ -7,7 +7,7 @@ import pytest
 from testing.aged import original_model, rows_after_change
 from testing.models import hand_made_model
 
-from pisigma.lifetime.recalibration.motion import judged_motion
+from pisigma.lifetime.recalibration.motion import find_motion
 from pisigma.workflow.settings.verification import VerificationSettings
 from pisigma.workflow.verify import verify
 
@@ -48,4 +48,4 @@ def test_a_small_motion_of_the_base_is_a_warning():
 
 
 def test_a_model_without_a_posterior_gives_no_session():
-    assert judged_motion(hand_made_model("kiro3"), rows_after_change(6, 1)) is None
+    assert find_motion(hand_made_model("kiro3"), rows_after_change(6, 1)) is None

@@ -38,4 +38,4 @@ def test_model_folders_store_the_json_of_a_movement(probability):
     assert set(plain) == {"what", "shift_mm", "interval"} | ({"probability"} if probability else set())
     again = stored.validate_python(plain)
     assert (again.what, again.shift, again.unit, again.probability) == ("base", 1.5, "mm", probability)
-    assert_close(again.deviation, movement.deviation, rtol=1e-12)
+    assert_close(again.sigma, movement.sigma, rtol=1e-12)

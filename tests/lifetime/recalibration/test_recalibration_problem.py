@@ -32,7 +32,7 @@ def test_the_prior_is_the_posterior_of_the_model():
     posterior = ModelPosterior.from_model(model)
     problem = recalibration_problem(model, posterior, rows, frozenset())
     parameters = len(posterior.space.parameters)
-    back = torch.cat([problem.change @ problem.root[:parameters], problem.root[parameters:]])
+    back = torch.cat([problem.coordinate_change @ problem.root[:parameters], problem.root[parameters:]])
     assert_close(back, posterior.root, atol=1e-12)
     elsewhere = recalibration_problem(model, posterior, rows, {("base", "")})
     base = elsewhere.design.problem.space.indices_of("base")

@@ -92,11 +92,11 @@ def test_deviations_are_those_of_the_calibration(hybrid):
     arm, model = hybrid
     own = replace(arm.measurements, q=everywhere(arm, len(arm.measurements.q)), position=None)
     rounding = 1e-5 if model.uncertainty.covariance_root.rounded is None else 1.5 * ROUNDING_TOLERANCE
-    expected = arm.result.deviation(own)
+    expected = arm.result.sigma(own)
     assert_close(sigma_of_rows(model, own), expected, atol=1e-12, rtol=rounding)
     rows = [i for i in range(own.rows) if (own.frame[i], own.target[i]) == (own.frame[0], own.target[0])]
     found = position_accuracy(model, own.q[rows].reshape(1, len(rows), -1))
-    expected = arm.result.deviation(replace(own, payload=None))  # under the usual conditions
+    expected = arm.result.sigma(replace(own, payload=None))  # under the usual conditions
     assert_close(found[0], expected[rows].norm(dim=-1), atol=1e-12, rtol=rounding)
 
 
@@ -185,9 +185,7 @@ def test_without_a_correction_it_is_the_geometric_model(tmp_path):
     q = everywhere(arm)
     assert torch.equal(loaded.forward(q), forward_kinematics(arm.result.geometric.robot, q))
     assert torch.equal(position_accuracy(loaded, q), position_accuracy(model, q))
-    assert_close(
-        sigma_of_rows(model, arm.measurements), result.deviation(arm.measurements), rtol=1e-3, atol=0
-    )
+    assert_close(sigma_of_rows(model, arm.measurements), result.sigma(arm.measurements), rtol=1e-3, atol=0)
 
 
 @pytest.mark.parametrize("batch", [(), (0,), (1,), (3, 1, 2), (5000,)], ids=str)

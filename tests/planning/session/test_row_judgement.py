@@ -15,7 +15,7 @@ ROBOT = PLAN.stored.arm.robot
 def counting(rows: Measurements, trusted: int) -> list[int]:
     """Rows that count, given the number of trusted ones."""
     mask = torch.arange(rows.rows) < trusted
-    return judge_rows(ROBOT, rows, NOISE, mask).counts.nonzero()[:, 0].tolist()
+    return judge_rows(ROBOT, rows, NOISE, mask).used_rows.nonzero()[:, 0].tolist()
 
 
 def swapped(rows: Measurements, one: int, other: int) -> Measurements:
@@ -63,7 +63,7 @@ def test_base_and_tool_of_every_set_of_rows_are_guessed_once(monkeypatch):
 def test_a_row_that_was_called_wrong_can_be_used_again():
     rows = PLAN.rows(15)
     mask = (torch.arange(15) < 14) & (torch.arange(15) != 4)
-    assert judge_rows(ROBOT, rows, NOISE, mask).counts.all()
+    assert judge_rows(ROBOT, rows, NOISE, mask).used_rows.all()
 
 
 def test_a_trusted_row_that_later_rows_contradict_stops_counting():

@@ -106,7 +106,7 @@ def test_stated_noise_applies_per_row_and_rows_without_it_are_exact(arm):
     known = predicted_spread(result, rows)
     exact = predicted_spread(result, replace(rows, sigma_position=None))
     loud = predicted_spread(result, replace(rows, sigma_position=10 * stated))
-    deviation = result.deviation(rows)
+    deviation = result.sigma(rows)
     assert_close(exact.sigma, deviation, atol=1e-15)
     added = (known.sigma.square() - deviation.square()).sqrt()
     assert_close(added, added[:1, :1].expand_as(added), rtol=1e-6)
@@ -149,7 +149,7 @@ def test_a_frame_that_was_held_out_is_fitted_under_both_arms(arm):
     assert found.spread.values == 0  # nothing is predicted of where a frame is that was not seen
     calibrator = small(arm.true.nominal)
     result = calibrator.fit(named.select(part[0]))
-    both = with_frames(calibrator.geometric, result, named.select(part[1]))
+    both = with_frames(calibrator.geometric_calibrator, result, named.select(part[1]))
     for known in (both.geometric.bases, both.learned.geometry.bases):
         assert list(known) == ["left", "right"]
         assert_close(known["right"], known["left"], atol=2e-3)  # it is the same place

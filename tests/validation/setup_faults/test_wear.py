@@ -36,7 +36,7 @@ def moved(what: str, size: float) -> Movement:
 @pytest.mark.parametrize("sign", [1, -1])
 @pytest.mark.parametrize("what", ["a_2", "d_1", "alpha_1"])
 def test_lengths_and_angles_have_limits_of_the_class(name, sign, what):
-    limit = getattr(RobotClass.from_robot(of_class(name)).change, KINDS[what])
+    limit = getattr(RobotClass.from_robot(of_class(name)).max_changes, KINDS[what])
     assert excessive_change_diagnostics(of_class(name), [moved(what, 0.99 * sign * limit)]) == ()
     (found,) = excessive_change_diagnostics(of_class(name), [moved(what, 1.01 * sign * limit)])
     assert (found.kind, found.severity) == ("beyond_wear", "implausible")
@@ -44,7 +44,7 @@ def test_lengths_and_angles_have_limits_of_the_class(name, sign, what):
 
 @pytest.mark.parametrize("name", CLASSES)
 def test_one_joint_may_be_zeroed_again_but_not_several(name):
-    far = 1.01 * RobotClass.from_robot(of_class(name)).change.joint_zero
+    far = 1.01 * RobotClass.from_robot(of_class(name)).max_changes.joint_zero
     assert excessive_change_diagnostics(of_class(name), [moved("joint 2", 1.0)]) == ()
     assert (
         excessive_change_diagnostics(of_class(name), [moved("joint 2", 1.0), moved("joint 3", 0.5 * far)])

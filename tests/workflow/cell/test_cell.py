@@ -224,10 +224,10 @@ def test_the_missing_poses_of_a_plan_are_requested(tmp_path):
 def test_a_file_in_the_folder_of_sessions_is_taken_in_by_the_next_step(tmp_path):
     cell = Cell.create(tmp_path / "cell", "ur10")
     measured(40, 1).write_csv(cell.folder / "sessions" / "by hand 2026-01-10.csv", ROBOT)
-    assert cell.status().facts.not_taken_in == ("by hand 2026-01-10.csv",)
+    assert cell.status().facts.unrecorded_files == ("by hand 2026-01-10.csv",)
     _, entry = cell.calibrate(model="geometric", folds=0)
     assert entry.sessions == "by hand 2026-01-10"
-    assert cell.status().facts.not_taken_in == ()
+    assert cell.status().facts.unrecorded_files == ()
     (one,) = cell.history.sessions()
     assert dataclasses.replace(one, sha256="", taken_in="", remark="").day == "2026-01-10"
 

@@ -45,7 +45,7 @@ def test_two_processes_work_on_one_cell(tmp_path):
     assert refusals.get() in (0, 1)
     assert refusals.empty()
     assert sorted(one.rows for one in cell.history.sessions()) == [12, 12, 40]
-    assert cell.status().facts.not_taken_in == cell.status().facts.edited == ()
+    assert cell.status().facts.unrecorded_files == cell.status().facts.edited == ()
     assert len(list((cell.folder / "plans").glob("*.csv"))) == 2
     assert len({one.name for one in cell.history.models()}) == 2
     for one in cell.history.models():
@@ -66,5 +66,5 @@ def test_rows_that_do_not_fit_on_the_disk_are_refused_and_nothing_is_lost(tmp_pa
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert cell.history.sessions() == (first,)
-    assert cell.status().facts.not_taken_in == ()
+    assert cell.status().facts.unrecorded_files == ()
     cell.add_session(measured(12, 2), day=day(8))

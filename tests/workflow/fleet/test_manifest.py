@@ -50,7 +50,7 @@ def test_rows_of_one_id_are_sessions_of_one_cell(tmp_path):
         0.3,
         "ur10",
     )
-    assert c.status().facts.not_taken_in == ("2026-03-01.csv",)
+    assert c.status().facts.unrecorded_files == ("2026-03-01.csv",)
 
 
 def test_a_later_call_adds_new_sessions_only(tmp_path):

@@ -82,7 +82,7 @@ def find_weak_directions(
     precision = wide.scaled_precision(stated, problem.prior_group)
     usual = torch.where(precision > 0, precision.clamp(min=1e-30).rsqrt(), problem.step_scale)
     data = data * usual * usual[:, None]
-    arm = problem.active < problem.space.arm_size
+    arm = problem.active < problem.space.arm_parameter_count
     if not bool(arm.any()):
         return ()
     # The Schur complement is the information on the arm with base and tool marginalised.

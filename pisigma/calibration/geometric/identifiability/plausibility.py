@@ -50,7 +50,7 @@ def refuse_implausible(
         for sensor in problem.sensors
         if sensor.unit == "m" and (sensor.components == 3 or sensor.name in _DISTANCES)
     ]
-    if not judged or robot.reach == 0 or not bool((problem.active < problem.space.arm_size).any()):
+    if not judged or robot.reach == 0 or not bool((problem.active < problem.space.arm_parameter_count).any()):
         return
     sizes = residual_sizes(problem, linearisation)[torch.stack(judged).any(0)]
     size = float(sizes.median()) if len(sizes) else 0.0
@@ -74,7 +74,7 @@ def _refuse_ruined_links(problem: CalibrationProblem, point: Tensor, source: str
     """
     robot = problem.space.robot
     is_length = problem.space.is_length.numpy()
-    nominal, fitted = robot.dh.ravel(), point.cpu().numpy()[: problem.space.arm_size]
+    nominal, fitted = robot.dh.ravel(), point.cpu().numpy()[: problem.space.arm_parameter_count]
     long = is_length[: len(nominal)] & (np.abs(nominal) > _LONG_SHARE * robot.reach)
     ruined = long & (np.abs(fitted - nominal) > _RUINED_SHARE * np.abs(nominal))
     for number in np.flatnonzero(ruined)[:1].tolist():

@@ -94,13 +94,13 @@ class RankFindings:
     Attributes:
         sizes: values of the candidates at the start.
         redundancy: redundancy of the candidates at the start.
-        extended: indices of parameters that were added after the start.
+        added_parameters: indices of parameters that were added after the start.
         estimated: number of unknowns to estimate; see `sufficiency.free_parameters`.
     """
 
     sizes: Float64[np.ndarray, " candidates"]
     redundancy: Redundancy
-    extended: list[int]
+    added_parameters: list[int]
     estimated: int
 
     @property

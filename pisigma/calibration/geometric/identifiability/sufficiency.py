@@ -63,27 +63,27 @@ _SOCKETS_WITHOUT_SCALE = (
 )
 
 
-def free_parameters(redundancy: Redundancy, explicit: bool, unknowns: int) -> int:
+def free_parameters(redundancy: Redundancy, named_individually: bool, unknowns: int) -> int:
     """Return the number of unknowns to estimate.
 
     Args:
         redundancy: redundancy of the candidates at the start.
-        explicit: whether the candidates were named individually.
+        named_individually: whether the candidates were named individually.
         unknowns: number of the sensors' unknowns, such as the positions of sockets.
     """
     acting = len(redundancy.names) - len(redundancy.no_effect)
-    return (acting if explicit else redundancy.rank) + unknowns
+    return (acting if named_individually else redundancy.rank) + unknowns
 
 
 def refuse_too_few(
-    problem: CalibrationProblem, redundancy: Redundancy, explicit: bool, unknowns: int, source: str
+    problem: CalibrationProblem, redundancy: Redundancy, named_individually: bool, unknowns: int, source: str
 ) -> None:
     """Refuse data that are too few to determine the free parameters.
 
     Args:
         problem: rows and sensors.
         redundancy: see `free_parameters`.
-        explicit: see `free_parameters`.
+        named_individually: see `free_parameters`.
         unknowns: see `free_parameters`.
         source: name of the data in error messages.
 
@@ -91,7 +91,7 @@ def refuse_too_few(
         IdentificationError: there are not more values than parameters.
     """
     values = distinct_values(problem)
-    if values > free_parameters(redundancy, explicit, unknowns):
+    if values > free_parameters(redundancy, named_individually, unknowns):
         return
     # The rank cannot be used, because it is at most the number of values.
     most = free_parameters(redundancy, True, unknowns)

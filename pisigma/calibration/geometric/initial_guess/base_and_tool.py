@@ -185,7 +185,7 @@ def _rms_position(problem: BaseToolProblem, state: BaseToolState) -> float:
 
 
 def _rms_rotation(problem: BaseToolProblem, state: BaseToolState) -> float:
-    turn = problem.rotation_residual(state)[problem.rotated]
+    turn = problem.rotation_residual(state)[problem.has_rotation]
     return float(turn.square().sum(-1).mean().sqrt())
 
 

@@ -33,7 +33,7 @@ def base_and_tool_starts(robot: Robot, problem: BaseToolProblem) -> Iterator[Bas
     R_tool, R_base = (rotation_from_rpy(like.new_tensor(frame[3:])) for frame in (robot.tool, robot.base))
     point, p_base = like.new_tensor(robot.tool[:3]), like.new_tensor(robot.base[:3])
     # Rows with a rotation determine both frames; positions of several targets share only a base, so one target is used.
-    rows = problem.rotated if problem.has_rotations else problem.target == problem.target.mode().values
+    rows = problem.has_rotation if problem.has_rotations else problem.target == problem.target.mode().values
     R_flange, p_flange = problem.R_flange[rows], problem.p_flange[rows]
     position, rotation = problem.position[rows], problem.rotation[rows]
     candidates: Iterator[tuple[Tensor, Tensor, Tensor, Tensor]]
@@ -157,13 +157,14 @@ def start_from_products(
 def fit_base_to_points(
     points: Float64[Tensor, "rows 3"],
     position: Float64[Tensor, "rows 3"],
-    like: Float64[Tensor, "3 3"] | None = None,
+    previous_rotation: Float64[Tensor, "3 3"] | None = None,
 ) -> tuple[Float64[Tensor, "3 3"], Float64[Tensor, " 3"]]:
     """Fit rotation and position [m] of the base to points in the base and their measured positions.
 
-    If the points are on one line, or there are fewer than three, `like` determines the rest of the rotation.
+    If the points are on one line, or there are fewer than three, `previous_rotation` determines the rest of the
+    rotation.
     """
-    R_base = _procrustes(points, position, like)
+    R_base = _procrustes(points, position, previous_rotation)
     return R_base, (position - points @ R_base.mT).mean(0)
 
 

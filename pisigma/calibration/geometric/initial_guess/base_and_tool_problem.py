@@ -54,7 +54,7 @@ class BaseToolProblem(AbstractLeastSquares[BaseToolState]):
         p_flange: positions of the last DH row's frame in the first DH row's frame [m].
         position: measured positions [m].
         rotation: measured rotations; the identity in rows without one.
-        rotated: mask of the rows with a measured rotation.
+        has_rotation: mask of the rows with a measured rotation.
         target: index of every row's target.
         targets: names of the targets.
         sigma_position: standard deviation of every row [m]; None to estimate the scatter.
@@ -67,7 +67,7 @@ class BaseToolProblem(AbstractLeastSquares[BaseToolState]):
     p_flange: Float64[Tensor, "rows 3"]
     position: Float64[Tensor, "rows 3"]
     rotation: Float64[Tensor, "rows 3 3"]
-    rotated: Bool[Tensor, " rows"]
+    has_rotation: Bool[Tensor, " rows"]
     target: Int64[Tensor, " rows"]
     targets: tuple[str, ...]
     sigma_position: Float64[Tensor, " rows"] | None
@@ -78,7 +78,7 @@ class BaseToolProblem(AbstractLeastSquares[BaseToolState]):
     @cached_property
     def has_rotations(self) -> bool:
         """Whether any rotation was measured."""
-        return bool(self.rotated.any())
+        return bool(self.has_rotation.any())
 
     @cached_property
     def active(self) -> Int64[Tensor, " active"]:
@@ -108,7 +108,7 @@ class BaseToolProblem(AbstractLeastSquares[BaseToolState]):
         """Compute rotation vectors from predicted to measured rotations [rad]; 0 where none was measured."""
         predicted = state.R_base @ self.R_flange @ state.R_tool
         turn = rotation_difference(self.rotation.permute(1, 2, 0), predicted.permute(1, 2, 0))
-        return (turn * self.rotated).t()
+        return (turn * self.has_rotation).t()
 
     def linearise(
         self, point: BaseToolState, like: Linearisation[BaseToolState] | None
@@ -167,7 +167,7 @@ class BaseToolProblem(AbstractLeastSquares[BaseToolState]):
 
     @cached_property
     def _rotations(self) -> int:
-        return int(self.rotated.sum())
+        return int(self.has_rotation.sum())
 
     @cached_property
     def _rounding(self) -> float:
@@ -190,7 +190,7 @@ class BaseToolProblem(AbstractLeastSquares[BaseToolState]):
     def _turns(self, R_base_flange: Tensor) -> Tensor:
         """Compute the derivative of the rotations with respect to all unknowns."""
         J = self.position.new_zeros((self.position.shape[0], 3, 9 + 3 * len(self.targets)))
-        rotated = self.rotated[:, None, None]
+        rotated = self.has_rotation[:, None, None]
         J[..., 3:6] = rotated * torch.eye(3, dtype=J.dtype, device=J.device)
         J[..., -3:] = rotated * R_base_flange
         return J
@@ -238,7 +238,7 @@ def build_base_and_tool_problem(
         p_flange=p_flange,
         position=measurements.position[keep],
         rotation=rotation,
-        rotated=rotated,
+        has_rotation=rotated,
         target=torch.tensor([numbers[name] for name in kept], dtype=torch.int64, device=keep.device),
         targets=targets,
         sigma_position=_given(measurements.sigma_position, keep, torch.ones_like(rotated)),
@@ -270,7 +270,7 @@ def _given(sigma: Tensor | None, keep: Tensor, used: Tensor) -> Tensor | None:
 
 def _check_size(problem: BaseToolProblem, measurements: Measurements) -> None:
     rows = problem.position.shape[0]
-    values = 3 * rows + 3 * int(problem.rotated.sum())
+    values = 3 * rows + 3 * int(problem.has_rotation.sum())
     if values < len(problem.active) or rows == 0:
         raise IdentificationError(
             f"expected at least {len(problem.active)} values for the unknowns of base and tool, got {values} "

@@ -65,8 +65,8 @@ def guess(
     measurements: Measurements,
     free_base: bool,
     free_tool: bool,
-    turn_tool: bool,
-    stated: Mapping[str, tuple[float, ...]],
+    free_rotation: bool,
+    stated_bases: Mapping[str, tuple[float, ...]],
 ) -> InitialGuess:
     """Guess bases, tools and the sensors' unknowns with the nominal arm.
 
@@ -80,16 +80,16 @@ def guess(
         measurements: usable rows; those of pairs come first.
         free_base: whether to identify bases; otherwise stated bases, or the robot's base, are used.
         free_tool: whether to identify tools.
-        turn_tool: whether to identify the rotations of tools.
-        stated: bases of frames that the user states.
+        free_rotation: whether to identify the rotations of tools.
+        stated_bases: bases of frames that the user states.
 
     Raises:
         IdentificationError: there are too few measurements for a guess, or they are implausible.
     """
-    _check_frame_names(stated, space.frames, measurements.source)
+    _check_frame_names(stated_bases, space.frames, measurements.source)
     if free_base:
         check_touched_frames(measurements, space.frames)
-    bases = {name: np.array(base, dtype=np.float64) for name, base in stated.items()}
+    bases = {name: np.array(base, dtype=np.float64) for name, base in stated_bases.items()}
     bases, tools = _from_positions(space, measurements, free_base, free_tool, bases)
     touched = {} if not free_base else _touched_rows(space, measurements, bases)
     wired = [name for name in space.frames if free_base and name not in bases and name not in touched]
@@ -103,7 +103,7 @@ def guess(
         if free_tool:
             tools = _from_sockets(space, measurements, T_flange, tools)
         tools = tools_from_distances(space, measurements, T_flange, tools, free_tool)
-    if not turn_tool:
+    if not free_rotation:
         tools = {name: np.concatenate([tool[:3], space.robot.tool[3:]]) for name, tool in tools.items()}
     all_tools = np.stack([tools.get(name, space.robot.tool) for name in space.targets])
     if poses_alone:

@@ -192,7 +192,7 @@ def tools_from_distances(
         position = torch.from_numpy(tools.get(name, nominal_tool)[:3].copy())
         tool, residual = (one[0] for one in distances.fitted(torch.ones(1).double(), position, held, reach))
         _refuse_other_units(space.robot, distances, (tool, residual), (position, held), measurements.source)
-        limit = max(MAX_NOMINAL_ERROR, RobotClass.from_robot(space.robot).usual.joint_offset) * reach
+        limit = max(MAX_NOMINAL_ERROR, RobotClass.from_robot(space.robot).prior_sizes.joint_offset) * reach
         off = int((residual.abs() > limit).sum())
         if off > _MAX_WRONG_SHARE * len(residual):
             raise ImplausibleError(

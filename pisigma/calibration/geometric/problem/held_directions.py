@@ -16,12 +16,12 @@ class HeldDirections:
 
     Attributes:
         directions: the directions, orthonormal in units of 1 mm and 1 mrad (`CalibrationProblem.step_scale`).
-        deviation: standard deviation of the values along the directions in these units; infinite if the rows contain
+        sigma: standard deviation of the values along the directions in these units; infinite if the rows contain
             no information on them.
     """
 
     directions: Float64[Tensor, "active held"]
-    deviation: Float64[Tensor, " held"]
+    sigma: Float64[Tensor, " held"]
 
     def restrict(
         self,
@@ -45,9 +45,7 @@ class HeldDirections:
         restricted = P @ scaled @ P + scaled.diagonal().max() * (V @ V.t())
         return restricted / units, (P @ (scale * descent)) / scale
 
-    def root(self, scale: Float64[Tensor, " active"]) -> Float64[Tensor, "active held"]:
+    def covariance_root(self, scale: Float64[Tensor, " active"]) -> Float64[Tensor, "active held"]:
         """Return a root of the covariance of the held values [m or rad]; see `restrict` for `scale`."""
-        root: Tensor = (
-            scale[:, None] * self.directions.to(scale) * self.deviation.clamp(max=LARGEST_DEVIATION)
-        )
+        root: Tensor = scale[:, None] * self.directions.to(scale) * self.sigma.clamp(max=LARGEST_DEVIATION)
         return root

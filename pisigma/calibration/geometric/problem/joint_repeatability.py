@@ -22,7 +22,7 @@ def with_joint_repeatability(
     robot: Robot,
     bases: Mapping[str, Float64[np.ndarray, " 6"]],
     tools: Mapping[str, Float64[np.ndarray, " 6"]],
-    deviation: float,
+    sigma: float,
 ) -> Measurements:
     """Return rows of images whose covariances include the repeatability of the joints.
 
@@ -35,9 +35,9 @@ def with_joint_repeatability(
         robot: robot with the geometric Jacobian J.
         bases: base in every frame of the rows: x, y, z [m], roll, pitch, yaw [rad].
         tools: tool of every target of the rows, in the same form.
-        deviation: standard deviation of the value of every revolute joint [rad].
+        sigma: standard deviation of the value of every revolute joint [rad].
     """
-    if not deviation or "corner" not in rows.kinds:
+    if not sigma or "corner" not in rows.kinds:
         return rows
     q, covariance = rows.q.cpu(), np.zeros((rows.rows, 6, 6))
     is_revolute = torch.tensor(robot.revolute)
@@ -46,7 +46,7 @@ def with_joint_repeatability(
         chosen = np.array([pair == (frame, target) for pair in pairs])
         there = robot.with_geometry(base=bases[frame], tool=tools[target])
         J = joint_jacobian(there, q[torch.from_numpy(chosen)])[1] * is_revolute
-        covariance[chosen] = (deviation**2 * J @ J.mT).numpy()
+        covariance[chosen] = (sigma**2 * J @ J.mT).numpy()
     return with_pose_noise(rows, covariance)
 
 

@@ -75,17 +75,17 @@ class SensorView:
         contributions: contributions per sensor.
         noise: standard deviation per sensor [m or rad], or a factor >= 1 on the standard deviations that the rows
             state.
-        repetition: factor >= 1 on the variance per sensor, because repeats of a pose and several targets in it share
-            the errors of the model and are not independent; see `group_variance_ratio`.
-        disagreement: factor >= 1 on the variance per sensor that makes angles agree with the measured lengths; see
-            `angle_disagreement`.
+        repeat_variance_factor: factor >= 1 on the variance per sensor, because repeats of a pose and several targets in
+            it share the errors of the model and are not independent; see `group_variance_ratio`.
+        angle_variance_factor: factor >= 1 on the variance per sensor that makes angles agree with the measured lengths;
+            see `angle_disagreement`.
         prior_scale: scale of the prior standard deviations, per group of parameters.
     """
 
     contributions: tuple[SensorContribution, ...]
     noise: Float64[Tensor, " sensors"]
-    repetition: Float64[Tensor, " sensors"]
-    disagreement: Float64[Tensor, " sensors"]
+    repeat_variance_factor: Float64[Tensor, " sensors"]
+    angle_variance_factor: Float64[Tensor, " sensors"]
     prior_scale: Float64[Tensor, " groups"]
 
     @staticmethod
@@ -103,7 +103,7 @@ class SensorView:
     @cached_property
     def variances(self) -> Float64[Tensor, " sensors"]:
         """Variance of the values of every sensor, including all factors."""
-        return self.noise.square() * self.repetition * self.disagreement
+        return self.noise.square() * self.repeat_variance_factor * self.angle_variance_factor
 
     def scaled_precision(
         self, precision: Float64[Tensor, " active"], group: Int64[Tensor, " active"]
@@ -118,7 +118,7 @@ def sensor_view_of(linearisation: Linearisation[Tensor]) -> SensorView:
     return linearisation.detail
 
 
-def parameters_used(
+def parameters_by_sensor(
     view: SensorView, covariance: Float64[Tensor, "active active"]
 ) -> Float64[Tensor, " sensors"]:
     """Compute the effective number of parameters that are estimated from every sensor's values (Förstner 1979)."""
@@ -151,7 +151,7 @@ def loss_scale(
         if view.contributions[k].measured < len(distance):
             distance = distance[sensor.present]
         if refine:
-            scale = loss.deviation(distance, sensor.components, effective_parameters[k], view.scales[k])
+            scale = loss.sigma(distance, sensor.components, effective_parameters[k], view.scales[k])
         else:
             scale = loss.scale(distance, sensor.components, effective_parameters[k])
         scales.append(scale.clamp(min=SMALLEST_NOISE if sensor.sigma is None else 1.0))
@@ -243,7 +243,7 @@ def angle_disagreement(
     lengths = [sensor.unit != "rad" and not sensor.certain for sensor in sensors]
     if not any(angular) or not any(lengths):
         return torch.ones_like(view.noise)
-    variance = view.noise.square() * view.repetition
+    variance = view.noise.square() * view.repeat_variance_factor
     normals = [part.normal / variance[k] for k, part in enumerate(view.contributions)]
     descents = [part.descent / variance[k] for k, part in enumerate(view.contributions)]
     zero = torch.zeros_like(normals[0]), torch.zeros_like(prior_gradient)

@@ -16,7 +16,7 @@ from pisigma.calibration.geometric.problem.prior_scales import PriorGroup, prior
 from pisigma.files.errors import IdentificationError, nearest_choice
 from pisigma.measurement.sensors.sensor import ParameterUnit, UnknownGroup, Unknowns
 from pisigma.robot.description import Robot
-from pisigma.robot.kinematics.parameter_jacobian import motion_order
+from pisigma.robot.kinematics.parameter_jacobian import parameter_order
 from pisigma.robot.row import DH_COLUMNS, FRAME_COLUMNS
 
 LENGTHS = frozenset({"d", "a", "x", "y", "z"})
@@ -137,7 +137,7 @@ class ParameterSpace:
         return tuple(parameter.name for parameter in self.parameters)
 
     @property
-    def arm_size(self) -> int:
+    def arm_parameter_count(self) -> int:
         """Number of parameters of the rows, which come first."""
         return 5 * len(self.robot.rows)
 
@@ -149,7 +149,7 @@ class ParameterSpace:
     @cached_property
     def motion_columns(self) -> Int64[Tensor, "3 parameters"]:
         """Per parameter, the column in a `ToolMotion`, the index of the frame and the index of the target."""
-        order = motion_order(len(self.robot.rows))
+        order = parameter_order(len(self.robot.rows))
         arm, frames, targets = order[:-12], len(self.frames), len(self.targets)
         others = len(self.parameters) - len(arm) - 6 * (frames + targets)
         columns = arm + order[-12:-6] * frames + order[-6:] * targets + [0] * others
@@ -167,16 +167,16 @@ class ParameterSpace:
     @cached_property
     def prior_groups(self) -> Int64[Tensor, "2 parameters"]:
         """Prior group of every parameter, for nominal values of 0 and for other values; see `prior_group_of`."""
-        others = [int(PriorGroup.JOINT_OFFSET)] * (len(self.parameters) - self.arm_size)
+        others = [int(PriorGroup.JOINT_OFFSET)] * (len(self.parameters) - self.arm_parameter_count)
         of_row = ([prior_group_of(column, nonzero) for column in DH_COLUMNS] for nonzero in (False, True))
         return torch.tensor([groups * len(self.robot.rows) + others for groups in of_row])
 
     @property
-    def always_moving(self) -> bool:
+    def moves_in_all_rows(self) -> bool:
         """Mask of the parameters that move the tool in all rows."""
         return len(self.frames) == len(self.targets) == 1 and not self.unknowns
 
-    def most_independent(self, with_orientation: bool) -> int:
+    def max_identifiable(self, with_orientation: bool) -> int:
         """Return the largest number of identifiable parameters of arm, bases and tools, for any measurements.
 
         A revolute axis is a line in space (4 parameters), a prismatic axis a direction (2), a target a pose (6) or a
@@ -227,7 +227,7 @@ class ParameterSpace:
     def _ranges(self) -> dict[str, range]:
         sizes = {"base": 6 * len(self.frames), "tool": 6 * len(self.targets)}
         sizes |= {own.name: len(own.columns) * len(own.owners) for own in self.unknowns}
-        start, stretches = self.arm_size, {}
+        start, stretches = self.arm_parameter_count, {}
         for name, size in sizes.items():
             stretches[name] = range(start, start + size)
             start += size
@@ -256,7 +256,7 @@ class ParameterSpace:
         bases, tools = (
             values[self.indices_of(group).start : self.indices_of(group).stop] for group in ("base", "tool")
         )
-        return values[: self.arm_size].view(-1, 5), bases.view(-1, 6), tools.view(-1, 6)
+        return values[: self.arm_parameter_count].view(-1, 5), bases.view(-1, 6), tools.view(-1, 6)
 
     def sensor_unknowns(self, values: Float64[Tensor, " parameters"]) -> Unknowns:
         """Return the sensors' unknowns in a vector of all parameters."""
@@ -282,7 +282,7 @@ class ParameterSpace:
         precision = np.zeros(len(self.parameters))
         if prior is not None:
             of_row = [getattr(prior, column) ** -2 for column in DH_COLUMNS]
-            precision[: self.arm_size] = np.tile(of_row, len(self.robot.rows))
+            precision[: self.arm_parameter_count] = np.tile(of_row, len(self.robot.rows))
         return precision
 
 

@@ -90,10 +90,10 @@ def _group_totals(
 
 
 def prior_scales(
-    off: Float64[Tensor, " active"],
+    difference: Float64[Tensor, " active"],
     precision: Float64[Tensor, " active"],
     group: Int64[Tensor, " active"],
-    before: Float64[Tensor, " groups"],
+    current_scales: Float64[Tensor, " groups"],
     covariance: Float64[Tensor, "active active"],
     floor: float = 1.0,
 ) -> Float64[Tensor, " groups"]:
@@ -102,18 +102,18 @@ def prior_scales(
     This is MacKay's update (1992, Neural Computation 4(3), eq. 4.7) with the `effective_parameters` of every group.
 
     Args:
-        off: difference of the parameters from their nominal values [m or rad].
+        difference: difference of the parameters from their nominal values [m or rad].
         precision: 1 / variance of the stated prior; 0 for parameters without a prior.
         group: index of every parameter's group.
-        before: current scale of the prior.
+        current_scales: current scale of the prior.
         covariance: posterior covariance of the parameters.
         floor: smallest scale; with 1, errors that are smaller than stated do not narrow the prior.
     """
-    squares = _group_totals(off.square() * precision, group)
+    squares = _group_totals(difference.square() * precision, group)
     least = 1.0 if floor == 1.0 else _MIN_EFFECTIVE
-    effective = effective_parameters(precision, group, before, covariance)
+    effective = effective_parameters(precision, group, current_scales, covariance)
     sized = (squares / effective).clamp(min=floor**2).sqrt()
-    return torch.where(effective > least, sized, before)
+    return torch.where(effective > least, sized, current_scales)
 
 
 def converged_prior_scales(
@@ -121,7 +121,7 @@ def converged_prior_scales(
     right_hand_side: Float64[Tensor, " active"],
     precision: Float64[Tensor, " active"],
     group: Int64[Tensor, " active"],
-    before: Float64[Tensor, " groups"],
+    current_scales: Float64[Tensor, " groups"],
     floor: float,
 ) -> Float64[Tensor, " groups"]:
     """Iterate the prior scales and the step that results from them until convergence.
@@ -131,21 +131,23 @@ def converged_prior_scales(
         right_hand_side: right-hand side of the normal equations relative to the nominal values.
         precision: see `prior_scales`.
         group: see `prior_scales`.
-        before: see `prior_scales`.
+        current_scales: see `prior_scales`.
         floor: see `prior_scales`.
     """
-    scale = before
+    scale = current_scales
     for _ in range(MAX_ITERATIONS):
         # The solution of the linearised problem is `covariance @ pull`, so no new residuals are needed.
-        held, before = normal.clone(), scale
-        held.diagonal().add_(scaled_precision(precision, group, before))
+        held, current_scales = normal.clone(), scale
+        held.diagonal().add_(scaled_precision(precision, group, current_scales))
         covariance = covariance_of(held)
-        scale = prior_scales(covariance @ right_hand_side, precision, group, before, covariance, floor)
-        if has_converged(before, scale, _CONVERGENCE_TOLERANCE):
+        scale = prior_scales(
+            covariance @ right_hand_side, precision, group, current_scales, covariance, floor
+        )
+        if has_converged(current_scales, scale, _CONVERGENCE_TOLERANCE):
             break
     return scale
 
 
-def has_converged(before: Tensor, after: Tensor, share: float) -> bool:
+def has_converged(previous: Tensor, current: Tensor, share: float) -> bool:
     """Return whether two estimates (of noise or prior scales) differ by less than a relative tolerance."""
-    return bool(((after / before - 1).abs() < share).all())
+    return bool(((current / previous - 1).abs() < share).all())

@@ -21,7 +21,7 @@ from pisigma.calibration.geometric.problem.noise import (
     group_variance_ratio,
     joined_contributions,
     loss_scale,
-    parameters_used,
+    parameters_by_sensor,
     rejects_rows,
     renumber,
     sensor_view_of,
@@ -60,7 +60,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         pose: index of every row's pose (joint values, frame, target); None if no pose is repeated.
         configuration: index of every row's joint values and frame; None if no configuration has several targets.
         pairs: number of pairs of rows that are measured together, which come first.
-        stated: conditions stated in the rows (see `JointState`), for corrections that depend on them.
+        stated_conditions: conditions stated in the rows (see `JointState`), for corrections that depend on them.
         prior_scaling: "stated": prior scales are 1; "widened": at least 1; "estimated": estimated without bounds.
         held_directions: directions along which the search does not move, because the rows do not determine them.
         memory: cache of the last motion, shared by problems that differ only in free parameters or prior.
@@ -78,7 +78,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
     pose: Int64[Tensor, " rows"] | None = None
     configuration: Int64[Tensor, " rows"] | None = None
     pairs: int = 0
-    stated: Mapping[str, Tensor] = field(default_factory=dict)
+    stated_conditions: Mapping[str, Tensor] = field(default_factory=dict)
     prior_scaling: PriorScaling = "widened"
     held_directions: HeldDirections | None = None
     memory: MotionMemory = field(default_factory=MotionMemory, repr=False)
@@ -136,14 +136,14 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
             pose=None if self.pose is None else renumber(self.pose[rows]),
             configuration=None if self.configuration is None else renumber(self.configuration[rows]),
             pairs=int((rows < 2 * self.pairs).sum()) // 2,
-            stated={name: values[rows] for name, values in self.stated.items()},
+            stated_conditions={name: values[rows] for name, values in self.stated_conditions.items()},
             memory=MotionMemory(),
         )
 
     @cached_property
     def state(self) -> JointState:
         """Joint values and stated conditions of the rows, as a `JointState`."""
-        return JointState(self.q, self.stated)
+        return JointState(self.q, self.stated_conditions)
 
     def apply_step(self, point: Tensor, step: Tensor) -> Tensor:
         """Return all parameters after a step of the free parameters."""
@@ -189,24 +189,24 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
     ) -> tuple[Linearisation[Tensor], bool]:
         view = sensor_view_of(linearisation)
         covariance = covariance_of(linearisation.normal)
-        used = parameters_used(view, covariance)
+        used = parameters_by_sensor(view, covariance)
         noise = loss_scale(self.sensors, self.loss, view, used, refine)
-        repetition = view.repetition
+        repetition = view.repeat_variance_factor
         if self.pose is not None or self.configuration is not None:
             repetition = group_variance_ratio(
                 self.sensors, self.loss, replace(view, noise=noise), used, self.pose, self.configuration
             )
         off = self._off(linearisation.point)
-        renewed = replace(view, noise=noise, repetition=repetition)
+        renewed = replace(view, noise=noise, repeat_variance_factor=repetition)
         if not refine and any(sensor.unit == "rad" for sensor in self.sensors):
             held = view.scaled_precision(self._prior, self.prior_group)
             renewed = replace(
-                renewed, disagreement=angle_disagreement(self.sensors, renewed, held, -held * off)
+                renewed, angle_variance_factor=angle_disagreement(self.sensors, renewed, held, -held * off)
             )
         if self._sized:
             renewed = replace(renewed, prior_scale=self._prior_scales(renewed, off, covariance, refine))
         before, after = (
-            torch.cat([one.noise, one.repetition, one.disagreement, one.prior_scale])
+            torch.cat([one.noise, one.repeat_variance_factor, one.angle_variance_factor, one.prior_scale])
             for one in (view, renewed)
         )
         return self.combine_contributions(linearisation.point, renewed), has_converged(
@@ -259,7 +259,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         motion = self.memory.motion(made_from, make) if rows == slice(0, self.rows) else make()
         columns = self.space.motion_columns.to(active.device)
         J = motion.derivative.index_select(0, columns[0].index_select(0, active))
-        if not self.space.always_moving:
+        if not self.space.moves_in_all_rows:
             f, t = columns[1:, active, None]
             moving = ((f == EVERYWHERE) | (f == self.frame[rows])) & (
                 (t == EVERYWHERE) | (t == self.target[rows])

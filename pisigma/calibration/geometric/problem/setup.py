@@ -82,13 +82,13 @@ class CalibrationSetup:
     def weighted_at(self, point: Float64[Tensor, " parameters"]) -> "CalibrationSetup":
         """Return the setup whose images are weighted by the repeatability of the joints of the arm at a point."""
         rows = self.weighted_rows(self.measurements, identified_geometry(self, point))
-        weighted, problem = self.corners_of(rows), self.problem
+        weighted, problem = self.corner_sensor(rows), self.problem
         if weighted is None or rows is self.measurements:
             return self
         sensors = tuple(weighted if isinstance(one, CornerSensor) else one for one in problem.sensors)
         return replace(self, problem=replace(problem, sensors=sensors))
 
-    def corners_of(self, rows: Measurements) -> CornerSensor | None:
+    def corner_sensor(self, rows: Measurements) -> CornerSensor | None:
         """Return the images in the rows of the problem, with the weights that these state; None without images."""
         return CornerSensor.build(self.anchors.sensor_rows(rows, self.problem.frame, self.problem.target))
 
@@ -100,7 +100,7 @@ class SetupOptions:
     Attributes:
         free_base: whether to identify bases.
         free_tool: whether to identify tools.
-        turn_tool: whether to identify the rotations of tools.
+        free_rotation: whether to identify the rotations of tools.
         base_guesses: initial guesses of bases by frame: x, y, z [m], roll, pitch, yaw [rad].
         socket_distances: distances between two sockets [m].
         socket_sigma: standard deviation of the distances between sockets [m].
@@ -111,7 +111,7 @@ class SetupOptions:
 
     free_base: bool
     free_tool: bool
-    turn_tool: bool = True
+    free_rotation: bool = True
     base_guesses: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     socket_distances: Mapping[PairOfSockets, float] = field(default_factory=dict)
     socket_sigma: float = 1e-5
@@ -141,14 +141,14 @@ def build_setup(
         unknown_groups(measurements),
     )
     guessed = guess(
-        space, measurements, options.free_base, options.free_tool, options.turn_tool, options.base_guesses
+        space, measurements, options.free_base, options.free_tool, options.free_rotation, options.base_guesses
     )
     return setup_from_guess(space, guessed, (rows, measurements), options, prior, loss)
 
 
 def setup_from_guess(
     space: ParameterSpace,
-    guessed: InitialGuess,
+    initial_guess: InitialGuess,
     usable: tuple[Tensor, Measurements],
     options: SetupOptions,
     prior: Prior | None,
@@ -159,7 +159,7 @@ def setup_from_guess(
 
     Args:
         space: the parameters.
-        guessed: bases, tools and sensors' unknowns.
+        initial_guess: bases, tools and sensors' unknowns.
         usable: result of `usable_rows`.
         options: settings of base, tool and sensors.
         prior: prior of the geometric errors.
@@ -173,9 +173,9 @@ def setup_from_guess(
     unknown_frames = {
         own.name: torch.tensor([space.frames.index(name) for name in own.frames]) for own in space.unknowns
     }
-    anchors, start = _anchored(space, guessed, options, unknown_frames)
+    anchors, start = _anchored(space, initial_guess, options, unknown_frames)
     if dh is not None:
-        start[: space.arm_size] = torch.from_numpy(dh.flatten())
+        start[: space.arm_parameter_count] = torch.from_numpy(dh.flatten())
     start = start.to(device)
     sensors = build_sensors(anchors.sensor_rows(measurements, frame, target))
     distances = SocketDistanceSensor.assign_distances(
@@ -195,13 +195,13 @@ def setup_from_guess(
         pose=number_repeats(repeats, frame, target),
         configuration=number_repeats(repeats, frame) if len(space.targets) > 1 else None,
         pairs=len(set(measurements.pair or ()) - {""}),
-        stated=JointState.from_measurements(measurements).stated,
+        stated_conditions=JointState.from_measurements(measurements).stated,
         prior_scaling=options.prior_scaling,
     )
     free = [
         space.indices_of(own.name).start + index
         for own in space.unknowns
-        for index in guessed.free_unknowns[own.name].flatten().nonzero()[:, 0].tolist()
+        for index in initial_guess.free_unknowns[own.name].flatten().nonzero()[:, 0].tolist()
     ]
     setup = CalibrationSetup(
         problem, start, anchors, rows, unknown_frames, free, measurements, options.joint_repeatability

@@ -46,13 +46,13 @@ class ControllerReading:
 
     Attributes:
         robot: nominal robot with the parameters of the file; its `source` names the file and the frames of its poses.
-        change: distance between its tool and that of the nominal robot, in the same frame.
+        deviation_from_nominal: distance between its tool and that of the nominal robot, in the same frame.
         frames: frames of the controller relative to frames of the nominal robot; None if they are equal.
         remarks: sentences on the description of the format, its tests, and the frames of poses.
     """
 
     robot: Robot
-    change: Departure
+    deviation_from_nominal: Departure
     frames: Frames | None
     remarks: tuple[str, ...]
 

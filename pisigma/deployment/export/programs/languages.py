@@ -90,10 +90,10 @@ class Language:
     Attributes:
         name: name of the language.
         template: template of its programs in the folder `templates`.
-        longest: largest number of characters of a program's name.
+        max_name_length: largest number of characters of a program's name.
         reserved: words of the language that cannot be names, in capitals.
         line_end: line ending.
-        most_lines: largest number of numbered lines of a program; None for any number.
+        max_lines: largest number of numbered lines of a program; None for any number.
         keeps_branch: whether Cartesian targets may be on several branches.
         uses_capitals: whether names are written in capitals.
         configuration: pattern of configurations of the arm, if Cartesian targets require a configuration.
@@ -103,10 +103,10 @@ class Language:
 
     name: str
     template: str
-    longest: int
+    max_name_length: int
     reserved: frozenset[str]
     line_end: str = "\r\n"
-    most_lines: int | None = None
+    max_lines: int | None = None
     keeps_branch: bool = False
     uses_capitals: bool = False
     configuration: re.Pattern[str] | None = None
@@ -120,20 +120,20 @@ class Language:
             OutputError: the name is not valid in the language; the message proposes a valid name.
         """
         stem = path.stem.upper() if self.uses_capitals else path.stem
-        fits = re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", stem, re.ASCII) and len(stem) <= self.longest
+        fits = re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", stem, re.ASCII) and len(stem) <= self.max_name_length
         if fits and stem.upper() not in self.reserved:
             return stem
         other = re.sub(r"[^A-Za-z0-9]+", "_", stem).strip("_")
         other = other if other[:1].isalpha() else f"P{'_' if other else ''}{other}"
         other = f"P_{other}" if other.upper() in self.reserved else other
         raise OutputError(
-            f"expected a file name that is a valid {self.name} program name: at most {self.longest} letters, digits "
-            "and _, starting with a letter, and not a reserved word",
-            expected=f"a {self.name} program name of at most {self.longest} characters",
+            f"expected a file name that is a valid {self.name} program name: at most {self.max_name_length} letters, "
+            "digits and _, starting with a letter, and not a reserved word",
+            expected=f"a {self.name} program name of at most {self.max_name_length} characters",
             value=path.stem,
             option="--out",
             at=Place(path),
-            remedy=f"choose another name, such as {other[: self.longest].rstrip('_')}{path.suffix}",
+            remedy=f"choose another name, such as {other[: self.max_name_length].rstrip('_')}{path.suffix}",
         )
 
     def write(self, program: Program) -> str:
@@ -146,11 +146,11 @@ class Language:
         content = {"program": program, "targets": program.cartesian, "cautions": sentences}
         text = _templates().get_template(self.template).render(content) + "\n"
         lines = len(_NUMBERED_LINE.findall(text))
-        if self.most_lines is not None and lines > self.most_lines:
+        if self.max_lines is not None and lines > self.max_lines:
             raise OutputError(
-                f"expected at most {self.most_lines} lines for a {self.name} controller, got {lines} in the program "
+                f"expected at most {self.max_lines} lines for a {self.name} controller, got {lines} in the program "
                 f"{program.name}",
-                expected=f"at most {self.most_lines} lines",
+                expected=f"at most {self.max_lines} lines",
                 value=lines,
                 remedy="split the file of poses",
             )
@@ -189,7 +189,7 @@ _FILES_OF_SYSTEMS = reserved_words("con prn aux nul") | {
 URSCRIPT = Language(
     name="URScript",
     template="urscript.j2",
-    longest=64,
+    max_name_length=64,
     reserved=reserved_words(
         "and break continue def elif else end enum false for global halt if local not or pass return run sec "
         "struct then thread true while xor movej get_inverse_kin pose_trans set_tcp p speed acceleration frame"
@@ -204,7 +204,7 @@ URSCRIPT = Language(
 KRL = Language(
     name="KRL",
     template="krl.j2",
-    longest=24,
+    max_name_length=24,
     reserved=_FILES_OF_SYSTEMS
     | reserved_words(
         "and anin anout b_and b_exor b_not b_or bool brake bas case ccomp channel char circ circ_rel confirm "
@@ -218,7 +218,7 @@ KRL = Language(
 RAPID = Language(
     name="RAPID",
     template="rapid.j2",
-    longest=27,  # names have at most 32 characters, and _tool is appended
+    max_name_length=27,  # names have at most 32 characters, and _tool is appended
     reserved=reserved_words(
         "alias and backward bool case connect const default div do else elseif endfor endfunc endif endmodule endproc "
         "endrecord endtest endtrap endwhile error exit false for from func goto if inout local mod module nostepin not "
@@ -229,9 +229,9 @@ RAPID = Language(
 FANUC = Language(
     name="FANUC",
     template="fanuc.j2",
-    longest=36,
+    max_name_length=36,
     reserved=_FILES_OF_SYSTEMS,
-    most_lines=9999,
+    max_lines=9999,
     uses_capitals=True,
     configuration=re.compile(r"[NF] ([LR] )?[UD] [TB], -?\d, -?\d, -?\d"),
     cautions=(

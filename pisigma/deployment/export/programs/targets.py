@@ -35,7 +35,7 @@ class Targets:
         q: corrected joint values [rad or m], NaN without a target.
         T: pose T_base_tool of the nominal robot at q, `FK_nominal(q)`, NaN without a target. A controller that computes
             with the nominal robot commands q for this pose.
-        deviation: predicted standard deviation of the reached position [m]; NaN if it is not known.
+        sigma: predicted standard deviation of the reached position [m]; NaN if it is not known.
         remarks: sentences about the model's frames and conditions.
     """
 
@@ -47,7 +47,7 @@ class Targets:
     branch: tuple[str, ...]
     q: Float64[Tensor, "poses dof"]
     T: Float64[Tensor, "poses 4 4"]
-    deviation: Float64[Tensor, " poses"]
+    sigma: Float64[Tensor, " poses"]
     remarks: tuple[str, ...] = ()
 
     @property
@@ -129,6 +129,6 @@ def targets_of(solution: Solution, source: str, line: tuple[int, ...], accuracy:
         branch=tuple(solution.branches[index] for index in solution.branch.tolist()),
         q=q,
         T=forward_kinematics(model.robot, model.robot.to_dh(q)).where(has_target[:, None, None], torch.nan),
-        deviation=deviation.double().where(has_target, torch.nan),
+        sigma=deviation.double().where(has_target, torch.nan),
         remarks=(*condition_remarks(model), *frame_remarks(model)),
     )

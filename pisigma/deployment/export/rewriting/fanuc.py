@@ -46,14 +46,14 @@ _REDEFINED = re.compile(r"\b(UFRAME|UTOOL)\[(\d+)?[^\]]*\]+(?:\.\w+)?\s*=|\$MN(U
 _MODIFIED = re.compile(r"\b(Offset|Tool_Offset|INC|VOFFSET|TOOL_OFFSET|Skip|OFFSET|COORD|RTCP)\b")
 
 
-def scan_fanuc(text: str, stated: FrameFile) -> ScannedProgram:
+def scan_fanuc(text: str, frame_file: FrameFile) -> ScannedProgram:
     """Scan a program; a position is that of tool `UT` (0 is the flange) in frame `UF` (0 is the world).
 
     Args:
         text: text of the program.
-        stated: frames and tools by number, as `UFRAME 1` and `UTOOL 1`.
+        frame_file: frames and tools by number, as `UFRAME 1` and `UTOOL 1`.
     """
-    return _Reader(Scan(text), text, stated).read()
+    return _Reader(Scan(text), text, frame_file).read()
 
 
 @dataclass

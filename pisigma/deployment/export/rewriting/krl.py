@@ -64,14 +64,14 @@ FIXED_TOOL = "the tool is fixed and the workpiece moves"
 STATED_ARC = "the angle of the arc or its orientation is stated, so it has no waypoints"
 
 
-def scan_krl(text: str, stated: FrameFile) -> ScannedProgram:
+def scan_krl(text: str, frame_file: FrameFile) -> ScannedProgram:
     """Scan a program in KRL; its poses of `$TOOL` in `$BASE` are known after the program has set both.
 
     Args:
         text: text of the program.
-        stated: frames that the program names but does not state, such as `BASE_DATA[1]` and `TOOL_DATA[2]`.
+        frame_file: frames that the program names but does not state, such as `BASE_DATA[1]` and `TOOL_DATA[2]`.
     """
-    return _Reader(Scan(text), mask_comments(text, _HIDDEN), stated).read()
+    return _Reader(Scan(text), mask_comments(text, _HIDDEN), frame_file).read()
 
 
 _POINT = re.compile(r"(?im)^[ \t]*(?:DECL\s+|GLOBAL\s+)+E?\d?POS\s+X(\w+)\s*=\s*(?=\{)")
@@ -81,14 +81,14 @@ _FRAMES = re.compile(
 )
 
 
-def scan_krl_data(text: str, stated: FrameFile) -> ScannedProgram:
+def scan_krl_data(text: str, frame_file: FrameFile) -> ScannedProgram:
     """Scan a data list (`.dat`) for points of inline forms, whose frame and tool are in the `FDAT` of the same name.
 
     The moves are in the program that belongs to the list, so they get no waypoints.
 
     Args:
         text: text of the data list.
-        stated: `BASE_DATA[n]` and `TOOL_DATA[n]`; number 0 is the origin and the flange.
+        frame_file: `BASE_DATA[n]` and `TOOL_DATA[n]`; number 0 is the origin and the flange.
     """
     scan, visible = Scan(text), mask_comments(text, _HIDDEN)
     frames = {match[1].upper(): match for match in _FRAMES.finditer(visible)}
@@ -99,8 +99,8 @@ def scan_krl_data(text: str, stated: FrameFile) -> ScannedProgram:
             reason = f"no FDAT F{match[1]} with IPO_FRAME #BASE states the frame and the tool of the point"
             scan.add_move(match.start(), reason, IDENTITY, IDENTITY)
             continue
-        tool = IDENTITY if data[2] == "0" else stated.tool(f"TOOL_DATA[{data[2]}]")
-        frame = IDENTITY if data[3] == "0" else stated.frame(f"BASE_DATA[{data[3]}]")
+        tool = IDENTITY if data[2] == "0" else frame_file.tool(f"TOOL_DATA[{data[2]}]")
+        frame = IDENTITY if data[3] == "0" else frame_file.frame(f"BASE_DATA[{data[3]}]")
         scan.add_move(match.start(), _target_pose(literal, in_use), frame, tool)
     return scan.program()
 

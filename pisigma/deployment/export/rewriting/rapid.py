@@ -79,14 +79,14 @@ _STATEMENT = re.compile(
 )
 
 
-def scan_rapid(text: str, stated: FrameFile) -> ScannedProgram:
+def scan_rapid(text: str, frame_file: FrameFile) -> ScannedProgram:
     """Scan a module in RAPID; every move states tool and work object.
 
     Args:
         text: text of the module.
-        stated: tools and work objects that are declared in other modules.
+        frame_file: tools and work objects that are declared in other modules.
     """
-    return _Reader(Scan(text), mask_comments(text, _HIDDEN), stated).read()
+    return _Reader(Scan(text), mask_comments(text, _HIDDEN), frame_file).read()
 
 
 @dataclass

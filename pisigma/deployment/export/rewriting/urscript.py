@@ -46,14 +46,14 @@ _BLEND = 1e-3
 """Blend radius at waypoints [m], which is reduced if they are close together."""
 
 
-def scan_urscript(text: str, stated: FrameFile) -> ScannedProgram:
+def scan_urscript(text: str, frame_file: FrameFile) -> ScannedProgram:
     """Scan a program; poses are relative to the base, or to the frame of a `pose_trans`.
 
     Args:
         text: text of the program.
-        stated: frames that the program does not state; their tool `tcp` applies until a `set_tcp` with numbers.
+        frame_file: frames that the program does not state; their tool `tcp` applies until a `set_tcp` with numbers.
     """
-    return _Reader(Scan(text), mask_comments(text, _HIDDEN), stated).read()
+    return _Reader(Scan(text), mask_comments(text, _HIDDEN), frame_file).read()
 
 
 @dataclass

@@ -21,7 +21,7 @@ from pisigma.robot.frame_fits import (
     MeasuredPoses,
     best_base,
     best_tool,
-    frame_columns,
+    frame_jacobian,
     moved_frame,
 )
 from pisigma.validation.held_out.calibration_summary import has_orientation
@@ -174,7 +174,7 @@ def fit_frames(
         fitted: what is fitted.
 
     Returns:
-        The poses, and the derivatives of their values with respect to all fitted parameters, see `frame_columns`.
+        The poses, and the derivatives of their values with respect to all fitted parameters, see `frame_jacobian`.
     """
     frame, target = numbers_of_names(rows.frame), numbers_of_names(rows.target)
     bases, tools = (torch.eye(4).to(T).repeat(int(number.max()) + 1, 1, 1) for number in (frame, target))
@@ -220,8 +220,8 @@ def _columns(
     tools: tuple[Tensor, Int64[Tensor, " rows"]],
     fitted: Collection[FrameKind],
 ) -> tuple[Float64[Tensor, "rows 6 numbers"], Float64[Tensor, "rows 6"]]:
-    """Compute derivatives with respect to the fitted bases and tools, and the errors; see `frame_columns`."""
-    J, error = frame_columns(T, measured, bases[0][bases[1]], tools[0][tools[1]])
+    """Compute derivatives with respect to the fitted bases and tools, and the errors; see `frame_jacobian`."""
+    J, error = frame_jacobian(T, measured, bases[0][bases[1]], tools[0][tools[1]])
     blocks = []
     for kind, (frames, number), part in zip(
         ("base", "tool"), (bases, tools), torch.split(J, 6, -1), strict=True

@@ -59,7 +59,7 @@ def condensed(
         q=q, position=T[:, :3, 3].contiguous(), rotation=T[:, :3, :3].contiguous() if poses else None
     )
     setup = GeometricCalibrator(robot, base="fixed", tool="fixed").build(data)
-    count = setup.problem.space.arm_size if arm_only else len(setup.start)
+    count = setup.problem.space.arm_parameter_count if arm_only else len(setup.start)
     at_start = information(setup.problem, setup.start, list(range(count)))
     return at_start, setup.start.numpy()[:count]
 
@@ -115,7 +115,7 @@ def test_no_more_is_independent_than_axes_targets_and_frames_have(
     point[list(tools)] += 0.1 * torch.from_numpy(rng.standard_normal(len(tools)))
     seen = information(problem, point, list(range(len(point))))
     found = find_redundancy(seen, point.numpy())
-    assert found.rank == problem.space.most_independent(with_orientation=poses)
+    assert found.rank == problem.space.max_identifiable(with_orientation=poses)
 
 
 @pytest.mark.parametrize("name", ["ur10", "panda", "kiro3"])

@@ -94,7 +94,7 @@ def test_published_calibrations_agree_with_the_makers_formula(case, tmp_path):
     q = joint_values()
     wanted = makers_formula(q, *with_deltas(name, deltas))
     assert_close(forward_kinematics(reading.robot, torch.from_numpy(q)), wanted, atol=1e-9)
-    assert 0.5 < reading.change.mean_mm < 5
+    assert 0.5 < reading.deviation_from_nominal.mean_mm < 5
     text = universal_robots.FILE.text(FileContent(reading.robot, reading.robot, REQUEST))
     assert_close(makers_formula(q, *with_deltas(name, deltas_of(text))), wanted, atol=1e-9)
 
@@ -234,7 +234,7 @@ def test_a_robot_far_from_the_nominal_one_is_refused(tmp_path):
     path.write_text(conf(deltas | {"delta_a": [0, 0.02, 0, 0, 0, 0]}))
     with refused(RobotError, file="calibration.conf", expected="a mean change of at most 5 mm"):
         read_controller_file(path, Robot.load(name))
-    assert read_controller_file(path, Robot.load(name), 50.0).change.mean_mm > 5
+    assert read_controller_file(path, Robot.load(name), 50.0).deviation_from_nominal.mean_mm > 5
 
 
 @pytest.mark.parametrize(
