@@ -67,7 +67,7 @@ def moved(rows: Measurements, joint: int, tracker: bool) -> Measurements:
 
 def is_right(session: Session, joint: int) -> bool:
     """Return whether exactly the moved joint is named, or no alarm is raised if no joint moved."""
-    named = [one.what for one in session.moved if not is_frame(one.what)]
+    named = [one.what for one in session.movements if not is_frame(one.what)]
     return named == ([f"joint {joint}"] if joint else []) and session.verdict != "unclear"
 
 

@@ -220,7 +220,7 @@ def speed() -> None:
         began = time.perf_counter()
         select_poses(posterior.sensitivities(q), posterior.tool_derivatives(q[:300]), 100, criterion)  # type: ignore[arg-type]
         seconds = time.perf_counter() - began
-        unknowns = len(posterior.uncertainty.root)
+        unknowns = len(posterior.uncertainty.dense_root)
         print(
             f"100 of 5,000 candidates, {unknowns} unknowns, criterion {criterion}: {seconds:.1f} s",
             flush=True,

@@ -129,7 +129,7 @@ def errors(draw: Draw, rows: pisigma.Measurements, q: Tensor, aligned: bool) -> 
     result, true = calibration.result, positions(draw.true, q)
     assert isinstance(result, CalibrationResult)
     before, after = (positions(one, q) for one in (draw.nominal, calibration.model.identified))
-    root = CovarianceRoot(result.solved.root)
+    root = CovarianceRoot(result.solved.covariance_root)
     known = PositionUncertainty(result.solved.problem.space, result.solved.geometry, (), root, 1.0)
     spread = root.left_multiply(known.pose_derivatives(JointState(q), q)[:, :3]).flatten(0, 1)
     if aligned:

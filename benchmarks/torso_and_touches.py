@@ -212,7 +212,9 @@ def compare_torso(sets: int) -> None:
         names = [right.space.index(name) for name in torso.branch]
         offsets = right.values[names].numpy() - torso.nominal[1].dh[0, :2] - values[1][-2:]
         errors.append(np.r_[pose_error(transform_from_xyzrpy(right.values[base]), where).numpy(), offsets])
-        stated.append(torch.cat([J @ right.root[base], right.root[names]]).norm(dim=1).numpy())
+        stated.append(
+            torch.cat([J @ right.covariance_root[base], right.covariance_root[names]]).norm(dim=1).numpy()
+        )
         bounds.append(torso.bound(values))
     print(f"{sets} sets; free parameters of the arms: {len(torso.free[0])} and {len(torso.free[1])}")
     show(

@@ -82,7 +82,7 @@ class FitResiduals:
         y: Float64[Tensor, " values"],
         fitted_columns: Float64[Tensor, "values unknowns"],
         known_root: Float64[Tensor, "values directions"],
-        exact: Bool[Tensor, " values"],
+        has_exact_noise: Bool[Tensor, " values"],
         is_stated: bool,
         causes: Mapping[str, Float64[Tensor, "values _columns"]],
     ) -> "FitResiduals":
@@ -92,7 +92,7 @@ class FitResiduals:
             y: residuals in units of the stated noise.
             fitted_columns: derivatives with respect to the fitted unknowns.
             known_root: root of the covariance of the residuals due to quantities known with a stated uncertainty.
-            exact: values whose noise is exactly as stated.
+            has_exact_noise: values whose noise is exactly as stated.
             is_stated: whether the noise of the other values is stated.
             causes: derivatives with respect to the unknowns of every cause at size 1.
         """
@@ -100,7 +100,7 @@ class FitResiduals:
         N = torch.linalg.qr(U, mode="complete")[0][:, U.shape[1] :].t()
         A = N @ known_root
         columns = {name: compressed_columns(N @ Z) for name, Z in causes.items()}
-        return FitResiduals(N @ y, A @ A.t(), N[:, exact], is_stated, columns)
+        return FitResiduals(N @ y, A @ A.t(), N[:, has_exact_noise], is_stated, columns)
 
     def compare(self) -> tuple[Cause, ...]:
         """Return all causes: first those that are `named` because they are clear, then the others by Bayes factor."""
@@ -233,7 +233,7 @@ class SessionEvidence:
         for B in (values.X[:, one.index] * one.sigma for one in standing):
             self._K += B @ B.t()
         self._sigma = values.sigma(usual_noise)
-        self._scaled = ~values.exact
+        self._scaled = ~values.has_exact_noise
         self._groups = tuple(hypotheses)
         self._Z = [compressed_columns(values.X[:, one.index] * one.scale) for one in self._groups]
 

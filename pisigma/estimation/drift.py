@@ -84,14 +84,14 @@ class LinearValues:
         """Return the standard deviation of the noise of every value, given that of every sensor."""
         deviation = noise[self.sensor]
         for number, factor in self.wrong_configurations.items():
-            wrong = (self.configuration == number) & ~self.exact
+            wrong = (self.configuration == number) & ~self.has_exact_noise
             deviation = torch.where(wrong, math.hypot(1.0, factor) * deviation, deviation)
         return deviation
 
     @property
-    def exact(self) -> Bool[Tensor, " values"]:
+    def has_exact_noise(self) -> Bool[Tensor, " values"]:
         """Mask of the values whose noise is exactly as stated."""
-        return torch.tensor([one.exact for one in self.counts])[self.sensor]
+        return torch.tensor([one.has_exact_noise for one in self.counts])[self.sensor]
 
     @property
     def log_prior_penalty(self) -> float:
@@ -158,7 +158,7 @@ class DriftSearch:
                 if not group.fixed_size:
                     self._resize(number, self._best_size(number))
             for sensor, count in enumerate(self.values.counts):
-                if not count.exact and count.values:
+                if not count.has_exact_noise and count.values:
                     self._update_noise(sensor, 1.0 if count.has_stated_noise else 0.0)
             if before == [one.size for one in self._groups]:
                 break
@@ -326,7 +326,7 @@ class PosteriorUpdate:
         self.shift = root @ z[:directions]
         self.shift.index_add_(0, index, deviation * z[directions:])
 
-    def root(self) -> Float64[Tensor, "unknowns directions"]:
+    def covariance_root(self) -> Float64[Tensor, "unknowns directions"]:
         """Return the covariance root of the posterior, with at most `MAX_DIRECTIONS` columns per unknown."""
         extra = torch.zeros(len(self._root), len(self._index), dtype=torch.float64)
         extra[self._index, torch.arange(len(self._index))] = self._deviation

@@ -37,7 +37,7 @@ class DualRegression(AbstractRegression):
         y: weighted values.
         sensor: index of every value's sensor.
         prior: prior that defines the groups and base of the matrices K; its sizes are not used.
-        active: number of parameters.
+        active_count: number of parameters.
         K: matrix K of every group of weights, lower triangle.
         sensors: number of values of every sensor.
     """
@@ -46,7 +46,7 @@ class DualRegression(AbstractRegression):
     y: Float64[Tensor, " values"]
     sensor: Int64[Tensor, " values"]
     prior: GaussianPrior
-    active: int
+    active_count: int
     K: Float64[Tensor, "groups pairs"]
     sensors: tuple[SensorCount, ...]
 
@@ -55,7 +55,7 @@ class DualRegression(AbstractRegression):
         if self.is_ill_conditioned(prior, noise):
             return self.primal_regression.solve(prior, noise)
         P, parameters, covariance, log_det = self.projection(prior, noise)
-        active, precision = self.active, prior.precision
+        active, precision = self.active_count, prior.precision
         variance = self.y.new_tensor(noise).square()[self.sensor]
         # alpha = V^-1 (y - G parameters); both weights and residuals are products with alpha.
         alpha = P @ self.y
@@ -67,7 +67,7 @@ class DualRegression(AbstractRegression):
         determined = prior.sum_by_group(held)
         # Both matrices are symmetric, so the trace of their product requires only one triangle.
         traces = self.K @ (P.flatten().index_select(0, self._pairs) * self._counts)
-        determined[prior.classes :] = prior.sizes[prior.classes :].square() * traces
+        determined[prior.class_count :] = prior.sizes[prior.class_count :].square() * traces
         # Parameters without a prior have precision 0; their constant term is left out.
         stated = precision[:active]
         evidence = float(self.y @ alpha) + log_det - float(stated[stated > 0].log().sum())
@@ -82,7 +82,7 @@ class DualRegression(AbstractRegression):
         """Return the covariance root of the unknowns; weights depend on the parameters by `-Λ^-1 X^T V^-1 G`."""
         if self.is_ill_conditioned(posterior.prior, posterior.noise):
             return self.primal_regression.covariance_root(posterior)
-        active, precision = self.active, posterior.prior.precision
+        active, precision = self.active_count, posterior.prior.precision
         sigma = self.y.new_tensor(posterior.noise)[self.sensor]
         size = precision[active:].rsqrt()
         G, Z = self.X[:, :active] / sigma[:, None], self.X[:, active:] / sigma[:, None] * size
@@ -116,13 +116,13 @@ class DualRegression(AbstractRegression):
     def is_ill_conditioned(self, prior: GaussianPrior, noise: tuple[float, ...]) -> bool:
         """Return whether traces of P cancel because the noise is very small; normal equations are then accurate."""
         diagonal = torch.arange(len(self.y)).add(1).cumsum(0) - 1
-        trace = float(prior.sizes[prior.classes :].square() @ self.K[:, diagonal].sum(1))
+        trace = float(prior.sizes[prior.class_count :].square() @ self.K[:, diagonal].sum(1))
         return trace > _MAX_VARIANCE_RATIO * min(noise) ** 2
 
     def _covariance(self, prior: GaussianPrior, noise: tuple[float, ...]) -> Tensor:
         """Return V, of which only the upper triangle is set."""
         V = self.y.new_zeros((len(self.y), len(self.y)))
-        V.view(-1)[self._pairs] = prior.sizes[prior.classes :].square() @ self.K
+        V.view(-1)[self._pairs] = prior.sizes[prior.class_count :].square() @ self.K
         V.diagonal().add_(self.y.new_tensor(noise).square()[self.sensor])
         return V
 
@@ -140,7 +140,7 @@ class DualRegression(AbstractRegression):
         self, prior: GaussianPrior, noise: tuple[float, ...]
     ) -> tuple[Tensor, Tensor, Tensor, float]:
         """Return P, the parameters and their covariance, and `log |V| + log |G^T V^-1 G + Λ|`."""
-        active = self.active
+        active = self.active_count
         factor = scaled_cholesky(lambda: self._covariance(prior, noise))
         log_det = log_determinant(*factor)
         inverse, G = invert_from_factor(*factor), self.X[:, :active]
@@ -184,10 +184,10 @@ def without_nuisance(
     return inverse - along @ solution, solution, int(certain.sum())
 
 
-def group_gram(X: Tensor, prior: GaussianPrior, group: int, active: int) -> Tensor:
+def group_gram(X: Tensor, prior: GaussianPrior, group: int, active_count: int) -> Tensor:
     """Return the matrix K of one group of weights, whose columns in X follow the columns of the parameters."""
     columns = (prior.group == group).nonzero()[:, 0]
-    columns = columns[columns >= active]
+    columns = columns[columns >= active_count]
     Z = X[:, columns] * prior.base[columns].rsqrt()
     return (Z @ Z.t()).flatten()[_upper_triangle(len(X))]
 

@@ -134,7 +134,7 @@ def most_deviating_row(
     X: Float64[Tensor, "values unknowns"],
     y: Float64[Tensor, " values"],
     row: Int64[Tensor, " values"],
-    exact: Bool[Tensor, " values"],
+    has_exact_noise: Bool[Tensor, " values"],
 ) -> RowTest | None:
     """Find the row whose values the fit to all other rows predicts worst.
 
@@ -147,7 +147,7 @@ def most_deviating_row(
         X: derivatives, in units of the noise.
         y: residuals of the fit, in units of the noise.
         row: index of every value's row.
-        exact: values that are not measured, such as priors; rows are tested without these values.
+        has_exact_noise: values that are not measured, such as priors; rows are tested without these values.
 
     Returns:
         The row; None if no row leaves degrees of freedom for the test.
@@ -157,9 +157,9 @@ def most_deviating_row(
     U = orthonormal_columns(X)
     total, freedom = float(y.square().sum()), len(y) - U.shape[1]
     worst: RowTest | None = None
-    numbers = torch.unique(row[~exact]).tolist()
+    numbers = torch.unique(row[~has_exact_noise]).tolist()
     for number in numbers:
-        chosen = (row == number) & ~exact
+        chosen = (row == number) & ~has_exact_noise
         block = torch.eye(int(chosen.sum()), dtype=y.dtype) - U[chosen] @ U[chosen].t()
         values, vectors = torch.linalg.eigh(block)
         certain = values > SINGULAR

@@ -65,14 +65,14 @@ class PrimalRegression(AbstractRegression):
     Attributes:
         normal: `Σ X^T X` for every sensor, of weighted rows.
         descent: `Σ X^T y` for every sensor.
-        square: `Σ y^T y` for every sensor.
+        squared_values: `Σ y^T y` for every sensor.
         sensors: number of values of every sensor.
         latest: cache of the last solution, which evidence, held-out errors and covariance share.
     """
 
     normal: Float64[Tensor, "sensors unknowns unknowns"]
     descent: Float64[Tensor, "sensors unknowns"]
-    square: tuple[float, ...]
+    squared_values: tuple[float, ...]
     sensors: tuple[SensorCount, ...]
     latest: list[SolvedRegression] = field(default_factory=list, init=False)
 
@@ -129,7 +129,7 @@ class PrimalRegression(AbstractRegression):
         cross = (self.descent @ x).tolist()
         inner = [float(x @ (N @ x)) for N in self.normal]
         return tuple(
-            max(total - 2 * a + b, 0.0) for total, a, b in zip(self.square, cross, inner, strict=True)
+            max(total - 2 * a + b, 0.0) for total, a, b in zip(self.squared_values, cross, inner, strict=True)
         )
 
 

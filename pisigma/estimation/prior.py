@@ -22,15 +22,15 @@ class GaussianPrior:
         base: 1 / variance at size 1; 0 without a prior.
         group: index in `sizes` of every unknown.
         sizes: standard deviation of every group at base 1.
-        classes: number of leading groups that are classes of geometric parameters. Their sizes, which are factors on
-            the stated sizes, remain as estimated by the geometric calibration: over a narrow joint range, low harmonics
-            resemble geometry, and if they could replace it, the arm would be wrong beyond this range.
+        class_count: number of leading groups that are classes of geometric parameters. Their sizes, which are factors
+            on the stated sizes, remain as estimated by the geometric calibration: over a narrow joint range, low
+            harmonics resemble geometry, and if they could replace it, the arm would be wrong beyond this range.
     """
 
     base: Float64[Tensor, " unknowns"]
     group: Int64[Tensor, " unknowns"]
     sizes: Float64[Tensor, " groups"]
-    classes: int
+    class_count: int
 
     @property
     def precision(self) -> Float64[Tensor, " unknowns"]:
@@ -42,13 +42,15 @@ class GaussianPrior:
         return torch.zeros_like(self.sizes).index_add(0, self.group, values * (self.base > 0))
 
     def updated(
-        self, square: Float64[Tensor, " groups"], determined: Float64[Tensor, " groups"]
+        self, squared_unknowns: Float64[Tensor, " groups"], determined_unknowns: Float64[Tensor, " groups"]
     ) -> "GaussianPrior":
         """Update the sizes by MacKay's rule (1992, Neural Computation 4(3), eq. 4.7): size² = Σ x² base / Σ determined.
 
         The rule approaches its fixed point from one side in ever shorter steps and is therefore over-relaxed.
         """
-        sizes = (square.clamp(min=0.0) / determined.clamp(min=1e-12)).sqrt()
+        sizes = (squared_unknowns.clamp(min=0.0) / determined_unknowns.clamp(min=1e-12)).sqrt()
         sizes = (self.sizes * (sizes / self.sizes) ** _RELAXATION).clamp(min=SMALLEST_SIZE)
-        is_fixed = (determined <= 1e-9) | (torch.arange(len(sizes), device=sizes.device) < self.classes)
+        is_fixed = (determined_unknowns <= 1e-9) | (
+            torch.arange(len(sizes), device=sizes.device) < self.class_count
+        )
         return replace(self, sizes=torch.where(is_fixed, self.sizes, sizes))

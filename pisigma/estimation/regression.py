@@ -26,7 +26,7 @@ class Posterior:
         log_evidence: log evidence of the data under the prior, up to a constant that depends only on the data.
         prior: prior with estimated sizes.
         noise: standard deviation of the noise of every sensor [m or rad], or a factor on the stated noise.
-        square: `Σ base x²` over the unknowns of every group.
+        squared_unknowns: `Σ base x²` over the unknowns of every group.
         determined_unknowns: effective number of unknowns of every group that the data determine; the prior determines
             the others.
         misfit: `Σ (y - X x)²` for every sensor.
@@ -37,7 +37,7 @@ class Posterior:
     log_evidence: float
     prior: GaussianPrior
     noise: tuple[float, ...]
-    square: Float64[Tensor, " groups"]
+    squared_unknowns: Float64[Tensor, " groups"]
     determined_unknowns: Float64[Tensor, " groups"]
     misfit: tuple[float, ...]
     effective_parameters: tuple[float, ...]
@@ -55,13 +55,13 @@ class SensorCount:
     Attributes:
         values: number of independent values.
         has_stated_noise: whether the rows of the sensor state their noise, which is then a lower bound.
-        exact: whether the noise is exactly as stated.
+        has_exact_noise: whether the noise is exactly as stated.
         repeat_variance_factor: see `SensorValues.repeat_variance_factor`.
     """
 
     values: float
     has_stated_noise: bool
-    exact: bool
+    has_exact_noise: bool
     repeat_variance_factor: float = 1.0
 
 
@@ -84,14 +84,16 @@ class AbstractRegression(ABC):
 
     def effective_share(self, posterior: Posterior) -> float:
         """Return the share of the values that the unknowns absorb; if it is near 1, the noise cannot be estimated."""
-        values = sum(sensor.values for sensor in self.sensors if not sensor.exact)
+        values = sum(sensor.values for sensor in self.sensors if not sensor.has_exact_noise)
         return posterior.effective_unknowns / max(values, 1.0)
 
     def updated_noise(self, posterior: Posterior) -> tuple[float, ...]:
         """Estimate the noise of every sensor from its misfit and degrees of freedom (Förstner 1979)."""
         noise = list(posterior.noise)
         for k, sensor in enumerate(self.sensors):
-            if not sensor.exact and sensor.values > 0.5:  # the noise of a sensor without values is unchanged
+            if (
+                not sensor.has_exact_noise and sensor.values > 0.5
+            ):  # the noise of a sensor without values is unchanged
                 sigma = math.sqrt(
                     posterior.misfit[k] / max(sensor.values - posterior.effective_parameters[k], 1.0)
                 )
@@ -114,7 +116,7 @@ class AbstractRegression(ABC):
         """
         posterior = self.solve(prior, tuple(max(sigma, SMALLEST_NOISE) for sigma in noise))
         for _ in range(iterations):
-            prior = posterior.prior.updated(posterior.square, posterior.determined_unknowns)
+            prior = posterior.prior.updated(posterior.squared_unknowns, posterior.determined_unknowns)
             following = self.solve(prior, self.updated_noise(posterior))
             gain = following.log_evidence - posterior.log_evidence
             posterior = following
@@ -123,7 +125,9 @@ class AbstractRegression(ABC):
         return posterior
 
 
-def prior_size_columns(posterior: Posterior, root: CovarianceRoot) -> Float64[Tensor, "unknowns groups"]:
+def prior_size_columns(
+    posterior: Posterior, covariance_root: CovarianceRoot
+) -> Float64[Tensor, "unknowns groups"]:
     """Return the columns that the uncertainty of the prior scales adds to a root of the covariance C of the unknowns.
 
     With `dx / d log s_g = 2 C Λ_g x` for the unknowns of group g and `var(log s_g) = 1 / (2 n_g)`, where n_g of
@@ -133,5 +137,5 @@ def prior_size_columns(posterior: Posterior, root: CovarianceRoot) -> Float64[Te
     groups = torch.zeros(len(x), len(prior.sizes), dtype=x.dtype, device=x.device)
     groups[torch.arange(len(x)), prior.group] = 1.0
     certain = posterior.determined_unknowns > MIN_EFFECTIVE
-    moved = 2 * root.covariance_times((groups * (prior.precision * x)[:, None])[:, certain])
+    moved = 2 * covariance_root.covariance_times((groups * (prior.precision * x)[:, None])[:, certain])
     return moved * (2 * posterior.determined_unknowns[certain]).rsqrt()

@@ -74,24 +74,24 @@ class RoundedRoot:
 
 
 def round_root(
-    root: Float64[Tensor, "unknowns directions"],
+    covariance_root: Float64[Tensor, "unknowns directions"],
     combinations: Float64[Tensor, "probes unknowns"],
     tolerance: float,
 ) -> RoundedRoot | None:
     """Round a root with the largest unit that keeps the standard deviations of given combinations of the unknowns.
 
     Args:
-        root: root of the covariance.
+        covariance_root: root of the covariance.
         combinations: combinations of the unknowns.
         tolerance: largest relative change of the standard deviation of a combination.
 
     Returns:
         The rounded root; None if even the smallest unit changes a standard deviation by more.
     """
-    exact = torch.linalg.vector_norm(combinations @ root, dim=1)
+    exact = torch.linalg.vector_norm(combinations @ covariance_root, dim=1)
     # R^T = Q U gives R R^T = U^T U without forming it, which would lose half of the digits of small directions
-    triangular: Tensor = torch.linalg.qr(root.t(), mode="r")[1].t()
-    lower = torch.nn.functional.pad(triangular, (0, len(root) - triangular.shape[1]))
+    triangular: Tensor = torch.linalg.qr(covariance_root.t(), mode="r")[1].t()
+    lower = torch.nn.functional.pad(triangular, (0, len(covariance_root) - triangular.shape[1]))
     for step in STEPS:
         rounded = _rounded(lower, step)
         change = torch.linalg.vector_norm(combinations @ rounded.as_matrix, dim=1) - exact

@@ -79,7 +79,7 @@ def _suspects(explained: ExplainedRows[What]) -> list[dict[int, float]]:
     a = inverse @ values.y
     tried: list[tuple[float, int, float]] = []
     for number in torch.unique(values.configuration).tolist():
-        chosen = (values.configuration == number) & ~values.exact
+        chosen = (values.configuration == number) & ~values.has_exact_noise
         if number in values.wrong_configurations or not bool(chosen.any()):
             continue
         sigma = explained.sigma[chosen]

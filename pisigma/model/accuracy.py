@@ -84,5 +84,7 @@ def parameter_posterior(model: CalibratedModel) -> ParameterPosterior | None:
     """
     known = model.uncertainty
     return (
-        None if known is None else ParameterPosterior.from_geometry(known.space, known.geometry, known.root)
+        None
+        if known is None
+        else ParameterPosterior.from_geometry(known.space, known.geometry, known.dense_root)
     )

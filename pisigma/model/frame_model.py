@@ -180,20 +180,20 @@ def _uncertainty(
     model: ArmUncertainty, fit: FrameFit, arm_root: Float64[Tensor, "frames directions"]
 ) -> PositionUncertainty:
     """Return the uncertainty of a model with fitted frames; points of sensors in a fitted base are dropped."""
-    known, solved = model.known, fit.solved.geometry
+    known, solved = model.uncertainty, fit.solved.geometry
     old, fits_base, fits_tool = known.space, fit.only != "tool", fit.only != "base"
     bases = solved.bases if fits_base else known.geometry.bases
     tools = solved.tools if fits_tool else known.geometry.tools
     unknowns = {} if fits_base else known.geometry.unknowns
     space = ParameterSpace(old.robot, tuple(bases), tuple(tools), () if fits_base else old.unknowns)
     arm = _with_first(known.geometry.robot, {"bases": bases, "tools": tools})
-    own = torch.cat([arm_root, fit.solved.root[fit.frame_indices]], 1)
-    weights, directions = known.root[len(old.parameters) :], known.root.shape[1]
+    own = torch.cat([arm_root, fit.solved.covariance_root[fit.frame_indices]], 1)
+    weights, directions = known.dense_root[len(old.parameters) :], known.dense_root.shape[1]
     root = torch.zeros(len(space.parameters) + len(weights), own.shape[1], dtype=torch.float64)
     positions = positions_by_key(space.parameters)
     for key, number in positions_by_key(old.parameters).items():
         if key in positions:
-            root[positions[key], :directions] = known.root[number]
+            root[positions[key], :directions] = known.dense_root[number]
     fitted = positions_by_key(fit.parameters)
     for key, number in fitted.items():
         root[positions[key]] = own[number]

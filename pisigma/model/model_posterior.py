@@ -47,8 +47,8 @@ class ModelPosterior:
         geometry: most probable values of the parameters.
         features: features of the joint correction, including products of inputs.
         weights: weights of the used columns of the features.
-        root: root `R` of the covariance `R R^T`, with the rows of the parameters, in the user's coordinates, followed
-            by the rows of the weights.
+        covariance_root: root `R` of the covariance `R R^T`, with the rows of the parameters, in the user's coordinates,
+            followed by the rows of the weights.
         noise: noise of the sensors of the calibration.
     """
 
@@ -56,7 +56,7 @@ class ModelPosterior:
     geometry: IdentifiedGeometry
     features: tuple[AbstractFeature, ...]
     weights: Float64[Tensor, " weights"]
-    root: Float64[Tensor, "unknowns directions"]
+    covariance_root: Float64[Tensor, "unknowns directions"]
     noise: CalibrationNoise
 
     @staticmethod
@@ -80,13 +80,17 @@ class ModelPosterior:
                 remedy="calibrate it again with `pisigma calibrate ROBOT DATA --out DIR`",
             )
         correction = None if model.hybrid is None else model.hybrid.correction
-        weights = known.root.new_zeros(0) if correction is None else _weights(correction, known.features)
-        return ModelPosterior(known.space, known.geometry, known.features, weights, known.root, known.noise)
+        weights = (
+            known.dense_root.new_zeros(0) if correction is None else _weights(correction, known.features)
+        )
+        return ModelPosterior(
+            known.space, known.geometry, known.features, weights, known.dense_root, known.noise
+        )
 
     @cached_property
     def rms_weights(self) -> Float64[Tensor, " weights"]:
         """Posterior root mean square [rad or m] of the weights that share a prior scale, for every weight."""
-        square = self.weights.square() + self.root[len(self.space.parameters) :].square().sum(1)
+        square = self.weights.square() + self.covariance_root[len(self.space.parameters) :].square().sum(1)
         first, numbers = 0, []
         for feature in self.features:
             numbers.append(feature.group[feature.used] + first)

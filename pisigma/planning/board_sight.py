@@ -34,7 +34,7 @@ class BoardSight:
         """Return T_camera_board for T_frame_target [m]."""
         return T_frame_target if self.is_fixed else invert(T_frame_target)
 
-    def weight(self, T_frame_target: Float64[Tensor, "poses 4 4"]) -> Float64[Tensor, "poses 6 6"]:
+    def whitening_matrix(self, T_frame_target: Float64[Tensor, "poses 4 4"]) -> Float64[Tensor, "poses 6 6"]:
         """Compute the lower triangular W for which `W^T W` is the inverse covariance of poses measured with images.
 
         The covariance is that of (translation [m], rotation vector [rad]) of the target in the axes of the measuring

@@ -141,7 +141,7 @@ def remaining_errors(
     known = posterior.uncertainty
     D, root, total = (
         posterior.tool_derivatives(task),
-        known.root,
+        known.dense_root,
         rms_of(posterior.tool_derivatives(task)) ** 2,
     )
     errors = []

@@ -160,7 +160,7 @@ class RobotPosterior:
         Args:
             q: commanded joint values [rad or m].
         """
-        root = multiply_updated_root(self.uncertainty.root, self.sensitivities(q).flatten(0, 1))
+        root = multiply_updated_root(self.uncertainty.dense_root, self.sensitivities(q).flatten(0, 1))
         return replace(self, uncertainty=replace(self.uncertainty, covariance_root=CovarianceRoot(root)))
 
     def corrected_joints(self, q: Float64[Tensor, "*batch dof"]) -> Float64[Tensor, "*batch dof"]:
@@ -211,7 +211,7 @@ class RobotPosterior:
             columns = columns[:, :3] / instrument.sigma
         elif instrument.sight is not None:
             T = forward_kinematics(self.uncertainty.geometry.robot, self.corrected_joints(q))
-            columns = instrument.sight.weight(T) @ columns
+            columns = instrument.sight.whitening_matrix(T) @ columns
         else:
             noise = q.new_tensor([instrument.sigma] * 3 + [instrument.sigma_rotation] * 3)
             columns = columns / noise[:, None]
@@ -243,7 +243,10 @@ class RobotPosterior:
         robot = before.geometry.robot.with_geometry(base=base, tool=tool)
         geometry = IdentifiedGeometry(robot, {"": base}, {"": tool}, {})
         space = ParameterSpace(before.space.robot)
-        arm, weights = before.root[: space.arm_parameter_count], before.root[len(before.space.parameters) :]
+        arm, weights = (
+            before.dense_root[: space.arm_parameter_count],
+            before.dense_root[len(before.space.parameters) :],
+        )
         wide = torch.diag(torch.tensor(_WIDE_PRIOR, dtype=torch.float64))
         blank = arm.new_zeros(len(wide), arm.shape[1])
         zeros = [rows.new_zeros(len(rows), len(wide)) for rows in (arm, weights)]

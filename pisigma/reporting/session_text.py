@@ -132,7 +132,7 @@ def session_page(step: SessionStep | None, state: SessionState, title: str) -> "
 
     first = max(0, len(state.rows.line) - _SHOWN_ROWS)
     rows = [(str(state.rows.line[row]), _verdict(state, row)) for row in range(first, len(state.rows.line))]
-    points = (*state.reached, *state.expected)[-_SHOWN_POINTS:]
+    points = (*state.reached_accuracy, *state.expected_accuracy)[-_SHOWN_POINTS:]
     waiting = "" if step is None else step.growth.waiting
     alarms = [make_printable(alarm.sentence, cut=False) for alarm in state.alarms[-_SHOWN_ALARMS:]]
     colour = {"measure": "bold", "repeat": "bold red", "correct": "bold red", "stop": "bold green"}[

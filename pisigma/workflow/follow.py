@@ -46,7 +46,7 @@ def follow(
         growth = file.read(final=True)
         alarms = session.add(growth.rows, growth.left_out)
         alarms += session.update()
-        yield SessionStep(growth, alarms, session.state, session.state.reached, session.replanned)
+        yield SessionStep(growth, alarms, session.state, session.state.reached_accuracy, session.replanned)
         return
     waiting, plan, state, ending = "", session.plan, session.state, False
     work: Future[tuple[Alarm, ...]] | None = None
@@ -65,7 +65,9 @@ def follow(
             if worked or growth.has_changes or growth.waiting != waiting:
                 waiting, before, state = growth.waiting, state, session.state
                 new = tuple(
-                    point for point in state.reached if all(point is not one for one in before.reached)
+                    point
+                    for point in state.reached_accuracy
+                    if all(point is not one for one in before.reached_accuracy)
                 )
                 yield SessionStep(growth, alarms, state, new, session.plan is not plan)
                 plan = session.plan

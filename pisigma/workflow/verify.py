@@ -127,7 +127,7 @@ class Verification:
             **self.comparison.to_json(),
             "diagnostics": [one.model_dump() for one in self.diagnostics],
             "setup_faults": [fault.to_json() for fault in self.setup_faults],
-            "moved": [one.to_json() for one in self.motion.moved] if self.motion else [],
+            "moved": [one.to_json() for one in self.motion.movements] if self.motion else [],
             "recalibrate": self.recalibration or None,
             "warnings": list(self.warnings),
             "seconds": self.seconds,
@@ -183,7 +183,7 @@ def verify(
     ratio = comparison.models[-1].position.statistics["mean"] / mean if mean > 0 else float("nan")
     difference = comparison.models[-1].position.difference
     assert difference is not None  # it is not the first
-    if motion is not None and motion.moved and motion.recalibrate:
+    if motion is not None and motion.movements and motion.recalibrate:
         verdict: Verdict = "moved"
         sentence, faults = motion_sentence(motion, comparison), ()
     else:

@@ -25,7 +25,7 @@ def test_the_posterior_is_that_of_kalman(count, drifted):
     C[range(drifted), range(drifted)] += 1.0
     gain = torch.linalg.solve(X @ C @ X.t() + NOISE**2 * torch.eye(count).double(), X @ C).t()
     assert_close(update.shift, gain @ y, atol=1e-9)
-    after = update.root()
+    after = update.covariance_root()
     assert after.shape[1] <= MAX_DIRECTIONS * UNKNOWNS or drifted == 1
     assert_close(after @ after.t(), C - gain @ X @ C, atol=1e-9)
     assert_close(after[4].norm() > 0, drifted > 4)

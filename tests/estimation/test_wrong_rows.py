@@ -22,7 +22,7 @@ def explained(off: float, seed: int = 0) -> ExplainedRows[DriftSearch]:
     y[15:18] += off * torch.tensor([0.6, 0.8, 0.0]).double()
     noise = torch.tensor([NOISE]).double()
     configuration = torch.arange(CONFIGURATIONS).repeat_interleave(3)
-    counts = (SensorCount(float(count), has_stated_noise=False, exact=False),)
+    counts = (SensorCount(float(count), has_stated_noise=False, has_exact_noise=False),)
     groups = [DriftGroup("joint 1", torch.tensor([0]), torch.ones(1).double())]
     groups += [DriftGroup("correction", torch.arange(1, count + 1), torch.ones(count).double())]
 

@@ -45,7 +45,7 @@ def known_along(model: CalibratedModel, name: str, size: float) -> CalibratedMod
     """Return the model with an uncertain parameter, or with uncertain weights that are known relative to each other."""
     known = model.uncertainty
     assert known is not None
-    root = torch.zeros(len(known.root), 1, dtype=torch.float64)
+    root = torch.zeros(len(known.dense_root), 1, dtype=torch.float64)
     weights = slice(len(known.space.parameters), None)
     root[weights if name == "weights" else known.space.index(name)] = size
     return replace(model, uncertainty=replace(known, covariance_root=CovarianceRoot(root)))

@@ -241,7 +241,9 @@ def test_a_folder_stores_the_unknown_sensor_parameters(tmp_path):
     rows, robot = wire_data(), true_robot().nominal
     result = GeometricCalibrator(robot).fit(rows)
     solved = result.solved
-    known = PositionUncertainty(solved.problem.space, solved.geometry, (), CovarianceRoot(solved.root), 1.0)
+    known = PositionUncertainty(
+        solved.problem.space, solved.geometry, (), CovarianceRoot(solved.covariance_root), 1.0
+    )
     hybrid = HybridResult(result, learned=None, uncertainty=known, trials=(), verdict="")
     model = model_of_hybrid("wires", robot, hybrid, rows)
     save_model(model, tmp_path)

@@ -24,7 +24,7 @@ def test_the_weight_of_a_pose_is_that_of_its_image(is_fixed: bool):
         [numbers_in(text, WEIGHTS) for text in texts], dtype=torch.float64
     )
     sight = BoardSight(CAMERA, BOARD, is_fixed, NOISE.corner, NOISE.repeatability)
-    weight = sight.weight(forward_kinematics(cell.true, cell.images.q))
+    weight = sight.whitening_matrix(forward_kinematics(cell.true, cell.images.q))
     covariance, expected = (torch.linalg.inv(W.mT @ W) for W in (weight, measured))
     scale = expected.diagonal(dim1=1, dim2=2).sqrt()
     scale = scale[:, :, None] * scale[:, None]

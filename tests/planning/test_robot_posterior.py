@@ -34,7 +34,7 @@ def test_columns_are_the_derivative_of_the_measured_values(robot: Robot, kind: s
     dh = robot.dh.copy()
     dh[0, 1] += step
     T = [forward_kinematics(one, q)[:, :3, 3] for one in (robot, robot.with_geometry(dh=dh))]
-    size = posterior.uncertainty.root[index, index]
+    size = posterior.uncertainty.dense_root[index, index]
     if kind == "distance":
         lengths = [(position - torch.tensor(instrument.anchor)).norm(dim=1) for position in T]
         moved = ((lengths[1] - lengths[0]) / step)[:, None]
@@ -55,7 +55,7 @@ def test_noise_of_an_arm_of_servos_includes_the_repeatability_of_its_joints(kind
         X = values if kind == "position" else (away / away.norm())[None] @ values
         J = X[:, joints]
         C = 1e-6 * torch.eye(len(X)) + np.deg2rad(0.5) ** 2 * J @ J.mT
-        X = X @ RobotPosterior.from_robot(so101, instrument).uncertainty.root
+        X = X @ RobotPosterior.from_robot(so101, instrument).uncertainty.dense_root
         assert_close(B[row].mT @ B[row], X.mT @ torch.linalg.solve(C, X), rtol=1e-6, atol=1e-6)
 
 
@@ -63,9 +63,9 @@ def test_conditioning_agrees_with_a_normal_distribution(robot: Robot) -> None:
     posterior = RobotPosterior.from_robot(robot, hybrid=False)
     q, task = random_joints(robot, 20, 1), random_joints(robot, 30, 2)
     A = posterior.pose_derivatives(q)[:, :3].flatten(0, 1)
-    C = posterior.uncertainty.root.square()
+    C = posterior.uncertainty.dense_root.square()
     expected = torch.linalg.inv(torch.linalg.inv(C) + A.t() @ A / posterior.instrument.sigma**2)
-    root = posterior.after_measuring(q).uncertainty.root
+    root = posterior.after_measuring(q).uncertainty.dense_root
     scale = expected.diagonal().sqrt()
     assert_close(root @ root.t() / scale / scale[:, None], expected / scale / scale[:, None], atol=1e-6)
     # What is measured first and what is measured second may be exchanged.

@@ -37,7 +37,7 @@ class DenseRegression(AbstractDesignRegression):
         """Return the regression of all weighted rows of all sensors."""
         parts = []
         for number, values in enumerate(rows.values):
-            root = values.root[:, None]
+            root = values.weight_root[:, None]
             group = torch.full_like(values.row, -1) if values.certain else rows.group[values.row]
             parts.append(
                 (
@@ -77,7 +77,7 @@ class DenseRegression(AbstractDesignRegression):
             log_evidence=evidence,
             prior=prior,
             noise=noise,
-            square=prior.sum_by_group(prior.base * x.square()),
+            squared_unknowns=prior.sum_by_group(prior.base * x.square()),
             determined_unknowns=prior.sum_by_group(1 - precision * covariance.diagonal()),
             misfit=self._by_sensor(residual.square()),
             effective_parameters=self._by_sensor(used),

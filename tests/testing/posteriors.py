@@ -46,7 +46,7 @@ def assert_same_posterior(
         assert_close(
             covariance(found, here) / deviation / deviation[:, None], correlation, atol=max(exactness, 1e-6)
         )
-        assert_close(here.square, there.square, rtol=exactness, atol=1e-9)
+        assert_close(here.squared_unknowns, there.squared_unknowns, rtol=exactness, atol=1e-9)
         assert_close(here.determined_unknowns, there.determined_unknowns, atol=max(exactness, 1e-6))
         assert_close(np.array(here.misfit), np.array(there.misfit), rtol=exactness)
         assert_close(

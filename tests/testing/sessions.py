@@ -63,8 +63,8 @@ def session_state(arm: ArmInSurroundings, rows: int, wrong: int | None = None) -
         next_pose=more,
         remaining=plan[rows:],
         coverage=tuple(JointSpan(joint.name, -1.0, 1.0, 0.7) for joint in arm.robot.joints) if rows else (),
-        reached=tuple(_point(poses) for poses in range(JUDGED_FROM, rows + 1, 4)),
-        expected=tuple(_point(poses, 1.5) for poses in range(max(rows, JUDGED_FROM), POSES + 1, 4)),
+        reached_accuracy=tuple(_point(poses) for poses in range(JUDGED_FROM, rows + 1, 4)),
+        expected_accuracy=tuple(_point(poses, 1.5) for poses in range(max(rows, JUDGED_FROM), POSES + 1, 4)),
         advice=measure if more else Advice("stop", "Stop: the limit is reached."),
         revolute=arm.robot.revolute,
     )

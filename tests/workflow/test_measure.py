@@ -82,15 +82,15 @@ def test_the_current_and_the_expected_accuracy(session):
     point = state.accuracy
     assert point.poses == 15
     # the session started with all its rows, and also has the point before the last three
-    assert [one.poses for one in state.reached] == [12, 15]
+    assert [one.poses for one in state.reached_accuracy] == [12, 15]
     for lower, higher in (
         (point.predicted_rms, point.predicted_p95),
         (point.cross_validated_rms, point.cross_validated_p95),
         (point.checked_rms, point.checked_p95),
     ):
         assert 1e-6 < lower <= higher < 5e-3
-    assert state.expected[-1].poses == 15 + 6
-    assert state.expected[-1].predicted_rms < point.predicted_rms
+    assert state.expected_accuracy[-1].poses == 15 + 6
+    assert state.expected_accuracy[-1].predicted_rms < point.predicted_rms
     figures = json.loads(json.dumps(state.to_json(), allow_nan=False))
     assert figures["accuracy"]["predicted_rms_mm"] == point.predicted_rms * 1e3
     assert figures["rows_counting"] == 17
@@ -133,12 +133,12 @@ def test_the_expected_accuracy_comes_first_and_the_cross_validation_while_idle()
     first = session.state
     assert first.accuracy.predicted_rms > 0
     assert isnan(first.accuracy.cross_validated_rms)
-    assert first.expected == ()
+    assert first.expected_accuracy == ()
     with no_type_checker():
         session.next_step()()
         assert session.next_step() is None
         outdated = session.idle_step()
-    assert session.state.expected
+    assert session.state.expected_accuracy
     validate = session_accuracy.validate
 
     def while_a_row_comes(calibrator, rows_, folds, progress):

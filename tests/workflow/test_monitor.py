@@ -38,7 +38,7 @@ def test_an_instrument_that_was_moved_raises_no_alarm():
     monitoring = monitor(
         original_model(), [rows_after_change(12, 3, base=(1e-3, -2e-3, 5e-4, 2e-3, 0.0, 0.0))]
     )
-    assert [one.what for one in monitoring.sessions[0].session.moved] == ["base", "base"]
+    assert [one.what for one in monitoring.sessions[0].session.movements] == ["base", "base"]
     assert monitoring.sentences == ()
     assert not monitoring.needs_action
 

@@ -12,7 +12,9 @@ def fit(task: Task) -> Predict:
     calibrator, train = calibrator_and_rows(task)
     result = calibrator.fit(train)
     solved = result.solved
-    known = PositionUncertainty(solved.problem.space, solved.geometry, (), CovarianceRoot(solved.root), 1.0)
+    known = PositionUncertainty(
+        solved.problem.space, solved.geometry, (), CovarianceRoot(solved.covariance_root), 1.0
+    )
     noise = {one.sensor: one.sigma for one in result.noise}
     return predict_with(result.predicted_poses, known.sigma, noise)
 

@@ -138,7 +138,7 @@ class ArmBases:
     @cached_property
     def updated_arms(self) -> tuple[ArmPosterior, ...]:
         """Posteriors of the arms given all equations; arms of a torso share the base and the rows of common joints."""
-        sizes = [arm.root.shape[1] for arm in self.arms]
+        sizes = [arm.covariance_root.shape[1] for arm in self.arms]
         parts = zip(
             torch.split(self.conditioned.z, sizes),
             torch.split(self.conditioned.z_root, sizes),
@@ -148,7 +148,7 @@ class ArmBases:
         arms: list[ArmPosterior] = []
         for number, (z, z_root, (before, count)) in enumerate(parts):
             arm, own = self.arms[number], len(self.arms[number].space.parameters)
-            arm = with_values(arm, arm.values + arm.root[:own] @ z, arm.root @ z_root)
+            arm = with_values(arm, arm.values + arm.covariance_root[:own] @ z, arm.covariance_root @ z_root)
             if count:
                 root = self.reference_arm(number)
                 T, steps = self.T_first_base, self.covariance_root
@@ -213,7 +213,7 @@ def fit_arm_bases(arms: Sequence[ArmPosterior]) -> ArmBases:
     touches = [one for one in shared if one.kind == TOUCH]
     others, tips = shared[: len(shared) - len(touches)], initial_tips(arms)
     T = torch.stack(list(initial_bases(arms, shared, tip_positions(arms, tips))))
-    z = [torch.zeros(arm.root.shape[1], dtype=torch.float64) for arm in arms]
+    z = [torch.zeros(arm.covariance_root.shape[1], dtype=torch.float64) for arm in arms]
     closed = [_CLOSURE] * sum(_count(arms, one) for one in others)
     closure = torch.tensor([*closed, *(sigma for sigma in touch_sigmas(arms, touches) for _ in range(3))]).to(
         T
@@ -286,7 +286,7 @@ def _linearised(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return derivatives of the equations of frames and points with respect to z and bases, and their values."""
     used = _used(arms, shared)
-    roots = [arm.root[rows] for arm, rows in zip(arms, used, strict=True)]
+    roots = [arm.covariance_root[rows] for arm, rows in zip(arms, used, strict=True)]
     now = [arm.values[rows] + R @ one for arm, rows, R, one in zip(arms, used, roots, z, strict=True)]
     sizes = [len(rows) for rows in used]
     places = [{row: place for place, row in enumerate(rows)} for rows in used]

@@ -20,11 +20,11 @@ class ArmUncertainty:
     """Uncertainty of a model, for fits of frames that hold its arm fixed.
 
     Attributes:
-        known: the posterior of the model.
+        uncertainty: the posterior of the model.
         rows: rows of the fit, with commanded joint values.
     """
 
-    known: PositionUncertainty
+    uncertainty: PositionUncertainty
     rows: Measurements
 
     def spread(
@@ -37,17 +37,17 @@ class ArmUncertainty:
             used_rows: indices of these rows.
             fitted_parameters: indices of the fitted parameters, whose uncertainty in the model does not matter.
         """
-        root, fit_space = self.known.root, solved.problem.space
-        positions = positions_by_key(self.known.space.parameters)
+        root, fit_space = self.uncertainty.dense_root, solved.problem.space
+        positions = positions_by_key(self.uncertainty.space.parameters)
         pairs = [
             (index, positions[key])
             for key, index in positions_by_key(fit_space.parameters).items()
             if index not in fitted_parameters and key in positions
         ]
         values = WhitenedValues.at_solution(solved, [index for index, _ in pairs])
-        rows = self.rows.select(torch.tensor(list(used_rows))).select(solved.setup.rows)
-        weights = values.weight_columns(self.known.features, JointState.from_measurements(rows))
-        parameters = len(self.known.space.parameters)
+        rows = self.rows.select(torch.tensor(list(used_rows))).select(solved.setup.row_indices)
+        weights = values.weight_columns(self.uncertainty.features, JointState.from_measurements(rows))
+        parameters = len(self.uncertainty.space.parameters)
         of_parameters = values.X @ root[[number for _, number in pairs]]
         spread: Tensor = of_parameters + weights @ root[parameters:]
         return spread

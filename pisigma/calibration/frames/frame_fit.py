@@ -272,10 +272,10 @@ def _wrong_row(fit: FrameFit) -> int | None:
     ):
         return None
     values = fit.values
-    tested = most_deviating_row(values.X, values.y, values.row, values.exact)
+    tested = most_deviating_row(values.X, values.y, values.row, values.has_exact_noise)
     if tested is None or not tested.is_wrong:
         return None
-    return fit.used_rows[int(fit.solved.setup.rows[tested.row])]
+    return fit.used_rows[int(fit.solved.setup.row_indices[tested.row])]
 
 
 def hold_undetermined(

@@ -45,7 +45,8 @@ def fitted_pose(
         assert arm.touches is not None
         assert touched is not None
         return transform(
-            torch.eye(3).to(arm.root), touched.position[arm.touches.names.index(shared_object.name)]
+            torch.eye(3).to(arm.covariance_root),
+            touched.position[arm.touches.names.index(shared_object.name)],
         )
     return shared_object_in_base(arm, shared_object.key, lambda rows: arm.values[list(rows)])[0]
 

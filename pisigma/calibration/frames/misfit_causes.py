@@ -97,7 +97,7 @@ def _residuals(
         y=unit * (values.y + X_unknowns @ moved),
         fitted_columns=unit[:, None] * X_frames,
         known_root=unit[:, None] * known,
-        exact=values.exact,
+        has_exact_noise=values.has_exact_noise,
         is_stated=bool(rows.is_measured("corner").any()),
         causes={name: unit[:, None] * Z for name, Z in causes.items()},
     )
@@ -125,9 +125,9 @@ def _noise_units(solved: SolvedCalibration, values: WhitenedValues) -> Float64[T
 
 def _per_row(values: WhitenedValues) -> Float64[Tensor, "values _joints"]:
     """Return the derivatives with respect to the joint values of every row separately."""
-    rows, dof = int(values.row.max()) + 1, values.joints.shape[1]
-    columns = values.joints.new_zeros(len(values.y), rows, dof)
-    columns[torch.arange(len(values.y)), values.row] = values.joints
+    rows, dof = int(values.row.max()) + 1, values.joint_derivatives.shape[1]
+    columns = values.joint_derivatives.new_zeros(len(values.y), rows, dof)
+    columns[torch.arange(len(values.y)), values.row] = values.joint_derivatives
     return columns.flatten(1)
 
 

@@ -91,20 +91,22 @@ def with_common_joints(
         )
 
     at = torch.cat([reference.values[:shared], arm.values, torch.zeros(12).to(arm.values)])
-    roots = torch.cat([reference.root[:shared], arm.root[:own], *step_roots])
+    roots = torch.cat([reference.covariance_root[:shared], arm.covariance_root[:own], *step_roots])
     return with_values(
-        arm, combined(at), torch.cat([torch.func.jacrev(combined)(at) @ roots, arm.root[own:]])
+        arm, combined(at), torch.cat([torch.func.jacrev(combined)(at) @ roots, arm.covariance_root[own:]])
     )
 
 
 def with_values(
-    arm: ArmPosterior, values: Float64[Tensor, " parameters"], root: Float64[Tensor, "unknowns directions"]
+    arm: ArmPosterior,
+    values: Float64[Tensor, " parameters"],
+    covariance_root: Float64[Tensor, "unknowns directions"],
 ) -> ArmPosterior:
     """Return the posterior of an arm with other values and another root."""
     known = replace(
         arm.uncertainty,
         geometry=geometry_at(arm.space, values),
-        covariance_root=CovarianceRoot(root.contiguous()),
+        covariance_root=CovarianceRoot(covariance_root.contiguous()),
     )
     return replace(arm, uncertainty=known)
 

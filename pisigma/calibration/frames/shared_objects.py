@@ -94,9 +94,9 @@ class ArmPosterior:
         return self.uncertainty.space
 
     @cached_property
-    def root(self) -> Float64[Tensor, "unknowns directions"]:
+    def covariance_root(self) -> Float64[Tensor, "unknowns directions"]:
         """Root `R` of the covariance `R R^T`, whose first rows are those of the parameters [m and rad]."""
-        return self.uncertainty.root.cpu().clone()
+        return self.uncertainty.dense_root.cpu().clone()
 
     @cached_property
     def values(self) -> Float64[Tensor, " parameters"]:
@@ -122,13 +122,13 @@ class ArmPosterior:
         found |= {
             ("frame", frame): (frame, tuple(self.base_rows(frame)))
             for frame in self.space.frames
-            if frame and is_determined(self.root[list(self.base_rows(frame))])
+            if frame and is_determined(self.covariance_root[list(self.base_rows(frame))])
         }
         for group in self.space.unknowns:
             first, size = self.space.indices_of(group.name).start, len(group.columns)
             for number, (owner, frame) in enumerate(zip(group.owners, group.frames, strict=False)):
                 rows = tuple(range(first + size * number, first + size * (number + 1)))
-                if group.has_point and bool(self.root[list(rows)].any()):
+                if group.has_point and bool(self.covariance_root[list(rows)].any()):
                     found[group.name, owner] = frame, rows
         return found
 
@@ -169,12 +169,12 @@ class ArmPosterior:
         return forward_kinematics(bare, postures.q_corrected), T_base[:3, :3].mT @ columns
 
 
-def is_determined(root: Float64[Tensor, "6 directions"]) -> bool:
+def is_determined(covariance_root: Float64[Tensor, "6 directions"]) -> bool:
     """Return whether all six directions of a base were estimated, by a root of its covariance [m and rad].
 
     A direction that was held at its previous value has no covariance.
     """
-    return int(torch.linalg.matrix_rank(root, rtol=_DETERMINED)) == len(root)
+    return int(torch.linalg.matrix_rank(covariance_root, rtol=_DETERMINED)) == len(covariance_root)
 
 
 @dataclass(frozen=True)
@@ -211,5 +211,5 @@ def uncertainty_of(result: CalibrationResult) -> PositionUncertainty:
     """Return the uncertainty of a geometric calibration."""
     solved = result.solved
     return PositionUncertainty(
-        solved.problem.space, solved.geometry, (), CovarianceRoot(solved.root), prior_scale=1.0
+        solved.problem.space, solved.geometry, (), CovarianceRoot(solved.covariance_root), prior_scale=1.0
     )

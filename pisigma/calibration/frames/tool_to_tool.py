@@ -35,9 +35,9 @@ def tool_to_tool_deviation(bases: ArmBases, first: int, second: int, postures: t
 def _tool_root(bases: ArmBases, number: int, postures: Postures) -> Float64[Tensor, "postures 3 directions"]:
     """Return a root of the covariance of the positions of a tool in the base of the first arm."""
     arm = bases.arms[number]
-    sizes = [one.root.shape[1] for one in bases.arms]
+    sizes = [one.covariance_root.shape[1] for one in bases.arms]
     T, columns = arm.positions_in_base(postures)
-    in_base = columns @ (arm.root @ torch.split(bases.conditioned.z_root, sizes)[number])
+    in_base = columns @ (arm.covariance_root @ torch.split(bases.conditioned.z_root, sizes)[number])
     R = bases.T_first_base[number, :3, :3]
     away = (R @ T[:, :3, 3, None])[..., 0]
     shift, turn = bases.covariance_root[number, :3], bases.covariance_root[number, 3:]

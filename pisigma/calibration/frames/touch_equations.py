@@ -65,7 +65,7 @@ def tip_positions(
 
 
 def _of_arm(number: int, arm: ArmPosterior, tips: dict[Tip, Tensor]) -> TipPositions:
-    touches, root = arm.touches, arm.root
+    touches, root = arm.touches, arm.covariance_root
     assert touches is not None
     count = len(touches.names)
     position, turned = root.new_empty(count, 3), root.new_empty(count, 3, 3)

@@ -25,18 +25,18 @@ class WhitenedValues:
 
     Attributes:
         X: derivatives of the predicted values with respect to the chosen parameters [1/m or 1/rad].
-        joints: derivatives with respect to the joint values of the row [1/rad or 1/m].
+        joint_derivatives: derivatives with respect to the joint values of the row [1/rad or 1/m].
         y: measured minus predicted [1].
         row: index of every value's row in the problem.
-        exact: whether the standard deviation of a value is exactly as stated, such as that of a prior.
+        has_exact_noise: whether the standard deviation of a value is exactly as stated, such as that of a prior.
         sensors: the values before whitening, each with its factor to standard deviations.
     """
 
     X: Float64[Tensor, "values parameters"]
-    joints: Float64[Tensor, "values dof"]
+    joint_derivatives: Float64[Tensor, "values dof"]
     y: Float64[Tensor, " values"]
     row: Int64[Tensor, " values"]
-    exact: Bool[Tensor, " values"]
+    has_exact_noise: Bool[Tensor, " values"]
     sensors: tuple[tuple[SensorValues, Float64[Tensor, " _rows"]], ...]
 
     @staticmethod
@@ -50,16 +50,20 @@ class WhitenedValues:
         problem, here = solved.problem.with_active(list(parameters)), solved.refined_linearisation
         deviation = sensor_view_of(here).variances.sqrt()
         scaled = [
-            (one, one.root / float(sigma))
+            (one, one.weight_root / float(sigma))
             for one, sigma in zip(sensor_values(problem, here.point), deviation, strict=True)
         ]
         by_component = [one.components for one, _ in scaled]
         return WhitenedValues(
-            X=torch.cat([(one.geometry * scale[:, None, None]).flatten(0, 1) for one, scale in scaled]),
-            joints=torch.cat([(one.joints * scale[:, None, None]).flatten(0, 1) for one, scale in scaled]),
+            X=torch.cat(
+                [(one.geometry_derivatives * scale[:, None, None]).flatten(0, 1) for one, scale in scaled]
+            ),
+            joint_derivatives=torch.cat(
+                [(one.joint_derivatives * scale[:, None, None]).flatten(0, 1) for one, scale in scaled]
+            ),
             y=torch.cat([(one.residual * scale[:, None]).flatten() for one, scale in scaled]),
             row=torch.cat([one.row.repeat_interleave(one.components) for one, _ in scaled]),
-            exact=torch.cat(
+            has_exact_noise=torch.cat(
                 [
                     torch.full((len(one.row) * count,), one.certain)
                     for (one, _), count in zip(scaled, by_component, strict=True)

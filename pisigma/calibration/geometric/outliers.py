@@ -54,7 +54,7 @@ def outliers_of(
     """
     outliers = []
     for k in (weight < 0.5).nonzero()[:, 0].tolist():
-        row = int(setup.rows[rows[k]])
+        row = int(setup.row_indices[rows[k]])
         where = measurements.place(row)
         outliers.append(
             Outlier(row, where, sensor.name, float(length[k]), float(residual_in_sigmas[k]), sensor.unit)

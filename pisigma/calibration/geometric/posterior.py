@@ -23,20 +23,22 @@ class ParameterPosterior:
     Attributes:
         parameters: the parameters in order, with names and units.
         mean: values of the parameters [m or rad]; NaN if a model of an earlier version does not store a value.
-        root: root `R` of the covariance `R R^T` [m and rad] of all parameters (0 for parameters that were not free),
-            followed by the weights of a joint correction, if any, which have no names.
+        covariance_root: root `R` of the covariance `R R^T` [m and rad] of all parameters (0 for parameters that were
+            not free), followed by the weights of a joint correction, if any, which have no names.
     """
 
     parameters: tuple[Parameter, ...]
     mean: Float64[Tensor, " parameters"]
-    root: Float64[Tensor, "unknowns directions"]
+    covariance_root: Float64[Tensor, "unknowns directions"]
 
     @staticmethod
     def from_geometry(
-        space: ParameterSpace, geometry: IdentifiedGeometry, root: Float64[Tensor, "unknowns directions"]
+        space: ParameterSpace,
+        geometry: IdentifiedGeometry,
+        covariance_root: Float64[Tensor, "unknowns directions"],
     ) -> "ParameterPosterior":
         """Return the posterior of the parameters of a space, with their values in the user's coordinates."""
-        return ParameterPosterior(space.parameters, geometry.values_of(space), root)
+        return ParameterPosterior(space.parameters, geometry.values_of(space), covariance_root)
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -46,17 +48,17 @@ class ParameterPosterior:
     @property
     def weight_count(self) -> int:
         """Number of weights of a joint correction, which follow the parameters in the covariance."""
-        return len(self.root) - len(self.parameters)
+        return len(self.covariance_root) - len(self.parameters)
 
     @cached_property
     def covariance(self) -> Float64[Tensor, "unknowns unknowns"]:
         """Covariance of all parameters, followed by all weights [m and rad]."""
-        return self.root @ self.root.t()
+        return self.covariance_root @ self.covariance_root.t()
 
     @property
     def standard_errors(self) -> Float64[Tensor, " parameters"]:
         """Standard deviation of every parameter [m or rad]; 0 for parameters that were not free."""
-        errors: Tensor = torch.linalg.vector_norm(self.root[: len(self.parameters)], dim=1)
+        errors: Tensor = torch.linalg.vector_norm(self.covariance_root[: len(self.parameters)], dim=1)
         return errors
 
     def select(self, names: Sequence[str]) -> "ParameterPosterior":
@@ -73,5 +75,5 @@ class ParameterPosterior:
                 )
         rows = [number[name] for name in names]
         return ParameterPosterior(
-            tuple(self.parameters[row] for row in rows), self.mean[rows], self.root[rows]
+            tuple(self.parameters[row] for row in rows), self.mean[rows], self.covariance_root[rows]
         )

@@ -110,7 +110,7 @@ class SolvedCalibration:
         return covariance
 
     @cached_property
-    def root(self) -> Float64[Tensor, "parameters directions"]:
+    def covariance_root(self) -> Float64[Tensor, "parameters directions"]:
         """Root `R` of the covariance `R R^T` of all parameters in the user's coordinates."""
         covariance, held = self._covariances
         # Eigenvectors of the correlation matrix, because eigenvectors of the covariance would mix metres and radians.
@@ -179,7 +179,7 @@ class CalibrationResult:
     def posterior(self) -> ParameterPosterior:
         """Joint posterior of all parameters in the user's coordinates; see `ParameterPosterior`."""
         solved = self.solved
-        return ParameterPosterior.from_geometry(solved.problem.space, solved.geometry, solved.root)
+        return ParameterPosterior.from_geometry(solved.problem.space, solved.geometry, solved.covariance_root)
 
     @cached_property
     def residuals(self) -> dict[str, Float64[np.ndarray, "rows components"]]:
@@ -247,7 +247,7 @@ class CalibrationResult:
     @cached_property
     def rms_path(self) -> tuple[float, ...]:
         """RMS residual length of the first sensor at the start and at every accepted point [m or rad]."""
-        return self.solved.solution.path
+        return self.solved.solution.rms_path
 
     @cached_property
     def warning_details(self) -> tuple[CalibrationWarning, ...]:
@@ -340,7 +340,7 @@ def _residuals(solved: SolvedCalibration) -> dict[str, Float64[np.ndarray, "rows
         if sensor.components == 3:
             own = (R @ own[..., None])[..., 0]
         values = torch.full((measurements.q.shape[0], sensor.components), torch.nan, dtype=own.dtype)
-        values[setup.rows.cpu()] = torch.where(sensor.present[:, None], own, torch.nan).cpu()
+        values[setup.row_indices.cpu()] = torch.where(sensor.present[:, None], own, torch.nan).cpu()
         residuals[sensor.name] = values.numpy()
     return residuals
 

@@ -160,7 +160,7 @@ class HybridCalibrator:
             refined.regression,
             refined.posterior,
             learned.geometry,
-            refined.held_out,
+            refined.held_out_errors,
         )
         return HybridResult(solved.result(), learned, uncertainty, trials, verdict)
 
@@ -197,7 +197,9 @@ class HybridCalibrator:
             problem, group = problem.select(chosen), renumber(group[chosen])
         design, point = Design(problem, ()), solved.solution.linearisation.point
         values = sensor_values(problem, point)
-        distances = [one.residual.norm(dim=1) * one.root / view.scales[k] for k, one in enumerate(values)]
+        distances = [
+            one.residual.norm(dim=1) * one.weight_root / view.scales[k] for k, one in enumerate(values)
+        ]
         weights = [
             ((distance < _GROSS) | one.certain).to(distance)
             for distance, one in zip(distances, values, strict=True)
@@ -275,7 +277,7 @@ def _outliers(solved: SolvedCalibration, refined: RefinedFit) -> tuple[Outlier, 
     weights = robust_weights(problem, values, refined.posterior.effective_unknowns)
     for number, (one, weight) in enumerate(zip(values, weights, strict=True)):
         length, sensor = one.residual.norm(dim=1), problem.sensors[number]
-        deviations = length * one.root / refined.posterior.noise[number]
+        deviations = length * one.weight_root / refined.posterior.noise[number]
         found += outliers_of(setup, solved.measurements, sensor, one.row, length, deviations, weight)
     return tuple(sorted(found, key=lambda outlier: -outlier.residual_in_sigmas))
 
@@ -295,6 +297,6 @@ def _geometric_alone(solved: SolvedCalibration, choice: FeatureChoice, verdict: 
     first = choice.geometry
     fit = build_regression(first.design, choice.rows)
     uncertainty = position_uncertainty(
-        choice.rows, first.design, fit, first.posterior, geometry, first.held_out
+        choice.rows, first.design, fit, first.posterior, geometry, first.held_out_errors
     )
     return HybridResult(solved.result(), None, uncertainty, choice.trials, verdict)

@@ -100,7 +100,7 @@ def held_out_row_errors(
     posterior: Posterior,
     group: Int64[Tensor, " rows"],
     folds: Sequence[Int64[Tensor, " _groups"]],
-    updates: int = 0,
+    update_count: int = 0,
 ) -> tuple[SensorErrors | None, ...]:
     """Leave out every fold, and predict its rows with an exact fit to the other folds.
 
@@ -112,7 +112,7 @@ def held_out_row_errors(
         posterior: posterior from all rows.
         group: see `Rows.group`.
         folds: groups that are held out together.
-        updates: number of updates of noise and prior scales for every fold.
+        update_count: number of updates of noise and prior scales for every fold.
 
     Returns:
         Errors per sensor; None for sensors whose values are given.
@@ -121,11 +121,11 @@ def held_out_row_errors(
     weights = robust_weights(design.problem, values, posterior.effective_unknowns)
     rows = Rows.from_linearisation(design, posterior.x, values, weights, group)
     fit = build_regression(design, rows)
-    held_out = [torch.full_like(one.root, torch.nan) for one in values]
+    held_out = [torch.full_like(one.weight_root, torch.nan) for one in values]
     for groups in folds:
         held = torch.isin(group, groups.to(group.device))
         others = torch.unique(group[~held])
-        rest = fit.without_groups(groups).maximise_evidence(posterior.prior, posterior.noise, updates)
+        rest = fit.without_groups(groups).maximise_evidence(posterior.prior, posterior.noise, update_count)
         here, x = rows, rest.x
         for _ in range(MAX_LINEARISATIONS):
             seen = _values(design, x)
@@ -140,9 +140,11 @@ def held_out_row_errors(
         x = _with_own_unknowns(design, x, posterior.x, values, held)
         for errors, one in zip(held_out, _values(design, x), strict=True):
             chosen = held[one.row]
-            errors[chosen] = (one.residual.norm(dim=1) * one.root)[chosen]
+            errors[chosen] = (one.residual.norm(dim=1) * one.weight_root)[chosen]
     return tuple(
-        None if one.certain else SensorErrors(group[one.row], one.residual.norm(dim=1) * one.root, *errors)
+        None
+        if one.certain
+        else SensorErrors(group[one.row], one.residual.norm(dim=1) * one.weight_root, *errors)
         for one, *errors in zip(values, held_out, weights, strict=True)
     )
 
@@ -150,7 +152,7 @@ def held_out_row_errors(
 def _values(design: Design, x: Float64[Tensor, " unknowns"]) -> tuple[SensorValues, ...]:
     """Return all rows linearised at given unknowns."""
     problem = design.problem
-    point = problem.nominal.index_add(0, problem.active, x[: design.active])
+    point = problem.nominal.index_add(0, problem.active, x[: design.active_count])
     return sensor_values(
         problem, point, evaluate_in_chunks(correction_from_weights(design, x)) if design.features else None
     )
@@ -164,10 +166,10 @@ def _with_own_unknowns(
     held: Bool[Tensor, " rows"],
 ) -> Float64[Tensor, " unknowns"]:
     """Fit unknowns on which only held-out rows depend to these rows, starting with their values from all rows."""
-    moving = torch.zeros(design.active, dtype=torch.bool, device=x.device)
+    moving = torch.zeros(design.active_count, dtype=torch.bool, device=x.device)
     for one in values:
         if not one.certain:
-            moving |= (one.geometry[~held[one.row]] != 0).flatten(0, 1).any(0)
+            moving |= (one.geometry_derivatives[~held[one.row]] != 0).flatten(0, 1).any(0)
     own = (~moving).nonzero()[:, 0]
     if not len(own):
         return x
@@ -176,8 +178,8 @@ def _with_own_unknowns(
         blocks = []
         for one in _values(design, x):
             chosen = held[one.row] | one.certain
-            columns = one.geometry[chosen][..., own] * one.root[chosen][:, None, None]
-            errors = one.residual[chosen] * one.root[chosen][:, None]
+            columns = one.geometry_derivatives[chosen][..., own] * one.weight_root[chosen][:, None, None]
+            errors = one.residual[chosen] * one.weight_root[chosen][:, None]
             blocks.append((columns.flatten(0, 1), errors.flatten()))
         J, r = (torch.cat(parts) for parts in zip(*blocks, strict=True))
         step = torch.linalg.lstsq(J, r[:, None], driver="gelsd").solution[:, 0]
@@ -226,7 +228,7 @@ def choose_final_correction(
     """
     problem = choice.rows.problem
     # The search leaves out whole anchors and sockets; exact fits to the few remaining ones may be undetermined.
-    group = choice.rows.group if problem.pairs else groups_of_equal_joints(problem.q)
+    group = choice.rows.group if problem.pair_count else groups_of_equal_joints(problem.q)
     count = int(group.max()) + 1
     if count > EXACT_GROUPS and set(solved.setup.measurements.kinds) <= {"position", "rotation"}:
         return FinalCorrection(

@@ -41,23 +41,23 @@ class Design:
     features: tuple[AbstractFeature, ...]
 
     @property
-    def active(self) -> int:
+    def active_count(self) -> int:
         """Number of free parameters, which come first."""
         return len(self.problem.active)
 
     @property
-    def classes(self) -> int:
+    def class_count(self) -> int:
         """Number of classes of geometric parameters, whose prior scales are the first ones."""
         return len(PriorGroup)
 
     @property
     def unknowns(self) -> int:
         """Number of unknowns."""
-        return self.active + sum(int(chosen.used.sum()) for chosen in self.features)
+        return self.active_count + sum(int(chosen.used.sum()) for chosen in self.features)
 
     def weights_of(self, number: int) -> slice:
         """Return the indices of the weights of a feature."""
-        start = self.active + sum(int(chosen.used.sum()) for chosen in self.features[:number])
+        start = self.active_count + sum(int(chosen.used.sum()) for chosen in self.features[:number])
         return slice(start, start + int(self.features[number].used.sum()))
 
     def correction(self, x: Float64[Tensor, " unknowns"], state: JointState) -> Float64[Tensor, "rows dof"]:
@@ -74,7 +74,7 @@ class Design:
         self, values: SensorValues, change: Float64[Tensor, " unknowns"]
     ) -> Float64[Tensor, "values components"]:
         """Compute the unweighted change of a sensor's predicted values for a change of the unknowns."""
-        moved = values.geometry @ change[: self.active]
+        moved = values.geometry_derivatives @ change[: self.active_count]
         if not self.features or not len(values.row):
             return moved
         for row, joints in values.row_derivatives:
@@ -86,7 +86,7 @@ class Design:
     def columns(self, values: SensorValues, rows: slice) -> Float64[Tensor, "values components unknowns"]:
         """Compute the unweighted derivative of a sensor's values with respect to all unknowns."""
         state = self.problem.state
-        blocks = [values.geometry[rows]]
+        blocks = [values.geometry_derivatives[rows]]
         blocks += [values.feature_columns(chosen, state, rows) for chosen in self.features]
         return torch.cat(blocks, -1)
 
@@ -114,32 +114,34 @@ class Design:
         """Return the prior of all unknowns, with the `usual_sizes` of the weights."""
         prior = self.prior(prior_scale)
         sizes = [size for chosen in self.features for size in chosen.usual_sizes]
-        return replace(prior, sizes=torch.cat([prior.sizes[: prior.classes], prior.sizes.new_tensor(sizes)]))
+        return replace(
+            prior, sizes=torch.cat([prior.sizes[: prior.class_count], prior.sizes.new_tensor(sizes)])
+        )
 
     def prior_like(self, other: "Design", prior: GaussianPrior) -> GaussianPrior:
         """Return a prior with the fitted sizes of another design; new bands get the size of its last band."""
-        prior_here = self.prior(prior.sizes[: prior.classes].tolist())
+        prior_here = self.prior(prior.sizes[: prior.class_count].tolist())
         sizes = prior_here.sizes.clone()
-        others = zip(other.features, other.group_starts(prior.classes), strict=True)
+        others = zip(other.features, other.group_starts(prior.class_count), strict=True)
         fitted = {like.name: (first, len(like.group_names)) for like, first in others}
-        for chosen, start in zip(self.features, self.group_starts(prior.classes), strict=True):
+        for chosen, start in zip(self.features, self.group_starts(prior.class_count), strict=True):
             if chosen.name in fitted:
                 first, count = fitted[chosen.name]
                 for number in range(len(chosen.group_names)):
                     sizes[start + number] = prior.sizes[first + min(number, count - 1)]
         return replace(prior_here, sizes=sizes)
 
-    def group_starts(self, classes: int) -> list[int]:
+    def group_starts(self, class_count: int) -> list[int]:
         """Return the index of the first prior scale of every feature."""
         counts = [len(chosen.group_names) for chosen in self.features]
-        return [classes + sum(counts[:k]) for k in range(len(counts))]
+        return [class_count + sum(counts[:k]) for k in range(len(counts))]
 
     def indices(self, features: Sequence[AbstractFeature]) -> Int64[Tensor, " chosen"]:
         """Return the indices of the unknowns of a design that has a subset of the features.
 
         A smaller feature of the same name, such as a series with fewer harmonics, is a part of the larger one.
         """
-        indices = [torch.arange(self.active)]
+        indices = [torch.arange(self.active_count)]
         for wanted in features:
             number = next(k for k, chosen in enumerate(self.features) if chosen.name == wanted.name)
             larger, start = self.features[number], self.weights_of(number).start
@@ -191,7 +193,7 @@ class Rows:
         kept = tuple(sensor.select(mask[self.group[sensor.row]]) for sensor in self.values)
         return replace(self, values=kept)
 
-    def held_out(self, groups: Int64[Tensor, " chosen"]) -> "Rows":
+    def held_out_rows(self, groups: Int64[Tensor, " chosen"]) -> "Rows":
         """Return the rows of the given groups, without sensors whose values are given."""
         rows = self.select_groups(groups)
         kept = [sensor.select(slice(0, 0)) if sensor.certain else sensor for sensor in rows.values]
@@ -253,7 +255,7 @@ class Rows:
             if not torch.equal(here.row, there.row):
                 return math.inf
             moved = design.predicted_change(here, x)
-            first, second = ((one.residual - moved) * one.root[:, None] for one in (here, there))
+            first, second = ((one.residual - moved) * one.weight_root[:, None] for one in (here, there))
             total += float((first - second).square().sum()) / sigma**2
         return total
 
@@ -281,7 +283,7 @@ def robust_weights(
     counts = [0.0 if sensor.certain else float(sensor.residual.numel()) for sensor in values]
     for number, sensor in enumerate(values):
         loss = problem.loss_for_sensor(problem.sensors[number])
-        distance = sensor.residual.norm(dim=1) * sensor.root
+        distance = sensor.residual.norm(dim=1) * sensor.weight_root
         if not bool(torch.isfinite(distance).all()):
             raise IdentificationError(
                 f"the joint correction predicts values of the sensor '{sensor.name}' that are not finite",
@@ -326,12 +328,14 @@ class AbstractDesignRegression(AbstractRegression):
         """
 
     def held_out_errors_refitted(
-        self, posterior: Posterior, folds: Sequence[Int64[Tensor, " _groups"]], updates: int
+        self, posterior: Posterior, folds: Sequence[Int64[Tensor, " _groups"]], update_count: int
     ) -> HeldOutErrors:
         """Return the errors of every fold, predicted without it, with updated noise and prior scales."""
         parts = []
         for groups in folds:
-            rest = self.without_groups(groups).maximise_evidence(posterior.prior, posterior.noise, updates)
+            rest = self.without_groups(groups).maximise_evidence(
+                posterior.prior, posterior.noise, update_count
+            )
             parts.append(self.held_out_errors(rest, [groups]))
         return HeldOutErrors.concatenate(parts)
 

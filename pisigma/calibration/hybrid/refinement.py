@@ -42,7 +42,7 @@ class RefinedFit:
         point: all parameters of the problem.
         correction: the joint correction.
         rounds: number of linearisations.
-        held_out: held-out predictions of the folds of the search; None if the model was fitted again after it.
+        held_out_errors: held-out predictions of the folds of the search; None if the model was fitted again after it.
     """
 
     rows: Rows
@@ -52,7 +52,7 @@ class RefinedFit:
     point: Float64[Tensor, " parameters"]
     correction: JointCorrection
     rounds: int
-    held_out: HeldOutErrors | None = None
+    held_out_errors: HeldOutErrors | None = None
 
 
 def refine(problem: CalibrationProblem, group: Int64[Tensor, " rows"], choice: FeatureChoice) -> RefinedFit:
@@ -75,14 +75,14 @@ def refine(problem: CalibrationProblem, group: Int64[Tensor, " rows"], choice: F
         posterior = fit.maximise_evidence(posterior.prior, posterior.noise)
         rounds += 1
     refined = _refined(rows, design, posterior, fit or build_regression(design, rows), rounds)
-    return replace(refined, held_out=choice.best.held_out) if rounds == 1 else refined
+    return replace(refined, held_out_errors=choice.best.held_out_errors) if rounds == 1 else refined
 
 
 def _refined(
     rows: Rows, design: Design, posterior: Posterior, fit: AbstractDesignRegression, rounds: int
 ) -> RefinedFit:
     problem = design.problem
-    point = problem.nominal.index_add(0, problem.active, posterior.x[: design.active])
+    point = problem.nominal.index_add(0, problem.active, posterior.x[: design.active_count])
     return RefinedFit(
         rows, design, posterior, fit, point, correction_from_weights(design, posterior.x), rounds
     )
@@ -126,7 +126,7 @@ def linearise_rows(
         group: see `Rows.group`.
     """
     problem = design.problem
-    point = problem.nominal.index_add(0, problem.active, x[: design.active])
+    point = problem.nominal.index_add(0, problem.active, x[: design.active_count])
     values = sensor_values(
         problem, point, evaluate_in_chunks(correction_from_weights(design, x)) if design.features else None
     )

@@ -78,7 +78,7 @@ class NormalEquations(PrimalRegression, AbstractDesignRegression):
             _copy_chosen(whole, before, N[:first, :first])
             N[new] = 0.0
             for rows in chunks(len(sensor.row), _NARROW):
-                root = sensor.root[rows, None]
+                root = sensor.weight_root[rows, None]
                 X = (design.columns(sensor, rows) * root[..., None]).flatten(0, 1)
                 N[new].addmm_(X[:, new].t(), X)
                 b[new].addmv_(X[:, new].t(), (sensor.residual[rows] * root).flatten())
@@ -87,13 +87,15 @@ class NormalEquations(PrimalRegression, AbstractDesignRegression):
 
     def without_groups(self, groups: Int64[Tensor, " groups"]) -> "NormalEquations":
         """Return the regression without groups of rows; see `AbstractDesignRegression.without_groups`."""
-        other = NormalEquations.from_rows(self.design, self.rows.held_out(groups))
+        other = NormalEquations.from_rows(self.design, self.rows.held_out_rows(groups))
         counts = zip(self.sensors, other.sensors, strict=True)
         return replace(
             self,
             normal=torch.sub(self.normal, other.normal, out=other.normal),
             descent=self.descent - other.descent,
-            square=tuple(a - b for a, b in zip(self.square, other.square, strict=True)),
+            squared_values=tuple(
+                a - b for a, b in zip(self.squared_values, other.squared_values, strict=True)
+            ),
             sensors=tuple(replace(a, values=a.values - b.values) for a, b in counts),
         )
 
@@ -107,11 +109,11 @@ class NormalEquations(PrimalRegression, AbstractDesignRegression):
     def _held_out_errors(self, groups: Int64[Tensor, " groups"], solved: SolvedRegression) -> HeldOutErrors:
         """Return the errors of one fold, predicted without it."""
         return_free_memory(len(solved.x))
-        test, x = self.rows.held_out(groups).values, solved.x
+        test, x = self.rows.held_out_rows(groups).values, solved.x
         whitened = x.new_empty((sum(sensor.residual.numel() for sensor in test), len(x)))
         r, number, first = [], [], 0
         for k, (sensor, sigma) in enumerate(zip(test, solved.noise, strict=True)):
-            root = sensor.root[:, None] / sigma
+            root = sensor.weight_root[:, None] / sigma
             columns = self.design.columns(sensor, slice(None))
             r.append(((sensor.residual - columns @ x) * root).flatten())
             number.append(torch.full(r[-1].shape, k, device=x.device))
@@ -141,7 +143,9 @@ class NormalEquations(PrimalRegression, AbstractDesignRegression):
         solved = self.select(design).solved_with(posterior.prior, posterior.noise)
         normal = sum(N[new] * sigma**-2 for N, sigma in zip(self.normal, posterior.noise, strict=True))
         descent = sum(b * sigma**-2 for b, sigma in zip(self.descent, posterior.noise, strict=True))
-        square = sum(total / sigma**2 for total, sigma in zip(self.square, posterior.noise, strict=True))
+        square = sum(
+            total / sigma**2 for total, sigma in zip(self.squared_values, posterior.noise, strict=True)
+        )
         # Schur complement: the remainder of the new columns after fitting the old columns.
         cross = normal[:, old]
         root = solved.inverse @ (cross * solved.scale).t()
@@ -150,10 +154,10 @@ class NormalEquations(PrimalRegression, AbstractDesignRegression):
         alone = PrimalRegression(
             normal=(normal[:, new] - root.t() @ root)[None],
             descent=(descent[new] - cross @ solved.x)[None],
-            square=(rest,),
+            squared_values=(rest,),
             sensors=(SensorCount(float(len(new)), False, True),),
         )
-        whole = Design(design.problem, (*design.features, features)).prior((1.0,) * design.classes)
+        whole = Design(design.problem, (*design.features, features)).prior((1.0,) * design.class_count)
         first = int(whole.group[design.unknowns :].min())
         prior = GaussianPrior(
             whole.base[design.unknowns :], whole.group[design.unknowns :] - first, whole.sizes[first:], 0
@@ -164,13 +168,13 @@ class NormalEquations(PrimalRegression, AbstractDesignRegression):
 
 def _add_sums(design: Design, sensor: SensorValues, N: Tensor, b: Tensor) -> float:
     """Add the normal matrix and right-hand side of a sensor's values in place; return the sum of the squared values."""
-    active, dof = design.active, sensor.joints.shape[-1]
+    active, dof = design.active_count, sensor.joint_derivatives.shape[-1]
     count = sum(chosen.count for chosen in design.features)
     size = active + dof * count
-    normal = sensor.root.new_zeros((size, size))
-    descent, square, weight = normal.new_zeros(size), 0.0, sensor.root.square()
+    normal = sensor.weight_root.new_zeros((size, size))
+    descent, square, weight = normal.new_zeros(size), 0.0, sensor.weight_root.square()
     for rows in chunks(len(sensor.row)):
-        G, y, w = sensor.geometry[rows], sensor.residual[rows], weight[rows]
+        G, y, w = sensor.geometry_derivatives[rows], sensor.residual[rows], weight[rows]
         Gw = G * w[:, None, None]
         normal[:active, :active] += Gw.flatten(0, 1).t() @ G.flatten(0, 1)
         descent[:active] += Gw.flatten(0, 1).t() @ y.flatten()
@@ -251,7 +255,7 @@ class ValueCovariance(DualRegression, AbstractDesignRegression):
         parts = []
         for k, sensor in enumerate(rows.values):
             X = design.columns(sensor, slice(None))
-            root = sensor.root[:, None]
+            root = sensor.weight_root[:, None]
             y = sensor.residual * root
             group = torch.full_like(sensor.row, -1) if sensor.certain else rows.group[sensor.row]
             parts.append(
@@ -263,23 +267,25 @@ class ValueCovariance(DualRegression, AbstractDesignRegression):
                 )
             )
         X, y, number, group = (torch.cat(column) for column in zip(*parts, strict=True))
-        prior = design.prior((1.0,) * design.classes)
-        K = [group_gram(X, prior, g, design.active) for g in range(prior.classes, len(prior.sizes))]
+        prior = design.prior((1.0,) * design.class_count)
+        K = [group_gram(X, prior, g, design.active_count) for g in range(prior.class_count, len(prior.sizes))]
         return ValueCovariance(
-            X, y, number, prior, design.active, stack_groups(K, y), rows.sensors, design, rows, group
+            X, y, number, prior, design.active_count, stack_groups(K, y), rows.sensors, design, rows, group
         )
 
     def select(self, design: Design) -> "ValueCovariance":
         """Return the regression for a subset of the features; see `AbstractDesignRegression.select`."""
         columns = self.design.indices(design.features)
-        X, prior = self.X[:, columns], design.prior((1.0,) * design.classes)
+        X, prior = self.X[:, columns], design.prior((1.0,) * design.class_count)
         before = self.prior.group[columns]
         K = []
-        for g in range(prior.classes, len(prior.sizes)):
+        for g in range(prior.class_count, len(prior.sizes)):
             members = (prior.group == g).nonzero()[:, 0]
-            other = int(before[members[0]]) if len(members) else prior.classes
+            other = int(before[members[0]]) if len(members) else prior.class_count
             whole = 0 < len(members) == int((self.prior.group == other).sum())
-            K.append(self.K[other - prior.classes] if whole else group_gram(X, prior, g, design.active))
+            K.append(
+                self.K[other - prior.class_count] if whole else group_gram(X, prior, g, design.active_count)
+            )
         return replace(self, design=design, X=X, prior=prior, K=stack_groups(K, self.y))
 
     def without_groups(self, groups: Int64[Tensor, " groups"]) -> "ValueCovariance":

@@ -87,13 +87,13 @@ class FeatureFit:
         design: the unknowns.
         posterior: posterior of the unknowns.
         largest_share: largest allowed effective number of unknowns per value.
-        held_out: held-out predictions of the folds; None if they were not computed.
+        held_out_errors: held-out predictions of the folds; None if they were not computed.
     """
 
     design: Design
     posterior: Posterior
     largest_share: float = _MAX_EFFECTIVE_SHARE
-    held_out: HeldOutErrors | None = None
+    held_out_errors: HeldOutErrors | None = None
 
     @property
     def name(self) -> str:
@@ -102,9 +102,9 @@ class FeatureFit:
 
     def gain(self, before: "FeatureFit") -> float:
         """Compute the decrease of the held-out squared errors from another fit [standard errors]; 0 without any."""
-        if self.held_out is None or before.held_out is None:
+        if self.held_out_errors is None or before.held_out_errors is None:
             return 0.0
-        return self.held_out.gain(self.posterior.noise, before.held_out, before.posterior.noise)
+        return self.held_out_errors.gain(self.posterior.noise, before.held_out_errors, before.posterior.noise)
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,7 +183,7 @@ class FeatureSearch:
         chosen = self._regression.select(design)
         posterior = chosen.maximise_evidence(prior, noise, tolerance=ROUGH_TOLERANCE)
         errors = chosen.held_out_errors(posterior, self._folds)
-        return FeatureFit(design, posterior, held_out=errors), errors.rms(posterior.noise, self.noise)
+        return FeatureFit(design, posterior, held_out_errors=errors), errors.rms(posterior.noise, self.noise)
 
     def _note(self, tried: FeatureFit, share: float, began: float, kept: bool) -> None:
         """Add a trial to the table of trials."""
@@ -192,9 +192,9 @@ class FeatureSearch:
 
     def select_features(
         self,
-        growing: Sequence[AbstractFeature],
-        others: Sequence[AbstractFeature],
-        last: Sequence[AbstractFeature] = (),
+        growing_features: Sequence[AbstractFeature],
+        other_features: Sequence[AbstractFeature],
+        final_features: Sequence[AbstractFeature] = (),
     ) -> FeatureFit:
         """Select features greedily: other features first, then growing features as long as they improve the fit.
 
@@ -202,29 +202,30 @@ class FeatureSearch:
         features are also tried together.
 
         Args:
-            growing: features of one name with increasing sizes.
-            others: features that are tried before the growing features, and again after them if they did not help.
-            last: features that are tried at the end; they must clearly reduce the held-out errors.
+            growing_features: features of one name with increasing sizes.
+            other_features: features that are tried before the growing features, and again after them if they did not
+                help.
+            final_features: features that are tried at the end; they must clearly reduce the held-out errors.
         """
         best = self.geometry
-        for chosen in others:
+        for chosen in other_features:
             best = self._tried([*best.design.features, chosen], best)
         before, failures, grown = best.design.features, 0, False
-        for chosen in growing:
+        for chosen in growing_features:
             tried = self._tried([*before, chosen], best)
             failures, grown = (failures + 1, grown) if tried is best else (0, True)
             best = tried
             if failures == _MAX_FAILURES:
                 break
-        for chosen in others if grown else ():
+        for chosen in other_features if grown else ():
             if chosen not in before:
                 best = self._tried([*best.design.features, chosen], best)
-        together = [*others, *growing[:FIRST_MODEL_SIZES][-1:]]
+        together = [*other_features, *growing_features[:FIRST_MODEL_SIZES][-1:]]
         if len(together) > 1 and self.rows.groups <= _FEW_TOGETHER:
             usual = tuple(max(scale, MIN_USUAL_SCALE) for scale in self.prior_scale)
             for scale in dict.fromkeys((tuple(self.prior_scale), usual)):
                 best = self._from_usual_sizes(together, scale, best)
-        for chosen in last:
+        for chosen in final_features:
             gain, sizes = self._regression.evidence_gain(best.posterior, best.design, chosen)
             if gain > CLEAR_EVIDENCE / 2:
                 best = self._tried([*best.design.features, chosen], best, sizes, least_gain=CLEAR_GAIN)

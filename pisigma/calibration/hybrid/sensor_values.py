@@ -26,36 +26,36 @@ class SensorValues:
     Attributes:
         name: name of the sensor.
         row: index of every row in the problem.
-        geometry: derivative of the predicted values with respect to the free parameters.
-        joints: derivative of the predicted values with respect to the joint values.
+        geometry_derivatives: derivative of the predicted values with respect to the free parameters.
+        joint_derivatives: derivative of the predicted values with respect to the joint values.
         residual: measured minus predicted values.
-        root: 1 / standard deviation if the rows state it, otherwise 1.
+        weight_root: 1 / standard deviation if the rows state it, otherwise 1.
         has_stated_noise: whether the rows state their standard deviations.
         certain: whether the values are given, not measured.
         other_row: index of the other row for distances between the targets of two rows; otherwise None.
-        other_joints: derivative with respect to the joint values of the other row.
+        other_joint_derivatives: derivative with respect to the joint values of the other row.
         repeat_variance_factor: factor >= 1 on the variance, because values of several targets in one configuration
             share the errors of the model (design effect, Kish 1965).
     """
 
     name: str
     row: Int64[Tensor, " values"]
-    geometry: Float64[Tensor, "values components active"]
-    joints: Float64[Tensor, "values components dof"]
+    geometry_derivatives: Float64[Tensor, "values components active"]
+    joint_derivatives: Float64[Tensor, "values components dof"]
     residual: Float64[Tensor, "values components"]
-    root: Float64[Tensor, " values"]
+    weight_root: Float64[Tensor, " values"]
     has_stated_noise: bool
     certain: bool
     other_row: Int64[Tensor, " values"] | None = None
-    other_joints: Float64[Tensor, "values components dof"] | None = None
+    other_joint_derivatives: Float64[Tensor, "values components dof"] | None = None
     repeat_variance_factor: float = 1.0
 
     @property
     def row_derivatives(self) -> list[tuple[Tensor, Tensor]]:
         """Return rows and derivatives with respect to their joint values; two of each for distances between rows."""
-        sides = [(self.row, self.joints)]
-        if self.other_row is not None and self.other_joints is not None:
-            sides.append((self.other_row, self.other_joints))
+        sides = [(self.row, self.joint_derivatives)]
+        if self.other_row is not None and self.other_joint_derivatives is not None:
+            sides.append((self.other_row, self.other_joint_derivatives))
         return sides
 
     def feature_columns(
@@ -83,18 +83,20 @@ class SensorValues:
         return replace(
             self,
             row=self.row[chosen],
-            geometry=self.geometry[chosen],
-            joints=self.joints[chosen],
+            geometry_derivatives=self.geometry_derivatives[chosen],
+            joint_derivatives=self.joint_derivatives[chosen],
             residual=self.residual[chosen],
-            root=self.root[chosen],
+            weight_root=self.weight_root[chosen],
             other_row=None if self.other_row is None else self.other_row[chosen],
-            other_joints=None if self.other_joints is None else self.other_joints[chosen],
+            other_joint_derivatives=None
+            if self.other_joint_derivatives is None
+            else self.other_joint_derivatives[chosen],
         )
 
     def apply_weights(self, weight: Float64[Tensor, " values"]) -> "SensorValues":
         """Return the rows with weights multiplied; rows with weight 0 are removed."""
         kept = weight > 0
-        return replace(self.select(kept), root=(self.root * weight.sqrt())[kept])
+        return replace(self.select(kept), weight_root=(self.weight_root * weight.sqrt())[kept])
 
     def merge_repeats(self, pose: Int64[Tensor, " rows"]) -> "SensorValues":
         """Return the rows with repeats of a pose joined to one row that has the sum of their weights.
@@ -109,7 +111,7 @@ class SensorValues:
         poses = int(key.max()) + 1
         if poses == len(key):
             return self
-        weight = self.root.square()
+        weight = self.weight_root.square()
         total = weight.new_zeros(poses).index_add(0, key, weight)
 
         def mean(values: Tensor) -> Tensor:
@@ -122,10 +124,10 @@ class SensorValues:
         return replace(
             self,
             row=self.row[first],
-            geometry=mean(self.geometry),
-            joints=mean(self.joints),
+            geometry_derivatives=mean(self.geometry_derivatives),
+            joint_derivatives=mean(self.joint_derivatives),
             residual=mean(self.residual),
-            root=total.sqrt(),
+            weight_root=total.sqrt(),
         )
 
     def downweight_correlated(self, configuration: Int64[Tensor, " rows"]) -> "SensorValues":
@@ -134,7 +136,7 @@ class SensorValues:
             return self
         key = renumber(configuration[self.row])
         groups = int(key.max()) + 1
-        weight = self.root.square()
+        weight = self.weight_root.square()
         total = weight.new_zeros(groups).index_add(0, key, weight)
         summed = self.residual.new_zeros((groups, self.components)).index_add(
             0, key, self.residual * weight[:, None]
@@ -144,11 +146,13 @@ class SensorValues:
         square = float((self.residual.square() * weight[:, None]).sum()) / len(key)
         shared = float((summed.square().sum(1) / total).sum()) / groups
         repetition = max(shared / max(square, 1e-300), 1.0)
-        return replace(self, repeat_variance_factor=repetition, root=self.root * repetition**-0.5)
+        return replace(
+            self, repeat_variance_factor=repetition, weight_root=self.weight_root * repetition**-0.5
+        )
 
     def _sights(self, pose: Int64[Tensor, " values"]) -> Int64[Tensor, " values"]:
         """Return, for every row, the first row of its pose that has about the same derivatives."""
-        J = torch.cat([self.geometry.flatten(1), self.joints.flatten(1)], 1)
+        J = torch.cat([self.geometry_derivatives.flatten(1), self.joint_derivatives.flatten(1)], 1)
         found, left = torch.zeros_like(pose), torch.arange(len(pose), device=pose.device)
         while len(left):
             first = torch.full_like(pose, len(pose)).scatter_reduce(0, pose[left], left, "amin")[pose[left]]
@@ -206,14 +210,14 @@ def sensor_values(
             SensorValues(
                 name=sensor.name,
                 row=row,
-                geometry=J[..., : len(problem.active)].contiguous(),
-                joints=joints - other * direction if paired else joints,
+                geometry_derivatives=J[..., : len(problem.active)].contiguous(),
+                joint_derivatives=joints - other * direction if paired else joints,
                 residual=r.contiguous(),
-                root=root,
+                weight_root=root,
                 has_stated_noise=sensor.sigma is not None,
                 certain=sensor.certain,
                 other_row=row + 1 if paired else None,
-                other_joints=other * direction if paired else None,
+                other_joint_derivatives=other * direction if paired else None,
             )
         )
     return tuple(values)

@@ -62,7 +62,7 @@ def _slope_and_curvature(
     slope, curvature = torch.zeros_like(design.problem.q), torch.zeros_like(design.problem.q)
     for sensor, sigma in zip(rows.values, posterior.noise, strict=True):
         if not sensor.certain:
-            weight = (sensor.root / sigma).square()[:, None]
+            weight = (sensor.weight_root / sigma).square()[:, None]
             residual = sensor.residual - design.predicted_change(sensor, posterior.x)
             for row, joints in sensor.row_derivatives:
                 slope.index_add_(0, row, torch.einsum("rcj,rc->rj", joints, residual) * weight)

@@ -73,7 +73,7 @@ class PositionUncertainty:
     noise: CalibrationNoise = field(default_factory=CalibrationNoise)
 
     @property
-    def root(self) -> Float64[Tensor, "unknowns directions"]:
+    def dense_root(self) -> Float64[Tensor, "unknowns directions"]:
         """Root `R` as a dense matrix."""
         return self.covariance_root.as_matrix
 
@@ -81,8 +81,8 @@ class PositionUncertainty:
     def uncertain_unknowns(self) -> list[int]:
         """Indices of the unknowns whose rows of R a model folder stores: the free parameters, and all weights."""
         parameters = len(self.space.parameters)
-        free: list[int] = self.root[:parameters].any(1).nonzero()[:, 0].tolist()
-        return [*free, *range(parameters, len(self.root))]
+        free: list[int] = self.dense_root[:parameters].any(1).nonzero()[:, 0].tolist()
+        return [*free, *range(parameters, len(self.dense_root))]
 
     def sigma(
         self, measurements: Measurements, correction: JointCorrection | None = None
@@ -118,7 +118,7 @@ class PositionUncertainty:
         Returns:
             The same uncertainty, with `R` in one matrix if it is small or cannot be rounded.
         """
-        kept = CovarianceRoot(root := self.root)
+        kept = CovarianceRoot(root := self.dense_root)
         if root.numel() > MAX_EXACT_ENTRIES:
             uncertain = self.uncertain_unknowns
             probes = self._probes(JointState.from_measurements(rows))[:, uncertain]
@@ -191,7 +191,7 @@ def position_uncertainty(
     fit: AbstractDesignRegression,
     posterior: Posterior,
     geometry: IdentifiedGeometry,
-    held_out: HeldOutErrors | None = None,
+    held_out_errors: HeldOutErrors | None = None,
 ) -> PositionUncertainty:
     """Return the uncertainty of positions predicted by a posterior, scaled by held-out errors.
 
@@ -201,7 +201,7 @@ def position_uncertainty(
         fit: regression of the rows on the unknowns.
         posterior: posterior of the unknowns.
         geometry: geometry in the user's coordinates.
-        held_out: held-out predictions of this fit, if available; they are used if there are too many groups to
+        held_out_errors: held-out predictions of this fit, if available; they are used if there are too many groups to
             estimate noise and prior scales again for every fold.
     """
     folds = rows.folds(FOLDS if rows.groups > _VERY_FEW_GROUPS else FOLDS_OF_FEW, MAX_GROUPS)
@@ -209,7 +209,7 @@ def position_uncertainty(
         updates = _FOLD_UPDATES if rows.groups <= _SOME_GROUPS else _FEWER_UPDATES
         missed = fit.held_out_errors_refitted(posterior, folds, updates)
     else:
-        missed = held_out or fit.held_out_errors(posterior, folds)
+        missed = held_out_errors or fit.held_out_errors(posterior, folds)
     prior_scale = held_out_scale(missed)
     root = fit.covariance_root(posterior)
     change = geometry.coordinate_jacobian[:, design.problem.active.cpu()]

@@ -51,7 +51,7 @@ class ArmBefore:
     def _noise(self, frame: str) -> Float64[Tensor, "6 directions"]:
         """Return a root of the covariance of the current base due to the noise of the rows."""
         fit = self.current_frames.fit
-        return fit.solved.root[[fit.frame_indices[k] for k in self._rows(frame)]]
+        return fit.solved.covariance_root[[fit.frame_indices[k] for k in self._rows(frame)]]
 
     @property
     def degrees_of_freedom(self) -> float:
@@ -80,7 +80,7 @@ class ArmBefore:
         both = torch.stack([now, before])
         J = torch.func.jacrev(motion)(both)
         arm = J[:, 0] @ self.current_frames.arm_root[self._rows(frame)]
-        arm = arm + J[:, 1] @ self.posterior.root[list(self.posterior.base_rows(frame))]
+        arm = arm + J[:, 1] @ self.posterior.covariance_root[list(self.posterior.base_rows(frame))]
         noise = J[:, 0] @ self._noise(frame)
         return motion(both), torch.cat([arm, noise], 1)
 

@@ -107,15 +107,15 @@ def fleet_prior(name: str, robot: Robot, fleet: Sequence[Measurements]) -> Fleet
 def robot_class_population(robot: Robot) -> Population:
     """Return the distribution of errors of a robot's class, see `pisigma.robot.robot_class`."""
     uncertainty = RobotPosterior.from_robot(robot).uncertainty
-    usual = select_arm_rows(uncertainty.root, uncertainty.space).square().sum(1)
+    usual = select_arm_rows(uncertainty.dense_root, uncertainty.space).square().sum(1)
     return Population(torch.zeros_like(usual), usual.diag(), uncertainty.space.arm_parameter_count)
 
 
 def select_arm_rows(
-    root: Float64[Tensor, "unknowns directions"], space: ParameterSpace
+    covariance_root: Float64[Tensor, "unknowns directions"], space: ParameterSpace
 ) -> Float64[Tensor, "arm directions"]:
     """Return the rows of a root for the arm's parameters and weights, without rows of base, tool and sensors."""
-    return torch.cat([root[: space.arm_parameter_count], root[len(space.parameters) :]])
+    return torch.cat([covariance_root[: space.arm_parameter_count], covariance_root[len(space.parameters) :]])
 
 
 def mean_robot(
@@ -141,7 +141,7 @@ def mean_robot(
     correction = _correction(nominal, usual.features, population.mean[size:])
     q = torch.cat([rows.q.cpu() for rows in fleet])
     starts = evenly_spaced_rows(torch.unique(q, dim=0))
-    root = torch.zeros(len(usual.root), len(population.mean), dtype=torch.float64)
+    root = torch.zeros(len(usual.dense_root), len(population.mean), dtype=torch.float64)
     factor = torch.linalg.cholesky(population.covariance)
     root[: space.arm_parameter_count], root[len(space.parameters) :] = factor[:size], factor[size:]
     frames = {"": np.array(nominal.base)}, {"": np.array(nominal.tool)}
@@ -253,7 +253,7 @@ class FleetConsistency:
             IdentificationError: the rows do not determine the robot's base and tool.
         """
         posterior = ModelPosterior.from_model(model)
-        root = select_arm_rows(posterior.root, posterior.space)
+        root = select_arm_rows(posterior.covariance_root, posterior.space)
         nominal = posterior.space.robot
         errors = torch.from_numpy(posterior.geometry.robot.dh - nominal.dh)
         mean = torch.cat([errors.flatten(), posterior.weights])

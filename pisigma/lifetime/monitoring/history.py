@@ -61,7 +61,7 @@ class Record:
             "rows": session.rows,
             "verdict": session.verdict,
             "unchanged_probability": session.unchanged_probability,
-            "moved": [one.to_json() for one in session.moved],
+            "moved": [one.to_json() for one in session.movements],
             "candidates": [{"what": what, "probability": share} for what, share in session.candidates],
             "unobservable": [f"joint {k}" for k, seen in enumerate(session.observable, 1) if not seen],
             "remarks": list(session.unobservable),

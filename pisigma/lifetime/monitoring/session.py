@@ -73,7 +73,7 @@ class Session:
     Attributes:
         rows: number of rows.
         unchanged_probability: probability that no part moved.
-        moved: movements; movements of the arm come first.
+        movements: movements; movements of the arm come first.
         candidates: names and probabilities of possible movements if these are ambiguous; otherwise empty.
         rms: RMS position error under the model, with the current base and tool [m].
         rms_after: RMS position error expected after a recalibration [m].
@@ -90,7 +90,7 @@ class Session:
 
     rows: int
     unchanged_probability: Annotated[float, Field(alias="unchanged")]  # histories store the keys
-    moved: tuple[HistoryMovement, ...]
+    movements: Annotated[tuple[HistoryMovement, ...], Field(alias="moved")]
     candidates: tuple[tuple[str, float], ...]
     rms: float
     rms_after: float
@@ -105,14 +105,14 @@ class Session:
     @property
     def verdict(self) -> Verdict:
         """Verdict: nothing moved ("unchanged"), something moved ("moved"), or the movement is ambiguous ("unclear")."""
-        if self.moved:
+        if self.movements:
             return "moved"
         return "unclear" if self.candidates else "unchanged"
 
     @property
     def recalibrate(self) -> bool:
         """Whether the arm has changed so much that a recalibration is recommended."""
-        arm = any(not is_frame(one.what) for one in self.moved) or bool(self.candidates)
+        arm = any(not is_frame(one.what) for one in self.movements) or bool(self.candidates)
         return arm and (
             self.rms > _MIN_GAIN_RATIO * self.rms_after
             or max(self.rotation_ratio, self.score_ratio) > _MIN_GAIN_RATIO
@@ -131,7 +131,9 @@ class Session:
         if self.verdict == "unchanged":
             return "nothing moved beyond its uncertainty."
         # for a base or a tool, omit the rotation if only the origin moved, and the other way round
-        clear = [one for one in self.moved if one.is_significant or not is_frame(one.what)] or self.moved
+        clear = [
+            one for one in self.movements if one.is_significant or not is_frame(one.what)
+        ] or self.movements
         moved = (f"{one.sentence} ({format_probability(one.probability)})" for one in clear)
         return f"{'; '.join(moved)}."
 
@@ -246,7 +248,7 @@ class _Solved:
         """Return the mean unknowns with moved bases and tools and some movements; all others are as in the model."""
         standing = tuple(group for group in self.problem.groups if group.fixed_size)
         drift = Drift((*standing, *motions), self.noise * self.explanation.noise_factor)
-        shift: Tensor = PosteriorUpdate(self.problem.root[:, :0], self.values, drift).shift
+        shift: Tensor = PosteriorUpdate(self.problem.covariance_root[:, :0], self.values, drift).shift
         return self.problem.mean + shift
 
 
@@ -278,7 +280,7 @@ def _explained(
 ) -> _Solved:
     """Find the most probable explanation of the values of a session, including wrong rows."""
     standing = [one for one in problem.groups if one.fixed_size]
-    every = SessionEvidence(values, problem.root, standing, movement_hypotheses(problem), noise)
+    every = SessionEvidence(values, problem.covariance_root, standing, movement_hypotheses(problem), noise)
 
     def explain(wrong: Mapping[int, float]) -> ExplainedRows[_Solved]:
         evidence = every.with_wrong(wrong)
@@ -318,7 +320,7 @@ def _judged(solved: _Solved, relocated: dict[FrameKey, float]) -> Session:
     return Session(
         rows=every.rows,
         unchanged_probability=explanation.unchanged_probability,
-        moved=_moved(solved, relocated),
+        movements=_moved(solved, relocated),
         candidates=tuple((one.group.what, one.probability) for one in explanation.candidates),
         rms=rms,
         rms_after=rms_after * optimism,

@@ -48,7 +48,7 @@ class AdaptedArm:
     def from_unknowns(problem: RecalibrationProblem, x: Float64[Tensor, " unknowns"]) -> "AdaptedArm":
         """Return the arm at the unknowns x of a problem, with parameters relative to `design.problem.nominal`."""
         design = problem.design
-        point = design.problem.nominal.index_add(0, design.problem.active, x[: design.active])
+        point = design.problem.nominal.index_add(0, design.problem.active, x[: design.active_count])
         return AdaptedArm(
             identified_geometry(problem.setup, point),
             correction_from_weights(design, x) if design.features else None,
@@ -94,14 +94,14 @@ class Adaptation:
     @property
     def wrong_rows(self) -> list[int]:
         """Rows that are not used, because the loss rejects them or the evidence shows that they are wrong."""
-        rows: list[int] = self.problem.setup.rows[self.problem.wrong_rows(self.values)].tolist()
+        rows: list[int] = self.problem.setup.row_indices[self.problem.wrong_rows(self.values)].tolist()
         return rows
 
     @cached_property
-    def root(self) -> Float64[Tensor, "unknowns directions"]:
+    def covariance_root(self) -> Float64[Tensor, "unknowns directions"]:
         """Root of the posterior covariance of all unknowns in the user's coordinates, parameters first."""
-        root = torch.cat([self.update.root(), self.problem.fixed_root], 1)
-        active = self.problem.design.active
+        root = torch.cat([self.update.covariance_root(), self.problem.fixed_root], 1)
+        active = self.problem.design.active_count
         return torch.cat([self.problem.coordinate_change @ root[:active], root[active:]])
 
     @property
@@ -148,7 +148,7 @@ def adapt(
         search = _searched(problem, values, drift, initial_noise)
         drift, wrong = search.drift, search.values.wrong_configurations
         values = replace(values, wrong_configurations=wrong)
-        update = PosteriorUpdate(problem.root, values, drift)
+        update = PosteriorUpdate(problem.covariance_root, values, drift)
         # Convergence is assessed with predicted values, because poorly determined unknowns may still wander.
         step = values.X @ (mean + update.shift - x) / values.sigma(drift.noise)
         x, effective = mean + update.shift, update.effective_unknowns
@@ -185,9 +185,9 @@ def linear_values(problem: RecalibrationProblem, rows: Rows) -> LinearValues:
     """Concatenate the values of all sensors, with residuals relative to the model."""
     X, y, sensor, configuration = [], [], [], []
     for number, one in enumerate(rows.values):
-        columns = (problem.design.columns(one, slice(None)) * one.root[:, None, None]).flatten(0, 1)
+        columns = (problem.design.columns(one, slice(None)) * one.weight_root[:, None, None]).flatten(0, 1)
         X.append(columns)
-        y.append((one.residual * one.root[:, None]).flatten() - columns @ problem.mean)
+        y.append((one.residual * one.weight_root[:, None]).flatten() - columns @ problem.mean)
         sensor.append(torch.full((len(columns),), number))
         configuration.append(problem.configuration[one.row].repeat_interleave(one.components))
     found = LinearValues(
@@ -208,7 +208,7 @@ def _searched(
     """Estimate sizes of the drift and find wrong rows by evidence, from a selection of the values if there are many."""
     if len(values.y) > MAX_VALUES:
         values = values.select(randomly_chosen_rows(len(values.y), MAX_VALUES).sort().values)
-    A = values.X @ problem.root
+    A = values.X @ problem.covariance_root
 
     def explain(wrong: Mapping[int, float]) -> ExplainedRows[DriftSearch]:
         there = replace(values, wrong_configurations=wrong)

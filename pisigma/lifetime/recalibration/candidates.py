@@ -234,7 +234,7 @@ def recalibrated_model(model: CalibratedModel, adaptation: Adaptation, rows: Mea
             dh=dh, base=next(iter(bases.values())), tool=next(iter(tools.values()))
         )
     robot = nominal.with_geometry(base=calibrated.base, tool=calibrated.tool)
-    root = CovarianceRoot(adaptation.root)
+    root = CovarianceRoot(adaptation.covariance_root)
     space = adaptation.problem.design.problem.space
     noise = known.noise.updated(adaptation.noise)
     uncertainty = PositionUncertainty(space, geometry, known.features, root, known.prior_scale, noise)
@@ -295,7 +295,7 @@ def recalibration_diagnostics(
     rows: Measurements,
     adaptation: Adaptation,
     wrong_rows: Sequence[int],
-    moved: Sequence[Movement],
+    movements: Sequence[Movement],
 ) -> tuple[Diagnostic, ...]:
     """Return findings that state why the result is implausible although the checks of the rows found nothing.
 
@@ -305,7 +305,7 @@ def recalibration_diagnostics(
         rows: all rows.
         adaptation: adaptation of the model to the rows that were not left out.
         wrong_rows: indices of the rows that were left out.
-        moved: movements that were found.
+        movements: movements that were found.
     """
     if len(wrong_rows) > MIN_WRONG_SHARE * rows.rows:
         chosen = torch.zeros(rows.rows, dtype=torch.bool)
@@ -315,7 +315,10 @@ def recalibration_diagnostics(
         implausible := check_rows(rows, parent.nominal or parent.robot).implausible
     ):
         return implausible
-    return (*_large_errors(parent, choice, adaptation), *excessive_change_diagnostics(parent.robot, moved))
+    return (
+        *_large_errors(parent, choice, adaptation),
+        *excessive_change_diagnostics(parent.robot, movements),
+    )
 
 
 def _large_errors(

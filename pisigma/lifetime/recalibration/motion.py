@@ -52,9 +52,9 @@ def find_motion(
         some = posterior.with_model_names(some)
         with torch.no_grad():
             session, _ = judge_session(model, posterior, some, frame_keys(some, fitted) if fitted else None)
-        moved = tuple(one for one in session.moved if one.what.split()[0] not in fitted)
+        moved = tuple(one for one in session.movements if one.what.split()[0] not in fitted)
         if not session_diagnostics(model, some, session):
-            return replace(session, moved=moved)
+            return replace(session, movements=moved)
     return None
 
 
@@ -79,7 +79,7 @@ def session_diagnostics(
             "is wrong; run `pisigma verify` on these rows."
         )
         return (Diagnostic(kind="implausible_errors", severity="implausible", sentence=sentence),)
-    return excessive_change_diagnostics(model.robot, session.moved)
+    return excessive_change_diagnostics(model.robot, session.movements)
 
 
 def motion_sentence(motion: Session, comparison: ModelComparison) -> str:
@@ -98,7 +98,7 @@ def motion_warnings(motion: Session) -> tuple[str, ...]:
         return ()
     return (
         (f"{motion_text(motion)}.",)
-        if motion.moved
+        if motion.movements
         else (f"{motion.sentence[:1].upper()}{motion.sentence[1:]}",)
     )
 
@@ -106,7 +106,7 @@ def motion_warnings(motion: Session) -> tuple[str, ...]:
 def motion_text(motion: Session) -> str:
     """Return a text about movements, such as "Joint 3 has moved by 0.24 ± 0.01 deg (probability more than 99.9 %)"."""
     amounts: dict[tuple[str, float | None], list[str]] = {}
-    for one in motion.moved:
+    for one in motion.movements:
         amounts.setdefault((one.what, one.probability), []).append(one.size)
     text = join_words(
         f"{_subject(what)} by {join_words(those)} (probability {format_probability(probability)})"
@@ -122,17 +122,17 @@ def _subject(what: str) -> str:
     return f"the parameter {what} has changed" if "_" in what else f"{what} has moved"
 
 
-def excessive_change_diagnostics(robot: Robot, moved: Sequence[Movement]) -> tuple[Diagnostic, ...]:
+def excessive_change_diagnostics(robot: Robot, movements: Sequence[Movement]) -> tuple[Diagnostic, ...]:
     """Return a diagnostic of changes that are larger than those due to wear or a collision.
 
     Bases, tools and the zero of a single joint may move by any amount.
 
     Args:
         robot: robot, whose class states the limits; see `RobotClass.max_changes`.
-        moved: movements that were found.
+        movements: movements that were found.
     """
     of_class = RobotClass.from_robot(robot)
-    far = [one for one in moved if not is_frame(one.what) and _is_beyond(one, of_class.max_changes)]
+    far = [one for one in movements if not is_frame(one.what) and _is_beyond(one, of_class.max_changes)]
     if not far or (len(far) == 1 and far[0].what.startswith("joint ")):
         return ()
     changes = join_words(f"{one.what} by {one.size}" for one in far)

@@ -139,11 +139,11 @@ def movements_of_group(
     return moved
 
 
-def movements_text(moved: tuple[Movement, ...]) -> str:
+def movements_text(movements: tuple[Movement, ...]) -> str:
     """Return a sentence about significant movements."""
-    if not moved:
+    if not movements:
         return "Nothing moved beyond its uncertainty."
-    clauses = "; ".join(one.sentence for one in moved)
+    clauses = "; ".join(one.sentence for one in movements)
     return f"{clauses[:1].upper()}{clauses[1:]}; nothing else moved beyond its uncertainty."
 
 

@@ -69,7 +69,8 @@ class RecalibrationProblem:
         setup: rows, relative to the current bases and tools.
         design: unknowns: all parameters of the model and the rows, and the weights of the correction.
         mean: prior mean of the unknowns, with parameters relative to `design.problem.nominal`.
-        root: root of the prior covariance of the unknowns, with parameters relative to the anchors of the setup.
+        covariance_root: root of the prior covariance of the unknowns, with parameters relative to the anchors of the
+            setup.
         coordinate_change: derivative of the parameters in the user's coordinates with respect to the problem's
             parameters.
         groups: groups that may drift, with size 0, and moved bases and tools.
@@ -80,7 +81,7 @@ class RecalibrationProblem:
     setup: CalibrationSetup
     design: Design
     mean: Float64[Tensor, " unknowns"]
-    root: Float64[Tensor, "unknowns directions"]
+    covariance_root: Float64[Tensor, "unknowns directions"]
     coordinate_change: Float64[Tensor, "parameters parameters"]
     groups: tuple[DriftGroup, ...]
     fixed_root: Float64[Tensor, "unknowns _directions"]
@@ -99,7 +100,9 @@ class RecalibrationProblem:
     def with_fixed_arm(self) -> "RecalibrationProblem":
         """Return the problem with the arm held fixed, in which only moved bases and tools are unknown."""
         relocated = tuple(group for group in self.groups if group.fixed_size)
-        return replace(self, root=self.fixed_root, groups=relocated, fixed_root=self.root)
+        return replace(
+            self, covariance_root=self.fixed_root, groups=relocated, fixed_root=self.covariance_root
+        )
 
 
 def recalibration_problem(
@@ -132,15 +135,17 @@ def recalibration_problem(
     start = setup.start
     problem = setup.problem.with_active(range(len(start)))
     change = coordinate_change(setup, start)
-    root = posterior.root.new_zeros((len(start) + len(posterior.weights), posterior.root.shape[1]))
+    root = posterior.covariance_root.new_zeros(
+        (len(start) + len(posterior.weights), posterior.covariance_root.shape[1])
+    )
     parameters = len(posterior.space.parameters)
-    root[posterior.positions_in(space)] = posterior.root[:parameters]
+    root[posterior.positions_in(space)] = posterior.covariance_root[:parameters]
     for group, name in new & known:
         # The posterior does not apply to a frame that was moved; a wide drift group replaces it.
         root[frame_slice(space, group, name)] = 0.0
     # The stored posterior is in the user's coordinates, the problem in the coordinates of its anchors.
     root[: len(start)] = torch.linalg.pinv(change) @ root[: len(start)]
-    root[len(start) :] = posterior.root[parameters:]
+    root[len(start) :] = posterior.covariance_root[parameters:]
     mean = torch.cat([torch.zeros_like(start), posterior.weights])
     design = Design(problem, posterior.features)
     groups = _groups(posterior, space, rows, root, new, setup.free_unknowns)

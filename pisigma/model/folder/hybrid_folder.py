@@ -94,7 +94,7 @@ def hybrid_tensors(model: CalibratedModel) -> dict[str, Tensor]:
         result["coverage.half"] = coverage.half_width
     if (known := model.uncertainty) is not None:
         if (rounded := known.covariance_root.rounded) is None:
-            result["uncertainty.root"] = known.root[known.uncertain_unknowns]
+            result["uncertainty.root"] = known.dense_root[known.uncertain_unknowns]
         else:
             rounded = rounded.select(known.uncertain_unknowns)
             result["uncertainty.unit"] = rounded.unit

@@ -133,11 +133,11 @@ class RowModel:
             point, rounds = _start_at(setup, of_kept.geometry), 1
         values = sensor_values(setup.problem, point)
         columns = torch.cat([design.columns(one, slice(None)).flatten(0, 1) for one in values])
-        weights = columns[:, design.active :]
+        weights = columns[:, design.active_count :]
         model = RowModel(setup, design, values, weights, point, _noise(setup, values, sigma), kept)
         for _ in range(rounds):
             point = setup.start.clone()
-            point[setup.problem.active] += model._solution()[: design.active]
+            point[setup.problem.active] += model._solution()[: design.active_count]
             model = replace(model, values=sensor_values(setup.problem, point), point=point)
         return model
 
@@ -235,7 +235,9 @@ class RowModel:
 
     @cached_property
     def _columns(self) -> Float64[Tensor, "values unknowns"]:
-        return torch.cat([torch.cat([one.geometry.flatten(0, 1) for one in self.values]), self.weights], 1)
+        return torch.cat(
+            [torch.cat([one.geometry_derivatives.flatten(0, 1) for one in self.values]), self.weights], 1
+        )
 
     @cached_property
     def _row(self) -> Int64[Tensor, " values"]:
@@ -246,7 +248,7 @@ class RowModel:
     def _residual(self) -> Float64[Tensor, " values"]:
         """Measured minus predicted values at the start parameters, from the linearisation."""
         moved = (self.point - self.setup.start)[self.setup.problem.active]
-        return torch.cat([(one.residual + one.geometry @ moved).flatten() for one in self.values])
+        return torch.cat([(one.residual + one.geometry_derivatives @ moved).flatten() for one in self.values])
 
     @cached_property
     def _size(self) -> Float64[Tensor, " unknowns"]:
@@ -257,7 +259,7 @@ class RowModel:
         )
         sizes = torch.cat(
             [
-                prior.sizes[: prior.classes],
+                prior.sizes[: prior.class_count],
                 prior.sizes.new_tensor([of_class.gravity_sigma, *of_class.series_sigmas]),
             ]
         )
@@ -304,7 +306,7 @@ def _noise(
     blocks = []
     for sensor, one in zip(setup.problem.sensors, values, strict=True):
         usual = _USUAL_NOISE[sensor.unit] if sigma is None or sensor.unit == "rad" else sigma
-        noise = 1 / one.root if one.has_stated_noise else torch.full_like(one.root, usual)
+        noise = 1 / one.weight_root if one.has_stated_noise else torch.full_like(one.weight_root, usual)
         noise = (noise.square() + _REPEATABILITY[sensor.unit] ** 2).sqrt()
         if isinstance(sensor, CornerSensor):  # the weights of corners include the repeatability
             noise = torch.as_tensor(setup.measurements.readings[NOISE_COLUMN])[one.row]

@@ -277,8 +277,8 @@ _AHEAD = 10
 def stopping_advice(
     limit_mm: float | None,
     least_gain_mm: float,
-    reached: Sequence[AccuracyPoint],
-    expected: Sequence[AccuracyPoint],
+    reached_accuracy: Sequence[AccuracyPoint],
+    expected_accuracy: Sequence[AccuracyPoint],
     remaining: int,
 ) -> Advice:
     """Return advice on whether to continue measuring or to stop, with the reason.
@@ -286,21 +286,23 @@ def stopping_advice(
     Args:
         limit_mm: limit on the 95 % quantile of the errors [mm]; None for no limit.
         least_gain_mm: decrease of this quantile due to the next `_AHEAD` poses, below which to stop [mm].
-        reached: accuracy so far. The limit is reached when the last two points are below it, because estimates from few
-            rows scatter and the first point below the limit is often there by chance.
-        expected: expected accuracy after the remaining poses.
+        reached_accuracy: accuracy so far. The limit is reached when the last two points are below it, because estimates
+            from few rows scatter and the first point below the limit is often there by chance.
+        expected_accuracy: expected accuracy after the remaining poses.
         remaining: number of remaining poses.
     """
     limit = "" if limit_mm is None else f"; the limit is {limit_mm:g} mm"
-    if reached:
-        point = reached[-1]
+    if reached_accuracy:
+        point = reached_accuracy[-1]
         now = f"95 % of the errors are expected below {point.predicted_p95 * 1e3:.3f} mm"
-        below = [limit_mm is not None and one.predicted_p95 * 1e3 <= limit_mm for one in reached[-2:]]
+        below = [
+            limit_mm is not None and one.predicted_p95 * 1e3 <= limit_mm for one in reached_accuracy[-2:]
+        ]
         if len(below) > 1 and all(below):
             return Advice("stop", f"Stop: with {point.poses} poses {now}{limit}.")
         confirm = ", which the next poses must confirm" if below[-1] else ""
-        ahead = next((one for one in expected if one.poses >= point.poses + _AHEAD), None) or next(
-            reversed(expected), None
+        ahead = next((one for one in expected_accuracy if one.poses >= point.poses + _AHEAD), None) or next(
+            reversed(expected_accuracy), None
         )
         gain = 0.0 if ahead is None else (point.predicted_p95 - ahead.predicted_p95) * 1e3
         if ahead is not None and gain < least_gain_mm:
@@ -308,7 +310,7 @@ def stopping_advice(
             return Advice("stop", f"Stop: {now}{limit}; {more}.")
     if not remaining:
         return Advice("stop", f"Stop: all poses of the plan have been measured{limit}.")
-    if not reached:
+    if not reached_accuracy:
         return Advice(
             "measure", f"{remaining} poses remain; there are too few rows to estimate the accuracy."
         )

@@ -160,8 +160,8 @@ class SessionState:
         next_pose: next pose to measure; None if the plan is finished.
         remaining: joint values of all remaining poses, beginning with the next [rad or m].
         coverage: measured range of every joint.
-        reached: accuracy so far, one point per computation; the last point is valid.
-        expected: expected accuracy after the remaining poses.
+        reached_accuracy: accuracy so far, one point per computation; the last point is valid.
+        expected_accuracy: expected accuracy after the remaining poses.
         advice: what to do next.
         revolute: whether each axis of the controller is revolute (values in rad) or prismatic (in m).
         base: `T_sensor_base`, pose of the robot's base in the frame of the sensor [m]; None while it is unknown.
@@ -172,8 +172,8 @@ class SessionState:
     next_pose: NextPose | None
     remaining: Float64[np.ndarray, "poses dof"]
     coverage: tuple[JointSpan, ...]
-    reached: tuple[AccuracyPoint, ...]
-    expected: tuple[AccuracyPoint, ...]
+    reached_accuracy: tuple[AccuracyPoint, ...]
+    expected_accuracy: tuple[AccuracyPoint, ...]
     advice: Advice
     revolute: tuple[bool, ...]
     base: Float64[np.ndarray, "4 4"] | None = None
@@ -181,7 +181,7 @@ class SessionState:
     @property
     def accuracy(self) -> AccuracyPoint | None:
         """Accuracy so far; None while it cannot be computed."""
-        return self.reached[-1] if self.reached else None
+        return self.reached_accuracy[-1] if self.reached_accuracy else None
 
     def to_json(self) -> dict[str, object]:
         """Return the figures as plain values, the result of `pisigma measure --json`; None for unknown values."""
@@ -213,7 +213,7 @@ class SessionState:
                 )
             ],
             "accuracy": None if self.accuracy is None else self.accuracy.to_json(),
-            "curve": [point.to_json() for point in (*self.reached, *self.expected)],
+            "curve": [point.to_json() for point in (*self.reached_accuracy, *self.expected_accuracy)],
             "action": self.advice.action,
             "advice": self.advice.sentence,
         }

@@ -173,13 +173,13 @@ def _predicted_error(result: CalibrationResult) -> tuple[float, dict[str, float]
         :, :3, : result.solved.problem.space.arm_parameter_count
     ].flatten(0, 1)
     posterior = result.posterior
-    total = _square(J, posterior.root)
+    total = _square(J, posterior.covariance_root)
     groups = {"camera": "the intrinsics", "board": "the scale of the board"}
     shares = {}
     for group, what in groups.items():
         rows = [k for k, parameter in enumerate(posterior.parameters) if parameter.group == group]
         if rows:
-            shares[what] = 1 - _square(J, _conditioned(posterior.root, rows)) / total
+            shares[what] = 1 - _square(J, _conditioned(posterior.covariance_root, rows)) / total
     return (total * 3) ** 0.5, shares
 
 

@@ -25,7 +25,7 @@ def check_torques(checked: CheckedCalibration) -> Iterator[Diagnostic]:
         count = int(feature.used.sum())
         if feature is learned:
             deviation = torch.zeros_like(weights[feature])
-            deviation[feature.used] = hybrid.uncertainty.root[first : first + count].norm(dim=1)
+            deviation[feature.used] = hybrid.uncertainty.dense_root[first : first + count].norm(dim=1)
             compliance = learned.compliances(weights[feature].detach())
             known = compliance.abs() > _SIGNIFICANT * learned.compliances(deviation).abs()
             yield from _negative(

@@ -300,7 +300,7 @@ def predicted_at_other_poses(
         deviation = result.sigma(others)
     else:
         solved = result.solved
-        root = CovarianceRoot(solved.root)
+        root = CovarianceRoot(solved.covariance_root)
         known = PositionUncertainty(solved.problem.space, solved.geometry, (), root, 1.0)
         deviation = known.sigma(others)
     rms = float((deviation.square() + _noise(result, others).square()).sum(1).mean().sqrt())

@@ -110,7 +110,7 @@ class OrderedRows:
         data, view, rows = (
             solved.measurements,
             sensor_view_of(solved.refined_linearisation),
-            solved.setup.rows.cpu(),
+            solved.setup.row_indices.cpu(),
         )
         errors = None if learned is None else result.errors_of(data)
         present = [sensor.present for sensor in solved.problem.sensors if sensor.name in SENSORS]
@@ -119,7 +119,7 @@ class OrderedRows:
         measured = torch.stack(present).any(0).nonzero()[:, 0].cpu()
         some = measured[randomly_chosen_rows(len(measured), _MAX_ROWS)]
         some = some[np.argsort(np.argsort(order_of_rows(data))[rows[some]])]
-        problem = replace(solved.problem, pairs=0).select(some)
+        problem = replace(solved.problem, pair_count=0).select(some)
         whole, every = slice(0, len(some)), torch.arange(len(problem.space.parameters))
         motion = problem.motion(solved.refined_linearisation.point, whole, every)
         unknowns = problem.space.sensor_unknowns(solved.refined_linearisation.point)

@@ -205,7 +205,7 @@ class SessionPanel:
         self._rows.content = str(
             self._text.rows(state, self._robot.axes, state.alarms[: -_MAX_ALARMS - 1 : -1], max_error, RAMP)
         )
-        points = (*state.expected, *state.reached)
+        points = (*state.expected_accuracy, *state.reached_accuracy)
         curves = _curves(points, self._limit)
         self._curve.visible = len(points) > 1
         self._curve.data, self._curve.scales = curves, _scales(curves)

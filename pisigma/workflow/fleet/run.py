@@ -320,7 +320,7 @@ def parameters_of(model: "CalibratedModel") -> list[ParameterValue]:
     space, values = posterior.space, posterior.geometry.robot.dh.ravel()
     changes, deviations = (
         values - space.robot.dh.ravel(),
-        posterior.root[: space.arm_parameter_count].norm(dim=1),
+        posterior.dense_root[: space.arm_parameter_count].norm(dim=1),
     )
     parameters = []
     for number in deviations.nonzero()[:, 0].tolist():

@@ -207,7 +207,7 @@ def test_arms_without_anything_in_common_are_refused():
 def test_frame_with_an_undetermined_direction_is_not_shared():
     left, right = posteriors(1, "hall")
     rows = list(right.base_rows("hall"))
-    root = right.root.clone()
+    root = right.covariance_root.clone()
     direction = torch.tensor([0.6, 0.8, 0, 0, 0, 0], dtype=torch.float64)
     root[rows] -= direction[:, None] * (direction @ root[rows])
     held = replace(right.uncertainty, covariance_root=CovarianceRoot(root))

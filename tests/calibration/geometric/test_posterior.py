@@ -63,7 +63,7 @@ def test_values_that_were_not_kept_are_nan(result: CalibrationResult) -> None:
     solved = result.solved
     space = solved.problem.space
     bare = solved.geometry.__class__(result.robot, result.bases, result.tools, {})
-    posterior = ParameterPosterior.from_geometry(space, bare, solved.root)
+    posterior = ParameterPosterior.from_geometry(space, bare, solved.covariance_root)
     first = space.arm_parameter_count + 6 * (len(space.frames) + len(space.targets))
     assert_close(posterior.mean[:first], result.posterior.mean[:first])
     assert bool(posterior.mean[first:].isnan().all())

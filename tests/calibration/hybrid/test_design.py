@@ -43,7 +43,7 @@ def test_what_unknowns_move_is_their_columns_times_them(monkeypatch: pytest.Monk
     geometry = Design(case.rows.problem, ())
     values = case.rows.values[0]
     moved = geometry.predicted_change(values, x[: geometry.unknowns])
-    assert_close(moved, values.geometry @ x[: geometry.unknowns], atol=1e-15)
+    assert_close(moved, values.geometry_derivatives @ x[: geometry.unknowns], atol=1e-15)
 
 
 def test_the_correction_is_the_weighted_sum_of_the_used_columns(arm: LinearisedArm) -> None:
@@ -88,13 +88,13 @@ def test_columns_that_a_joint_does_not_have_get_no_unknown(arm: LinearisedArm) -
     gravity = GravityTorques(robot)
     design = Design(arm.rows.problem, (gravity,))
     assert not bool(gravity.used.all())
-    assert design.unknowns == design.active + int(gravity.used.sum())
+    assert design.unknowns == design.active_count + int(gravity.used.sum())
     columns = design.columns(arm.rows.values[0], slice(0, 5))
     assert columns.shape == (5, 3, design.unknowns)
     q = arm.rows.problem.q[arm.rows.values[0].row[:5]]
     weight = torch.randn(gravity.used.shape, generator=torch.Generator().manual_seed(0)).double()
     delta = (gravity.columns(JointState(q)) * weight * gravity.used).sum(-1)
-    expected = (arm.rows.values[0].joints[:5] @ delta[..., None])[..., 0]
+    expected = (arm.rows.values[0].joint_derivatives[:5] @ delta[..., None])[..., 0]
     assert_close(columns[..., design.weights_of(0)] @ weight[gravity.used], expected, atol=1e-13)
 
 
@@ -102,9 +102,9 @@ def test_prior_has_a_size_for_every_class_and_every_group_of_weights(arm: Linear
     robot, problem = arm.rows.problem.space.robot, arm.rows.problem
     design = Design(problem, features(robot, 3))
     prior = design.prior((0.5, 2.0, 1.0, 3.0))
-    assert prior.classes == 4
+    assert prior.class_count == 4
     assert_close(prior.sizes, torch.tensor([0.5, 2.0, 1.0, 3.0, *[FIRST_SIZE] * 5]).double(), rtol=1e-7)
-    active = slice(0, design.active)
+    active = slice(0, design.active_count)
     expected = problem.precision[problem.active] / prior.sizes[problem.prior_group].square()
     assert_close(prior.precision[active], expected, rtol=1e-14)
     assert prior.group[design.weights_of(0)].unique().tolist() == [4]

@@ -64,7 +64,9 @@ def test_posterior_is_that_of_normal_variables(seed: int) -> None:
     told = 1 - prior().precision.numpy() * covariance.diagonal()
     assert_close(found.effective_unknowns, told.sum(), rtol=1e-10)
     assert_close(found.determined_unknowns, np.bincount(GROUP, told), rtol=1e-10)
-    assert_close(found.square, np.bincount(GROUP, prior().base.numpy() * found.x.numpy() ** 2), rtol=1e-12)
+    assert_close(
+        found.squared_unknowns, np.bincount(GROUP, prior().base.numpy() * found.x.numpy() ** 2), rtol=1e-12
+    )
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -116,7 +118,7 @@ def test_log_evidence_of_linearised_rows_is_stationary() -> None:
     case = poses()
     fit = NormalEquations.from_rows(case.design, case.rows)
     found = fit.maximise_evidence(case.prior, case.noise, 300, 1e-9)
-    moving = (found.prior.sizes > 10 * SMALLEST_SIZE).nonzero()[found.prior.classes :, 0].tolist()
+    moving = (found.prior.sizes > 10 * SMALLEST_SIZE).nonzero()[found.prior.class_count :, 0].tolist()
     assert moving
     step, slopes = 1e-3, []
     for number in [*moving, -1, -2]:

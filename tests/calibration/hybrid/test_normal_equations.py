@@ -30,7 +30,7 @@ def assert_same_sums(found: NormalEquations, expected: DenseRegression) -> None:
             found.normal[k] / length / length[:, None], X.t() @ X / length / length[:, None], atol=1e-12
         )
         assert_close(found.descent[k] / length, X.t() @ y / length, atol=1e-12 * float(y.norm()) + 1e-300)
-        assert_close(found.square[k], float(y.square().sum()), rtol=1e-12)
+        assert_close(found.squared_values[k], float(y.square().sum()), rtol=1e-12)
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -48,7 +48,7 @@ def test_the_cases_are_what_they_are_for() -> None:
     assert len(values["socket distance"].row) == 1
     assert values["socket distance"].certain
     assert len(values["pair"].row_derivatives) == 2
-    assert len(poses().rows.values[0].root.unique()) > 20
+    assert len(poses().rows.values[0].weight_root.unique()) > 20
     assert not bool(poses().design.features[1].used.all())
     assert several_targets().rows.values[0].repeat_variance_factor > 1.2
     assert len(CASES["few values"]().dense.y) < CASES["few values"]().design.unknowns / 4
@@ -109,7 +109,7 @@ def with_sums(normal: Tensor, descent: Tensor) -> NormalEquations:
     """Return normal equations of one sensor with the given sums instead of those of rows."""
     whole = NormalEquations.from_rows(poses().design, poses().rows)
     return replace(
-        whole, normal=normal[None], descent=descent[None], square=(1.0,), sensors=whole.sensors[:1]
+        whole, normal=normal[None], descent=descent[None], squared_values=(1.0,), sensors=whole.sensors[:1]
     )
 
 

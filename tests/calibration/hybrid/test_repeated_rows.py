@@ -38,8 +38,8 @@ def test_excluded_rows_are_left_out_and_the_others_weighted() -> None:
     found = values.apply_weights(torch.tensor([1.0, 0.0, 0.25, 0.0, 4.0], dtype=torch.float64))
     assert found.row.tolist() == [0, 2, 4]
     assert found.components == 3
-    assert_close(found.root, values.root[[0, 2, 4]] * torch.tensor([1.0, 0.5, 2.0]), atol=1e-15)
-    assert_close(found.geometry, values.geometry[[0, 2, 4]])
+    assert_close(found.weight_root, values.weight_root[[0, 2, 4]] * torch.tensor([1.0, 0.5, 2.0]), atol=1e-15)
+    assert_close(found.geometry_derivatives, values.geometry_derivatives[[0, 2, 4]])
 
 
 def test_repeats_as_one_row_come_to_the_same_normal_equations() -> None:
@@ -52,8 +52,10 @@ def test_repeats_as_one_row_come_to_the_same_normal_equations() -> None:
     values = replace(
         values_of(7),
         row=pose,
-        geometry=values_of(4).geometry[pose, :, :1].expand(-1, -1, len(problem.active)),
-        joints=torch.cat([own.joints, own.joints[..., :1]], -1)[pose],
+        geometry_derivatives=values_of(4)
+        .geometry_derivatives[pose, :, :1]
+        .expand(-1, -1, len(problem.active)),
+        joint_derivatives=torch.cat([own.joint_derivatives, own.joint_derivatives[..., :1]], -1)[pose],
     )
     design = Design(problem, (FourierSeries(robot, 1),))
     collapsed = values.merge_repeats(torch.arange(problem.q.shape[0]))
@@ -62,10 +64,10 @@ def test_repeats_as_one_row_come_to_the_same_normal_equations() -> None:
     assert_close(few.normal, many.normal, atol=1e-11)
     assert_close(few.descent, many.descent, atol=1e-11)
     assert (few.sensors[0].values, many.sensors[0].values) == (12.0, 21.0)
-    mean = torch.stack([values.residual[pose == k].T @ values.root[pose == k] ** 2 for k in range(4)])
-    total = torch.stack([(values.root[pose == k] ** 2).sum() for k in range(4)])
-    assert_close(few.square[0], float((mean.square().sum(1) / total).sum()), rtol=1e-12)
-    assert few.square[0] < many.square[0]
+    mean = torch.stack([values.residual[pose == k].T @ values.weight_root[pose == k] ** 2 for k in range(4)])
+    total = torch.stack([(values.weight_root[pose == k] ** 2).sum() for k in range(4)])
+    assert_close(few.squared_values[0], float((mean.square().sum(1) / total).sum()), rtol=1e-12)
+    assert few.squared_values[0] < many.squared_values[0]
 
 
 def test_repeats_whose_joint_values_encoders_read_are_one_row() -> None:
@@ -98,7 +100,7 @@ def test_other_sights_of_a_pose_are_no_repeats() -> None:
     collapsed = values.merge_repeats(problem.pose)
     assert len(values.row) == 120
     assert len(collapsed.row) == 60
-    assert_close(collapsed.root, torch.full((60,), 2.0).double().sqrt(), atol=1e-12)
+    assert_close(collapsed.weight_root, torch.full((60,), 2.0).double().sqrt(), atol=1e-12)
     design = Design(problem.with_active(range(30)), (FourierSeries(robot, 1),))
     many, few = (sums_of(design, one) for one in (values, collapsed))
     assert_close(few.normal, many.normal, atol=1e-10)
@@ -124,10 +126,10 @@ def test_three_identical_targets_of_a_configuration_count_as_one() -> None:
     copies = alike(3)
     found = copies.downweight_correlated(torch.arange(8).repeat_interleave(3))
     assert_close(found.repeat_variance_factor, 3.0, rtol=1e-12)
-    assert_close(found.root, copies.root / 3**0.5, rtol=1e-12)
+    assert_close(found.weight_root, copies.weight_root / 3**0.5, rtol=1e-12)
     one = values_of(8)
-    weight = found.root.square().view(8, 3).sum(1)
-    assert_close(weight, one.root.square(), rtol=1e-12)
+    weight = found.weight_root.square().view(8, 3).sum(1)
+    assert_close(weight, one.weight_root.square(), rtol=1e-12)
     assert_close(found.residual, copies.residual)
 
 
@@ -141,7 +143,7 @@ def test_identical_targets_come_to_the_regression_of_one() -> None:
     many, single = (NormalEquations.from_rows(design, one) for one in rows)
     assert_close(many.normal, single.normal, rtol=1e-12)
     assert_close(many.descent, single.descent, rtol=1e-12, atol=1e-12)
-    assert_close(many.square[0], single.square[0], rtol=1e-12)
+    assert_close(many.squared_values[0], single.squared_values[0], rtol=1e-12)
     assert_close(many.sensors[0].values, 24.0, rtol=1e-12)
     assert single.sensors[0].values == 24.0
     prior = design.prior((1.0,) * 4)
@@ -152,7 +154,7 @@ def test_identical_targets_come_to_the_regression_of_one() -> None:
 
 def test_targets_with_independent_errors_have_full_weight() -> None:
     values = values_of(3_000)
-    values = replace(values, residual=values.residual / values.root[:, None])
+    values = replace(values, residual=values.residual / values.weight_root[:, None])
     independent = values.downweight_correlated(torch.arange(1_000).repeat_interleave(3))
     assert 1.0 <= independent.repeat_variance_factor < 1.1
     opposite = alike(2)
@@ -165,7 +167,7 @@ def test_exact_values_pairs_and_single_targets_have_full_weight() -> None:
     copies, configuration = alike(3), torch.arange(8).repeat_interleave(3)
     certain = replace(copies, certain=True)
     assert certain.downweight_correlated(configuration) is certain
-    pair = replace(copies, other_row=copies.row, other_joints=copies.joints)
+    pair = replace(copies, other_row=copies.row, other_joint_derivatives=copies.joint_derivatives)
     assert pair.downweight_correlated(configuration) is pair
     none = copies.select(slice(0, 0))
     assert none.downweight_correlated(configuration) is none

@@ -38,7 +38,7 @@ def test_rows_of_a_group_are_never_parted(arm: LinearisedArm) -> None:
 def test_what_is_certain_is_not_held_out(arm: LinearisedArm) -> None:
     certain = replace(arm.rows, values=(arm.rows.values[0], replace(arm.rows.values[1], certain=True)))
     groups = torch.tensor([3, 4, 20])
-    position, rotation = certain.held_out(groups).values
+    position, rotation = certain.held_out_rows(groups).values
     assert_close(position.residual, certain.select_groups(groups).values[0].residual)
     assert len(rotation.row) == 0
     assert rotation.residual.shape == (0, 3)
@@ -63,7 +63,7 @@ def test_repeats_of_a_pose_count_as_one_row_with_their_weight(arm: LinearisedArm
     """40 poses, ten of them measured twice."""
     for sensor in arm.rows.values:
         assert len(sensor.row) == 40
-        assert sorted(sensor.root.square().round().tolist()) == [1.0] * 30 + [2.0] * 10
+        assert sorted(sensor.weight_root.square().round().tolist()) == [1.0] * 30 + [2.0] * 10
     assert [one.values for one in arm.rows.sensors] == [120.0, 120.0]
 
 
@@ -72,9 +72,9 @@ def test_residuals_are_counted_from_nominal_and_no_correction(arm: LinearisedArm
     robot, problem = arm.rows.problem.space.robot, arm.rows.problem
     design = Design(problem, (FourierSeries(robot, 2),))
     x = 1e-4 * torch.randn(design.unknowns, generator=torch.Generator().manual_seed(2)).double()
-    point = problem.nominal.index_add(0, problem.active, x[: design.active])
+    point = problem.nominal.index_add(0, problem.active, x[: design.active_count])
     values = sensor_values(problem, point, correction_from_weights(design, x))
-    weights = [torch.ones_like(sensor.root) for sensor in values]
+    weights = [torch.ones_like(sensor.weight_root) for sensor in values]
     bare = replace(problem, pose=None)
     found = Rows.from_linearisation(replace(design, problem=bare), x, values, weights, arm.rows.group)
     for there, sensor in zip(values, found.values, strict=True):
@@ -89,10 +89,10 @@ def test_rows_agree_as_far_as_their_weighted_residuals_are_equal(arm: Linearised
     x = 1e-4 * torch.randn(design.unknowns, generator=torch.Generator().manual_seed(2)).double()
     first, second = arm.rows.values
     off = replace(arm.rows, values=(replace(first, residual=first.residual + 2e-5), second))
-    expected = float((first.root.square() * 3 * 4e-10).sum()) / 1e-10
+    expected = float((first.weight_root.square() * 3 * 4e-10).sum()) / 1e-10
     assert_close(off.squared_difference(arm.rows, x, design, (1e-5, 1e-4)), expected, rtol=1e-9)
-    heavier = replace(arm.rows, values=(replace(first, root=2 * first.root), second))
-    left = (first.residual - first.geometry @ x) * first.root[:, None]
+    heavier = replace(arm.rows, values=(replace(first, weight_root=2 * first.weight_root), second))
+    left = (first.residual - first.geometry_derivatives @ x) * first.weight_root[:, None]
     expected = float(left.square().sum()) / 1e-10
     assert_close(heavier.squared_difference(arm.rows, x, design, (1e-5, 1e-4)), expected, rtol=1e-9)
     fewer = arm.rows.select_groups(torch.arange(39))
@@ -103,7 +103,10 @@ def test_far_off_rows_count_less_and_squared_loss_counts_all_alike(arm: Linearis
     problem, (first, second) = arm.rows.problem, arm.rows.values
     residual = 3e-5 * torch.randn(40, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     residual[7] += 5e-3
-    values = (replace(first, residual=residual, root=torch.ones(40).double()), replace(second, certain=True))
+    values = (
+        replace(first, residual=residual, weight_root=torch.ones(40).double()),
+        replace(second, certain=True),
+    )
     robust, certain = robust_weights(replace(problem, loss=HampelLoss()), values, 20.0)
     assert float(robust[7]) == 0.0
     assert float(robust[torch.arange(40) != 7].mean()) > 0.97

@@ -54,7 +54,7 @@ def test_geometry_is_the_first_line_and_the_unit(series: LinearisedArm) -> None:
     (line,) = search.trials
     assert (line.name, line.held_out_ratio, line.kept) == ("geometry", 1.0, True)
     assert search.geometry.name == "geometry"
-    assert line.unknowns == search.geometry.design.active
+    assert line.unknowns == search.geometry.design.active_count
     alone = series.fitted(())
     assert_close(search.geometry.posterior.log_evidence, alone.posterior.log_evidence, atol=0.5)
 
@@ -116,7 +116,7 @@ def test_few_rows_are_fitted_with_all_features_from_usual_sizes() -> None:
     *before, together, wider = search.trials
     assert not wider.kept  # the geometry is nominal here
     assert together.log_evidence > max(line.log_evidence for line in before) + CLEAR_EVIDENCE
-    assert together.held_out_ratio < 0.7 * min(line.held_out for line in before if line.kept)
+    assert together.held_out_ratio < 0.7 * min(line.held_out_ratio for line in before if line.kept)
 
 
 def test_what_does_not_help_leaves_the_geometry() -> None:

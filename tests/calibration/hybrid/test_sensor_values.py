@@ -121,12 +121,12 @@ def test_derivatives_are_those_of_the_residuals(name: str, shifted: bool) -> Non
     for j in range(q.shape[1]):
         numeric = differences(lambda moved: residuals(problem, point, moved), q, 1e-3, (slice(None), j))
         for sensor, expected in zip(values, numeric, strict=True):
-            assert_close(sensor.joints[..., j], expected, atol=1e-9)
+            assert_close(sensor.joint_derivatives[..., j], expected, atol=1e-9)
     some = torch.randperm(len(point), generator=torch.Generator().manual_seed(5))[:15]
     for i in some.tolist():
         numeric = differences(lambda moved: residuals(problem, moved, q), point, 1e-3, i)
         for sensor, expected in zip(values, numeric, strict=True):
-            assert_close(sensor.geometry[..., i], expected, atol=1e-8)
+            assert_close(sensor.geometry_derivatives[..., i], expected, atol=1e-8)
 
 
 @pytest.mark.parametrize("name", ["panda", "sliding"])
@@ -141,7 +141,7 @@ def test_joint_derivatives_are_those_of_the_forward_kinematics(name: str) -> Non
         (numeric,) = differences(
             lambda moved: [-forward_kinematics(robot, moved)[:, :3, 3]], q, 1e-3, (slice(None), j)
         )
-        assert_close(values.joints[..., j], numeric, atol=1e-9)
+        assert_close(values.joint_derivatives[..., j], numeric, atol=1e-9)
 
 
 @pytest.mark.parametrize("name", sorted(CASES))
@@ -156,7 +156,7 @@ def test_columns_are_the_derivative_by_the_weights(name: str) -> None:
     problem, point = case(name, correction_from_weights(empty, weights))
     design = Design(problem, chosen)
     values = sensor_values(problem, point, correction_from_weights(empty, weights))
-    assert design.unknowns == design.active + len(weights)
+    assert design.unknowns == design.active_count + len(weights)
 
     def at(moved: Tensor) -> list[Tensor]:
         return residuals(problem, point, problem.q + empty.correction(moved, problem.state))
@@ -164,7 +164,7 @@ def test_columns_are_the_derivative_by_the_weights(name: str) -> None:
     columns = [design.columns(sensor, slice(None)) for sensor in values]
     for k in torch.randperm(len(weights), generator=generator)[:8].tolist():
         for X, expected in zip(columns, differences(at, weights, 1e-3, k), strict=True):
-            assert_close(X[..., design.active + k], expected, atol=1e-9)
+            assert_close(X[..., design.active_count + k], expected, atol=1e-9)
 
 
 def test_columns_of_pairs_are_the_derivative_by_the_weights() -> None:
@@ -191,9 +191,9 @@ def test_given_standard_deviations_are_the_rows_roots() -> None:
     problem = GeometricCalibrator(robot).build(replace(data, sigma_position=sigma)).problem
     values = sensor_values(problem.with_active([0, 1]), problem.nominal)
     found = {sensor.name: sensor for sensor in values}
-    assert_close(found["position"].root, 1 / sigma[problem_rows(problem, data)], rtol=1e-12)
+    assert_close(found["position"].weight_root, 1 / sigma[problem_rows(problem, data)], rtol=1e-12)
     assert (found["position"].has_stated_noise, found["rotation"].has_stated_noise) == (True, False)
-    assert_close(found["rotation"].root, torch.ones(data.rows))
+    assert_close(found["rotation"].weight_root, torch.ones(data.rows))
 
 
 def problem_rows(problem: CalibrationProblem, data: Measurements) -> Tensor:

@@ -104,7 +104,7 @@ def uncertainty(arm: LinearisedArm) -> tuple[PositionUncertainty, FeatureFit, Jo
     robot = arm.rows.problem.space.robot
     fitted = arm.fitted((GravityTorques(robot), FourierSeries(robot, 1)), 5)
     problem = arm.rows.problem
-    point = problem.nominal.index_add(0, problem.active, fitted.posterior.x[: fitted.design.active])
+    point = problem.nominal.index_add(0, problem.active, fitted.posterior.x[: fitted.design.active_count])
     known = identified_geometry(arm.setup, point)
     found = position_uncertainty(
         arm.rows, fitted.design, NormalEquations.from_rows(fitted.design, arm.rows), fitted.posterior, known
@@ -155,7 +155,7 @@ def test_deviation_is_that_of_the_derivative_by_all_unknowns(arm: LinearisedArm)
         )
     predicted(parameters, weights)
     J = torch.stack(columns, -1)
-    expected = (J @ found.root).square().sum(-1).sqrt()
+    expected = (J @ found.dense_root).square().sum(-1).sqrt()
     got = found.sigma(test, correction)
     assert_close(got, expected, rtol=1e-5)
     assert float(got.min()) > 1e-6

@@ -63,9 +63,9 @@ def test_without_some_groups_it_is_that_of_the_others(name: str) -> None:
     assert_close(values[0], values[1], rtol=1e-6)
     assert_close(found.X, expected.X)
     assert_close(found.y, expected.y)
-    covariance, X = found._covariance(case.prior, case.noise), expected.X[:, case.design.active :]
+    covariance, X = found._covariance(case.prior, case.noise), expected.X[:, case.design.active_count :]
     sigma = torch.tensor(case.noise, dtype=torch.float64)[expected.sensor]
-    wanted = X / case.prior.precision[case.design.active :] @ X.t() + torch.diag(sigma.square())
+    wanted = X / case.prior.precision[case.design.active_count :] @ X.t() + torch.diag(sigma.square())
     assert_close(covariance, wanted.triu(), atol=1e-12 * float(wanted.abs().max()))
 
 

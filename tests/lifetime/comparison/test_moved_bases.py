@@ -100,7 +100,7 @@ def test_frame_whose_base_was_not_determined_is_not_compared():
         known = posterior("left", own_fit(0, 0, "hall"))
         found = frames_of_model(model(0, 0), rows_now(0, 0, STILL, ""), "base")
     assert ArmBefore(known, STILL, found).frames == ("hall",)
-    root = known.root.clone()
+    root = known.covariance_root.clone()
     root[known.base_rows("hall")[0]] = 0.0
     held = replace(known.uncertainty, covariance_root=CovarianceRoot(root))
     arm = ArmBefore(replace(known, uncertainty=held), STILL, found)

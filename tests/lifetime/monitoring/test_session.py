@@ -29,10 +29,10 @@ def test_the_joint_that_moved_is_named_from_five_poses(joint):
     degrees = 0.05 if joint < 4 else 0.5  # nearer to the reflector
     session, zeros = judged(rows_after_change(5, 20 + joint, moved_joint(joint, degrees)))
     assert session.verdict == "moved"
-    assert [one.what for one in session.moved] == [f"joint {joint}"]
-    low, high = session.moved[0].interval
+    assert [one.what for one in session.movements] == [f"joint {joint}"]
+    low, high = session.movements[0].interval
     assert low < degrees < high
-    assert session.moved[0].probability > 0.9
+    assert session.movements[0].probability > 0.9
     assert session.unchanged_probability < 0.01
     assert abs(float(zeros.shift[joint - 1]) - math.radians(degrees)) < 4 * float(zeros.sigma[joint - 1])
 
@@ -58,7 +58,7 @@ def test_a_wrong_row_is_not_mistaken_for_a_movement(joint):
     wrong[4, 1] += 0.005
     session, _ = judged(replace(rows, position=wrong))
     assert session.outliers == (rows.place(4),)
-    assert [one.what for one in session.moved] == (["joint 3"] if joint else [])
+    assert [one.what for one in session.movements] == (["joint 3"] if joint else [])
     assert_close(session.rms, judged(rows.select(torch.tensor([0, 1, 2, 3, 5, 6, 7, 8, 9])))[0].rms, rtol=0.1)
 
 
@@ -76,14 +76,14 @@ def test_a_wrong_reading_of_a_repeated_pose_is_named_and_left_out():
 def test_two_joints_that_moved_are_both_named():
     both = tuple(a + b for a, b in zip(moved_joint(2, 0.2), moved_joint(5, -0.3), strict=True))
     session, _ = judged(rows_after_change(12, 4, both))
-    assert {one.what for one in session.moved} == {"joint 2", "joint 5"}
+    assert {one.what for one in session.movements} == {"joint 2", "joint 5"}
 
 
 @pytest.mark.parametrize("joint", [0, 3])
 def test_a_moved_instrument_is_distinguished_from_a_joint(joint):
     session, _ = judged(rows_after_change(12, 5, moved_joint(joint, 0.1), ELSEWHERE))
     expected = ["joint 3"] if joint else []
-    assert [one.what for one in session.moved] == [*expected, "base", "base"]
+    assert [one.what for one in session.movements] == [*expected, "base", "base"]
     assert session.recalibrate == bool(joint)
     assert "base" in session.relocated_frames
     assert not session.observable[0]
@@ -93,14 +93,14 @@ def test_a_moved_instrument_is_distinguished_from_a_joint(joint):
 
 def test_a_small_motion_of_the_base_is_not_mistaken_for_a_joint():
     session, _ = judged(rows_after_change(10, 6, base=(3e-4, -2e-4, 4e-4, 0.0, 0.0, 0.0)))
-    assert {one.what for one in session.moved} == {"base"}
+    assert {one.what for one in session.movements} == {"base"}
     assert not session.recalibrate
 
 
 def test_moved_frames_can_be_stated():
     session, _ = judged(rows_after_change(12, 5), frozenset({("base", "")}))
     assert session.relocated_frames == ("base",)
-    assert all(one.what == "base" for one in session.moved)
+    assert all(one.what == "base" for one in session.movements)
 
 
 def test_scores_are_as_large_as_expected_where_nothing_changes():
@@ -119,6 +119,6 @@ def test_only_the_part_of_a_tool_that_moved_is_named():
     session, _ = judged(rows_after_change(10, 3))
     origin = Movement("tool", 30.0, 0.01, "mm", 0.999)
     still = Movement("tool", 0.0, 0.0001, "deg", 0.999)
-    both = replace(session, moved=(origin, still))
-    assert both.sentence == replace(session, moved=(origin,)).sentence
-    assert replace(session, moved=(still,)).sentence != both.sentence
+    both = replace(session, movements=(origin, still))
+    assert both.sentence == replace(session, movements=(origin,)).sentence
+    assert replace(session, movements=(still,)).sentence != both.sentence

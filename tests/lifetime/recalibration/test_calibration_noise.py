@@ -57,9 +57,9 @@ def test_a_move_is_found_whatever_states_its_noise(models, of_model, of_rows):
     with no_type_checker():
         session = monitor(models[of_model], [rows], MonitorSettings(history=False)).sessions[-1].session
         recalibrated = recalibrate(models[of_model], rows)
-    assert [one.what for one in session.moved] == ["joint 3"]
+    assert [one.what for one in session.movements] == ["joint 3"]
     assert all(session.observable)
-    assert_close(session.moved[0].shift, MOVED_DEG, atol=0.005)
+    assert_close(session.movements[0].shift, MOVED_DEG, atol=0.005)
     assert [one.what for one in recalibrated.moved] == ["joint 3"]
     assert recalibrated.summary.kept == "recalibrated"
     found = recalibrated.model.uncertainty.noise
@@ -97,7 +97,7 @@ def test_rows_without_standard_deviations_are_refused_where_an_older_folder_has_
     stated = rows_with(SIGMA, 12, 3, zero=MOVED_DEG)
     with no_type_checker():
         session = monitor(older, [stated], MonitorSettings(history=False)).sessions[-1].session
-        assert [one.what for one in session.moved] == ["joint 3"]
+        assert [one.what for one in session.movements] == ["joint 3"]
         for judge in (
             lambda rows: monitor(older, [rows], MonitorSettings(history=False)),
             lambda rows: recalibrate(older, rows),
@@ -112,7 +112,7 @@ def test_an_older_folder_with_a_standard_deviation_takes_rows_of_both_kinds(mode
         rows = rows_with(sigma, 12, 3, zero=MOVED_DEG)
         with no_type_checker():
             session = monitor(older, [rows], MonitorSettings(history=False)).sessions[-1].session
-        assert [one.what for one in session.moved] == ["joint 3"]
+        assert [one.what for one in session.movements] == ["joint 3"]
 
 
 @pytest.mark.parametrize("value", [0.02, 0.3, 1.0, 4.0])

@@ -41,7 +41,7 @@ def test_the_model_is_the_same_after_writing_and_reading(tmp_path):
     assert_close(poses_of_rows(loaded, test), poses_of_rows(model, test))
     errors = adaptation.errors_of(test)["position"]
     assert_close(test.position - poses_of_rows(model, test)[:, :3, 3], errors, atol=1e-12)
-    assert_close(loaded.uncertainty.root, model.uncertainty.root)
+    assert_close(loaded.uncertainty.dense_root, model.uncertainty.dense_root)
     assert loaded.uncertainty.noise == model.uncertainty.noise
     again = ModelPosterior.from_model(loaded)
     assert_close(again.weights, ModelPosterior.from_model(model).weights, atol=1e-12)
@@ -63,8 +63,8 @@ def test_moved_frames_move_the_geometric_calibration_as_well():
     assert_close(model.robot.base, model.bases[""])
     known = len(before.uncertainty.space.parameters)
     assert_close(
-        (model.uncertainty.root[known:] @ model.uncertainty.root[known:].t()).diagonal(),
-        (before.uncertainty.root[known:] @ before.uncertainty.root[known:].t()).diagonal(),
+        (model.uncertainty.dense_root[known:] @ model.uncertainty.dense_root[known:].t()).diagonal(),
+        (before.uncertainty.dense_root[known:] @ before.uncertainty.dense_root[known:].t()).diagonal(),
         rtol=1e-5,
     )
 

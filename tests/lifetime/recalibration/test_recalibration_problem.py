@@ -32,13 +32,18 @@ def test_the_prior_is_the_posterior_of_the_model():
     posterior = ModelPosterior.from_model(model)
     problem = recalibration_problem(model, posterior, rows, frozenset())
     parameters = len(posterior.space.parameters)
-    back = torch.cat([problem.coordinate_change @ problem.root[:parameters], problem.root[parameters:]])
-    assert_close(back, posterior.root, atol=1e-12)
+    back = torch.cat(
+        [
+            problem.coordinate_change @ problem.covariance_root[:parameters],
+            problem.covariance_root[parameters:],
+        ]
+    )
+    assert_close(back, posterior.covariance_root, atol=1e-12)
     elsewhere = recalibration_problem(model, posterior, rows, {("base", "")})
     base = elsewhere.design.problem.space.indices_of("base")
-    assert not elsewhere.root[base.start : base.stop].any()
+    assert not elsewhere.covariance_root[base.start : base.stop].any()
     assert [group.what for group in elsewhere.groups if group.fixed_size] == ["base"]
     still = problem.with_fixed_arm()
-    assert still.root.shape[1] == 0
+    assert still.covariance_root.shape[1] == 0
     assert still.groups == ()
-    assert_close(still.fixed_root, problem.root)
+    assert_close(still.fixed_root, problem.covariance_root)

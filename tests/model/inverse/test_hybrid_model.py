@@ -137,7 +137,7 @@ def test_a_folder_predicts_the_same_to_the_last_bit(hybrid, tmp_path):
     posterior, kept = parameter_posterior(model), parameter_posterior(loaded)
     assert (kept.names, kept.weight_count) == (posterior.names, posterior.weight_count)
     assert torch.equal(kept.mean, posterior.mean)
-    assert torch.equal(kept.root, posterior.root)
+    assert torch.equal(kept.covariance_root, posterior.covariance_root)
     assert np.array_equal(loaded.robot.dh, model.robot.dh)
     assert np.array_equal(loaded.robot.limits, model.robot.limits)
     assert loaded.branches == model.branches
@@ -152,12 +152,12 @@ def test_a_folder_predicts_the_same_to_the_last_bit(hybrid, tmp_path):
 
 def test_a_folder_with_a_rounded_root(tmp_path):
     arm, rounded = model_of("products")
-    root = CovarianceRoot(arm.result.uncertainty.root)
+    root = CovarianceRoot(arm.result.uncertainty.dense_root)
     exact = replace(rounded, uncertainty=replace(rounded.uncertainty, covariance_root=root))
     save_model(rounded, tmp_path)
     loaded = load_model(tmp_path)
     assert loaded.uncertainty.covariance_root.rounded is not None
-    assert torch.equal(loaded.uncertainty.root, rounded.uncertainty.root)
+    assert torch.equal(loaded.uncertainty.dense_root, rounded.uncertainty.dense_root)
     q = everywhere(arm)
     assert torch.equal(loaded.forward(q), exact.forward(q))
     assert torch.equal(position_accuracy(loaded, q), position_accuracy(rounded, q))
@@ -176,7 +176,7 @@ def test_without_a_correction_it_is_the_geometric_model(tmp_path):
     arm, _ = model_of("additive")
     known = arm.result.uncertainty
     size = len(known.space.parameters)
-    bare = replace(known, features=(), covariance_root=CovarianceRoot(known.root[:size]))
+    bare = replace(known, features=(), covariance_root=CovarianceRoot(known.dense_root[:size]))
     result = replace(arm.result, learned=None, uncertainty=bare)
     model = model_of_hybrid("geometric", arm.true.nominal, result, arm.measurements)
     assert (model.kind, model.hybrid) == ("geometric_calibration", None)

@@ -111,10 +111,10 @@ class BaseToolProblem(AbstractLeastSquares[BaseToolState]):
         return (turn * self.has_rotation).t()
 
     def linearise(
-        self, point: BaseToolState, like: Linearisation[BaseToolState] | None
+        self, point: BaseToolState, with_noise_of: Linearisation[BaseToolState] | None
     ) -> Linearisation[BaseToolState]:
         """Sum the normal equations of positions and of rotations separately."""
-        noise = (1.0, 1.0) if like is None else _view_of(like).noise
+        noise = (1.0, 1.0) if with_noise_of is None else _view_of(with_noise_of).noise
         R_base_flange = point.R_base @ self.R_flange
         blocks = [(self._shifts(point, R_base_flange), self.position_residual(point), self.sigma_position)]
         if self.has_rotations:

@@ -67,8 +67,8 @@ class AbstractLeastSquares(ABC, Generic[Point]):
     """Interface of least-squares problems for the solver."""
 
     @abstractmethod
-    def linearise(self, point: Point, like: Linearisation[Point] | None) -> Linearisation[Point]:
-        """Linearise the problem at a point with the noise of `like`, or with a default noise if None."""
+    def linearise(self, point: Point, with_noise_of: Linearisation[Point] | None) -> Linearisation[Point]:
+        """Linearise the problem at a point with the noise of `with_noise_of`, or with a default noise if None."""
 
     def linearise_at_start(self, point: Point) -> Linearisation[Point]:
         """Linearise the problem at a start, with the noise estimated from its residuals."""
@@ -100,17 +100,19 @@ class Solution(Generic[Point]):
         linearisation: the problem linearised at the best point, with the noise estimated there.
         iterations: number of steps tried.
         status: reason why the search ended.
-        path: size of the residuals at the start and at every accepted point; see `AbstractLeastSquares.rms`.
+        rms_path: size of the residuals at the start and at every accepted point; see `AbstractLeastSquares.rms`.
     """
 
     linearisation: Linearisation[Point]
     iterations: int
     status: SolutionStatus
-    path: tuple[float, ...]
+    rms_path: tuple[float, ...]
 
     def continued_by(self, other: "Solution[Point]") -> "Solution[Point]":
         """Return the result of a search that continued this one, with the iterations and the path of both."""
-        return replace(other, iterations=self.iterations + other.iterations, path=self.path + other.path[1:])
+        return replace(
+            other, iterations=self.iterations + other.iterations, rms_path=self.rms_path + other.rms_path[1:]
+        )
 
 
 def levenberg_marquardt(

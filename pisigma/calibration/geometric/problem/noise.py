@@ -37,20 +37,20 @@ class SensorContribution:
         descent: `Σ w J r / sigma_row²`, the right-hand side of the normal equations.
         residual: measured minus predicted values [m or rad]; 0 in rows without a value.
         distance: length of the residual divided by sigma_row; 0 in rows without a value.
-        measured: number of measured rows.
+        measured_rows: number of measured rows.
     """
 
     normal: Float64[Tensor, "active active"]
     descent: Float64[Tensor, " active"]
     residual: Float64[Tensor, "components rows"]
     distance: Float64[Tensor, " rows"]
-    measured: int
+    measured_rows: int
 
     @property
     def rms(self) -> Float64[Tensor, ""]:
         """Root mean square length of the residuals [m or rad]."""
         size: Tensor = torch.linalg.vector_norm(self.residual)
-        return size / math.sqrt(max(self.measured, 1))
+        return size / math.sqrt(max(self.measured_rows, 1))
 
 
 def joined_contributions(chunks: Sequence[SensorContribution]) -> SensorContribution:
@@ -63,7 +63,7 @@ def joined_contributions(chunks: Sequence[SensorContribution]) -> SensorContribu
         descent=torch.stack([part.descent for part in chunks]).sum(0),
         residual=torch.cat([part.residual for part in chunks], 1),
         distance=torch.cat([part.distance for part in chunks]),
-        measured=first.measured,
+        measured_rows=first.measured_rows,
     )
 
 
@@ -148,7 +148,7 @@ def loss_scale(
             scales.append(torch.ones_like(effective_parameters[k]))
             continue
         distance = view.contributions[k].distance
-        if view.contributions[k].measured < len(distance):
+        if view.contributions[k].measured_rows < len(distance):
             distance = distance[sensor.present]
         if refine:
             scale = loss.sigma(distance, sensor.components, effective_parameters[k], view.scales[k])

@@ -59,7 +59,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         active: indices of the free parameters.
         pose: index of every row's pose (joint values, frame, target); None if no pose is repeated.
         configuration: index of every row's joint values and frame; None if no configuration has several targets.
-        pairs: number of pairs of rows that are measured together, which come first.
+        pair_count: number of pairs of rows that are measured together, which come first.
         stated_conditions: conditions stated in the rows (see `JointState`), for corrections that depend on them.
         prior_scaling: "stated": prior scales are 1; "widened": at least 1; "estimated": estimated without bounds.
         held_directions: directions along which the search does not move, because the rows do not determine them.
@@ -77,7 +77,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
     active: Int64[Tensor, " active"]
     pose: Int64[Tensor, " rows"] | None = None
     configuration: Int64[Tensor, " rows"] | None = None
-    pairs: int = 0
+    pair_count: int = 0
     stated_conditions: Mapping[str, Tensor] = field(default_factory=dict)
     prior_scaling: PriorScaling = "widened"
     held_directions: HeldDirections | None = None
@@ -118,9 +118,9 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
 
     def with_partners(self, rows: Int64[Tensor, " chosen"]) -> Int64[Tensor, " _rows"]:
         """Return rows with the other rows of their pairs, in ascending order if there are pairs."""
-        if not self.pairs:
+        if not self.pair_count:
             return rows
-        partner = torch.where(rows < 2 * self.pairs, rows ^ 1, rows)
+        partner = torch.where(rows < 2 * self.pair_count, rows ^ 1, rows)
         both: Tensor = torch.unique(torch.cat([rows, partner]))
         return both
 
@@ -135,7 +135,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
             sensors=tuple(sensor.select(rows) for sensor in self.sensors),
             pose=None if self.pose is None else renumber(self.pose[rows]),
             configuration=None if self.configuration is None else renumber(self.configuration[rows]),
-            pairs=int((rows < 2 * self.pairs).sum()) // 2,
+            pair_count=int((rows < 2 * self.pair_count).sum()) // 2,
             stated_conditions={name: values[rows] for name, values in self.stated_conditions.items()},
             memory=MotionMemory(),
         )
@@ -153,9 +153,9 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         """Return the RMS residual length of the first sensor [m or rad]."""
         return sensor_view_of(linearisation).contributions[0].rms
 
-    def linearise(self, point: Tensor, like: Linearisation[Tensor] | None) -> Linearisation[Tensor]:
-        """Sum the normal equations, with rows weighted by the noise of `like`, or equally if None."""
-        before = None if like is None else sensor_view_of(like)
+    def linearise(self, point: Tensor, with_noise_of: Linearisation[Tensor] | None) -> Linearisation[Tensor]:
+        """Sum the normal equations, with rows weighted by the noise of `with_noise_of`, or equally if None."""
+        before = None if with_noise_of is None else sensor_view_of(with_noise_of)
         unknowns = self.space.sensor_unknowns(point)
         chunks = []
         for rows in self.chunks():

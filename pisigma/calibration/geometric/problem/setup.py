@@ -56,7 +56,7 @@ class CalibrationSetup:
         problem: the problem, not yet with free parameters.
         start: start values of all parameters.
         anchors: frames to which bases and tools are relative.
-        rows: indices of the problem's rows in the measurements, in the order of the problem.
+        row_indices: indices of the problem's rows in the measurements, in the order of the problem.
         unknown_frames: index of every owner's frame, by group of the sensors' unknowns.
         free_unknowns: indices of the sensors' unknowns to identify, such as positions of sockets.
         measurements: the rows of the problem, in the order of the problem.
@@ -67,7 +67,7 @@ class CalibrationSetup:
     problem: CalibrationProblem
     start: Float64[Tensor, " parameters"]
     anchors: Anchors
-    rows: Tensor
+    row_indices: Tensor
     unknown_frames: Mapping[str, Int64[Tensor, " owners"]]
     free_unknowns: list[int]
     measurements: Measurements
@@ -194,7 +194,7 @@ def setup_from_guess(
         active=torch.zeros(0, dtype=torch.int64, device=device),
         pose=number_repeats(repeats, frame, target),
         configuration=number_repeats(repeats, frame) if len(space.targets) > 1 else None,
-        pairs=len(set(measurements.pair or ()) - {""}),
+        pair_count=len(set(measurements.pair or ()) - {""}),
         stated_conditions=JointState.from_measurements(measurements).stated,
         prior_scaling=options.prior_scaling,
     )

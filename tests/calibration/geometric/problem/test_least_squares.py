@@ -27,7 +27,7 @@ class Curve(AbstractLeastSquares[torch.Tensor]):
     offset: float = 0.0
 
     def linearise(
-        self, point: torch.Tensor, like: Linearisation[torch.Tensor] | None
+        self, point: torch.Tensor, with_noise_of: Linearisation[torch.Tensor] | None
     ) -> Linearisation[torch.Tensor]:
         x, y = point.tolist()
         r = torch.tensor([self.steepness * (x * x - y), x - 1, self.offset], dtype=torch.float64) / SIGMA
@@ -52,9 +52,9 @@ class Swinging(AbstractLeastSquares[torch.Tensor]):
     """A length measured by two sensors, of which now one and now the other is believed."""
 
     def linearise(
-        self, point: torch.Tensor, like: Linearisation[torch.Tensor] | None
+        self, point: torch.Tensor, with_noise_of: Linearisation[torch.Tensor] | None
     ) -> Linearisation[torch.Tensor]:
-        believed = 1.0 if like is None else float(like.detail)
+        believed = 1.0 if with_noise_of is None else float(with_noise_of.detail)
         r = torch.stack([point[0] - believed, torch.ones(()).double()])
         return Linearisation(point, r @ r, -r[:1], torch.eye(1).double(), r @ r, ROUNDING, believed)
 
@@ -85,9 +85,9 @@ def test_curved_valleys_are_followed(steepness: float) -> None:
 
 def test_the_best_point_is_kept_and_costs_fall() -> None:
     solution = levenberg_marquardt(Curve(100.0), START)
-    assert list(solution.path) == sorted(solution.path, reverse=True)
-    assert len(solution.path) > 2
-    assert_close(solution.linearisation.cost.sqrt(), solution.path[-1], rtol=1e-12)
+    assert list(solution.rms_path) == sorted(solution.rms_path, reverse=True)
+    assert len(solution.rms_path) > 2
+    assert_close(solution.linearisation.cost.sqrt(), solution.rms_path[-1], rtol=1e-12)
 
 
 def test_a_remaining_residual_ends_by_convergence() -> None:
