@@ -96,7 +96,7 @@ class UncertaintySection(Section):
             the products of inputs in its product units.
         prior_scale: see `pisigma.calibration.hybrid.uncertainty.PositionUncertainty`.
         noise: see `pisigma.calibration.hybrid.noise.CalibrationNoise`.
-        stated_noise: see `pisigma.calibration.hybrid.noise.CalibrationNoise.stated`.
+        stated_noise: see `pisigma.calibration.hybrid.noise.CalibrationNoise.median_stated_sigma`.
     """
 
     unknowns: tuple[UnknownsSection, ...] = ()
