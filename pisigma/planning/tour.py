@@ -44,7 +44,7 @@ class Pace:
         """Refuse values outside their valid range."""
         for option, speed, factor, unit in (
             ("speed", self.speed, math.degrees(1.0), "deg/s"),
-            ("slide", self.prismatic_speed, 1e3, "mm/s"),
+            ("prismatic_speed", self.prismatic_speed, 1e3, "mm/s"),
         ):
             if not _MIN_SPEED <= speed < math.inf:
                 expected, value = f"a speed >= {factor * _MIN_SPEED:.2g} {unit}", f"{factor * speed:g} {unit}"

@@ -116,7 +116,7 @@ def test_paths_with_several_waypoints_are_collision_free():
 
 
 def test_invalid_paces_are_refused():
-    for option, value in (("speed", "0 deg/s"), ("slide", "-250 mm/s"), ("settling", "-1 s")):
-        stated = {"speed": 0.0, "slide": -0.25, "settling": -1.0}[option]
+    for option, value in (("speed", "0 deg/s"), ("prismatic_speed", "-250 mm/s"), ("settling", "-1 s")):
+        stated = {"speed": 0.0, "prismatic_speed": -0.25, "settling": -1.0}[option]
         with refused(PlanningError, option=option, value=value):
             Pace(**{option: stated})

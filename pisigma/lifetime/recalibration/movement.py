@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import numpy as np
 import torch
 from jaxtyping import Float64
-from pydantic import BeforeValidator, Field, PlainSerializer
+from pydantic import AliasChoices, BeforeValidator, Field, PlainSerializer
 from torch import Tensor
 
 from pisigma.calibration.geometric.problem.setup import IdentifiedGeometry
@@ -39,7 +39,9 @@ class Movement:
 
     what: str
     shift: float
-    sigma: Annotated[float, Field(alias="deviation")]  # histories store the key
+    sigma: Annotated[
+        float, Field(validation_alias=AliasChoices("deviation", "sigma"), serialization_alias="deviation")
+    ]
     unit: ShownUnit
     probability: float | None = None
 

@@ -41,4 +41,4 @@ def test_images_of_other_classes_are_weighted_by_their_corners():
     rows = rows_of_phone(true, q[:30], random, 3, 1e-4)
     setup = GeometricCalibrator(Robot.load("so101"), robot_class="industrial").build(rows)
     (corners,) = (one for one in setup.problem.sensors if one.name == "corner")
-    assert_close(corners.whitening_matrix, setup.corner_sensor(setup.measurements).weight)
+    assert_close(corners.weight, setup.corner_sensor(setup.measurements).weight)
