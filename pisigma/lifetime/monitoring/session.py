@@ -17,7 +17,12 @@ from pisigma.estimation.drift import Drift, DriftGroup, LinearValues, PosteriorU
 from pisigma.estimation.wrong_rows import ExplainedRows, mark_wrong_rows
 from pisigma.files.errors import IdentificationError
 from pisigma.lifetime.recalibration.adaptation import AdaptedArm, linear_values, usual_noise
-from pisigma.lifetime.recalibration.movement import HistoryMovement, Movement, movements_of_group
+from pisigma.lifetime.recalibration.movement import (
+    HistoryMovement,
+    Movement,
+    is_frame,
+    movements_of_group,
+)
 from pisigma.lifetime.recalibration.recalibration_problem import (
     FrameKey,
     RecalibrationProblem,
@@ -380,11 +385,6 @@ def format_probability(probability: float | None) -> str:
     if probability is None:
         return "unknown"
     return "more than 99.9 %" if probability > 0.999 else f"{100 * probability:.1f} %"
-
-
-def is_frame(what: str) -> bool:
-    """Return whether `what` names a base or a tool."""
-    return what.split()[0] in ("base", "tool")
 
 
 def _rms(arm: AdaptedArm, rows: Measurements) -> tuple[float, float]:

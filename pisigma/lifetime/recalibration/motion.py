@@ -8,8 +8,8 @@ from dataclasses import replace
 import torch
 
 from pisigma.files.errors import IdentificationError, ModelError
-from pisigma.lifetime.monitoring.session import Session, format_probability, is_frame, judge_session
-from pisigma.lifetime.recalibration.movement import Movement
+from pisigma.lifetime.monitoring.session import Session, format_probability, judge_session
+from pisigma.lifetime.recalibration.movement import Movement, is_frame
 from pisigma.lifetime.recalibration.recalibration_problem import frame_keys
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel

@@ -22,6 +22,9 @@ CLEAR = 3.3
 """Standard deviations above which a movement is significant: chance exceeds them in one of 1,000 cases."""
 NORMAL_95 = 1.959964
 """Half-width of the 95 % interval of a normal distribution [standard deviations]."""
+_CLEAR_DISTANCE, _DISTANCE_95 = 4.033, 3.058
+"""Values that the length of a normal vector with three components exceeds in one of 1,000 and in 2.5 % of all cases
+[standard deviations]; this length is positive even if nothing moved."""
 
 
 @dataclass(frozen=True)
@@ -48,18 +51,23 @@ class Movement:
     @property
     def interval(self) -> tuple[float, float]:
         """95 % confidence interval of the shift [`unit`]."""
-        half = NORMAL_95 * self.sigma
-        return self.shift - half, self.shift + half
+        return self.shift - self.half_width, self.shift + self.half_width
+
+    @property
+    def half_width(self) -> float:
+        """Half-width of the 95 % interval [`unit`], which contains 0 if chance explains the shift of a base or tool."""
+        half, may_be_zero = NORMAL_95 * self.sigma, self.shift < _DISTANCE_95 * self.sigma
+        return max(half, self.shift) if is_frame(self.what) and may_be_zero else half
 
     @property
     def is_significant(self) -> bool:
-        """Whether the shift is above `CLEAR` standard deviations."""
-        return abs(self.shift) > CLEAR * self.sigma
+        """Whether chance exceeds the shift in less than one of 1,000 cases."""
+        return abs(self.shift) > (_CLEAR_DISTANCE if is_frame(self.what) else CLEAR) * self.sigma
 
     @property
     def size(self) -> str:
         """Shift, half-width of its 95 % interval and unit, such as "0.25 ± 0.01 deg"."""
-        half = NORMAL_95 * self.sigma
+        half = self.half_width
         digits = min(max(1 - math.floor(math.log10(max(half, 1e-6))), 0), 4)
         shown = max(half, 10.0**-digits)  # never an uncertainty of 0
         return f"{self.shift:.{digits}f} ± {shown:.{digits}f} {self.unit}"
@@ -96,8 +104,13 @@ SummaryMovement = Annotated[Movement, BeforeValidator(_fields), PlainSerializer(
 """Type of a movement that a model folder stores as `Movement.to_json`."""
 
 
+def is_frame(what: str) -> bool:
+    """Return whether `what` names a base or a tool."""
+    return what.split()[0] in ("base", "tool")
+
+
 def significant_movements(adaptation: Adaptation) -> tuple[Movement, ...]:
-    """Return the movements above `CLEAR` standard deviations: joints, then lengths and angles, then bases and tools.
+    """Return the significant movements: joints, then lengths and angles, then bases and tools.
 
     The shift of a joint zero is estimated without a prior, together with everything else that has drifted. It is
     positive in the positive direction of the joint: a joint with a shift of 0.1 deg is 0.1 deg beyond the value that

@@ -2,6 +2,7 @@
 
 import re
 
+import numpy as np
 import pytest
 from pydantic import TypeAdapter
 from testing.closeness import assert_close
@@ -39,3 +40,16 @@ def test_model_folders_store_the_json_of_a_movement(probability):
     again = stored.validate_python(plain)
     assert (again.what, again.shift, again.unit, again.probability) == ("base", 1.5, "mm", probability)
     assert_close(again.sigma, movement.sigma, rtol=1e-12)
+
+
+@pytest.mark.parametrize("size", [0.0, 0.5, 1.0, 2.0, 3.0, 5.0, 20.0])
+@pytest.mark.parametrize("what", ["joint 3", "base", "tool left"])
+def test_intervals_cover_true_shifts_and_chance_is_not_significant(what: str, size: float):
+    draws = np.random.default_rng(1).normal(size=(20_000, 3 if what != "joint 3" else 1))
+    draws[:, 0] += size
+    shifts = draws[:, 0] if what == "joint 3" else np.linalg.norm(draws, axis=1)
+    movements = [Movement(what, float(shift), 1.0, "mm") for shift in shifts]
+    covered = np.mean([low <= size <= high for low, high in (one.interval for one in movements)])
+    assert 0.935 < covered < 0.98
+    if size == 0.0:
+        assert np.mean([one.is_significant for one in movements]) < 0.0015
