@@ -130,7 +130,8 @@ def _range_table(summary: DistillationSummary) -> Table:
 
 UNDETERMINED = (
     "A parameter that the rows do not determine, such as the position of the first axis in the base, has mean 0 and "
-    "the usual standard deviation of the robot's class."
+    "the usual standard deviation of the robot's class. Parameters in a sum, such as d_2 and d_3 of parallel axes, "
+    "move the tool in the same way as each other, base or tool, so only their sum is that of the robots."
 )
 
 
@@ -155,8 +156,11 @@ def write_fleet_prior_card(model: CalibratedModel, summary: FleetPriorSummary, f
 
 def common_table(summary: FleetPriorSummary) -> Table:
     """Return a table of the mean and the standard deviation between robots of every geometric parameter."""
-    rows = ((one.name, one.unit, f"{one.mean:z.4f}", f"{one.deviation:.4f}") for one in summary.parameters)
-    return Table(("parameter", "unit", "mean", "between robots"), tuple(rows))
+    rows = (
+        (one.name, one.unit, f"{one.mean:z.4f}", f"{one.deviation:.4f}", "in a sum" if one.in_a_sum else "")
+        for one in summary.parameters
+    )
+    return Table(("parameter", "unit", "mean", "between robots", "remark"), tuple(rows))
 
 
 def spectrum_table(summary: FleetPriorSummary) -> Table:

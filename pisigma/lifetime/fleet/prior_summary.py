@@ -3,13 +3,21 @@
 import math
 from collections.abc import Sequence
 
+import torch
+from jaxtyping import Bool, Float64
 from pydantic import Field
+from torch import Tensor
 
 from pisigma.files.yaml_file import Section
 from pisigma.lifetime.fleet.prior import FleetPrior
 from pisigma.measurement.sensors.sensor import SHOWN_UNITS
 from pisigma.model.model_posterior import FLEET_PRIOR
+from pisigma.robot.description import Robot
+from pisigma.robot.kinematics.parameter_jacobian import identification_jacobian
 from pisigma.validation.held_out.summary import AbstractSummary
+
+_SAME = 1e-6
+"""Largest difference of the effects of parameters, relative to their sizes, that is due to rounding."""
 
 
 class ParameterErrorFigures(Section):
@@ -20,12 +28,15 @@ class ParameterErrorFigures(Section):
         unit: "mm" or "deg".
         mean: mean error.
         deviation: standard deviation between robots.
+        in_a_sum: whether other parameters, base or tool move the tool of the nominal robot in the same way, so that
+            mean and deviation are determined only together with theirs.
     """
 
     name: str
     unit: str
     mean: float
     deviation: float
+    in_a_sum: bool = False
 
 
 class WeightSpreadFigures(Section):
@@ -81,11 +92,15 @@ def summarise_prior(prior: FleetPrior, ids: Sequence[str]) -> FleetPriorSummary:
     population, uncertainty = prior.population, prior.model.uncertainty
     assert uncertainty is not None
     deviation = population.covariance.diagonal().sqrt()
+    in_a_sum = _dependent_columns(uncertainty.space.robot, prior.model.starts)
     parameters = []
     for number, name in enumerate(prior.names):
         unit, scale = SHOWN_UNITS[uncertainty.space.parameters[number].unit]
         mean, spread = float(population.mean[number]) * scale, float(deviation[number]) * scale
-        parameters.append(ParameterErrorFigures(name=name, unit=unit, mean=mean, deviation=spread))
+        dependent = bool(in_a_sum[number])
+        parameters.append(
+            ParameterErrorFigures(name=name, unit=unit, mean=mean, deviation=spread, in_a_sum=dependent)
+        )
     weights, start, spectrum = deviation[population.geometric_count :], 0, []
     for feature in uncertainty.features:
         group = feature.group[feature.used]
@@ -101,3 +116,13 @@ def summarise_prior(prior: FleetPrior, ids: Sequence[str]) -> FleetPriorSummary:
         parameters=tuple(parameters),
         spectrum=tuple(spectrum),
     )
+
+
+def _dependent_columns(robot: Robot, q: Float64[Tensor, "poses dof"]) -> Bool[Tensor, " parameters"]:
+    """Return the mask of the parameters of arm, base and tool whose effect on poses is that of other parameters."""
+    J = identification_jacobian(robot, q)[1].flatten(0, 1)
+    J = J / torch.linalg.vector_norm(J, dim=0).clamp(min=1e-300)
+    _, sizes, directions = torch.linalg.svd(J)
+    null = directions[int((sizes > _SAME * sizes[0]).sum()) :]
+    dependent: Tensor = torch.linalg.vector_norm(null, dim=0) > _SAME
+    return dependent

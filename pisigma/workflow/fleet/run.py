@@ -94,6 +94,7 @@ class ParameterValue:
         value: identified value.
         change: difference from the nominal value.
         standard_error: standard error of the estimate.
+        remark: "identified", the sum with other parameters that is identified instead, or "" if it is not known.
     """
 
     name: str
@@ -101,6 +102,7 @@ class ParameterValue:
     value: float
     change: float
     standard_error: float
+    remark: str = ""
 
 
 Parameters = Mapping[str, Sequence[ParameterValue]]
@@ -139,7 +141,7 @@ def write_results(path: Path, cells: Sequence[CellFacts], parameters: Parameters
 
     text, number = pyarrow.string(), pyarrow.float64()
     estimates = ((name, number) for name in ("value", "change", "standard_error"))
-    parameter = pyarrow.struct([("name", text), ("unit", text), *estimates])
+    parameter = pyarrow.struct([("name", text), ("unit", text), *estimates, ("remark", text)])
     schema = pyarrow.schema(
         [
             *((name, text) for name in ("cell", "command", "session", "day")),
@@ -310,9 +312,9 @@ def parameters_of(model: "CalibratedModel") -> list[ParameterValue]:
     """Return the geometric parameters of a calibration, or of the posterior of a recalibrated model."""
     estimated = model.metrics.get("parameters")
     if estimated is not None:
-        names = ("name", "unit", "estimated", "change", "standard_error")
+        names = ("name", "unit", "estimated", "change", "standard_error", "remark")
         rows = [[one.get(name) for name in names] for one in estimated]
-        return [ParameterValue(*row) for row in rows if row[-1] is not None]
+        return [ParameterValue(*row) for row in rows if row[4] is not None]
     if (posterior := model.uncertainty) is None:
         return []
     from pisigma.measurement.sensors.sensor import SHOWN_UNITS
@@ -325,8 +327,8 @@ def parameters_of(model: "CalibratedModel") -> list[ParameterValue]:
     parameters = []
     for number in deviations.nonzero()[:, 0].tolist():
         unit, scale = SHOWN_UNITS[space.parameters[number].unit]
-        figures = (float(those[number]) * scale for those in (values, changes, deviations))
-        parameters.append(ParameterValue(space.names[number], unit, *figures))
+        value, change, error = (float(those[number]) * scale for those in (values, changes, deviations))
+        parameters.append(ParameterValue(space.names[number], unit, value, change, error))
     return parameters
 
 

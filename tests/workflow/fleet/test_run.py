@@ -85,6 +85,8 @@ def test_an_invalid_file_is_named_and_does_not_affect_the_others(first):
         ("r2", "import", "refused"),
     ]
     assert len(rows[0]["parameters"]) > len(rows[1]["parameters"]) > 0
+    remarks = {one["remark"] for one in rows[0]["parameters"]}
+    assert remarks > {"identified"}  # others are identified only in a sum
     assert 0 < rows[0]["rms_mm"] < 1
     assert load_model(plant / "r0" / "models" / rows[0]["model"]).robot.name == "rb5"
     assert FleetStatus.read(plant).states == {"file_refused": ("r2",), "not_verified": ("r0", "r1")}
