@@ -19,22 +19,22 @@ os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 os.environ.setdefault("PISIGMA_TRACEBACK", "1")
 
 import pytest
+import torch
 
 if TYPE_CHECKING:
     import playwright.sync_api
-    import torch
-
-    from pisigma.workflow.recipes.recipe import InverseRecipe
 
 sys.path.insert(0, str(Path(__file__).parent))
 sys.path.append(str(Path(__file__).parent.parent / "training" / "papers"))
 
 import testing.bytecode
+import testing.type_checker  # noqa: F401  its place is before pisigma's, which it shall check
+from testing.models import no_type_checker
+from testing.pictures import no_pictures
 from testing.stored import FOLDER
 
-# The process that only starts workers, which wait for it, imports no torch and no pisigma: functions import them here.
-if "PYTEST_XDIST_WORKER" in os.environ or "--dist" not in sys.argv:
-    import testing.type_checker  # noqa: F401  before pisigma, which it shall check
+from pisigma.workflow.recipes.reader import read_recipe
+from pisigma.workflow.recipes.recipe import InverseRecipe
 
 REPOSITORY = Path(__file__).parent.parent
 
@@ -52,8 +52,6 @@ def pytest_configure(config: pytest.Config) -> None:
         folder = tempfile.TemporaryDirectory(prefix="pisigma-tests-")
         config.add_cleanup(folder.cleanup)
         os.environ[FOLDER] = folder.name
-    else:
-        import testing.type_checker  # noqa: F401  for `--dist` without workers
 
 
 def pytest_collection_finish() -> None:
@@ -92,18 +90,14 @@ def browser() -> Iterator["playwright.sync_api.Browser"]:
 
 
 @pytest.fixture
-def generator() -> "torch.Generator":
+def generator() -> torch.Generator:
     """A seeded source of randomness."""
-    import torch
-
     return torch.Generator().manual_seed(0)
 
 
 @pytest.fixture
 def without_type_checker() -> Iterator[None]:
     """Call pisigma as users do, whom no type checker stops before our own complaints."""
-    from testing.models import no_type_checker
-
     with no_type_checker():
         yield
 
@@ -111,8 +105,6 @@ def without_type_checker() -> Iterator[None]:
 @pytest.fixture(scope="module")
 def blank_pictures() -> Iterator[None]:
     """Write blank figures where they are not what is tested."""
-    from testing.pictures import no_pictures
-
     with no_pictures():
         yield
 
@@ -134,8 +126,6 @@ def write_recipe(repository: Path, tmp_path: Path) -> Callable[..., Path]:
 
 
 @pytest.fixture
-def small_recipe(write_recipe: Callable[..., Path]) -> "Callable[..., InverseRecipe]":
+def small_recipe(write_recipe: Callable[..., Path]) -> Callable[..., InverseRecipe]:
     """A shipped recipe with replacements, read."""
-    from pisigma.workflow.recipes.reader import read_recipe
-
     return lambda name, *replacements: read_recipe(write_recipe(name, *replacements))
